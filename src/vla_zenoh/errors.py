@@ -1,0 +1,82 @@
+"""Every error the package raises on purpose.
+
+::
+
+    VlaZenohError
+    ├── RecordError        a value cannot be a valid record (shape, finiteness, range)
+    ├── CodecError         bytes from the wire are not what their key promises
+    ├── ProfileError       a profile file is wrong; names file, line and path
+    ├── SpecError          a model's spec is wrong or does not fit the profile
+    ├── ResourceError      a model, scene, profile or robot description was not found
+    ├── MissingExtraError  an optional dependency is not installed
+    ├── SessionError       no Zenoh session could be had
+    ├── WorkerError        a model worker cannot be loaded or broke its contract
+    └── NodeError          a node cannot start or go on (a second command node, a dead device)
+
+A message says what is wrong, what is allowed and what to do. Errors of libraries are turned into
+these at the edge, with ``from``.
+"""
+
+from __future__ import annotations
+
+
+class VlaZenohError(Exception):
+    """Root of every error this package raises on purpose."""
+
+
+class RecordError(VlaZenohError, ValueError):
+    """A value cannot be a valid record."""
+
+
+class CodecError(VlaZenohError, ValueError):
+    """Bytes from the wire are not what their key promises.
+
+    Attributes:
+        reason: short stable name used as a counter in status, for example ``truncated``.
+    """
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+class ProfileError(VlaZenohError, ValueError):
+    """A profile file is wrong."""
+
+
+class SpecError(VlaZenohError, ValueError):
+    """A model's spec is wrong, or does not fit the profile."""
+
+
+class ResourceError(VlaZenohError, FileNotFoundError):
+    """A model, scene, profile or robot description was not found."""
+
+    def __str__(self) -> str:  # FileNotFoundError would print errno and file name
+        return str(self.args[0]) if self.args else ""
+
+
+class MissingExtraError(VlaZenohError, ImportError):
+    """An optional dependency is not installed.
+
+    Args:
+        module: the module that could not be imported.
+        extra: the extra of this package that brings it.
+    """
+
+    def __init__(self, module: str, extra: str) -> None:
+        super().__init__(
+            f"the Python module {module!r} is not installed; "
+            f"install it with: pip install 'vla-zenoh[{extra}]'"
+        )
+
+
+class SessionError(VlaZenohError, ConnectionError):
+    """No Zenoh session could be had."""
+
+
+class WorkerError(VlaZenohError):
+    """A model worker cannot be loaded, or broke its contract."""
+
+
+class NodeError(VlaZenohError):
+    """A node cannot start or go on."""

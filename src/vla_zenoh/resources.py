@@ -1,0 +1,104 @@
+"""Finds models, scenes, profiles and robot descriptions, in a checkout and in a wheel alike.
+
+Looked through in this order, first hit wins: an explicit path, each folder in ``VLA_ZENOH_PATH``
+(``<folder>/profiles/name.yaml``), what the package ships. Nothing is ever fetched from the net.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import sysconfig
+from pathlib import Path
+
+from vla_zenoh.errors import MissingExtraError, ResourceError
+
+KINDS = {"models": (".py", ""), "profiles": (".yaml", ".yml"), "sim": ("",)}
+SEARCH_PATH_VARIABLE = "VLA_ZENOH_PATH"
+ROBOT_DATA_PREFIX = "example-robot-data:"
+
+
+def shipped(kind: str) -> Path:
+    """The folder that holds what the package ships of `kind`."""
+    package = Path(__file__).resolve().parent
+    inside_wheel = package / "_data" / kind
+    if inside_wheel.is_dir():
+        return inside_wheel
+    checkout = package.parents[1] / kind
+    if checkout.is_dir() and (package.parents[1] / "pyproject.toml").is_file():
+        return checkout
+    raise ResourceError(f"the installation of vla-zenoh is damaged: its {kind}/ folder is missing")
+
+
+def folders(kind: str) -> list[Path]:
+    """Where things of `kind` are looked for, first match wins."""
+    named = [Path(part) for part in os.environ.get(SEARCH_PATH_VARIABLE, "").split(os.pathsep) if part]
+    return [folder / kind for folder in named if (folder / kind).is_dir()] + [shipped(kind)]
+
+
+def names(kind: str) -> list[str]:
+    """Names of everything of `kind` that can be found, sorted."""
+    found: set[str] = set()
+    for folder in folders(kind):
+        for entry in folder.iterdir():
+            if entry.name.startswith((".", "_")):
+                continue
+            if entry.is_dir() and "" in KINDS[kind]:
+                found.add(entry.name)
+            elif entry.is_file() and entry.suffix and entry.suffix in KINDS[kind]:
+                found.add(entry.stem)
+    return sorted(found)
+
+
+def find(kind: str, name: str) -> Path:
+    """The file or folder called `name`, which may also be a path.
+
+    Raises:
+        ResourceError: nothing there; lists what exists and the nearest name.
+    """
+    if os.sep in name or Path(name).suffix in (".py", ".yaml", ".yml"):
+        path = Path(name).expanduser()
+        if path.exists():
+            return path.resolve()
+        raise ResourceError(f"there is no file or folder {name!r}")
+    for folder in folders(kind):
+        for suffix in KINDS[kind]:
+            path = folder / f"{name}{suffix}"
+            if path.exists() and (suffix or path.is_dir()):
+                return path
+    known = names(kind)
+    near = difflib.get_close_matches(name, known, 1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise ResourceError(f"no {kind} called {name!r}{hint} Known: {', '.join(known) or 'none'}")
+
+
+def robot_urdf(description: str) -> Path:
+    """The URDF a profile names: a path, or ``example-robot-data:<path below robots/>``.
+
+    Raises:
+        ResourceError: the file is not there.
+        MissingExtraError: the package that carries the robot descriptions is not installed.
+    """
+    if not description.startswith(ROBOT_DATA_PREFIX):
+        path = Path(description).expanduser()
+        if not path.is_file():
+            raise ResourceError(f"robot description {description!r} is not a file")
+        return path.resolve()
+    root = Path(sysconfig.get_path("purelib")) / "cmeel.prefix/share/example-robot-data/robots"
+    if not root.is_dir():
+        raise MissingExtraError("example-robot-data", "control")
+    path = root / description.removeprefix(ROBOT_DATA_PREFIX)
+    if not path.is_file():
+        raise ResourceError(
+            f"robot description {description!r} is not in example-robot-data; "
+            f"robots there: {', '.join(sorted(entry.name for entry in root.iterdir()))}"
+        )
+    return path
+
+
+def meshes_of(urdf: Path) -> Path:
+    """Folder of the collision meshes beside a URDF of the usual layout (``../meshes/collision``)."""
+    folder = urdf.parent.parent / "meshes" / "collision"
+    if not folder.is_dir():
+        raise ResourceError(f"no collision meshes for {urdf.name}: {folder} is not a folder")
+    return folder

@@ -1,0 +1,450 @@
+"""Records that travel on keys: frozen, checked, units in their names.
+
+A record that exists is valid: arrays have their shape, are finite, contiguous and read-only,
+quaternions are unit. Who makes one from bad values gets a `RecordError` that names the field.
+The stamp is not part of a record: it travels beside it as a `Header`.
+
+Frames: poses are those of the tool centre point (TCP) in the robot's base frame. A twist is
+``[linear m/s, angular rad/s]``, a wrench ``[force N, torque Nm]``, both with respect to the base
+frame's axes and the TCP's origin. Quaternions are stored ``x, y, z, w``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vla_zenoh.errors import RecordError
+
+FloatArray = NDArray[np.float64]
+
+QUATERNION_NORM_TOLERANCE = 1e-3
+MAX_TEXT = 4096
+
+
+def vector(name: str, value: ArrayLike, size: int | None) -> FloatArray:
+    """Copy `value` into a finite, read-only float64 vector of `size` (None: any size)."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise RecordError(f"{name} is not a list of numbers: {error}") from error
+    if array.ndim != 1 or (size is not None and array.shape[0] != size):
+        wanted = "(n,)" if size is None else f"({size},)"
+        raise RecordError(f"{name} has shape {array.shape}, wanted {wanted}")
+    if not np.isfinite(array).all():
+        raise RecordError(f"{name} is not finite: {array.tolist()}")
+    array.setflags(write=False)
+    return array
+
+
+def unit_quaternion(name: str, value: ArrayLike) -> FloatArray:
+    """Like `vector` for four numbers x, y, z, w; normalised, refused when far from unit."""
+    array = vector(name, value, 4)
+    norm = float(np.linalg.norm(array))
+    if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
+        raise RecordError(f"{name} has norm {norm:.6g}, wanted a unit quaternion x, y, z, w")
+    array = array / norm
+    array.setflags(write=False)
+    return array
+
+
+def number(
+    name: str, value: Any, minimum: float = -math.inf, maximum: float = math.inf
+) -> float:
+    """A finite float within ``[minimum, maximum]``."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise RecordError(f"{name} is not a number: {value!r}")
+    if not math.isfinite(value) or not minimum <= value <= maximum:
+        raise RecordError(f"{name} is {value!r}, wanted a number in [{minimum:g}, {maximum:g}]")
+    return float(value)
+
+
+def integer(name: str, value: Any, minimum: int = 0, maximum: int = 2**63 - 1) -> int:
+    """An int within ``[minimum, maximum]``."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise RecordError(f"{name} is not a whole number: {value!r}")
+    if not minimum <= value <= maximum:
+        raise RecordError(f"{name} is {value!r}, wanted a whole number in [{minimum}, {maximum}]")
+    return int(value)
+
+
+def text(name: str, value: Any, limit: int = MAX_TEXT) -> str:
+    """A str of at most `limit` characters."""
+    if not isinstance(value, str):
+        raise RecordError(f"{name} is not text: {type(value).__name__}")
+    if len(value) > limit:
+        raise RecordError(f"{name} has {len(value)} characters, at most {limit} are allowed")
+    return value
+
+
+def boolean(name: str, value: Any) -> bool:
+    """A bool, and nothing that merely looks like one."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise RecordError(f"{name} is not true or false: {value!r}")
+    return bool(value)
+
+
+def _set(record: Any, name: str, value: Any) -> None:
+    object.__setattr__(record, name, value)
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What stands beside every streamed record.
+
+    Args:
+        stamp_wall_ns: time of capture, nanoseconds since the Unix epoch on the writer's clock.
+        seq: counts up by one for every record this source writes on this key.
+        source: who wrote it: node name and a number that differs after every restart.
+    """
+
+    stamp_wall_ns: int
+    seq: int
+    source: str
+
+    def __post_init__(self) -> None:
+        integer("stamp_wall_ns", self.stamp_wall_ns)
+        integer("seq", self.seq)
+        text("source", self.source, 128)
+
+
+Record = TypeVar("Record")
+
+
+@dataclass(frozen=True, slots=True)
+class Stamped(Generic[Record]):
+    """A record as it arrived.
+
+    Args:
+        header: what its writer said of it.
+        record: the record.
+        received_ns: when it arrived here, same clock as the caller's ``now_ns``.
+    """
+
+    header: Header
+    record: Record
+    received_ns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Image:
+    """A picture: RGB, uint8, ``(height, width, 3)``, row by row from the top left."""
+
+    rgb: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        rgb = self.rgb
+        if not isinstance(rgb, np.ndarray) or rgb.dtype != np.uint8:
+            raise RecordError("an image must be a uint8 array (H, W, 3) in RGB order")
+        if rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape:
+            raise RecordError(f"an image has shape {rgb.shape}, wanted (H, W, 3)")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointState:
+    """Arm joints, without the fingers: all arrays have one entry per name."""
+
+    names: tuple[str, ...]
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+    effort_nm: FloatArray
+
+    def __post_init__(self) -> None:
+        names = tuple(text("names", name, 128) for name in self.names)
+        if not names or len(set(names)) != len(names):
+            raise RecordError(f"joint names must be present and differ: {names}")
+        _set(self, "names", names)
+        for name in ("position_rad", "velocity_rad_s", "effort_nm"):
+            _set(self, name, vector(name, getattr(self, name), len(names)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseState:
+    """Measured TCP pose in the base frame.
+
+    Args:
+        position_m: (3,).
+        quat_xyzw: (4,) unit.
+        twist: (6,) m/s and rad/s, base axes.
+        wrench: (6,) external N and Nm, or None where the robot does not know it.
+        reference_position_m: (3,) pose the robot's controller holds right now, or None.
+        reference_quat_xyzw: (4,), or None. Both or neither.
+    """
+
+    position_m: FloatArray
+    quat_xyzw: FloatArray
+    twist: FloatArray
+    wrench: FloatArray | None = None
+    reference_position_m: FloatArray | None = None
+    reference_quat_xyzw: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        _set(self, "position_m", vector("position_m", self.position_m, 3))
+        _set(self, "quat_xyzw", unit_quaternion("quat_xyzw", self.quat_xyzw))
+        _set(self, "twist", vector("twist", self.twist, 6))
+        if self.wrench is not None:
+            _set(self, "wrench", vector("wrench", self.wrench, 6))
+        if (self.reference_position_m is None) != (self.reference_quat_xyzw is None):
+            raise RecordError("a reference pose needs both position and quaternion")
+        if self.reference_position_m is not None and self.reference_quat_xyzw is not None:
+            _set(
+                self,
+                "reference_position_m",
+                vector("reference_position_m", self.reference_position_m, 3),
+            )
+            _set(
+                self,
+                "reference_quat_xyzw",
+                unit_quaternion("reference_quat_xyzw", self.reference_quat_xyzw),
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class GripperState:
+    """Gripper and robot condition.
+
+    Args:
+        width_m: opening between the fingers.
+        moving: the fingers move.
+        holding: an object is held.
+        mode: the robot's own word for its mode, ``ready`` when it will move.
+        faults: what the robot complains of, empty when well.
+    """
+
+    width_m: float
+    moving: bool
+    holding: bool
+    mode: str = "ready"
+    faults: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        number("width_m", self.width_m, -0.01, 1.0)
+        boolean("moving", self.moving)
+        boolean("holding", self.holding)
+        text("mode", self.mode, 128)
+        _set(self, "faults", tuple(text("faults", fault, 512) for fault in self.faults))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ActionChunk:
+    """What a model asks for: `H` steps of `D` numbers whose meaning its spec declares.
+
+    Args:
+        worker: name of the worker.
+        spec_hash: hash of the spec its steps are to be read with.
+        episode: the episode (see `Task`) the policy was reset for.
+        observation_stamp_ns: capture time of the observation, wall clock.
+        observation_seq: its sequence number.
+        valid_until_ns: after this wall time the chunk must not be started.
+        steps: (H, D) float32.
+        observed_ns: wall time at which the worker took the observation.
+        inference_start_ns: wall time.
+        inference_end_ns: wall time.
+        done: the policy says its task is finished.
+    """
+
+    worker: str
+    spec_hash: str
+    episode: int
+    observation_stamp_ns: int
+    observation_seq: int
+    valid_until_ns: int
+    steps: NDArray[np.float32]
+    observed_ns: int
+    inference_start_ns: int
+    inference_end_ns: int
+    done: bool = False
+
+    def __post_init__(self) -> None:
+        text("worker", self.worker, 128)
+        text("spec_hash", self.spec_hash, 128)
+        for name in (
+            "episode",
+            "observation_stamp_ns",
+            "observation_seq",
+            "valid_until_ns",
+            "observed_ns",
+            "inference_start_ns",
+            "inference_end_ns",
+        ):
+            integer(name, getattr(self, name))
+        boolean("done", self.done)
+        try:
+            steps = np.array(self.steps, dtype=np.float32, order="C")
+        except (TypeError, ValueError) as error:
+            raise RecordError(f"steps is not an array of numbers: {error}") from error
+        if steps.ndim != 2 or 0 in steps.shape:
+            raise RecordError(f"steps has shape {steps.shape}, wanted (H, D)")
+        if not np.isfinite(steps).all():
+            raise RecordError("steps holds NaN or infinity")
+        steps.setflags(write=False)
+        _set(self, "steps", steps)
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Which chunk a command carries out, and when that chunk passed each stage (wall clock)."""
+
+    worker: str
+    chunk_seq: int
+    observation_stamp_ns: int
+    observed_ns: int
+    inference_start_ns: int
+    inference_end_ns: int
+    published_ns: int
+    received_ns: int
+
+    def __post_init__(self) -> None:
+        text("worker", self.worker, 128)
+        for name in self.__dataclass_fields__:
+            if name != "worker":
+                integer(name, getattr(self, name))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseCommand:
+    """Where the TCP has to be now, in the base frame, with feed-forward.
+
+    Args:
+        position_m: (3,).
+        quat_xyzw: (4,) unit.
+        twist: (6,) m/s and rad/s.
+        acceleration: (6,) m/s^2 and rad/s^2.
+        goal_position_m: (3,) where the smoothed motion is heading.
+        goal_quat_xyzw: (4,) unit.
+        state: the command node's state.
+        cause: the chunk carried out, None while nothing is.
+    """
+
+    position_m: FloatArray
+    quat_xyzw: FloatArray
+    twist: FloatArray
+    acceleration: FloatArray
+    goal_position_m: FloatArray
+    goal_quat_xyzw: FloatArray
+    state: str
+    cause: Cause | None = None
+
+    def __post_init__(self) -> None:
+        for name, size in (("position_m", 3), ("goal_position_m", 3)):
+            _set(self, name, vector(name, getattr(self, name), size))
+        for name in ("quat_xyzw", "goal_quat_xyzw"):
+            _set(self, name, unit_quaternion(name, getattr(self, name)))
+        for name in ("twist", "acceleration"):
+            _set(self, name, vector(name, getattr(self, name), 6))
+        text("state", self.state, 32)
+
+
+@dataclass(frozen=True, slots=True)
+class GripperCommand:
+    """An absolute opening to go to; a newer one replaces it."""
+
+    width_m: float
+    speed_m_s: float
+    force_n: float
+
+    def __post_init__(self) -> None:
+        number("width_m", self.width_m, 0.0, 1.0)
+        number("speed_m_s", self.speed_m_s, 1e-4, 10.0)
+        number("force_n", self.force_n, 0.0, 1000.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is to be done now, as the command node has agreed to it.
+
+    Args:
+        episode: grows with every activation and every change of prompt or worker; a policy
+            starts afresh with it and a chunk of an older episode is refused.
+        active: the arm obeys the worker.
+        prompt: plain text.
+        worker: name of the worker whose chunks are obeyed.
+        rate_hz: chunks per second asked of the workers.
+    """
+
+    episode: int
+    active: bool
+    prompt: str
+    worker: str
+    rate_hz: float
+
+    def __post_init__(self) -> None:
+        integer("episode", self.episode)
+        boolean("active", self.active)
+        text("prompt", self.prompt)
+        text("worker", self.worker, 128)
+        number("rate_hz", self.rate_hz, 0.01, 1000.0)
+
+
+@dataclass(frozen=True, slots=True)
+class NodeStatus:
+    """A node's word on itself.
+
+    Args:
+        node: its name.
+        state: one word.
+        host: where it runs.
+        pid: process number.
+        started_wall_ns: when it started; tells a restart.
+        ages_s: age of the newest of every input.
+        rates_hz: of what it writes and loops.
+        latency_ms: stage -> ``[p50, p95]``.
+        counters: everything counted; refusals as ``refused.<reason>``.
+        detail: whatever else a person wants to know; values are str, int, float, bool or lists.
+    """
+
+    node: str
+    state: str
+    host: str
+    pid: int
+    started_wall_ns: int
+    ages_s: Mapping[str, float] = field(default_factory=dict)
+    rates_hz: Mapping[str, float] = field(default_factory=dict)
+    latency_ms: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    counters: Mapping[str, int] = field(default_factory=dict)
+    detail: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("node", "state", "host"):
+            text(name, getattr(self, name), 256)
+        integer("pid", self.pid)
+        integer("started_wall_ns", self.started_wall_ns)
+        for name in ("ages_s", "rates_hz", "latency_ms", "counters", "detail"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise RecordError(f"{name} is not a map")
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something happened that a person may ask about later.
+
+    Args:
+        level: ``info``, ``warning`` or ``error``.
+        kind: ``refusal``, ``transition``, ``limit``, ``fault`` or ``notice``.
+        what: short stable name, for example ``stale_chunk``.
+        why: a sentence.
+        value: the value that led to it, where there is one.
+        limit: the bound it met, where there is one.
+        count: how many of the same this stands for.
+    """
+
+    level: str
+    kind: str
+    what: str
+    why: str = ""
+    value: float | None = None
+    limit: float | None = None
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("level", "kind", "what", "why"):
+            text(name, getattr(self, name))
+        integer("count", self.count, 1)
+        for name in ("value", "limit"):
+            if getattr(self, name) is not None:
+                _set(self, name, number(name, getattr(self, name)))
