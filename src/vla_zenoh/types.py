@@ -448,3 +448,41 @@ class Event:
         for name in ("value", "limit"):
             if getattr(self, name) is not None:
                 _set(self, name, number(name, getattr(self, name)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneState:
+    """All generalised positions of a simulation, enough for a renderer to draw it.
+
+    Args:
+        scene: name of the scene.
+        qpos: (nq,), the simulator's own order and units, then what it can place by hand.
+    """
+
+    scene: str
+    qpos: FloatArray
+
+    def __post_init__(self) -> None:
+        text("scene", self.scene, 512)
+        _set(self, "qpos", vector("qpos", self.qpos, None))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectPoses:
+    """True poses of a simulation's objects in the base frame.
+
+    Args:
+        names: one per object.
+        position_m: (n, 3).
+        quat_xyzw: (n, 4).
+    """
+
+    names: tuple[str, ...]
+    position_m: FloatArray
+    quat_xyzw: FloatArray
+
+    def __post_init__(self) -> None:
+        _set(self, "names", tuple(text("names", name, 128) for name in self.names))
+        for name, size in (("position_m", 3), ("quat_xyzw", 4)):
+            flat = vector(name, np.ravel(getattr(self, name)), len(self.names) * size)
+            _set(self, name, flat.reshape(len(self.names), size))

@@ -1,0 +1,1 @@
+"""Bytes to records and back. Pure; every decoder decodes or raises `CodecError`."""

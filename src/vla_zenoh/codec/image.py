@@ -1,0 +1,106 @@
+"""Pictures: raw pixels with their size in the header's place, or a plain JPEG file.
+
+Raw frames are prefixed by nothing: the shape travels in the sample's encoding schema
+(``zenoh/bytes;rgb8;480x640``), so that the payload is the pixels and no more.
+"""
+
+from __future__ import annotations
+
+import re
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.errors import CodecError
+from vla_zenoh.types import Image
+
+MAX_SIDE = 8192
+MAX_JPEG_BYTES = 32 * 1024 * 1024
+DEFAULT_JPEG_QUALITY = 90
+
+_RAW_SCHEMA = re.compile(r"rgb8;(\d{1,5})x(\d{1,5})")
+
+
+def raw_schema(image: Image) -> str:
+    """What goes into the encoding's schema for this picture: ``rgb8;HEIGHTxWIDTH``."""
+    height, width, _ = image.rgb.shape
+    return f"rgb8;{height}x{width}"
+
+
+def encode_raw(image: Image) -> bytes:
+    """The pixels, row by row."""
+    return image.rgb.tobytes()
+
+
+def decode_raw(payload: bytes, schema: str) -> Image:
+    """Pixels back to a picture without copying.
+
+    Raises:
+        CodecError: schema or length do not fit.
+    """
+    match = _RAW_SCHEMA.fullmatch(schema)
+    if match is None:
+        raise CodecError("malformed", f"raw image schema {schema!r}, wanted rgb8;HEIGHTxWIDTH")
+    height, width = int(match[1]), int(match[2])
+    if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
+        raise CodecError("invalid", f"an image of {height}x{width}, sides are 1 to {MAX_SIDE}")
+    if len(payload) != height * width * 3:
+        raise CodecError(
+            "truncated", f"{len(payload)} bytes for an rgb8 image of {height}x{width}"
+        )
+    return Image(np.frombuffer(payload, np.uint8).reshape(height, width, 3))
+
+
+def encode_jpeg(image: Image, quality: int = DEFAULT_JPEG_QUALITY) -> bytes:
+    """A JPEG file."""
+    ok, data = cv2.imencode(
+        ".jpg", cv2.cvtColor(image.rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
+    )
+    if not ok:
+        raise CodecError("unencodable", f"no JPEG could be made of a {image.rgb.shape} image")
+    return data.tobytes()
+
+
+def decode_jpeg(payload: bytes) -> Image:
+    """A JPEG file to RGB pixels.
+
+    Raises:
+        CodecError: not a whole JPEG file, or larger than we read.
+    """
+    if len(payload) > MAX_JPEG_BYTES:
+        raise CodecError("oversize", f"a JPEG of {len(payload)} bytes, at most {MAX_JPEG_BYTES}")
+    if payload[:3] != b"\xff\xd8\xff":
+        raise CodecError("malformed", "not a JPEG file")
+    if payload.rstrip(b"\0")[-2:] != b"\xff\xd9":
+        raise CodecError("truncated", "a JPEG file without its end")
+    height, width = _jpeg_size(payload)
+    if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
+        raise CodecError("invalid", f"a JPEG of {height}x{width}, sides are 1 to {MAX_SIDE}")
+    try:
+        bgr = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error as error:
+        raise CodecError("malformed", f"not a JPEG file: {error.err}") from error
+    if bgr is None:
+        raise CodecError("malformed", "not a JPEG file that can be decoded")
+    rgb: NDArray[np.uint8] = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+    return Image(rgb)
+
+
+def _jpeg_size(payload: bytes) -> tuple[int, int]:
+    """Height and width from the frame header, read before any memory is taken for pixels."""
+    at = 2
+    while at + 9 <= len(payload):
+        if payload[at] != 0xFF:
+            break
+        marker = payload[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            return (
+                int.from_bytes(payload[at + 5 : at + 7], "big"),
+                int.from_bytes(payload[at + 7 : at + 9], "big"),
+            )
+        at += 2 + int.from_bytes(payload[at + 2 : at + 4], "big")
+    raise CodecError("malformed", "a JPEG file without a frame header")

@@ -1,0 +1,92 @@
+"""Structured records as msgpack maps with string keys: the field names of `vla_zenoh.types`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from vla_zenoh.codec import message
+from vla_zenoh.errors import CodecError, RecordError, SpecError
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.types import Cause
+
+Record = TypeVar("Record")
+
+
+def encode(record: Any) -> bytes:
+    """Bytes of a record dataclass or a `ModelSpec`."""
+    if isinstance(record, ModelSpec):
+        return message.pack(record.to_dict())
+    return message.pack(_fields(record))
+
+
+def decode(kind: type[Record], payload: bytes) -> Record:
+    """Read a record of `kind`.
+
+    Raises:
+        CodecError: reason ``malformed`` (not such a map) or ``invalid`` (a value that the record
+            refuses: NaN, wrong shape, out of range).
+    """
+    data = message.unpack(payload)
+    if not isinstance(data, dict):
+        raise CodecError(
+            "malformed", f"{kind.__name__} is a map, this is a {type(data).__name__}"
+        )
+    if kind is ModelSpec:
+        try:
+            return ModelSpec.from_dict(data)  # pyright: ignore[reportReturnType]
+        except SpecError as error:
+            raise CodecError("invalid", str(error)) from error
+    return _record(kind, data)
+
+
+def _fields(record: Any) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if dataclasses.is_dataclass(value):
+            value = _fields(value)
+        elif isinstance(value, Mapping):
+            value = dict(value)
+        out[field.name] = value
+    return out
+
+
+def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
+    fields = {field.name: field for field in dataclasses.fields(kind)}  # pyright: ignore
+    unknown = [str(name) for name in data if name not in fields]
+    if unknown:
+        raise CodecError("malformed", f"{kind.__name__} has no field {', '.join(sorted(unknown))}")
+    missing = [
+        name
+        for name, field in fields.items()
+        if name not in data
+        and field.default is dataclasses.MISSING
+        and field.default_factory is dataclasses.MISSING
+    ]
+    if missing:
+        raise CodecError("malformed", f"{kind.__name__} lacks {', '.join(missing)}")
+    values = {name: _convert(name, value) for name, value in data.items()}
+    try:
+        return kind(**values)
+    except RecordError as error:
+        raise CodecError("invalid", f"{kind.__name__}: {error}") from error
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise CodecError("malformed", f"{kind.__name__}: {error}") from error
+
+
+def _cause(value: Any) -> Cause | None:
+    if value is None:
+        return None
+    if not isinstance(value, dict):
+        raise CodecError("malformed", "cause is a map or nothing")
+    return _record(Cause, value)
+
+
+_CONVERTERS: dict[str, Callable[[Any], Any]] = {"cause": _cause}
+
+
+def _convert(name: str, value: Any) -> Any:
+    converter = _CONVERTERS.get(name)
+    return converter(value) if converter else value

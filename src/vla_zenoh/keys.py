@@ -1,0 +1,219 @@
+"""Every key expression, and what may be said on it. The only file with key text.
+
+A key is ``{root}/{robot}/...``: `Keys` makes them for one robot, `Kind` says what each is for. Who
+reads the table below knows the whole wire.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import Enum
+
+from vla_zenoh.errors import ProfileError
+
+SCHEMA = 1
+"""Version of headers and payloads; a reader refuses any other."""
+
+DEFAULT_ROOT = "vla"
+
+_CHUNK = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+
+
+class Kind(Enum):
+    """How samples on a key are to be carried (see nodes/qos.py)."""
+
+    FRAME = "frame"  # large, newest only, may be dropped
+    STATE = "state"  # small, fast, newest only, may be dropped
+    CONTROL = "control"  # small, real-time priority, express, may be dropped: a newer one follows
+    ORDER = "order"  # small, real-time priority, express, must arrive
+    NEWS = "news"  # status and events
+
+
+def chunk(name: str, what: str) -> str:
+    """Check that `name` can stand between two slashes of a key.
+
+    Raises:
+        ProfileError: it cannot; says what is allowed.
+    """
+    if not _CHUNK.fullmatch(name):
+        raise ProfileError(
+            f"{what} {name!r} cannot be part of a key: use letters, digits, '_', '-' and '.', "
+            "starting with a letter, digit or '_'"
+        )
+    return name
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """The keys of one robot.
+
+    Args:
+        robot: the robot's name.
+        root: what stands before it, may hold slashes.
+    """
+
+    robot: str
+    root: str = DEFAULT_ROOT
+
+    def __post_init__(self) -> None:
+        chunk(self.robot, "robot name")
+        for part in self.root.split("/"):
+            chunk(part, "root")
+
+    def _at(self, *parts: str) -> str:
+        return "/".join((self.root, self.robot, *parts))
+
+    # -- streams of the robot side ------------------------------------------------------------
+    def camera_raw(self, camera: str) -> str:
+        """Pixels, C-contiguous RGB uint8 (H, W, 3); written while someone listens."""
+        return self._at("camera", chunk(camera, "camera name"), "raw")
+
+    def camera_jpeg(self, camera: str) -> str:
+        """A plain JPEG file, encoding image/jpeg; written while someone listens."""
+        return self._at("camera", chunk(camera, "camera name"), "jpeg")
+
+    @property
+    def state_joint(self) -> str:
+        """`JointState`."""
+        return self._at("state", "joint")
+
+    @property
+    def state_pose(self) -> str:
+        """`PoseState`, with the stamp and seq of the `JointState` it belongs to."""
+        return self._at("state", "pose")
+
+    @property
+    def state_gripper(self) -> str:
+        """`GripperState`, likewise."""
+        return self._at("state", "gripper")
+
+    # -- settings: plain text, any client may put ---------------------------------------------
+    @property
+    def prompt(self) -> str:
+        """Plain UTF-8 text."""
+        return self._at("prompt")
+
+    @property
+    def active(self) -> str:
+        """true / false, also 1/0, on/off."""
+        return self._at("active")
+
+    @property
+    def worker(self) -> str:
+        """Name of the worker whose chunks are obeyed."""
+        return self._at("worker")
+
+    @property
+    def rate(self) -> str:
+        """Chunks per second, a plain number."""
+        return self._at("rate")
+
+    @property
+    def stop(self) -> str:
+        """Anything: latched emergency stop."""
+        return self._at("stop")
+
+    @property
+    def reset(self) -> str:
+        """Anything: clears the emergency stop."""
+        return self._at("reset")
+
+    # -- model workers ------------------------------------------------------------------------
+    @property
+    def task(self) -> str:
+        """`Task`: the settings as the command node agreed to them; workers follow it."""
+        return self._at("task")
+
+    def delta(self, worker: str) -> str:
+        """`ActionChunk` of one worker: the delta key."""
+        return self._at("delta", chunk(worker, "worker name"))
+
+    def spec(self, worker: str) -> str:
+        """The worker's `ModelSpec`, once a second and on request."""
+        return self._at("spec", chunk(worker, "worker name"))
+
+    def seen(self, worker: str, camera: str) -> str:
+        """JPEG of exactly what the model saw; written while someone listens."""
+        return self._at("seen", chunk(worker, "worker name"), chunk(camera, "camera name"))
+
+    # -- command node -------------------------------------------------------------------------
+    @property
+    def command_pose(self) -> str:
+        """`PoseCommand` at a fixed rate. The command node is its only writer."""
+        return self._at("command", "pose")
+
+    @property
+    def command_gripper(self) -> str:
+        """`GripperCommand`, newest wins."""
+        return self._at("command", "gripper")
+
+    # -- every node ---------------------------------------------------------------------------
+    def status(self, node: str) -> str:
+        """`NodeStatus`, 2 Hz and on change."""
+        return self._at("status", chunk(node, "node name"))
+
+    def event(self, node: str) -> str:
+        """`Event`."""
+        return self._at("event", chunk(node, "node name"))
+
+    def alive(self, node: str) -> str:
+        """Liveliness token."""
+        return self._at("alive", chunk(node, "node name"))
+
+    # -- the simulator's own ------------------------------------------------------------------
+    @property
+    def sim_scene(self) -> str:
+        """`SceneState`: all generalised positions, for renderers."""
+        return self._at("sim", "scene")
+
+    @property
+    def sim_objects(self) -> str:
+        """`ObjectPoses`: true poses of all free objects, for measuring success."""
+        return self._at("sim", "objects")
+
+    @property
+    def sim_reset(self) -> str:
+        """Empty, or a seed as plain text: the arm goes home, objects are placed anew."""
+        return self._at("sim", "reset")
+
+    @property
+    def sim_step(self) -> str:
+        """Query in lockstep mode: advance by so many nanoseconds, reply with the state."""
+        return self._at("sim", "step")
+
+    # -- selectors ----------------------------------------------------------------------------
+    @property
+    def everything(self) -> str:
+        """All keys of this robot."""
+        return self._at("**")
+
+    @property
+    def all_deltas(self) -> str:
+        return self._at("delta", "*")
+
+    @property
+    def all_specs(self) -> str:
+        return self._at("spec", "*")
+
+    @property
+    def all_status(self) -> str:
+        return self._at("status", "*")
+
+    @property
+    def all_events(self) -> str:
+        return self._at("event", "*")
+
+    @property
+    def all_alive(self) -> str:
+        return self._at("alive", "*")
+
+    def short(self, key: str) -> str:
+        """`key` without the root and robot, as people say it; other keys as they are."""
+        return key.removeprefix(f"{self.root}/{self.robot}/")
+
+
+
+def last(key: str) -> str:
+    """The last part of a key: the node, worker or camera it is about."""
+    return key.rsplit("/", 1)[-1]

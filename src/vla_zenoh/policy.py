@@ -1,0 +1,252 @@
+"""The model contract: what a model declares, what it is given, what it returns.
+
+A model is a class with a `spec` and ``infer(observation) -> ActionSteps``; `Policy` is the whole
+contract. `ModelSpec` is published before anything moves, and its hash travels in every chunk, so
+that steps are never read with another meaning than the one agreed at activation.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from vla_zenoh.errors import SpecError
+from vla_zenoh.types import GripperState, JointState, PoseState, Task
+
+StatePart = Literal["joint", "pose", "gripper"]
+Resize = Literal["none", "stretch", "pad", "crop"]
+Frame = Literal["base", "tcp"]
+Rotation = Literal["rpy", "rotvec", "quaternion"]
+MotionKind = Literal["delta", "absolute"]
+GripperMeaning = Literal["none", "delta_m", "absolute_m", "open_fraction", "binary"]
+
+ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
+
+
+class _Spec(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class CameraSpec(_Spec):
+    """One picture the model needs.
+
+    Args:
+        camera: name of the camera in the profile.
+        width: pixels the model is given; None: as they come.
+        height: likewise.
+        resize: how other sizes become this one. ``stretch`` ignores the aspect ratio, ``pad`` keeps
+            it and fills with black, ``crop`` keeps it and cuts the longer side.
+        colour: channel order the model is given.
+    """
+
+    camera: str
+    width: int | None = Field(default=None, ge=8, le=8192)
+    height: int | None = Field(default=None, ge=8, le=8192)
+    resize: Resize = "none"
+    colour: Literal["rgb", "bgr"] = "rgb"
+
+    @model_validator(mode="after")
+    def _size_goes_with_resize(self) -> CameraSpec:
+        if (self.width is None) != (self.height is None):
+            raise ValueError("give both width and height, or neither")
+        if self.resize != "none" and self.width is None:
+            raise ValueError(f"resize {self.resize!r} needs width and height")
+        return self
+
+
+class ObservationSpec(_Spec):
+    """What the model has to see.
+
+    Args:
+        cameras: pictures, may be empty.
+        state: which parts of the robot's state.
+        prompt: the model needs a prompt that is not empty.
+        max_skew_s: the parts of one observation may lie this far apart in time.
+        max_age_s: an older observation is not given to the model.
+    """
+
+    cameras: tuple[CameraSpec, ...] = ()
+    state: tuple[StatePart, ...] = ("pose", "gripper")
+    prompt: bool = True
+    max_skew_s: float = Field(default=0.1, gt=0, le=10)
+    max_age_s: float = Field(default=0.5, gt=0, le=10)
+
+
+class ActionSpec(_Spec):
+    """What the numbers of a chunk mean: ``[x y z | rotation | gripper]`` in each of H steps.
+
+    Args:
+        horizon: H, steps in a chunk (at most; a shorter chunk is allowed).
+        dt_s: duration of one step.
+        kind: ``delta`` adds to the goal, ``absolute`` is the goal.
+        frame: axes of a delta: the robot's ``base`` or the ``tcp`` at that moment. An absolute pose
+            is always in the base frame.
+        rotation: ``rpy`` extrinsic x, y, z in rad; ``rotvec`` axis times angle in rad;
+            ``quaternion`` x, y, z, w.
+        position_scale_m: metres of one unit of x, y, z.
+        gripper: ``none`` no such number; ``delta_m`` added to the width; ``absolute_m`` the width;
+            ``open_fraction`` 0 shut to 1 open; ``binary`` above or below `gripper_threshold`.
+        gripper_open_is_high: polarity of ``open_fraction`` and ``binary``: True: a large value
+            means open (OpenVLA), False: it means closed.
+        gripper_threshold: where ``binary`` switches.
+        normalisation: the key of the statistics the model's output was scaled with, for people.
+    """
+
+    horizon: int = Field(ge=1, le=1000)
+    dt_s: float = Field(gt=0, le=60)
+    kind: MotionKind = "delta"
+    frame: Frame = "base"
+    rotation: Rotation = "rpy"
+    position_scale_m: float = Field(default=1.0, gt=0, le=10)
+    gripper: GripperMeaning = "absolute_m"
+    gripper_open_is_high: bool = True
+    gripper_threshold: float = 0.5
+    normalisation: str | None = None
+
+    @property
+    def dimension(self) -> int:
+        """D: numbers in one step."""
+        return 3 + ROTATION_SIZE[self.rotation] + (self.gripper != "none")
+
+    @model_validator(mode="after")
+    def _absolute_is_in_base(self) -> ActionSpec:
+        if self.kind == "absolute" and self.frame != "base":
+            raise ValueError("an absolute pose is given in the base frame; set frame: base")
+        return self
+
+
+class ModelSpec(_Spec):
+    """Everything a command node has to know of a model before it obeys it."""
+
+    name: str
+    observation: ObservationSpec = ObservationSpec()
+    action: ActionSpec
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain types, ready for the wire."""
+        return self.model_dump(mode="json")
+
+    @property
+    def hash(self) -> str:
+        """16 hex digits that differ when any declared meaning differs."""
+        canonical = json.dumps(self.to_dict(), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+    @staticmethod
+    def from_dict(data: Any) -> ModelSpec:
+        """Read what `to_dict` wrote.
+
+        Raises:
+            SpecError: names every wrong field.
+        """
+        try:
+            return ModelSpec.model_validate(data)
+        except ValidationError as error:
+            faults = "; ".join(
+                f"{'.'.join(map(str, fault['loc'])) or 'spec'}: {fault['msg']}"
+                for fault in error.errors()
+            )
+            raise SpecError(f"not a valid model spec: {faults}") from error
+
+
+class ActionSteps(NamedTuple):
+    """What `Policy.infer` returns.
+
+    Args:
+        steps: (H, D), H at most the declared horizon; anything numpy can read.
+        done: the task is finished as far as the model can tell.
+    """
+
+    steps: ArrayLike
+    done: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """One coherent look at the world, in the form the spec asks for.
+
+    Args:
+        stamp_wall_ns: capture time of its oldest picture (of its state, without pictures).
+        seq: number of that part.
+        images: camera -> (H, W, 3) uint8 in the declared order and size.
+        joint: arm joints, where asked for.
+        pose: TCP pose, where asked for.
+        gripper: gripper state, where asked for.
+        task: prompt, episode and rate.
+    """
+
+    stamp_wall_ns: int
+    seq: int
+    task: Task
+    images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    joint: JointState | None = None
+    pose: PoseState | None = None
+    gripper: GripperState | None = None
+
+    @property
+    def prompt(self) -> str:
+        return self.task.prompt
+
+    @property
+    def rate_hz(self) -> float:
+        return self.task.rate_hz
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """A model. Only `spec` and `infer` are needed; ``load()`` and ``reset()`` are called if there.
+
+    ``load()`` runs once before the first inference: heavy imports and weights belong there.
+    ``reset()`` runs at the start of every episode.
+    """
+
+    @property
+    def spec(self) -> ModelSpec: ...
+
+    def infer(self, observation: Observation) -> ActionSteps: ...
+
+
+def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
+    """`steps` as finite float32 (H, D) of the declared shape.
+
+    Raises:
+        SpecError: says what is wrong and what was declared.
+    """
+    try:
+        array = np.array(steps, dtype=np.float32, order="C")
+    except (TypeError, ValueError) as error:
+        raise SpecError(f"steps are not numbers: {error}") from error
+    if array.ndim == 1 and array.shape[0] == spec.dimension:
+        array = array[None]
+    if array.ndim != 2 or array.shape[1] != spec.dimension:
+        raise SpecError(f"steps have shape {array.shape}, the spec says (H, {spec.dimension})")
+    if not 1 <= array.shape[0] <= spec.horizon:
+        raise SpecError(f"a chunk of {array.shape[0]} steps, the spec says 1 to {spec.horizon}")
+    if not np.isfinite(array).all():
+        raise SpecError("steps hold NaN or infinity")
+    return array
+
+
+def example_observation(spec: ModelSpec, *, prompt: str = "put the red brick in the box") -> Observation:
+    """A valid observation of the declared form, gray pictures and an arm at rest: for dry runs."""
+    images = {
+        camera.camera: np.full((camera.height or 480, camera.width or 640, 3), 128, np.uint8)
+        for camera in spec.observation.cameras
+    }
+    zeros = np.zeros(7)
+    return Observation(
+        stamp_wall_ns=0,
+        seq=0,
+        task=Task(episode=0, active=False, prompt=prompt, worker=spec.name, rate_hz=5.0),
+        images=images,
+        joint=JointState(tuple(f"joint{i}" for i in range(1, 8)), zeros, zeros, zeros),
+        pose=PoseState(np.array([0.45, 0.0, 0.3]), np.array([1.0, 0, 0, 0]), np.zeros(6)),
+        gripper=GripperState(width_m=0.08, moving=False, holding=False),
+    )
