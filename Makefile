@@ -1,0 +1,44 @@
+# Every target sets up ./.venv by itself. Needed from the system: make and Python 3.11 or newer.
+# Another interpreter: make setup PYTHON=python3.12        Options for a command: make test ARGS="-k brake"
+
+PYTHON ?= python3
+ARGS ?=
+BIN := .venv/bin
+READY := .venv/.ready
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check format bench build clean
+
+help: ## Show this list
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 16
+
+setup: $(READY) ## Make ./.venv with everything in it
+
+$(READY): pyproject.toml constraints.txt scripts/bootstrap.py
+	@$(PYTHON) scripts/bootstrap.py
+	@touch $@
+
+demo: $(READY) ## Simulator, model and command node at work, no GPU needed
+	$(BIN)/vla-zenoh demo $(ARGS)
+
+test: $(READY) ## Run all tests
+	$(BIN)/python -m pytest $(ARGS)
+
+check: $(READY) ## Lint, format and types, as CI does
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/basedpyright
+
+format: $(READY) ## Let ruff put files into shape
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(READY) ## Measure camera to command on this machine
+	$(BIN)/vla-zenoh bench chain $(ARGS)
+
+build: $(READY) ## Build wheel and sdist into dist/ and try each in an empty environment
+	$(BIN)/python scripts/check_wheel.py $(ARGS)
+
+clean: ## Remove everything these targets made
+	rm -rf .venv .tools dist .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

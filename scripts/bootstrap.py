@@ -1,0 +1,165 @@
+"""Makes ./.venv with the package and everything it is tested with; needs Python alone.
+
+The work is done by uv: the one on PATH, else one put into ./.tools. Versions come from
+constraints.txt. What pip was told about indexes, wheel folders and certificates (``PIP_*``
+variables, pip.conf) is handed on to uv.
+"""
+
+from __future__ import annotations
+
+import configparser
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+VENV = ROOT / ".venv"
+TOOLS = ROOT / ".tools"
+CONSTRAINTS = ROOT / "constraints.txt"
+
+OLDEST_PYTHON = (3, 11)
+OLDEST_UV = (0, 8)
+
+PIP_TO_UV = {
+    # pip's name: uv's variable, what stands between several values there
+    "index-url": ("UV_DEFAULT_INDEX", " "),
+    "extra-index-url": ("UV_INDEX", " "),
+    "find-links": ("UV_FIND_LINKS", ","),
+    "trusted-host": ("UV_INSECURE_HOST", " "),
+    "no-index": ("UV_NO_INDEX", " "),
+    "cert": ("SSL_CERT_FILE", " "),
+    "timeout": ("UV_HTTP_TIMEOUT", " "),
+}
+
+
+def pip_settings(environ: Mapping[str, str]) -> dict[str, str]:
+    """What pip would obey: its files, then its variables, by the long name of the option."""
+    home = Path(environ.get("HOME", "/nonexistent"))
+    files = [
+        Path("/etc/pip.conf"),
+        home / ".pip" / "pip.conf",
+        Path(environ.get("XDG_CONFIG_HOME") or home / ".config") / "pip" / "pip.conf",
+        Path(environ.get("PIP_CONFIG_FILE") or "/etc/pip.conf"),
+    ]
+    parser = configparser.RawConfigParser()
+    parser.read(files)
+    settings = {}
+    for section in ("global", "install"):
+        if parser.has_section(section):
+            settings.update(parser.items(section))
+    settings.update(
+        (name[len("PIP_") :].lower().replace("_", "-"), value)
+        for name, value in environ.items()
+        if name.startswith("PIP_") and value
+    )
+    if "default-timeout" in settings:
+        settings.setdefault("timeout", settings["default-timeout"])
+    return settings
+
+
+def uv_environment(environ: Mapping[str, str]) -> dict[str, str]:
+    """`environ` with pip's settings said again in uv's words; what uv was told itself stays."""
+    result = dict(environ)
+    settings = pip_settings(environ)
+    for option, (variable, separator) in PIP_TO_UV.items():
+        values = settings.get(option, "").split()
+        if option == "find-links":
+            # pip passes over folders that do not exist, uv stops at them.
+            values = [value for value in values if "://" in value or Path(value).is_dir()]
+        if values:
+            result.setdefault(variable, separator.join(values))
+    if "extra-index-url" in settings:
+        # As pip does: the best version of all indexes, not of the first that knows the name.
+        result.setdefault("UV_INDEX_STRATEGY", "unsafe-best-match")
+    result.setdefault("UV_PYTHON_DOWNLOADS", "never")
+    return result
+
+
+def fail(message: str) -> None:
+    """Ends the program with a message for people."""
+    sys.exit("setup: " + message)
+
+
+def say(message: str) -> None:
+    """One line of progress."""
+    print("setup: " + message, flush=True)
+
+
+def run(*command: object) -> None:
+    """Runs a command; ends the program when it fails."""
+    words = [str(word) for word in command]
+    if subprocess.run(words, cwd=ROOT, env=uv_environment(os.environ), check=False).returncode:
+        fail("this failed, see above: " + " ".join(words))
+
+
+def works(uv: Path) -> bool:
+    """Whether `uv` runs and is new enough."""
+    try:
+        done = subprocess.run([uv, "--version"], capture_output=True, text=True, check=False)
+    except OSError:
+        return False
+    match = re.match(r"uv (\d+)\.(\d+)", done.stdout)
+    return bool(match) and tuple(map(int, match.groups())) >= OLDEST_UV
+
+
+def find_uv() -> Path:
+    """uv from PATH, or put into ./.tools by whatever this Python has."""
+    in_venv, in_folder = TOOLS / "venv" / "bin" / "uv", TOOLS / "uv" / "bin" / "uv"
+    on_path = shutil.which("uv")
+    for known in ([Path(on_path)] if on_path else []) + [in_venv, in_folder]:
+        if works(known):
+            return known
+    install = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    install += ["--constraint", str(CONSTRAINTS), "uv"]
+    if importlib.util.find_spec("ensurepip"):
+        say("installing uv into .tools/venv")
+        run(sys.executable, "-m", "venv", "--clear", TOOLS / "venv")
+        run(TOOLS / "venv" / "bin" / "python", *install)
+        return in_venv
+    if importlib.util.find_spec("pip"):
+        say("installing uv into .tools/uv")
+        run(sys.executable, *install, "--upgrade", "--target", TOOLS / "uv")
+        return in_folder
+    fail(
+        "this Python has neither venv nor pip, and there is no uv. On Debian and Ubuntu: "
+        "sudo apt install python3-venv"
+    )
+    raise AssertionError  # fail does not return
+
+
+def make_venv(uv: Path) -> None:
+    """An environment of this interpreter at ./.venv, unless a usable one is there."""
+    code = f"import sys; sys.exit(sys.version_info[:2] != {tuple(sys.version_info[:2])!r})"
+    try:
+        if subprocess.run([VENV / "bin" / "python", "-c", code], check=False).returncode == 0:
+            return
+    except OSError:
+        pass
+    run(uv, "--quiet", "venv", "--clear", "--python", sys.executable, VENV)
+
+
+def main() -> None:
+    """Sets everything up, or says what is missing."""
+    if sys.version_info < OLDEST_PYTHON:
+        fail(
+            "Python {}.{} or newer is needed, this is {}.{} ({}). "
+            "Name another one: make setup PYTHON=python3.12".format(
+                *OLDEST_PYTHON, *sys.version_info[:2], sys.executable
+            )
+        )
+    uv = find_uv()
+    make_venv(uv)
+    say("installing the package and its libraries into .venv (once; about 1 GB on disk)")
+    quiet = [] if sys.stderr.isatty() else ["--quiet"]
+    target = ["--python", VENV / "bin" / "python", "--constraint", CONSTRAINTS]
+    run(uv, *quiet, "pip", "install", *target, "--editable", ".[all,dev]")
+    say("done; the command is .venv/bin/vla-zenoh")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""Builds sdist and wheel, then tries each in an empty environment, away from the checkout."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from bootstrap import CONSTRAINTS, ROOT, uv_environment
+
+DIST = ROOT / "dist"
+UV = Path(sys.executable).parent / "uv"
+LIMIT_S = 300
+
+TRIALS = [
+    ["--help"],
+    ["profile", "list"],
+    ["demo", "--prompt", "HARD: go up", "--rate", "5", "--steps", "5", "--out", "runs"],
+]
+
+
+def run(*command: object, cwd: Path = ROOT) -> None:
+    """Runs a command and shows it; ends the program when it fails."""
+    words = [str(word) for word in command]
+    print("+", " ".join(words), flush=True)
+    environ = uv_environment(os.environ)
+    # Nothing of the checkout may help the installed package.
+    for name in ("PYTHONPATH", "VLA_ZENOH_PATH", "VIRTUAL_ENV"):
+        environ.pop(name, None)
+    try:
+        done = subprocess.run(words, cwd=cwd, env=environ, check=False, timeout=LIMIT_S)
+    except subprocess.TimeoutExpired:
+        sys.exit(f"build: no end after {LIMIT_S} s: {' '.join(words)}")
+    if done.returncode:
+        sys.exit(f"build: exit status {done.returncode}: {' '.join(words)}")
+
+
+def only(pattern: str) -> Path:
+    """The one file in dist/ that fits `pattern`."""
+    found = list(DIST.glob(pattern))
+    if len(found) != 1:
+        sys.exit(f"build: expected one {pattern} in {DIST}, found {len(found)}")
+    return found[0]
+
+
+def try_out(archive: Path, extra: str) -> None:
+    """Installs `archive` into an empty environment and runs the command from an empty folder."""
+    with tempfile.TemporaryDirectory(prefix="vla-zenoh-build-") as name:
+        folder = Path(name)
+        work = folder / "work"
+        work.mkdir()
+        run(UV, "--quiet", "venv", "--python", sys.executable, folder / "venv")
+        python = folder / "venv" / "bin" / "python"
+        target = ["--python", python, "--constraint", CONSTRAINTS]
+        run(UV, "--quiet", "pip", "install", *target, f"vla-zenoh[{extra}] @ {archive.as_uri()}")
+        for trial in TRIALS:
+            run(folder / "venv" / "bin" / "vla-zenoh", *trial, cwd=work)
+        if not any((work / "runs").rglob("*")):
+            sys.exit("build: the demo left nothing in the folder named with --out")
+
+
+def main() -> None:
+    """Builds, then tries wheel and sdist."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only-build", action="store_true", help="build, try nothing")
+    options = parser.parse_args()
+    shutil.rmtree(DIST, ignore_errors=True)
+    # The wheel is made from the sdist, so a file missing there is missed here.
+    run(UV, "--quiet", "build", "--out-dir", DIST, ROOT)
+    wheel, sdist = only("*.whl"), only("*.tar.gz")
+    if options.only_build:
+        return
+    try_out(wheel, "all")
+    try_out(sdist, "all")
+    print(f"build: {wheel.name} and {sdist.name} work")
+
+
+if __name__ == "__main__":
+    main()
