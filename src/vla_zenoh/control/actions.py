@@ -1,0 +1,83 @@
+"""What the numbers of a chunk mean: one step of an `ActionSpec` to a pose and a gripper width."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vla_zenoh.control.so3 import (
+    Pose,
+    exp3,
+    orthonormal,
+    rotation_from_quat,
+    rotation_from_rpy,
+)
+from vla_zenoh.errors import RecordError
+from vla_zenoh.policy import ROTATION_SIZE, ActionSpec
+from vla_zenoh.types import FloatArray, unit_quaternion
+
+GRIPPER_SLACK = 0.25
+"""A fraction outside [0, 1] by up to this much is a model's rounding and is clipped."""
+
+
+def rotation_of(spec: ActionSpec, numbers: FloatArray) -> FloatArray:
+    """Rotation matrix of a step's rotation numbers.
+
+    Raises:
+        RecordError: a quaternion that is not unit.
+    """
+    if spec.rotation == "rpy":
+        return rotation_from_rpy(numbers)
+    if spec.rotation == "rotvec":
+        return exp3(numbers)
+    return rotation_from_quat(unit_quaternion("rotation of the action", numbers))
+
+
+def step_pose(spec: ActionSpec, step: FloatArray, before: Pose) -> Pose:
+    """The pose that one step asks for, after the goal `before`.
+
+    A delta in the base frame is ``p + dp, dR R``; in the TCP frame ``p + R dp, R dR``; an absolute
+    step is the pose itself.
+    """
+    translation = np.asarray(step[:3], dtype=np.float64) * spec.position_scale_m
+    size = ROTATION_SIZE[spec.rotation]
+    rotation = rotation_of(spec, np.asarray(step[3 : 3 + size], dtype=np.float64))
+    if spec.kind == "absolute":
+        return Pose(translation, rotation)
+    if spec.frame == "tcp":
+        return Pose(
+            before.position_m + before.rotation @ translation,
+            orthonormal(before.rotation @ rotation),
+        )
+    return Pose(before.position_m + translation, orthonormal(rotation @ before.rotation))
+
+
+def step_width(
+    spec: ActionSpec, step: FloatArray, before_m: float, max_width_m: float
+) -> float | None:
+    """The gripper width that one step asks for, after the width `before_m`; None: says nothing.
+
+    Raises:
+        RecordError: a number that this meaning cannot have; names the meaning, because the usual
+            cause is that the model's gripper means something else than its spec says.
+    """
+    if spec.gripper == "none":
+        return None
+    value = float(step[-1])
+    if spec.gripper == "delta_m":
+        if abs(value) > max_width_m + GRIPPER_SLACK:
+            raise RecordError(f"gripper delta_m of {value:g} m is more than any gripper opens")
+        wanted_m = before_m + value
+    elif spec.gripper == "absolute_m":
+        if not -0.01 <= value <= max_width_m + 0.05:
+            raise RecordError(
+                f"gripper absolute_m of {value:g} m; this gripper opens to {max_width_m:g} m"
+            )
+        wanted_m = value
+    else:
+        if spec.gripper == "open_fraction" and not -GRIPPER_SLACK <= value <= 1 + GRIPPER_SLACK:
+            raise RecordError(f"gripper open_fraction of {value:g}; wanted a number in [0, 1]")
+        fraction = value if spec.gripper == "open_fraction" else float(value > spec.gripper_threshold)
+        if not spec.gripper_open_is_high:
+            fraction = 1.0 - fraction
+        wanted_m = fraction * max_width_m
+    return min(max(wanted_m, 0.0), max_width_m)

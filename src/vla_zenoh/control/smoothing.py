@@ -1,0 +1,164 @@
+"""Jerk-limited motion towards a pose that may change at any tick: Ruckig on R^3 x SO(3).
+
+Translation is planned in the base frame. Rotation is planned as the rotation vector ``r`` of
+``R_anchor^T R``; at every new target the anchor moves to the current smoothed rotation, so ``r``
+starts at zero, stays small, never wraps at pi, and velocity and acceleration carry over exactly
+(at r = 0, r' is the body velocity and r'' the body acceleration).
+
+Ruckig: Berscheid and Kroeger, "Jerk-limited real-time trajectory generation with arbitrary target
+states", RSS 2021.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from ruckig import (
+    ControlInterface,
+    InputParameter,
+    OutputParameter,
+    Ruckig,
+    RuckigError,
+    Synchronization,
+)
+
+from vla_zenoh.control.so3 import Pose, body_rates, exp3, log3, orthonormal
+from vla_zenoh.types import FloatArray
+
+AXES = 6
+REST_VELOCITY = 1e-6
+"""m/s and rad/s: slower counts as standing."""
+
+
+class MotionLimits(NamedTuple):
+    """Per axis: (velocity, acceleration, jerk) in m, s and in rad, s."""
+
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float]
+
+
+class Motion(NamedTuple):
+    """One point of the smoothed motion, base frame.
+
+    Args:
+        pose: position (3,) m, rotation (3, 3).
+        twist: (6,) m/s, rad/s.
+        acceleration: (6,) m/s^2, rad/s^2.
+    """
+
+    pose: Pose
+    twist: FloatArray
+    acceleration: FloatArray
+
+
+class Smoother:
+    """Follows targets within velocity, acceleration and jerk limits, or brakes.
+
+    Args:
+        pose: where it stands at first.
+        dt_s: duration of a tick.
+        limits: of each axis.
+    """
+
+    def __init__(self, pose: Pose, dt_s: float, limits: MotionLimits) -> None:
+        self._otg = Ruckig(AXES, dt_s)
+        self._input = InputParameter(AXES)
+        self._output = OutputParameter(AXES)
+        self._input.max_velocity = self._box(limits, 0)
+        self._input.max_acceleration = self._box(limits, 1)
+        self._input.max_jerk = self._box(limits, 2)
+        self.failures = 0
+        self.reset(pose)
+
+    @staticmethod
+    def _box(limits: MotionLimits, order: int) -> list[float]:
+        return [limits.translation[order]] * 3 + [limits.rotation[order]] * 3
+
+    def reset(self, pose: Pose) -> None:
+        """Stand still at `pose`, forgetting all motion. Only for an arm that is not streamed to."""
+        self._anchor = orthonormal(pose.rotation)
+        zeros = [0.0] * AXES
+        self._otg.reset()
+        self._input.control_interface = ControlInterface.Position
+        self._input.synchronization = Synchronization.Phase
+        self._input.current_position = [*pose.position_m.tolist(), 0.0, 0.0, 0.0]
+        self._input.current_velocity = zeros
+        self._input.current_acceleration = zeros
+        self._input.target_position = self._input.current_position
+        self._input.target_velocity = zeros
+        self._input.target_acceleration = zeros
+        self.braking = False
+        self.motion = Motion(
+            Pose(np.array(pose.position_m, dtype=np.float64), self._anchor), np.zeros(6), np.zeros(6)
+        )
+
+    def target(self, pose: Pose) -> None:
+        """Head for `pose` from the present state, without a step in velocity or acceleration."""
+        self._anchor_here()
+        self.braking = False
+        self._input.control_interface = ControlInterface.Position
+        self._input.synchronization = Synchronization.Phase
+        self._input.target_position = [
+            *pose.position_m.tolist(),
+            *log3(self._anchor.T @ pose.rotation).tolist(),
+        ]
+
+    def brake(self) -> None:
+        """Come to rest as fast as the limits allow, each axis by itself."""
+        if self.braking:
+            return
+        self._anchor_here()
+        self.braking = True
+        self._input.control_interface = ControlInterface.Velocity
+        self._input.synchronization = Synchronization.No
+
+    def tick(self) -> Motion:
+        """Advance by one tick."""
+        try:
+            self._otg.update(self._input, self._output)
+        except (RuckigError, ValueError):
+            # A failed calculation leaves the old trajectory half overwritten: forget it, and stop.
+            self.failures += 1
+            self._otg.reset()
+            self.braking = False
+            self.brake()
+            try:
+                self._otg.update(self._input, self._output)
+            except (RuckigError, ValueError):
+                self._otg.reset()
+                self.reset(self.motion.pose)
+                return self.motion
+        self._output.pass_to_input(self._input)
+        position = np.array(self._output.new_position)
+        velocity = np.array(self._output.new_velocity)
+        acceleration = np.array(self._output.new_acceleration)
+        spin, spin_change = body_rates(position[3:], velocity[3:], acceleration[3:])
+        rotation = self._anchor @ exp3(position[3:])
+        velocity[3:] = rotation @ spin
+        acceleration[3:] = rotation @ spin_change
+        self.motion = Motion(Pose(position[:3], rotation), velocity, acceleration)
+        return self.motion
+
+    @property
+    def at_rest(self) -> bool:
+        """Standing, and not about to start."""
+        if float(np.abs(self.motion.twist).max()) > REST_VELOCITY:
+            return False
+        if self.braking:
+            return float(np.abs(self.motion.acceleration).max()) < 1e-3
+        ahead = np.array(self._input.target_position) - np.array(self._input.current_position)
+        return float(np.abs(ahead).max()) < 1e-9
+
+    def _anchor_here(self) -> None:
+        rotvec = np.array(self._input.current_position[3:])
+        rate = np.array(self._input.current_velocity[3:])
+        change = np.array(self._input.current_acceleration[3:])
+        spin, spin_change = body_rates(rotvec, rate, change)
+        self._anchor = orthonormal(self._anchor @ exp3(rotvec))
+        self._input.current_position = [*self._input.current_position[:3], 0.0, 0.0, 0.0]
+        self._input.current_velocity = [*self._input.current_velocity[:3], *spin.tolist()]
+        self._input.current_acceleration = [
+            *self._input.current_acceleration[:3],
+            *spin_change.tolist(),
+        ]

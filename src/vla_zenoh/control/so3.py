@@ -1,0 +1,119 @@
+"""Poses and rotations: Pinocchio's exp and log with the few helpers this package needs."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from vla_zenoh.types import FloatArray
+
+
+class Pose(NamedTuple):
+    """A pose in the base frame: position (3,) in m and rotation matrix (3, 3)."""
+
+    position_m: FloatArray
+    rotation: FloatArray
+
+
+def exp3(rotvec: FloatArray) -> FloatArray:
+    """Rotation matrix of a rotation vector (rad)."""
+    return pin.exp3(np.asarray(rotvec, dtype=np.float64))
+
+
+def log3(rotation: FloatArray) -> FloatArray:
+    """Rotation vector (rad) of a rotation matrix, angle within [0, pi]."""
+    return pin.log3(np.asarray(rotation, dtype=np.float64))
+
+
+def rotation_from_rpy(rpy: FloatArray) -> FloatArray:
+    """Extrinsic x, y, z: ``R = Rz(yaw) Ry(pitch) Rx(roll)``."""
+    return pin.rpy.rpyToMatrix(float(rpy[0]), float(rpy[1]), float(rpy[2]))
+
+
+def rotation_from_quat(quat_xyzw: FloatArray) -> FloatArray:
+    """Rotation matrix of a quaternion x, y, z, w, which is normalised first."""
+    x, y, z, w = (float(value) for value in quat_xyzw)
+    quaternion = pin.Quaternion(w, x, y, z)
+    quaternion.normalize()
+    return quaternion.matrix()
+
+
+def quat_from_rotation(rotation: FloatArray) -> FloatArray:
+    """Unit quaternion x, y, z, w with w >= 0."""
+    quaternion = pin.Quaternion(rotation)
+    quaternion.normalize()
+    coefficients = np.array(quaternion.coeffs(), dtype=np.float64)
+    return -coefficients if coefficients[3] < 0 else coefficients
+
+
+def orthonormal(rotation: FloatArray) -> FloatArray:
+    """The rotation matrix nearest to a product of many rotation matrices."""
+    quaternion = pin.Quaternion(rotation)
+    quaternion.normalize()
+    return quaternion.matrix()
+
+
+def angle_between(a: FloatArray, b: FloatArray) -> float:
+    """Geodesic distance of two rotation matrices in rad."""
+    return float(np.linalg.norm(log3(b @ a.T)))
+
+
+def shorten(vector: FloatArray, length: float) -> FloatArray:
+    """`vector`, or the same direction with `length` when it is longer."""
+    norm = float(np.linalg.norm(vector))
+    return vector * (length / norm) if norm > length else vector
+
+
+def body_rates(
+    rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Angular velocity and acceleration of ``R = exp3(r(t))`` in the body frame.
+
+    With the right Jacobian ``Jr(r) = I - B [r] + C [r]^2``, ``B = (1 - cos t)/t^2``,
+    ``C = (t - sin t)/t^3``, ``t = |r|``::
+
+        w     = Jr r'
+        alpha = Jr r'' + Jr' r'
+        Jr'r' = -B' [r]r' + C' [r][r]r' + C [r'][r]r'
+
+    Closed form, because finite differences of Jr show as spikes in the jerk.
+
+    Args:
+        rotvec: r, rad, (3,).
+        rate: r', (3,).
+        rate_change: r'', (3,).
+
+    Returns:
+        w (rad/s) and alpha (rad/s^2), both (3,), in the axes of R.
+
+    Source: Sola, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 143, differentiated.
+    """
+    squared = float(rotvec @ rotvec)
+    angle = math.sqrt(squared)
+    if angle < 1e-3:  # series: the closed forms lose all digits here
+        b, c = 0.5 - squared / 24, 1 / 6 - squared / 120
+        db_over_angle, dc_over_angle = -1 / 12, -1 / 60
+    else:
+        sine, cosine = math.sin(angle), math.cos(angle)
+        b = (1 - cosine) / squared
+        c = (angle - sine) / (squared * angle)
+        db_over_angle = (angle * sine - 2 * (1 - cosine)) / squared**2
+        dc_over_angle = ((1 - cosine) * angle - 3 * (angle - sine)) / (squared**2 * angle)
+    cross = pin.skew(rotvec)
+    along = float(rotvec @ rate)
+    r_rate = cross @ rate
+    r_r_rate = cross @ r_rate
+    r_change = cross @ rate_change
+    velocity = rate - b * r_rate + c * r_r_rate
+    acceleration = (
+        rate_change
+        - b * r_change
+        + c * (cross @ r_change)
+        - db_over_angle * along * r_rate
+        + dc_over_angle * along * r_r_rate
+        + c * (pin.skew(rate) @ r_rate)
+    )
+    return velocity, acceleration
