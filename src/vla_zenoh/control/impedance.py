@@ -203,7 +203,7 @@ class ImpedanceController:
         wanted = transposed @ (wrench - seen_at_tcp) + posture + state.bias_nm
         torque = np.minimum(np.maximum(wanted, -self._effort_nm), self._effort_nm)
         saturated = bool((torque != wanted).any())
-        self._integrate(spring_error, held=saturated or feed < 1.0)
+        self._integrate(spring_error, held=saturated or feed <= 0.0)
         return ImpedanceOutput(torque, error, wrench, saturated)
 
     def _clamp(self, error: FloatArray) -> tuple[FloatArray, float]:

@@ -1,0 +1,179 @@
+"""Builds the MuJoCo model: the scene a folder of ``sim/`` describes, with the robot in it.
+
+Everything that shows the world (the stepping process, a renderer process) builds its model with
+`build_model` from the same arguments, so that a pose vector of one fits the other.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from vla_zenoh import resources
+from vla_zenoh.errors import ResourceError
+from vla_zenoh.simulation.robot_model import MountedCamera, RobotModel
+
+STEP_S = 1e-3
+PREFIX = "robot/"  # before every name the robot brings, so that a scene may use any name
+TCP_SITE = "tcp"
+GRIPPER = "gripper"
+STATIC_GROUP = 0
+MOVING_GROUP = 1
+HIDDEN_GROUP = 3  # MuJoCo's own convention: groups from here on are not drawn
+
+# Measured creep of a held brick in 10 s: pyramidal cone and impratio 1: 1.06 mm, this: 0.03 mm.
+IMPRATIO = 10.0
+STIFF_SOLREF = (0.004, 1.0)
+STIFF_SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
+PAD_CONDIM = 4
+
+
+def scene_file(scene: str) -> Path:
+    """The MJCF file of `scene`: a name below ``sim/`` or the path of such a folder.
+
+    Raises:
+        ResourceError: no such folder, or no ``scene.xml`` in it.
+    """
+    folder = resources.find("sim", scene)
+    path = folder / "scene.xml" if folder.is_dir() else folder
+    if not path.is_file():
+        raise ResourceError(f"scene {scene!r} has no scene.xml in {folder}")
+    return path
+
+
+def build_model(
+    scene: str, robot: RobotModel, *, joint_friction_nm: float = 0.0
+) -> mujoco.MjModel:
+    """Compile `scene` with `robot` standing at the world's origin.
+
+    Args:
+        scene: name or path of the scene.
+        robot: the robot.
+        joint_friction_nm: dry friction in every arm joint.
+
+    Raises:
+        ResourceError: scene or robot are missing, or MuJoCo refuses them.
+    """
+    path = scene_file(scene)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        arm = _robot_spec(robot, joint_friction_nm)
+        spec.worldbody.add_frame().attach_body(arm.bodies[1], PREFIX, "")
+        _set_solver(spec)
+        if robot.camera is not None:
+            spec.camera(PREFIX + robot.camera.name).name = robot.camera.name
+        model = spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise ResourceError(f"MuJoCo refuses scene {path} with {robot.description}: {error}") from error
+    _sort_groups(model)
+    return model
+
+
+def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
+    urdf = resources.robot_urdf(robot.description)
+    spec = mujoco.MjSpec.from_file(str(urdf))
+    meshes = resources.meshes_of(urdf)
+    for mesh in spec.meshes:
+        mesh.file = str(meshes / Path(mesh.file).name)
+    # Fusing would melt the TCP and the base into their parents and lose their frames.
+    spec.compiler.fusestatic = False
+    for light in list(spec.lights):
+        spec.delete(light)
+
+    colours = dict(robot.colours)
+    for geom in spec.geoms:
+        link = geom.parent.name
+        geom.rgba = colours.get(link, robot.colour)
+        # Masks that meet the scene (contype 1, conaffinity 1) but not the robot itself.
+        geom.contype, geom.conaffinity = 1, 0
+        if link in robot.finger_links:
+            geom.priority = 1  # the pads decide, whatever the object's author wrote
+            geom.friction = robot.pad_friction
+            geom.condim = PAD_CONDIM
+            geom.solref, geom.solimp = STIFF_SOLREF, STIFF_SOLIMP
+    for equality in spec.equalities:
+        equality.solref = STIFF_SOLREF
+    for name in robot.arm_joints:
+        _named(spec.joint(name), "joint", name, [joint.name for joint in spec.joints])
+        spec.joint(name).frictionloss = joint_friction_nm
+
+    links = [body.name for body in spec.bodies]
+    tcp = _named(spec.body(robot.tcp_link), "link", robot.tcp_link, links)
+    tcp.add_site(name=TCP_SITE, group=HIDDEN_GROUP)
+    if robot.camera is not None:
+        link = _named(spec.body(robot.camera.link), "link", robot.camera.link, links)
+        _add_camera(link, robot.camera)
+    _add_actuators(spec, robot)
+    return spec
+
+
+def _named(element: mujoco.MjsBody | None, kind: str, name: str, known: list[str]) -> mujoco.MjsBody:
+    if element is None:
+        raise ResourceError(f"the robot description has no {kind} {name!r}; it has: {', '.join(known)}")
+    return element
+
+
+def _add_camera(link: mujoco.MjsBody, camera: MountedCamera) -> None:
+    eye = np.array(camera.position_m)
+    back = eye - np.array(camera.look_at_m)  # a MuJoCo camera looks along its own -z
+    back /= np.linalg.norm(back)
+    right = np.cross(np.array(camera.up), back)
+    right /= np.linalg.norm(right)
+    rotation = np.column_stack([right, np.cross(back, right), back])
+    quat_wxyz = np.empty(4)
+    mujoco.mju_mat2Quat(quat_wxyz, rotation.ravel())
+    link.add_camera(
+        name=camera.name, pos=eye, quat=quat_wxyz, fovy=math.degrees(camera.fovy_rad)
+    )
+
+
+def _add_actuators(spec: mujoco.MjSpec, robot: RobotModel) -> None:
+    for name in robot.arm_joints:
+        limit = spec.joint(name).actfrcrange  # the URDF's effort limit
+        spec.add_actuator(
+            name=name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            target=name,
+            ctrllimited=True,
+            ctrlrange=limit,
+        )
+    width = spec.add_tendon(name=GRIPPER)
+    for name in robot.finger_joints:
+        width.wrap_joint(name, 1.0)
+    # A servo on the opening: its force acts in full on either finger.
+    stiffness, damping = robot.gripper_stiffness_n_m, robot.gripper_damping_ns_m
+    spec.add_actuator(
+        name=GRIPPER,
+        trntype=mujoco.mjtTrn.mjTRN_TENDON,
+        target=GRIPPER,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+        gainprm=[stiffness] + [0.0] * 9,
+        biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+        biasprm=[0.0, -stiffness, -damping] + [0.0] * 7,
+        forcelimited=True,
+        forcerange=(-1.0, 1.0),
+    )
+
+
+def _set_solver(spec: mujoco.MjSpec) -> None:
+    option = spec.option
+    option.timestep = STEP_S
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = IMPRATIO
+    # A blown-up state must stay visible instead of being reset behind the caller's back.
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    # Multisampling costs ten times the rest of a software-rendered frame.
+    spec.visual.quality.offsamples = 0
+    spec.visual.quality.shadowsize = 0
+
+
+def _sort_groups(model: mujoco.MjModel) -> None:
+    """Put visible geoms in two groups by whether a step can move them; ray casting needs it."""
+    moving = model.body_weldid[model.geom_bodyid] != 0
+    visible = model.geom_group < HIDDEN_GROUP
+    model.geom_group[visible & moving] = MOVING_GROUP
+    model.geom_group[visible & ~moving] = STATIC_GROUP

@@ -1,0 +1,314 @@
+"""The simulated world: robot, impedance controller, gripper and objects, one millisecond a tick."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vla_zenoh.control.impedance import ArmState, ImpedanceController, ImpedanceGains, Reference
+from vla_zenoh.errors import NodeError, ResourceError
+from vla_zenoh.simulation.gripper import GripperServo
+from vla_zenoh.simulation.placement import draw_places, objects_of
+from vla_zenoh.simulation.pose_vector import read_pose_vector, write_pose_vector
+from vla_zenoh.simulation.robot_model import RobotModel
+from vla_zenoh.simulation.scene import GRIPPER, PREFIX, STEP_S, TCP_SITE, build_model
+from vla_zenoh.types import GripperState, JointState, PoseState, vector
+
+FloatArray = NDArray[np.float64]
+
+STEP_NS = round(STEP_S * 1e9)
+MAX_GRIPPER_FORCE_N = 70.0
+
+
+class World:
+    """A scene with a robot under Cartesian impedance control.
+
+    Deterministic to the bit: the same seed, references and gripper commands give the same state.
+    All poses are those of the TCP in the robot's base frame, which is the world frame.
+
+    Args:
+        scene: name of a folder of ``sim/``, or a path.
+        robot: the robot in it.
+        home_rad: (n,) arm joints after a reset; also the posture the nullspace prefers.
+        gains: of the impedance controller.
+        joint_friction_nm: dry friction in every arm joint, unknown to the controller.
+        seed: see `reset`.
+
+    Raises:
+        ResourceError: scene or robot are not there or do not fit.
+        RecordError: `home_rad` is not a vector of the arm's size.
+    """
+
+    def __init__(
+        self,
+        scene: str,
+        robot: RobotModel,
+        *,
+        home_rad: ArrayLike,
+        gains: ImpedanceGains,
+        joint_friction_nm: float = 0.0,
+        seed: int | None = None,
+    ) -> None:
+        self.robot = robot
+        self.model = build_model(scene, robot, joint_friction_nm=joint_friction_nm)
+        self._data = mujoco.MjData(self.model)
+        self._home_rad = vector("home_rad", home_rad, len(robot.arm_joints))
+        self._bind()
+        self._controller = ImpedanceController(
+            gains,
+            lower_rad=self._lower_rad,
+            upper_rad=self._upper_rad,
+            effort_nm=self.model.actuator_ctrlrange[self._arm_actuators, 1],
+            posture_rad=self._home_rad,
+            period_s=STEP_S,
+        )
+        fingers = [self.model.joint(PREFIX + name).range[1] for name in robot.finger_joints]
+        self._gripper = GripperServo(float(sum(fingers)), STEP_S, MAX_GRIPPER_FORCE_N)
+        self._finger_open_m = fingers
+        self.saturated = 0
+        self.reset(seed)
+
+    def _bind(self) -> None:
+        """Look up every address once; the views into `_data` stay valid for its life."""
+        model, data = self.model, self._data
+        joints = [model.joint(PREFIX + name) for name in self.robot.arm_joints]
+        fingers = [model.joint(PREFIX + name) for name in self.robot.finger_joints]
+        first_dof, first_q = joints[0].dofadr[0], joints[0].qposadr[0]
+        if [joint.dofadr[0] - first_dof for joint in joints] != list(range(len(joints))):
+            raise ResourceError("the arm's joints do not follow each other in the URDF")
+        self._dofs = slice(first_dof, first_dof + len(joints))
+        arm_q = slice(first_q, first_q + len(joints))
+        self._lower_rad = np.array([joint.range[0] for joint in joints])
+        self._upper_rad = np.array([joint.range[1] for joint in joints])
+        self._q, self._qd = data.qpos[arm_q], data.qvel[self._dofs]
+        self._bias, self._effort = data.qfrc_bias[self._dofs], data.qfrc_actuator[self._dofs]
+        self._finger_q = [int(joint.qposadr[0]) for joint in fingers]
+        self._finger_dofs = [int(joint.dofadr[0]) for joint in fingers]
+        self._arm_actuators = [model.actuator(PREFIX + j).id for j in self.robot.arm_joints]
+        self._gripper_actuator = model.actuator(PREFIX + GRIPPER).id
+        self._tcp = model.site(PREFIX + TCP_SITE).id
+        self._tcp_position = data.site_xpos[self._tcp]
+        self._tcp_rotation = data.site_xmat[self._tcp].reshape(3, 3)
+        self._objects = objects_of(model)
+        tcp_root = model.body_rootid[model.site_bodyid[self._tcp]]
+        self._of_robot = model.body_rootid[model.geom_bodyid] == tcp_root
+        self._linear, self._angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+        self._inertia = np.zeros((model.nv, model.nv))
+
+    # -- time ----------------------------------------------------------------------------------
+
+    def reset(self, seed: int | None = None) -> None:
+        """Back to the home pose, gripper open, clock at zero.
+
+        Args:
+            seed: places objects at random in the scene's regions, the same for the same number;
+                None puts them where the scene file has them.
+        """
+        model, data = self.model, self._data
+        mujoco.mj_resetData(model, data)
+        self._q[:] = self._home_rad
+        data.qpos[self._finger_q] = self._finger_open_m
+        if seed is not None:
+            for name, place in draw_places(model, seed).items():
+                height = float(model.body_pos[self._objects[name], 2])
+                half = place.yaw_rad / 2.0
+                self._put(name, (place.x_m, place.y_m, height), (0, 0, math.sin(half), math.cos(half)))
+        self._gripper.reset(self._gripper.max_width_m)
+        self._bound_gripper_force()
+        self._controller.reset()
+        self._ticks = 0
+        self.saturated = 0
+        mujoco.mj_forward(model, data)
+        self._fresh = True
+
+    def tick(self, reference: Reference) -> None:
+        """Go on by exactly one millisecond towards `reference`.
+
+        Raises:
+            NodeError: the simulation blew up; `reset` makes it usable again.
+        """
+        model, data = self.model, self._data
+        mujoco.mj_step1(model, data)
+        output = self._controller.torque(reference, self._arm_state())
+        if not math.isfinite(output.torque_nm.sum()):
+            raise NodeError(f"the impedance controller got a reference that is not finite: {reference}")
+        self.saturated += output.saturated
+        data.ctrl[self._arm_actuators] = output.torque_nm
+        data.ctrl[self._gripper_actuator] = self._gripper.step(*self._opening())
+        mujoco.mj_step2(model, data)
+        self._ticks += 1
+        self._fresh = False
+        if data.warning.number.any():
+            self._raise_blown_up()
+
+    def hold_reference(self) -> Reference:
+        """The reference that keeps the TCP where it is now."""
+        position, rotation = self.tcp()
+        return Reference(position, rotation, np.zeros(6), np.zeros(6))
+
+    def set_gripper(self, width_m: float, speed_m_s: float, force_n: float) -> None:
+        """Open or close to `width_m` at `speed_m_s`, pressing with at most `force_n`.
+
+        Raises:
+            RecordError: speed or force are not above zero.
+        """
+        self._gripper.command(width_m, speed_m_s, force_n)
+        self._bound_gripper_force()
+
+    # -- what a robot reports ------------------------------------------------------------------
+
+    @property
+    def time_ns(self) -> int:
+        """Simulated time since the last reset."""
+        return self._ticks * STEP_NS
+
+    @property
+    def wrench(self) -> FloatArray:
+        """(6,) what the surroundings exert on the robot at the TCP: N, Nm about the TCP."""
+        self._refresh()
+        model, data = self.model, self._data
+        total, local = np.zeros(6), np.zeros(6)
+        for index in range(data.ncon):
+            contact = data.contact[index]
+            first, second = self._of_robot[contact.geom]
+            if first == second:
+                continue
+            mujoco.mj_contactForce(model, data, index, local)
+            axes = contact.frame.reshape(3, 3)  # rows; the force acts on the second geom
+            sign = 1.0 if second else -1.0
+            force, moment = sign * (local[:3] @ axes), sign * (local[3:] @ axes)
+            arm = contact.pos - self._tcp_position
+            total[:3] += force
+            total[3:] += moment + np.cross(arm, force)
+        return total
+
+    def joint_state(self) -> JointState:
+        """Arm joints; the effort is what the motors apply."""
+        return JointState(self.robot.arm_joints, self._q, self._qd, self._effort)
+
+    def tcp(self) -> tuple[FloatArray, FloatArray]:
+        """Measured TCP: position (3,) in metres and rotation (3, 3), copies."""
+        self._refresh()
+        return self._tcp_position.copy(), self._tcp_rotation.copy()
+
+    def pose_state(self, reference: Reference) -> PoseState:
+        """Measured TCP pose, twist and wrench beside the reference held now."""
+        position, rotation = self.tcp()
+        return PoseState(
+            position_m=position,
+            quat_xyzw=_quat_xyzw(rotation),
+            twist=self._jacobian() @ self._qd,
+            wrench=self.wrench,
+            reference_position_m=reference.position_m,
+            reference_quat_xyzw=_quat_xyzw(reference.rotation),
+        )
+
+    def gripper_state(self) -> GripperState:
+        """Opening between the fingers, and whether they move or hold something."""
+        width, _ = self._opening()
+        return GripperState(width, moving=self._gripper.moving, holding=self._gripper.holding)
+
+    # -- objects and pictures ------------------------------------------------------------------
+
+    def objects(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Position (3,) and quaternion x, y, z, w (4,) of every object, copies."""
+        self._refresh()
+        data = self._data
+        return {
+            name: (data.xpos[body].copy(), np.roll(data.xquat[body], -1))
+            for name, body in self._objects.items()
+        }
+
+    def place(self, name: str, position_m: ArrayLike, quat_xyzw: ArrayLike = (0, 0, 0, 1)) -> None:
+        """Put an object somewhere, at rest.
+
+        Raises:
+            ResourceError: the scene has no such object.
+        """
+        if name not in self._objects:
+            raise ResourceError(
+                f"the scene has no object {name!r}; it has: {', '.join(self._objects) or 'none'}"
+            )
+        self._put(name, position_m, quat_xyzw)
+        mujoco.mj_forward(self.model, self._data)
+        self._fresh = True
+
+    def qpos(self) -> FloatArray:
+        """Every pose of the world in one flat vector, for a renderer of the same scene."""
+        return read_pose_vector(self.model, self._data)
+
+    def set_qpos(self, vector: FloatArray) -> None:
+        """Take over poses from `qpos` of an equal world; everything stands still afterwards."""
+        write_pose_vector(self.model, self._data, vector)
+        self._data.qvel[:] = 0.0
+        self._controller.reset()
+        self._gripper.reset(self._opening()[0])
+        self._bound_gripper_force()
+        mujoco.mj_forward(self.model, self._data)
+        self._fresh = True
+
+    # -- inside --------------------------------------------------------------------------------
+
+    def _arm_state(self) -> ArmState:
+        mujoco.mj_fullM(self.model, self._data, self._inertia)
+        return ArmState(
+            position_rad=self._q,
+            velocity_rad_s=self._qd,
+            tcp_position_m=self._tcp_position,
+            tcp_rotation=self._tcp_rotation,
+            jacobian=self._jacobian(),
+            inertia=self._inertia[self._dofs, self._dofs],
+            bias_nm=self._bias,
+        )
+
+    def _jacobian(self) -> FloatArray:
+        mujoco.mj_jacSite(self.model, self._data, self._linear, self._angular, self._tcp)
+        return np.concatenate([self._linear[:, self._dofs], self._angular[:, self._dofs]])
+
+    def _refresh(self) -> None:
+        """Bring positions up to the last step; contacts and forces stay those of that step."""
+        if not self._fresh:
+            mujoco.mj_kinematics(self.model, self._data)
+            mujoco.mj_comPos(self.model, self._data)
+            self._fresh = True
+
+    def _opening(self) -> tuple[float, float]:
+        left, right = self._finger_q
+        left_dof, right_dof = self._finger_dofs
+        q, v = self._data.qpos, self._data.qvel
+        return float(q[left] + q[right]), float(v[left_dof] + v[right_dof])
+
+    def _bound_gripper_force(self) -> None:
+        limit = self._gripper.force_n
+        self.model.actuator_forcerange[self._gripper_actuator] = (-limit, limit)
+
+    def _put(self, name: str, position_m: ArrayLike, quat_xyzw: ArrayLike) -> None:
+        model, data, body = self.model, self._data, self._objects[name]
+        quat_wxyz = np.roll(np.asarray(quat_xyzw, float), 1)
+        mocap = model.body_mocapid[body]
+        if mocap >= 0:
+            data.mocap_pos[mocap], data.mocap_quat[mocap] = position_m, quat_wxyz
+            return
+        joint = model.body_jntadr[body]
+        q, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+        data.qpos[q : q + 3], data.qpos[q + 3 : q + 7] = position_m, quat_wxyz
+        data.qvel[dof : dof + 6] = 0.0
+
+    def _raise_blown_up(self) -> None:
+        raised = [
+            mujoco.mjtWarning(kind).name.removeprefix("mjWARN_").lower()
+            for kind in np.flatnonzero(self._data.warning.number)
+        ]
+        raise NodeError(
+            f"the simulation blew up after {self.time_ns / 1e9:.3f} s ({', '.join(raised)}); "
+            "reset it, and look at gains, limits and the scene"
+        )
+
+
+def _quat_xyzw(rotation: FloatArray) -> FloatArray:
+    quat_wxyz = np.empty(4)
+    mujoco.mju_mat2Quat(quat_wxyz, np.ascontiguousarray(rotation).ravel())
+    return np.roll(quat_wxyz, -1)
