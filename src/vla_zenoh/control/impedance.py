@@ -7,7 +7,7 @@ the TCP shows in task space and ``J`` its Jacobian::
     Lambda  = (J M^-1 J^T)^-1
     D       = zeta (Lambda^1/2 K^1/2 + K^1/2 Lambda^1/2)
     I      += ki K e dt                                 clamped to ``max_integral_*``
-    F       = K e + D (xd_ref - J qd) + Lambda xdd_ref + I
+    F       = K e + D (xd_ref - J qd) + Lambda (xdd_ref - Jd qd) + I
     Jbar    = M^-1 J^T Lambda                           dynamically consistent inverse
     tau     = J^T F + (1 - J^T Jbar^T) tau_posture + h
 
@@ -63,6 +63,7 @@ class ArmState(NamedTuple):
         tcp_position_m: (3,).
         tcp_rotation: (3, 3).
         jacobian: (6, n) of the TCP, linear rows first, base axes.
+        drift: (6,) m/s^2 and rad/s^2, the TCP's acceleration from joint velocity alone, Jd qd.
         inertia: (n, n) joint-space inertia, kg m^2.
         bias_nm: (n,) Coriolis, centrifugal and gravity torques.
     """
@@ -72,6 +73,7 @@ class ArmState(NamedTuple):
     tcp_position_m: FloatArray
     tcp_rotation: FloatArray
     jacobian: FloatArray
+    drift: FloatArray
     inertia: FloatArray
     bias_nm: FloatArray
 
@@ -129,8 +131,10 @@ class ImpedanceGains:
 
     @classmethod
     def compliant(cls) -> ImpedanceGains:
-        """Gives way to a hand; presses with at most 23 N."""
-        return cls(translational_n_m=400.0, rotational_nm_rad=20.0)
+        """Gives way to a hand; presses with at most 39 N."""
+        return cls(
+            translational_n_m=400.0, rotational_nm_rad=20.0, max_error_m=0.06, max_error_rad=0.5
+        )
 
 
 class ImpedanceController:
@@ -196,7 +200,7 @@ class ImpedanceController:
         spring = self._stiffness * spring_error
         slip = feed * reference.twist - jacobian @ state.velocity_rad_s
         wrench = spring + half_damping @ slip + half_damping.T @ slip + self._integral
-        wrench += feed * (task_inertia @ reference.acceleration)
+        wrench += task_inertia @ (feed * reference.acceleration - state.drift)
 
         posture = self._posture_torque(state)
         seen_at_tcp = task_inertia @ (compliance.T @ posture)  # Jbar^T tau_posture
@@ -212,8 +216,8 @@ class ImpedanceController:
         A reference that runs on while the arm is blocked would push through its velocity alone,
         so the feed-forward fades over the second half of the allowed error.
         """
-        distance = math.sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
-        angle = math.sqrt(error[3] ** 2 + error[4] ** 2 + error[5] ** 2)
+        x, y, z, a, b, c = error.tolist()
+        distance, angle = math.hypot(x, y, z), math.hypot(a, b, c)
         stretch = max(distance / self.gains.max_error_m, angle / self.gains.max_error_rad)
         if stretch <= 0.5:
             return error, 1.0

@@ -39,7 +39,9 @@ class GripperServo:
             RecordError: speed or force are not above zero.
         """
         if not speed_m_s > 0.0 or not force_n > 0.0:
-            raise RecordError(f"a gripper needs speed and force above 0, got {speed_m_s}, {force_n}")
+            raise RecordError(
+                f"a gripper needs speed and force above 0, got {speed_m_s} and {force_n}"
+            )
         target = min(max(width_m, 0.0), self.max_width_m)
         # Squeezing goes on from where the ramp is, else a repeated command would let go for a
         # moment; a turn-about starts at the fingers, else it would lag by the whole squeeze.

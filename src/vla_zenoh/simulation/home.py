@@ -30,7 +30,7 @@ def solve_home(
     rotation: FloatArray = TOOL_DOWN,
     start_rad: ArrayLike = PANDA_START_RAD,
 ) -> FloatArray:
-    """Joints (n,) whose TCP is at `position_m`, `rotation`, near `start_rad` where there is a choice.
+    """Joints (n,) that put the TCP at `position_m`, `rotation`, as near `start_rad` as can be.
 
     Damped least squares with the posture in the nullspace::
 

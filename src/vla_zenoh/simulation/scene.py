@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,8 +28,8 @@ HIDDEN_GROUP = 3  # MuJoCo's own convention: groups from here on are not drawn
 # Measured creep of a held brick in 10 s: pyramidal cone and impratio 1: 1.06 mm, this: 0.03 mm.
 IMPRATIO = 10.0
 STIFF_SOLREF = (0.004, 1.0)
-STIFF_SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
 PAD_CONDIM = 4
+PAD_SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)  # the fingers are light, hence soft otherwise
 
 
 def scene_file(scene: str) -> Path:
@@ -67,7 +68,9 @@ def build_model(
             spec.camera(PREFIX + robot.camera.name).name = robot.camera.name
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise ResourceError(f"MuJoCo refuses scene {path} with {robot.description}: {error}") from error
+        raise ResourceError(
+            f"MuJoCo refuses scene {path} with {robot.description}: {error}"
+        ) from error
     _sort_groups(model)
     return model
 
@@ -93,7 +96,7 @@ def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
             geom.priority = 1  # the pads decide, whatever the object's author wrote
             geom.friction = robot.pad_friction
             geom.condim = PAD_CONDIM
-            geom.solref, geom.solimp = STIFF_SOLREF, STIFF_SOLIMP
+            geom.solref, geom.solimp = STIFF_SOLREF, PAD_SOLIMP
     for equality in spec.equalities:
         equality.solref = STIFF_SOLREF
     for name in robot.arm_joints:
@@ -110,9 +113,11 @@ def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
     return spec
 
 
-def _named(element: mujoco.MjsBody | None, kind: str, name: str, known: list[str]) -> mujoco.MjsBody:
+def _named(element: Any, kind: str, name: str, known: list[str]) -> Any:
     if element is None:
-        raise ResourceError(f"the robot description has no {kind} {name!r}; it has: {', '.join(known)}")
+        raise ResourceError(
+            f"the robot description has no {kind} {name!r}; it has: {', '.join(known)}"
+        )
     return element
 
 

@@ -90,6 +90,7 @@ class World:
         self._arm_actuators = [model.actuator(PREFIX + j).id for j in self.robot.arm_joints]
         self._gripper_actuator = model.actuator(PREFIX + GRIPPER).id
         self._tcp = model.site(PREFIX + TCP_SITE).id
+        self._tcp_body = int(model.site_bodyid[self._tcp])
         self._tcp_position = data.site_xpos[self._tcp]
         self._tcp_rotation = data.site_xmat[self._tcp].reshape(3, 3)
         self._objects = objects_of(model)
@@ -115,7 +116,8 @@ class World:
             for name, place in draw_places(model, seed).items():
                 height = float(model.body_pos[self._objects[name], 2])
                 half = place.yaw_rad / 2.0
-                self._put(name, (place.x_m, place.y_m, height), (0, 0, math.sin(half), math.cos(half)))
+                turn = (0.0, 0.0, math.sin(half), math.cos(half))
+                self._put(name, (place.x_m, place.y_m, height), turn)
         self._gripper.reset(self._gripper.max_width_m)
         self._bound_gripper_force()
         self._controller.reset()
@@ -134,7 +136,7 @@ class World:
         mujoco.mj_step1(model, data)
         output = self._controller.torque(reference, self._arm_state())
         if not math.isfinite(output.torque_nm.sum()):
-            raise NodeError(f"the impedance controller got a reference that is not finite: {reference}")
+            raise NodeError(f"the impedance controller got a bad reference: {reference}")
         self.saturated += output.saturated
         data.ctrl[self._arm_actuators] = output.torque_nm
         data.ctrl[self._gripper_actuator] = self._gripper.step(*self._opening())
@@ -253,13 +255,15 @@ class World:
     # -- inside --------------------------------------------------------------------------------
 
     def _arm_state(self) -> ArmState:
+        jacobian = self._jacobian()
         mujoco.mj_fullM(self.model, self._data, self._inertia)
         return ArmState(
             position_rad=self._q,
             velocity_rad_s=self._qd,
             tcp_position_m=self._tcp_position,
             tcp_rotation=self._tcp_rotation,
-            jacobian=self._jacobian(),
+            jacobian=jacobian,
+            drift=self._jacobian_rate() @ self._qd,
             inertia=self._inertia[self._dofs, self._dofs],
             bias_nm=self._bias,
         )
@@ -267,6 +271,13 @@ class World:
     def _jacobian(self) -> FloatArray:
         mujoco.mj_jacSite(self.model, self._data, self._linear, self._angular, self._tcp)
         return np.concatenate([self._linear[:, self._dofs], self._angular[:, self._dofs]])
+
+    def _jacobian_rate(self) -> FloatArray:
+        linear, angular = self._linear, self._angular
+        mujoco.mj_jacDot(
+            self.model, self._data, linear, angular, self._tcp_position, self._tcp_body
+        )
+        return np.concatenate([linear[:, self._dofs], angular[:, self._dofs]])
 
     def _refresh(self) -> None:
         """Bring positions up to the last step; contacts and forces stay those of that step."""
