@@ -115,7 +115,7 @@ class ImpedanceGains:
     translational_n_m: float = 2000.0
     rotational_nm_rad: float = 120.0
     damping_ratio: float = 1.0
-    integral_1_s: float = 2.0
+    integral_1_s: float = 4.0
     max_integral_n: float = 15.0
     max_integral_nm: float = 3.0
     max_error_m: float = 0.02

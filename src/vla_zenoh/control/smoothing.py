@@ -30,9 +30,13 @@ AXES = 6
 REST_VELOCITY = 1e-6
 """m/s and rad/s: slower counts as standing."""
 
+ROTATION_BOX = 0.55
+"""Share of a rotation limit given to each axis, so that the norm over three axes (sqrt 3 of it) and
+the small terms of a moving chart (5 %) stay below the limit whatever the direction."""
+
 
 class MotionLimits(NamedTuple):
-    """Per axis: (velocity, acceleration, jerk) in m, s and in rad, s."""
+    """(velocity, acceleration, jerk): translation per axis in m, s; rotation as norm in rad, s."""
 
     translation: tuple[float, float, float]
     rotation: tuple[float, float, float]
@@ -58,7 +62,7 @@ class Smoother:
     Args:
         pose: where it stands at first.
         dt_s: duration of a tick.
-        limits: of each axis.
+        limits: of the motion.
     """
 
     def __init__(self, pose: Pose, dt_s: float, limits: MotionLimits) -> None:
@@ -73,7 +77,7 @@ class Smoother:
 
     @staticmethod
     def _box(limits: MotionLimits, order: int) -> list[float]:
-        return [limits.translation[order]] * 3 + [limits.rotation[order]] * 3
+        return [limits.translation[order]] * 3 + [limits.rotation[order] * ROTATION_BOX] * 3
 
     def reset(self, pose: Pose) -> None:
         """Stand still at `pose`, forgetting all motion. Only for an arm that is not streamed to."""
@@ -112,6 +116,21 @@ class Smoother:
         self.braking = True
         self._input.control_interface = ControlInterface.Velocity
         self._input.synchronization = Synchronization.No
+
+    def brake_from(self, motion: Motion) -> None:
+        """Take over a motion that somebody else made, and brake."""
+        self.reset(motion.pose)
+        body = motion.pose.rotation.T
+        self._input.current_velocity = [
+            *motion.twist[:3].tolist(),
+            *(body @ motion.twist[3:]).tolist(),
+        ]
+        self._input.current_acceleration = [
+            *motion.acceleration[:3].tolist(),
+            *(body @ motion.acceleration[3:]).tolist(),
+        ]
+        self.motion = motion
+        self.brake()
 
     def tick(self) -> Motion:
         """Advance by one tick."""

@@ -1,0 +1,554 @@
+"""The command node's mind: chunks and settings in, a bounded smooth pose stream out.
+
+`Commander.step` is called once a tick with everything that arrived since the last one. It has no
+clock, no thread and no session; the same inputs give the same outputs, in a test, in lockstep with
+a simulator and on the robot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from vla_zenoh.control import limits as bounds
+from vla_zenoh.control.acceptance import Lease, Refusal, refuse
+from vla_zenoh.control.actions import step_pose, step_width
+from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
+from vla_zenoh.control.gripper import GripperArbiter
+from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate, worker_node
+from vla_zenoh.control.smoothing import Motion, MotionLimits, Smoother
+from vla_zenoh.control.so3 import (
+    Pose,
+    angle_between,
+    quat_from_rotation,
+    rotation_from_quat,
+)
+from vla_zenoh.control.states import OBEYING, State, Trigger, after
+from vla_zenoh.errors import RecordError
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import (
+    ActionChunk,
+    Cause,
+    Event,
+    GripperCommand,
+    GripperState,
+    PoseCommand,
+    PoseState,
+    Stamped,
+    Task,
+)
+
+FIRST_CHUNK_PATIENCE_S = 1.0
+"""After activation a new observation, an inference and a chunk have to happen first."""
+LINGER_NS = 500_000_000
+"""The stream goes on for this long after the arm stands, so that its last pose is not lost."""
+
+
+class Setting(NamedTuple):
+    """Somebody put a setting. `name`: prompt, active, worker, rate, stop, reset or lose."""
+
+    name: str
+    value: str | bool | float | None = None
+
+
+@dataclass(slots=True)
+class Inputs:
+    """Everything that arrived since the last tick, oldest first.
+
+    Args:
+        settings: in the order they were put.
+        chunks: of all workers.
+        pose: newest TCP pose, or None when none came since.
+        gripper: likewise.
+        around: the nodes around; None: unchanged.
+    """
+
+    settings: Sequence[Setting] = ()
+    chunks: Sequence[Stamped[ActionChunk]] = ()
+    pose: Stamped[PoseState] | None = None
+    gripper: Stamped[GripperState] | None = None
+    around: Surroundings | None = None
+
+
+@dataclass(slots=True)
+class Outputs:
+    """What to publish.
+
+    Args:
+        pose: None while nothing is streamed.
+        gripper: None unless a new width is to be sent.
+        task_changed: `Commander.task` differs from the last tick's.
+        events: what happened.
+        refusals: counted by reason by the caller.
+        accepted: the chunk that came in force with this tick, for latencies.
+    """
+
+    pose: PoseCommand | None = None
+    gripper: GripperCommand | None = None
+    task_changed: bool = False
+    events: list[Event] = field(default_factory=list)
+    refusals: list[Refusal] = field(default_factory=list)
+    accepted: Cause | None = None
+
+
+class Commander:
+    """See the module.
+
+    Args:
+        profile: limits, timing and first settings.
+        dry_run: compute everything, stream nothing.
+    """
+
+    def __init__(self, profile: Profile, *, dry_run: bool = False) -> None:
+        self.profile = profile
+        self.dry_run = dry_run
+        self.state = State.INACTIVE
+        self.why = "not activated yet"
+        self.task = Task(
+            0, False, profile.task.prompt, profile.task.worker, profile.task.rate_hz
+        )
+        self.pose: Stamped[PoseState] | None = None
+        self.gripper_state: Stamped[GripperState] | None = None
+        self.gripper = GripperArbiter(profile.robot.gripper)
+        self.lease: Lease | None = None
+        self.accepted_chunks = 0
+        self.accepted_steps = 0
+        self.policy_done = False
+        self.tracking_m = 0.0
+        self.tracking_rad = 0.0
+        self._around = Surroundings()
+        self._shadow: dict[str, Stamped[ActionChunk]] = {}
+        self._smoother: Smoother | None = None
+        self._timeline: GoalTimeline | None = None
+        self._deadline_ns = 0
+        self._rest_since_ns: int | None = None
+        self._streaming = False
+        self._target: Goal | None = None
+        self._out = Outputs()
+
+    # -- one tick -----------------------------------------------------------------------------
+    def step(self, inputs: Inputs, now_ns: int, ticks: int = 1) -> Outputs:
+        """Take in what arrived and say what to publish.
+
+        Args:
+            inputs: since the last call.
+            now_ns: nominal time of this tick on the wall clock of this node, which must not jump.
+            ticks: periods since the last call. More than one after a late wake-up: the motion is a
+                function of time, so the same trajectory is sampled later, and nothing is hurried.
+        """
+        self._out = Outputs()
+        task_before, state_before = self.task, self.state
+        self._take_state(inputs)
+        for setting in inputs.settings:
+            self._take_setting(setting, now_ns)
+        for chunk in inputs.chunks:
+            self._take_chunk(chunk, now_ns)
+        self._watch(now_ns)
+        self._move(now_ns, ticks)
+        if self.state is not state_before and self.task.active != (self.state in OBEYING):
+            self.task = replace(self.task, active=self.state in OBEYING)
+        self._out.task_changed = self.task != task_before
+        return self._out
+
+    @property
+    def goal(self) -> Goal | None:
+        """Where the arm is heading, None before the first activation."""
+        return self._target
+
+    @property
+    def at_rest(self) -> bool:
+        """The commanded pose stands still."""
+        return self._smoother is None or self._smoother.at_rest
+
+    @property
+    def streaming(self) -> bool:
+        """Poses are being published."""
+        return self._streaming
+
+    @property
+    def smoothing_failures(self) -> int:
+        """Times Ruckig found no way and the arm was braked instead."""
+        return self._smoother.failures if self._smoother else 0
+
+    # -- inputs -------------------------------------------------------------------------------
+    def _take_state(self, inputs: Inputs) -> None:
+        if inputs.around is not None:
+            self._around = inputs.around
+        if inputs.pose is not None:
+            self.pose = inputs.pose
+        if inputs.gripper is not None:
+            self.gripper_state = inputs.gripper
+            faults, mode = inputs.gripper.record.faults, inputs.gripper.record.mode
+            if faults:
+                self._change(Trigger.FAULT, f"the robot reports: {'; '.join(faults)}")
+            elif mode != "ready":
+                self._change(Trigger.LOSE, f"the robot is not ready but {mode!r}")
+
+    def _take_setting(self, setting: Setting, now_ns: int) -> None:
+        name, value = setting.name, setting.value
+        if name == "prompt" and isinstance(value, str):
+            if value != self.task.prompt:
+                self._new_episode(now_ns, prompt=value)
+        elif name == "worker" and isinstance(value, str):
+            if value != self.task.worker:
+                self._change_worker(value, now_ns)
+        elif name == "rate" and isinstance(value, float):
+            self.task = replace(self.task, rate_hz=value)
+        elif name == "active":
+            if value:
+                self._activate(now_ns)
+            else:
+                self._change(Trigger.DEACTIVATE, "deactivated")
+        elif name == "stop":
+            self._change(Trigger.STOP, "emergency stop")
+        elif name == "reset":
+            self._reset()
+        elif name == "lose":
+            self._change(Trigger.LOSE, str(value))
+
+    def _new_episode(self, now_ns: int, **changes: str) -> None:
+        # The wall clock, so that an episode number never comes again after a restart.
+        episode = max(self.task.episode + 1, now_ns // 1_000_000)
+        self.task = replace(self.task, episode=episode, **changes)  # pyright: ignore
+        self.accepted_chunks = self.accepted_steps = 0
+        self.policy_done = False
+        if self.state in OBEYING:
+            self._deadline_ns = now_ns + self._patience_ns(FIRST_CHUNK_PATIENCE_S)
+
+    def _change_worker(self, worker: str, now_ns: int) -> None:
+        if self.state in OBEYING:
+            lease, reasons = self._preflight(worker, now_ns)
+            if lease is None:
+                self._refuse_setting("worker", reasons)
+                return
+            self.lease = lease
+        self._new_episode(now_ns, worker=worker)
+
+    def _activate(self, now_ns: int) -> None:
+        if self.state in OBEYING:
+            return
+        if self.state is not State.INACTIVE:
+            self._refuse_setting(
+                "activate", [f"the state is {self.state.value} ({self.why}); put anything on reset"]
+            )
+            return
+        lease, reasons = self._preflight(self.task.worker, now_ns)
+        if lease is None or self.pose is None or self.gripper_state is None:
+            self._refuse_setting("activate", reasons)
+            return
+        self.lease = lease
+        self._anchor(self.pose.record, self.gripper_state.record, now_ns)
+        self._change(Trigger.ACTIVATE, f"activated with worker {self.task.worker!r}")
+        self._new_episode(now_ns)
+
+    def _preflight(self, worker: str, now_ns: int) -> tuple[Lease | None, list[str]]:
+        chunk = self._shadow.get(worker)
+        reasons = reasons_not_to_activate(
+            self.profile,
+            worker,
+            self.task.prompt,
+            self._around,
+            self.pose,
+            self.gripper_state,
+            chunk,
+            now_ns,
+        )
+        if reasons or chunk is None:
+            return None, reasons
+        spec = self._around.specs[worker]
+        return Lease(spec, chunk.header.source, now_ns, chunk.header.seq), []
+
+    def _refuse_setting(self, what: str, reasons: list[str]) -> None:
+        self.why = f"{what} refused: {'; '.join(reasons)}"
+        for reason in reasons:
+            self._tell("warning", "refusal", f"{what}_refused", reason)
+            self._out.refusals.append(Refusal(f"{what}_refused", reason, quiet=True))
+
+    def _anchor(self, measured: PoseState, gripper: GripperState, now_ns: int) -> None:
+        """Begin where the robot's own controller stands, so that nothing jumps."""
+        actual = Pose(measured.position_m, rotation_from_quat(measured.quat_xyzw))
+        start = actual
+        if measured.reference_position_m is not None and measured.reference_quat_xyzw is not None:
+            start = Pose(
+                measured.reference_position_m, rotation_from_quat(measured.reference_quat_xyzw)
+            )
+        apart_m, apart_rad = _distance(start, actual)
+        blocked = (
+            apart_m > self.profile.limits.tracking_m or apart_rad > self.profile.limits.tracking_rad
+        )
+        if self._smoother is None:
+            translation, rotation = (
+                self.profile.limits.translation,
+                self.profile.limits.rotation,
+            )
+            self._smoother = Smoother(
+                start,
+                1.0 / self.profile.timing.command_hz,
+                MotionLimits(
+                    (translation.velocity_m_s, translation.acceleration_m_s2, translation.jerk_m_s3),
+                    (rotation.velocity_rad_s, rotation.acceleration_rad_s2, rotation.jerk_rad_s3),
+                ),
+            )
+        elif not self._streaming:
+            self._smoother.reset(start)
+        width_m = self.gripper.sent_m
+        if width_m is None or not (gripper.holding or abs(width_m - gripper.width_m) < 0.005):
+            width_m = min(max(gripper.width_m, 0.0), self.profile.robot.gripper.max_width_m)
+        self.gripper.restart(width_m)
+        goal = Goal(actual if blocked else self._smoother.motion.pose, width_m)
+        if self._timeline is None:
+            self._timeline = GoalTimeline(goal, now_ns)
+        else:
+            self._timeline.restart(goal, now_ns)
+        self._target = None
+        self._deadline_ns = now_ns + self._patience_ns(FIRST_CHUNK_PATIENCE_S)
+
+    def _reset(self) -> None:
+        faults = self.gripper_state.record.faults if self.gripper_state else ()
+        if self.state is State.FAULT and faults:
+            self._refuse_setting("reset", [f"the robot still reports: {'; '.join(faults)}"])
+            return
+        self._change(Trigger.RESET, "reset")
+
+    def _take_chunk(self, chunk: Stamped[ActionChunk], now_ns: int) -> None:
+        worker = chunk.record.worker
+        owner = self._around.spec_sources.get(worker)
+        if owner is None or chunk.header.source != owner:
+            self._refuse(
+                Refusal(
+                    "foreign",
+                    f"a chunk by {chunk.header.source[:60]!r}, who did not publish this worker's spec",
+                ),
+                worker,
+            )
+            return
+        if self.state not in OBEYING or worker != self.task.worker or self.lease is None:
+            self._shadow[worker] = chunk
+            return
+        refusal = refuse(
+            chunk, self.lease, self.task, self.profile.timing.max_observation_age_s, now_ns
+        )
+        if refusal is None:
+            refusal = self._compose(chunk, now_ns)
+        if refusal is not None:
+            self._refuse(refusal, worker)
+            return
+        self._shadow[worker] = chunk
+        self.lease.last_observation_ns = chunk.record.observation_stamp_ns
+        self.accepted_chunks += 1
+        self.accepted_steps += len(chunk.record.steps)
+        self.policy_done = chunk.record.done
+        self._change(Trigger.FRESH, "fresh chunk")
+
+    def _compose(self, chunk: Stamped[ActionChunk], now_ns: int) -> Refusal | None:
+        assert self.lease is not None and self._timeline is not None
+        action, record = self.lease.spec.action, chunk.record
+        before = self._timeline.at(record.observation_stamp_ns)
+        goals: list[Goal] = []
+        hits: list[bounds.LimitHit] = []
+        for step in record.steps:
+            try:
+                asked = step_pose(action, step, before.pose)
+                width_m = step_width(action, step, before.width_m, self.gripper_max_m)
+            except RecordError as error:
+                return Refusal("meaning", str(error))
+            pose, acted = bounds.bound_step(self.profile.limits, before.pose, asked)
+            for hit in acted:
+                if hit.fatal:
+                    return Refusal(
+                        hit.name,
+                        f"a step of {hit.value:.4g} is over {bounds.REFUSE_FACTOR:g} times its limit; "
+                        "is its unit right?",
+                        hit.value,
+                        hit.limit,
+                    )
+            if acted and self.profile.limits.out_of_bounds == "refuse":
+                return Refusal(
+                    acted[0].name, "out of bounds, and the profile says refuse", *acted[0][1:3]
+                )
+            hits += acted
+            before = Goal(pose, before.width_m if width_m is None else width_m)
+            goals.append(before)
+        for hit in hits[:1]:
+            self._tell("warning", "limit", hit.name, "shortened", hit.value, hit.limit)
+        cause = Cause(
+            record.worker,
+            chunk.header.seq,
+            record.observation_stamp_ns,
+            record.observed_ns,
+            record.inference_start_ns,
+            record.inference_end_ns,
+            chunk.header.stamp_wall_ns,
+            chunk.received_ns,
+        )
+        dt_ns = int(action.dt_s * 1e9)
+        plan = Plan(chunk.header.stamp_wall_ns, record.observation_stamp_ns, dt_ns, goals, cause)
+        self._timeline.add(plan, now_ns)
+        self._deadline_ns = max(plan.end_ns, now_ns) + self._patience_ns(0.0)
+        self._out.accepted = cause
+        return None
+
+    @property
+    def gripper_max_m(self) -> float:
+        """Widest opening."""
+        return self.profile.robot.gripper.max_width_m
+
+    def _refuse(self, refusal: Refusal, worker: str) -> None:
+        self._out.refusals.append(refusal)
+        if not refusal.quiet:
+            self._tell(
+                "warning",
+                "refusal",
+                refusal.reason,
+                f"{worker}: {refusal.why}",
+                refusal.value,
+                refusal.limit,
+            )
+
+    # -- watching -----------------------------------------------------------------------------
+    def _patience_ns(self, extra_s: float) -> int:
+        """How long to wait for the next chunk: one period at the asked rate, and the watchdog."""
+        return int((1.0 / self.task.rate_hz + self.profile.timing.watchdog_s + extra_s) * 1e9)
+
+    def _watch(self, now_ns: int) -> None:
+        if self.pose is not None:
+            self._measure_tracking(self.pose.record)
+        if self.state not in OBEYING:
+            return
+        lost = self._what_is_lost(now_ns)
+        if lost:
+            self._change(Trigger.LOSE, lost)
+        elif now_ns > self._deadline_ns:
+            self._change(Trigger.STARVE, "no fresh chunk within the watchdog")
+
+    def _measure_tracking(self, measured: PoseState) -> None:
+        reference = self._smoother.motion.pose if self._smoother and self._streaming else None
+        if reference is None:
+            self.tracking_m = self.tracking_rad = 0.0
+            return
+        actual = Pose(measured.position_m, rotation_from_quat(measured.quat_xyzw))
+        self.tracking_m, self.tracking_rad = _distance(reference, actual)
+
+    def _what_is_lost(self, now_ns: int) -> str:
+        assert self.pose is not None and self.lease is not None
+        limits, timing = self.profile.limits, self.profile.timing
+        age_s = (now_ns - self.pose.received_ns) / 1e9
+        if age_s > timing.state_timeout_s:
+            return f"robot state lost: {age_s:.3f} s old, at most {timing.state_timeout_s:g} s"
+        needed = [self._around.robot_node, worker_node(self.task.worker)]
+        needed += [
+            self._around.camera_nodes.get(camera.camera, "camera")
+            for camera in self.lease.spec.observation.cameras
+        ]
+        for node in needed:
+            if node not in self._around.alive:
+                return f"node {node!r} is gone"
+        if self.dry_run:
+            return ""
+        if self.tracking_m > limits.tracking_m:
+            return (
+                f"the arm does not follow: {self.tracking_m:.3f} m from its command, "
+                f"at most {limits.tracking_m:g} m (is it blocked?)"
+            )
+        if self.tracking_rad > limits.tracking_rad:
+            return (
+                f"the arm does not follow: {self.tracking_rad:.3f} rad from its command, "
+                f"at most {limits.tracking_rad:g} rad (is it blocked?)"
+            )
+        return ""
+
+    def _change(self, trigger: Trigger, why: str) -> None:
+        new = after(self.state, trigger)
+        if new is self.state:
+            return
+        old, self.state, self.why = self.state, new, why
+        level = "info" if new in OBEYING or trigger in (Trigger.DEACTIVATE, Trigger.RESET) else "warning"
+        self._tell(level, "transition", f"{old.value}->{new.value}", why)
+
+    def _tell(
+        self,
+        level: str,
+        kind: str,
+        what: str,
+        why: str,
+        value: float | None = None,
+        limit: float | None = None,
+    ) -> None:
+        self._out.events.append(Event(level, kind, what, why, value, limit))
+
+    # -- motion -------------------------------------------------------------------------------
+    def _move(self, now_ns: int, ticks: int) -> None:
+        if self._smoother is None or self._timeline is None:
+            return
+        cause: Cause | None = None
+        if self.state is State.ACTIVE:
+            cause = self._follow(self._smoother, self._timeline, now_ns)
+        else:
+            self._brake(self._smoother, self._timeline, now_ns)
+        if not self._must_stream(self._smoother, now_ns):
+            self._streaming = False
+            return
+        self._streaming = True
+        failures = self._smoother.failures
+        motion = self._smoother.tick()
+        for _ in range(ticks - 1):
+            motion = self._smoother.tick()
+        if self._smoother.failures > failures:
+            self._change(Trigger.FAULT, "no trajectory could be computed; braked")
+        if not self.dry_run:
+            self._out.pose = self._command(motion, cause)
+        if self.state is State.ACTIVE and not self.dry_run:
+            self._out.gripper = self.gripper.step(now_ns, self.gripper_state)
+
+    def _follow(self, smoother: Smoother, timeline: GoalTimeline, now_ns: int) -> Cause | None:
+        plan = timeline.plan
+        index = plan.index_at(now_ns)
+        goal = plan.goals[index]
+        if goal is not self._target:
+            pose, hits = bounds.leash(self.profile.limits, goal.pose, smoother.motion.pose)
+            if hits:
+                goal = Goal(pose, goal.width_m)
+                timeline.shift_rest(index, goal)
+                self._tell("warning", "limit", hits[0].name, "leash", hits[0].value, hits[0].limit)
+            smoother.target(goal.pose)
+            self._target = goal
+            self.gripper.want(goal.width_m)
+        return plan.cause
+
+    def _brake(self, smoother: Smoother, timeline: GoalTimeline, now_ns: int) -> None:
+        """Stop, and let the goal be where the arm stops, so that nothing pulls it further."""
+        smoother.brake()
+        self._target = None
+        if timeline.plan.cause is not None and smoother.at_rest:
+            timeline.hold(Goal(smoother.motion.pose, timeline.at(now_ns).width_m), now_ns)
+
+    def _must_stream(self, smoother: Smoother, now_ns: int) -> bool:
+        if self.state in OBEYING or not smoother.at_rest:
+            self._rest_since_ns = None
+            return self.state in OBEYING or self._streaming
+        if self._rest_since_ns is None:
+            self._rest_since_ns = now_ns
+        return self._streaming and now_ns - self._rest_since_ns < LINGER_NS
+
+    def _command(self, motion: Motion, cause: Cause | None) -> PoseCommand:
+        goal = self._target.pose if self._target else motion.pose
+        return PoseCommand(
+            motion.pose.position_m,
+            quat_from_rotation(motion.pose.rotation),
+            motion.twist,
+            motion.acceleration,
+            goal.position_m,
+            quat_from_rotation(goal.rotation),
+            self.state.value,
+            cause,
+        )
+
+
+def _distance(a: Pose, b: Pose) -> tuple[float, float]:
+    return (
+        float(np.linalg.norm(a.position_m - b.position_m)),
+        angle_between(a.rotation, b.rotation),
+    )

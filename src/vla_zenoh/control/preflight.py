@@ -1,0 +1,172 @@
+"""Every reason not to activate, at once: a person should not meet them one by one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from vla_zenoh.control.limits import into_workspace
+from vla_zenoh.errors import SpecError
+from vla_zenoh.policy import ModelSpec, check_steps
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import ActionChunk, GripperState, PoseState, Stamped
+
+CHUNK_PATIENCE_S = 2.0
+"""A worker that runs beside the robot publishes chunks all the time; the newest may be this old."""
+CLOCK_TOLERANCE_S = 0.02
+"""A state may seem to come from the future by this much before clocks are said to differ."""
+CAMERA_PATIENCE_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What the command node knows of the nodes around it.
+
+    Args:
+        alive: names of the nodes whose liveliness token stands.
+        robot_node: the node that drives the robot.
+        specs: worker -> the spec it published last.
+        spec_sources: worker -> who published that spec; only this source speaks for the worker.
+        worker_complaints: worker -> why it cannot infer, where it said so.
+        camera_ages_s: camera -> age of its newest picture, as its node says.
+        camera_nodes: camera -> the node that serves it.
+    """
+
+    alive: frozenset[str] = frozenset()
+    robot_node: str = "sim"
+    specs: Mapping[str, ModelSpec] = field(default_factory=dict)
+    spec_sources: Mapping[str, str] = field(default_factory=dict)
+    worker_complaints: Mapping[str, str] = field(default_factory=dict)
+    camera_ages_s: Mapping[str, float] = field(default_factory=dict)
+    camera_nodes: Mapping[str, str] = field(default_factory=dict)
+
+
+def worker_node(worker: str) -> str:
+    """Node name of a worker."""
+    return f"worker-{worker}"
+
+
+def reasons_not_to_activate(
+    profile: Profile,
+    worker: str,
+    prompt: str,
+    around: Surroundings,
+    pose: Stamped[PoseState] | None,
+    gripper: Stamped[GripperState] | None,
+    chunk: Stamped[ActionChunk] | None,
+    now_ns: int,
+) -> list[str]:
+    """All of them as sentences, empty when the arm may move.
+
+    Args:
+        profile: the effective profile.
+        worker: the worker that holds the lease.
+        prompt: the prompt in force.
+        around: see `Surroundings`.
+        pose: newest TCP pose.
+        gripper: newest gripper state.
+        chunk: newest chunk of that worker, made while it was not obeyed.
+        now_ns: same clock as the records' ``received_ns``.
+    """
+    return [
+        *_robot(profile, around, pose, gripper, now_ns),
+        *_worker(worker, prompt, around, chunk, now_ns),
+        *_cameras(profile, worker, around),
+    ]
+
+
+def _robot(
+    profile: Profile,
+    around: Surroundings,
+    pose: Stamped[PoseState] | None,
+    gripper: Stamped[GripperState] | None,
+    now_ns: int,
+) -> list[str]:
+    reasons: list[str] = []
+    if around.robot_node not in around.alive:
+        reasons.append(f"the robot's node {around.robot_node!r} is not alive")
+    if pose is None:
+        return [*reasons, "the TCP pose is not known: nothing was heard on state/pose"]
+    age_s = (now_ns - pose.received_ns) / 1e9
+    if age_s > profile.timing.state_timeout_s:
+        reasons.append(
+            f"the TCP pose is {age_s:.2f} s old, at most {profile.timing.state_timeout_s:g} s is allowed"
+        )
+    delay_s = (pose.received_ns - pose.header.stamp_wall_ns) / 1e9
+    if not -CLOCK_TOLERANCE_S <= delay_s <= CLOCK_TOLERANCE_S + profile.timing.state_timeout_s:
+        reasons.append(
+            f"the robot's clock and this one differ: its newest state arrived {delay_s:+.3f} s after "
+            "its stamp; synchronise the clocks of both hosts (chrony or ptp)"
+        )
+    _, outside_m = into_workspace(profile.limits, pose.record.position_m)
+    if outside_m > profile.limits.step_m:
+        box = profile.limits.workspace
+        at = ", ".join(f"{value:.3f}" for value in pose.record.position_m)
+        reasons.append(
+            f"the TCP at ({at}) m is {outside_m:.3f} m outside the workspace "
+            f"x {box.x_m} y {box.y_m} z {box.z_m}; move it inside"
+        )
+    if gripper is None:
+        reasons.append("the gripper is not known: nothing was heard on state/gripper")
+    elif gripper.record.faults:
+        reasons.append(f"the robot reports: {'; '.join(gripper.record.faults)}")
+    elif gripper.record.mode != "ready":
+        reasons.append(f"the robot is not ready but {gripper.record.mode!r}")
+    return reasons
+
+
+def _worker(
+    worker: str,
+    prompt: str,
+    around: Surroundings,
+    chunk: Stamped[ActionChunk] | None,
+    now_ns: int,
+) -> list[str]:
+    node = worker_node(worker)
+    if node not in around.alive:
+        others = sorted(
+            name.removeprefix("worker-") for name in around.alive if name.startswith("worker-")
+        )
+        return [f"worker {worker!r} is not alive; alive are: {', '.join(others) or 'none'}"]
+    spec = around.specs.get(worker)
+    if spec is None:
+        return [f"worker {worker!r} has not published its spec"]
+    reasons: list[str] = []
+    if spec.observation.prompt and not prompt:
+        reasons.append(f"worker {worker!r} needs a prompt and there is none")
+    complaint = around.worker_complaints.get(worker)
+    if complaint:
+        reasons.append(f"worker {worker!r} says: {complaint}")
+    if chunk is None or now_ns - chunk.received_ns > CHUNK_PATIENCE_S * 1e9:
+        reasons.append(f"worker {worker!r} has published no chunk in the last {CHUNK_PATIENCE_S:g} s")
+    elif chunk.record.spec_hash != spec.hash:
+        reasons.append(f"worker {worker!r} publishes chunks of another spec than its own")
+    else:
+        try:
+            check_steps(spec.action, chunk.record.steps)
+        except SpecError as error:
+            reasons.append(f"worker {worker!r}: its newest chunk is not sane: {error}")
+    return reasons
+
+
+def _cameras(profile: Profile, worker: str, around: Surroundings) -> list[str]:
+    spec = around.specs.get(worker)
+    if spec is None:
+        return []
+    reasons: list[str] = []
+    for wanted in spec.observation.cameras:
+        camera = wanted.camera
+        if camera not in profile.cameras:
+            reasons.append(
+                f"worker {worker!r} needs camera {camera!r}, the profile has: "
+                f"{', '.join(profile.cameras) or 'none'}"
+            )
+            continue
+        age_s = around.camera_ages_s.get(camera, math.inf)
+        node = around.camera_nodes.get(camera)
+        if node is None or node not in around.alive:
+            reasons.append(f"no living node serves camera {camera!r}")
+        elif age_s > CAMERA_PATIENCE_S:
+            reasons.append(f"camera {camera!r} has sent no picture for {age_s:.1f} s")
+    return reasons

@@ -1,0 +1,1 @@
+"""Processes on the bus. The only rooms that know Zenoh, clocks and threads."""

@@ -1,0 +1,75 @@
+"""A wall clock that does not jump, and the loop that keeps time by it."""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import os
+import time
+from typing import NamedTuple
+
+ADOPT_S = 0.005
+"""A smaller difference to the system's wall clock is slewing, and is followed silently."""
+REALTIME_PRIORITY = 40
+TIMER_SLACK_OPTION = 29  # PR_SET_TIMERSLACK
+
+
+class Clock:
+    """Wall time made of the monotonic clock and an offset taken now and then."""
+
+    def __init__(self) -> None:
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
+
+    def wall_ns(self) -> int:
+        """Nanoseconds since the Unix epoch."""
+        return time.monotonic_ns() + self._offset_ns
+
+    def follow(self) -> float:
+        """Take over the system's wall clock; returns by how much it had been stepped (s), or 0."""
+        offset_ns = time.time_ns() - time.monotonic_ns()
+        step_s = (offset_ns - self._offset_ns) / 1e9
+        self._offset_ns = offset_ns
+        return step_s if abs(step_s) > ADOPT_S else 0.0
+
+
+class Tick(NamedTuple):
+    """One turn of a fixed-rate loop.
+
+    Args:
+        periods: how many periods have passed since the last turn, at least 1.
+        late_s: how late this turn was woken.
+    """
+
+    periods: int
+    late_s: float
+
+
+class FixedRate:
+    """Wakes at multiples of a period; a missed one is reported, not made up for."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = round(1e9 / rate_hz)
+        self._next_ns = time.monotonic_ns() + self._period_ns
+
+    def wait(self) -> Tick:
+        """Sleep until the next multiple."""
+        now_ns = time.monotonic_ns()
+        if now_ns < self._next_ns:
+            time.sleep((self._next_ns - now_ns) / 1e9)
+            now_ns = time.monotonic_ns()
+        late_ns = max(now_ns - self._next_ns, 0)
+        periods = 1 + late_ns // self._period_ns
+        self._next_ns += periods * self._period_ns
+        return Tick(int(periods), (late_ns % self._period_ns if periods == 1 else late_ns) / 1e9)
+
+
+def make_this_thread_realtime() -> bool:
+    """Ask for a real-time scheduler (SCHED_FIFO) for the calling thread; False where not allowed."""
+    library = ctypes.util.find_library("c")
+    if library is not None:
+        ctypes.CDLL(library, use_errno=True).prctl(TIMER_SLACK_OPTION, 1, 0, 0, 0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REALTIME_PRIORITY))
+    except (OSError, AttributeError):
+        return False
+    return True

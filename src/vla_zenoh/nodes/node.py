@@ -1,0 +1,237 @@
+"""What every node has: a name on the bus, status, events, counters, and checked streams."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import zenoh
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
+from vla_zenoh.errors import CodecError, NodeError
+from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.clock import Clock
+from vla_zenoh.nodes.session import QOS
+from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import Event, Header, NodeStatus, Stamped
+
+MSGPACK = zenoh.Encoding("application/msgpack")
+STATUS_PERIOD_S = 0.5
+EVENT_PERIOD_S = 0.25
+"""The same kind of event is written at most this often; what came between is counted in `count`."""
+
+Record = TypeVar("Record")
+Slot = TypeVar("Slot", Latest, Inbox)
+
+
+class Stream:
+    """Writes records on one key, each with its header."""
+
+    def __init__(
+        self, session: zenoh.Session, key: str, kind: Kind, source: str, clock: Clock
+    ) -> None:
+        self._publisher = session.declare_publisher(key, **QOS[kind])
+        self._source, self._clock = source, clock
+        self.key = key
+        self.seq = 0
+
+    @property
+    def wanted(self) -> bool:
+        """Somebody listens."""
+        return self._publisher.matching_status.matching
+
+    def put(
+        self,
+        record: Any,
+        *,
+        stamp_wall_ns: int | None = None,
+        seq: int | None = None,
+        encoding: Any = MSGPACK,
+    ) -> Header:
+        """Write a record, or ready-made bytes, stamped now unless told otherwise."""
+        header = Header(
+            self._clock.wall_ns() if stamp_wall_ns is None else stamp_wall_ns,
+            self.seq if seq is None else seq,
+            self._source,
+        )
+        payload = record if isinstance(record, bytes) else records.encode(record)
+        self._publisher.put(payload, attachment=header_codec.encode(header), encoding=encoding)
+        self.seq += 1
+        return header
+
+
+class Node:
+    """A process on the bus.
+
+    Args:
+        name: unique for this robot; a second node of the same name is refused.
+        profile: the effective profile.
+        session: an open session, closed by whoever opened it.
+
+    Raises:
+        NodeError: a node of this name is alive already.
+    """
+
+    def __init__(self, name: str, profile: Profile, session: zenoh.Session) -> None:
+        self.name, self.profile, self.session = name, profile, session
+        self.keys = profile.keys
+        self.clock = Clock()
+        self.source = f"{name}#{secrets.token_hex(4)}"
+        self.counters: Counter[str] = Counter()
+        self.started_wall_ns = time.time_ns()
+        self._declared: list[Any] = []
+        self._last_event: dict[tuple[str, str], float] = {}
+        self._held_events: Counter[tuple[str, str]] = Counter()
+        self._last_status = 0.0
+        self._last_state = ""
+        self._refuse_a_second_one()
+        self._token = session.liveliness().declare_token(self.keys.alive(name))
+        self._status = self.stream(self.keys.status(name), Kind.NEWS)
+        self._events = self.stream(self.keys.event(name), Kind.NEWS)
+
+    def _refuse_a_second_one(self) -> None:
+        for reply in self.session.liveliness().get(self.keys.alive(self.name), timeout=1.0):
+            if reply.ok is not None:
+                raise NodeError(
+                    f"a node {self.name!r} of robot {self.profile.robot.name!r} is alive already; "
+                    "stop it first, or give this one another --name where the command has it"
+                )
+
+    # -- writing ------------------------------------------------------------------------------
+    def stream(self, key: str, kind: Kind) -> Stream:
+        """A writer for `key`."""
+        return Stream(self.session, key, kind, self.source, self.clock)
+
+    def tell(self, event: Event) -> None:
+        """Write an event; a flood of the same is thinned out and counted."""
+        kind = (event.kind, event.what)
+        now = time.monotonic()
+        if len(self._last_event) > 512:
+            self._last_event.clear()
+        if event.kind != "transition" and now - self._last_event.get(kind, -1e9) < EVENT_PERIOD_S:
+            self._held_events[kind] += 1
+            return
+        self._last_event[kind] = now
+        held = self._held_events.pop(kind, 0)
+        if held:
+            event = Event(
+                event.level,
+                event.kind,
+                event.what,
+                event.why,
+                event.value,
+                event.limit,
+                held + 1,
+            )
+        self._events.put(event)
+
+    def refuse(self, reason: str, why: str) -> None:
+        """Count a refusal by reason, and say why."""
+        self.counters[f"refused.{reason}"] += 1
+        self.tell(Event("warning", "refusal", reason, why[:1000]))
+
+    def report(
+        self,
+        state: str,
+        *,
+        detail: Mapping[str, Any] | None = None,
+        ages_s: Mapping[str, float] | None = None,
+        rates_hz: Mapping[str, float] | None = None,
+        latency_ms: Mapping[str, tuple[float, float]] | None = None,
+        now: bool = False,
+    ) -> None:
+        """Write status when it is time, when `state` changed, or `now`."""
+        clock = time.monotonic()
+        if not now and state == self._last_state and clock - self._last_status < STATUS_PERIOD_S:
+            return
+        self._last_status, self._last_state = clock, state
+        self._status.put(
+            NodeStatus(
+                self.name,
+                state,
+                socket.gethostname(),
+                os.getpid(),
+                self.started_wall_ns,
+                ages_s or {},
+                rates_hz or {},
+                latency_ms or {},
+                dict(self.counters),
+                detail or {},
+            )
+        )
+
+    def report_due(self, state: str) -> bool:
+        """Whether `report` would write now: lets a fast loop skip collecting what to report."""
+        due = time.monotonic() - self._last_status >= STATUS_PERIOD_S
+        return due or state != self._last_state
+
+    # -- reading ------------------------------------------------------------------------------
+    def listen(self, key: str, slot: Slot) -> Slot:
+        """Let samples on `key` fall into `slot`."""
+        handler = zenoh.handlers.Callback(slot, indirect=False)
+        self._declared.append(self.session.declare_subscriber(key, handler))
+        return slot
+
+    def on_alive(self, callback: Callable[[str, bool], None]) -> None:
+        """Call back with (node name, alive) now and at every change, on Zenoh's thread."""
+
+        def change(sample: zenoh.Sample) -> None:
+            callback(
+                str(sample.key_expr).rsplit("/", 1)[-1], sample.kind == zenoh.SampleKind.PUT
+            )
+
+        handler = zenoh.handlers.Callback(change, indirect=False)
+        self._declared.append(
+            self.session.liveliness().declare_subscriber(
+                self.keys.all_alive, handler, history=True
+            )
+        )
+
+    def answer(self, key: str, reply: Callable[[zenoh.Query], None]) -> None:
+        """Answer `get` on `key`; `reply` runs on Zenoh's thread."""
+
+        def handle(query: zenoh.Query) -> None:
+            with query:
+                reply(query)
+
+        handler = zenoh.handlers.Callback(handle, indirect=False)
+        self._declared.append(self.session.declare_queryable(key, handler, complete=True))
+
+    def wall_of(self, arrival: Arrival) -> int:
+        """Arrival time on this node's wall clock."""
+        return self.clock.wall_ns() - (time.monotonic_ns() - arrival.mono_ns)
+
+    def read(self, kind: type[Record], arrival: Arrival) -> Stamped[Record] | None:
+        """Decode a stream sample; a refusal is counted and told, and None is returned."""
+        sample = arrival.sample
+        try:
+            attachment = sample.attachment
+            header = header_codec.decode(attachment.to_bytes() if attachment is not None else None)
+            record = records.decode(kind, sample.payload.to_bytes())
+        except CodecError as error:
+            self.refuse(error.reason, f"{self.keys.short(str(sample.key_expr))}: {error}")
+            return None
+        return Stamped(header, record, self.wall_of(arrival))
+
+    def read_text(self, decode: Callable[[bytes], Record], arrival: Arrival) -> Record | None:
+        """Decode a plain setting likewise."""
+        try:
+            return decode(arrival.sample.payload.to_bytes())
+        except CodecError as error:
+            key = self.keys.short(str(arrival.sample.key_expr))
+            self.refuse(error.reason, f"{key}: {error}")
+            return None
+
+    def close(self) -> None:
+        """Say goodbye: the liveliness token goes first, so that others notice at once."""
+        self._token.undeclare()
+        for declared in self._declared:
+            declared.undeclare()
+        self._declared.clear()
