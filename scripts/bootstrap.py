@@ -8,6 +8,7 @@ variables, pip.conf) is handed on to uv.
 from __future__ import annotations
 
 import configparser
+import ctypes
 import importlib.util
 import os
 import re
@@ -20,10 +21,17 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 TOOLS = ROOT / ".tools"
+UV_IN_VENV = TOOLS / "venv" / "bin" / "uv"
+UV_IN_FOLDER = TOOLS / "uv" / "bin" / "uv"
 CONSTRAINTS = ROOT / "constraints.txt"
 
 OLDEST_PYTHON = (3, 11)
 OLDEST_UV = (0, 8)
+
+LIBRARIES = {
+    # what a wheel needs from the system and does not bring: Debian and Ubuntu package
+    "libgomp.so.1": "libgomp1",  # Pinocchio
+}
 
 PIP_TO_UV = {
     # pip's name: uv's variable, what stands between several values there
@@ -97,6 +105,20 @@ def run(*command: object) -> None:
         fail("this failed, see above: " + " ".join(words))
 
 
+def missing_packages(has_uv: bool) -> list[str]:
+    """Debian packages without which nothing will work here."""
+    packages = []
+    if not has_uv and not any(map(importlib.util.find_spec, ("ensurepip", "pip"))):
+        packages.append("python3-venv")
+    for library, package in LIBRARIES.items():
+        try:
+            if sys.platform == "linux":
+                ctypes.CDLL(library)
+        except OSError:
+            packages.append(package)
+    return packages
+
+
 def works(uv: Path) -> bool:
     """Whether `uv` runs and is new enough."""
     try:
@@ -107,29 +129,28 @@ def works(uv: Path) -> bool:
     return bool(match) and tuple(map(int, match.groups())) >= OLDEST_UV
 
 
-def find_uv() -> Path:
-    """uv from PATH, or put into ./.tools by whatever this Python has."""
-    in_venv, in_folder = TOOLS / "venv" / "bin" / "uv", TOOLS / "uv" / "bin" / "uv"
+def find_uv() -> Path | None:
+    """uv on PATH, or the one put into ./.tools before."""
     on_path = shutil.which("uv")
-    for known in ([Path(on_path)] if on_path else []) + [in_venv, in_folder]:
+    for known in ([Path(on_path)] if on_path else []) + [UV_IN_VENV, UV_IN_FOLDER]:
         if works(known):
             return known
+    return None
+
+
+def install_uv() -> Path:
+    """Puts uv into ./.tools by whatever this Python has."""
     install = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     install += ["--constraint", str(CONSTRAINTS), "uv"]
+    say("installing uv into .tools")
     if importlib.util.find_spec("ensurepip"):
-        say("installing uv into .tools/venv")
         run(sys.executable, "-m", "venv", "--clear", TOOLS / "venv")
         run(TOOLS / "venv" / "bin" / "python", *install)
-        return in_venv
-    if importlib.util.find_spec("pip"):
-        say("installing uv into .tools/uv")
-        run(sys.executable, *install, "--upgrade", "--target", TOOLS / "uv")
-        return in_folder
-    fail(
-        "this Python has neither venv nor pip, and there is no uv. On Debian and Ubuntu: "
-        "sudo apt install python3-venv"
-    )
-    raise AssertionError  # fail does not return
+        return UV_IN_VENV
+    # Debian without python3-venv, but with python3-pip.
+    folder = ["--root-user-action", "ignore", "--upgrade", "--target", TOOLS / "uv"]
+    run(sys.executable, *install, *folder)
+    return UV_IN_FOLDER
 
 
 def make_venv(uv: Path) -> None:
@@ -153,8 +174,12 @@ def main() -> None:
             )
         )
     uv = find_uv()
+    missing = missing_packages(has_uv=uv is not None)
+    if missing:
+        fail("a part of the system is missing. On Debian and Ubuntu: sudo apt install " + " ".join(missing))
+    uv = uv or install_uv()
     make_venv(uv)
-    say("installing the package and its libraries into .venv (once; about 1 GB on disk)")
+    say("installing the package and its libraries into .venv (once; 2 GB on disk)")
     quiet = [] if sys.stderr.isatty() else ["--quiet"]
     target = ["--python", VENV / "bin" / "python", "--constraint", CONSTRAINTS]
     run(uv, *quiet, "pip", "install", *target, "--editable", ".[all,dev]")

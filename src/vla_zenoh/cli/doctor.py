@@ -1,0 +1,79 @@
+"""vla-zenoh doctor: what is missing on this host."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Annotated
+
+import typer
+import zenoh
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from vla_zenoh.doctor import Finding, Needs, examine, needs_of
+from vla_zenoh.profile import load_profile
+
+ANSWER_LIMIT_MS = 1000
+COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
+
+
+def try_zenoh(endpoint: str) -> str:
+    """Opens a Zenoh session at `endpoint` and closes it; returns the reason if it cannot."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("transport/unicast/open_timeout", str(ANSWER_LIMIT_MS))
+    try:
+        zenoh.open(config).close()
+    except zenoh.ZError as error:
+        return str(error).split(" at ", maxsplit=1)[0].rstrip("! ")
+    return ""
+
+
+def doctor(
+    profile: Annotated[
+        str | None, typer.Option("--profile", "-p", help="Look for what this profile needs.")
+    ] = None,
+    host: Annotated[
+        str | None, typer.Option("--host", help="Only what this host of the profile needs.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print a list of objects instead of a table.")
+    ] = False,
+) -> None:
+    """Look at this computer: what is missing, and the package or setting that helps.
+
+    Exits with 1 when something will not work, with 0 when all works or works only less well.
+    """
+    if host is not None and profile is None:
+        raise typer.BadParameter("it is the name of a host in a profile: give --profile too")
+    zenoh.init_log_from_env_or("off")
+    needs = Needs() if profile is None else needs_of(load_profile(profile), host)
+    findings = []
+    with Console(stderr=True).status("Looking at this computer"):
+        findings.extend(examine(needs, try_zenoh))
+    if as_json:
+        print(json.dumps([dataclasses.asdict(finding) for finding in findings], indent=2))
+    else:
+        show(findings, Console())
+    if any(finding.level == "fail" for finding in findings):
+        raise typer.Exit(1)
+
+
+def show(findings: list[Finding], console: Console) -> None:
+    """Prints a table and how many findings want something done."""
+    table = Table(show_lines=False, header_style="bold")
+    table.add_column("what", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    table.add_column("found and what to do", overflow="fold")
+    for finding in findings:
+        text = finding.found if not finding.advice else f"{finding.found}\n-> {finding.advice}"
+        colour = COLOURS[finding.level]
+        table.add_row(finding.name, f"[{colour}]{finding.level}[/]", escape(text))
+    console.print(table)
+    fails = sum(finding.level == "fail" for finding in findings)
+    warns = sum(finding.level == "warn" for finding in findings)
+    console.print(f"{fails} will not work, {warns} could work better")

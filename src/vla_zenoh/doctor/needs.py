@@ -1,0 +1,63 @@
+"""What a host has to be able to do, as a profile says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.profile import Profile
+
+Role = Literal["base", "control", "sim"]
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """What this host is for.
+
+    Args:
+        roles: sets of libraries that must be there; of the others a missing one is only a warning.
+        is_router: the router is to run here, so its port has to be free or already a router's.
+        endpoints: where the router is looked for.
+        devices: video devices that have to exist.
+    """
+
+    roles: frozenset[Role] = frozenset({"base"})
+    is_router: bool = True
+    endpoints: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    devices: tuple[str, ...] = ()
+
+
+def needs_of(profile: Profile, host: str | None = None) -> Needs:
+    """What `profile` asks of one of its hosts; of all of them together when `host` is None.
+
+    Raises:
+        ProfileError: the profile has no such host; lists those it has.
+    """
+    if host is not None and host not in profile.hosts:
+        raise ProfileError(
+            f"profile {profile.name!r} has no host {host!r}; it has: {', '.join(profile.hosts)}"
+        )
+    hosts = [profile.hosts[host]] if host is not None else list(profile.hosts.values())
+    nodes = {node for part in hosts for node in part.nodes}
+    roles: set[Role] = {"base"}
+    if "command" in nodes:
+        roles.add("control")
+    if "sim" in nodes:
+        roles.add("sim")
+    cameras: set[str] = set()
+    for part in hosts:
+        if "camera" in part.nodes:
+            cameras.update(profile.cameras if part.cameras is None else part.cameras)
+    return Needs(
+        roles=frozenset(roles),
+        is_router="router" in nodes,
+        endpoints=(hosts[0].connect if host is not None else None) or profile.session.connect,
+        devices=tuple(
+            source.removeprefix("v4l2:")
+            for source in (profile.cameras[name].source for name in sorted(cameras))
+            if source.startswith("v4l2:")
+        ),
+    )
