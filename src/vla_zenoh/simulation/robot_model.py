@@ -33,10 +33,10 @@ def _panda_wrist() -> MountedCamera:
     return MountedCamera(
         name="wrist",
         link="panda_hand",
-        position_m=(0.068, 0.0, 0.012),
-        look_at_m=(0.012, 0.0, 0.1034),
+        position_m=(0.085, 0.0, 0.03),
+        look_at_m=(0.02, 0.0, 0.13),
         up=(1.0, 0.0, 0.0),
-        fovy_rad=1.25,
+        fovy_rad=1.2,
     )
 
 

@@ -1,0 +1,80 @@
+"""Pictures by OpenGL, through EGL or OSMesa, without a window system."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.errors import NodeError
+
+MAX_GEOMS = 1000
+
+
+class OpenGlCanvas:
+    """An off-screen OpenGL context of one model. Belongs to the thread that made it.
+
+    Args:
+        model: what to draw.
+        platform: ``egl`` or ``osmesa``.
+
+    Raises:
+        NodeError: OpenGL does not work this way here.
+    """
+
+    def __init__(self, model: mujoco.MjModel, platform: str) -> None:
+        self._model = model
+        # MuJoCo's own Renderer takes its context from MUJOCO_GL as it was at `import mujoco`; the
+        # platform's module can be asked directly and does not care who imported what when.
+        other = os.environ.get("PYOPENGL_PLATFORM")
+        if other not in (None, "", platform):
+            raise NodeError(
+                f"this process already draws with PYOPENGL_PLATFORM={other}; {platform} needs a "
+                "process of its own"
+            )
+        try:
+            self._context: Any = importlib.import_module(f"mujoco.{platform}").GLContext(64, 64)
+            self._context.make_current()
+            self._gl = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except Exception as error:  # drivers raise whatever they like here
+            raise NodeError(f"no OpenGL through {platform}: {error}") from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._gl)
+        self._scene = mujoco.MjvScene(model, MAX_GEOMS)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._scene.flags[flag] = False  # each costs several times the rest of the frame
+        self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._size = (0, 0)
+
+    def draw(
+        self, data: mujoco.MjData, camera: str, width: int, height: int
+    ) -> NDArray[np.uint8]:
+        """Draw what `camera` sees, (height, width, 3) RGB."""
+        if self._size != (width, height):
+            mujoco.mjr_resizeOffscreen(width, height, self._gl)
+            self._size = (width, height)
+        self._camera.fixedcamid = self._model.camera(camera).id
+        mujoco.mjv_updateScene(
+            self._model,
+            data,
+            self._option,
+            self._perturb,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self._scene,
+        )
+        viewport = mujoco.MjrRect(0, 0, width, height)
+        rgb = np.empty((height, width, 3), np.uint8)
+        mujoco.mjr_render(viewport, self._scene, self._gl)
+        mujoco.mjr_readPixels(rgb, None, viewport, self._gl)
+        return np.ascontiguousarray(rgb[::-1])  # OpenGL's first row is the lowest
+
+    def close(self) -> None:
+        """Give the context back."""
+        self._gl.free()
+        self._context.free()
