@@ -2,8 +2,8 @@
 
 One ray a pixel costs 110 ms at 640x480, so most of them are not cast. Before a camera that stands
 still only the pixels that moving bodies can cover are, over a background cast once. Before a moving
-camera a coarse grid comes first, and only its cells that are not of one flat surface are cast in
-full; something that fits between the grid's rays, 4 pixels apart, may then be overlooked.
+camera a coarse grid comes first; only its cells with an edge in them are cast in full, the others
+are interpolated. What fits between the grid's rays, 4 pixels apart, may then be overlooked.
 
 The light is that of MuJoCo's OpenGL without shadows, textures and gloss::
 
@@ -20,13 +20,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.simulation.scene import HIDDEN_GROUP, MOVING_GROUP, STATIC_GROUP
+from vla_zenoh.simulation.scene import MOVING_GROUP, STATIC_GROUP
 
 FloatArray = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
 GRID_PX = 4
-FLAT_COSINE = 0.9999
+SMOOTH_COSINE = 0.97
 FAR = 100.0
 NEAR_M = 1e-3
 GROUPS = 6
@@ -72,7 +72,7 @@ class RaycastCanvas:
         self._rgb = np.where(own[:, None], model.geom_rgba, model.mat_rgba[model.geom_matid])[:, :3]
         moving = np.flatnonzero(model.geom_group == MOVING_GROUP)
         self._outlines = {int(geom): _outline(model, int(geom)) for geom in moving}
-        self._rays: dict[tuple[float, int, int], FloatArray] = {}
+        self._rays: dict[tuple[float, int, int, int], FloatArray] = {}
         self._backgrounds: dict[tuple[int, int, int], Background] = {}
 
     def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> Pixels:
@@ -110,33 +110,41 @@ class RaycastCanvas:
 
     def _coarse_to_fine(self, data: mujoco.MjData, view: View) -> Pixels:
         groups = {STATIC_GROUP, MOVING_GROUP}
-        directions = self._directions(view)
-        rows = np.append(np.arange(0, view.height - 1, GRID_PX), view.height - 1)
-        columns = np.append(np.arange(0, view.width - 1, GRID_PX), view.width - 1)
-        rays = np.ascontiguousarray(directions[np.ix_(rows, columns)]).reshape(-1, 3)
-        hits = self._cast(data, view, rays, groups)
-        grid = (len(rows), len(columns))
-        colour = self._shade(data, view, rays, hits).reshape(*grid, 3)
-        flat = _flat_cells(hits.geom.reshape(grid), hits.normal.reshape(*grid, 3))
+        coarse = self._directions(view, GRID_PX)
+        grid = coarse.shape[:2]
+        hits = self._cast(data, view, coarse.reshape(-1, 3), groups)
+        colour = self._shade(data, view, coarse.reshape(-1, 3), hits).reshape(*grid, 3)
+        smooth = _smooth_cells(hits.geom.reshape(grid), hits.normal.reshape(*grid, 3))
 
-        # Cell (i, j) covers the pixels from its upper left ray up to the next rays.
-        row_cell = np.minimum(np.arange(view.height) // GRID_PX, grid[0] - 2)
-        column_cell = np.minimum(np.arange(view.width) // GRID_PX, grid[1] - 2)
-        picture = colour[row_cell[:, None], column_cell]
-        fine_rows, fine_columns = np.nonzero(~flat[row_cell[:, None], column_cell])
-        rays = directions[fine_rows, fine_columns]
+        size, scale = (view.width, view.height), 1.0 / GRID_PX
+        picture = cv2.warpAffine(
+            colour,
+            np.array([[scale, 0.0, 0.0], [0.0, scale, 0.0]]),
+            size,
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        )
+        rough = np.kron(~smooth, np.ones((GRID_PX, GRID_PX), dtype=bool))
+        rows, columns = np.nonzero(rough[: view.height, : view.width])
+        rays = self._directions(view)[rows, columns]
         fine = self._cast(data, view, rays, groups)
-        picture[fine_rows, fine_columns] = self._shade(data, view, rays, fine)
-        return picture
+        picture[rows, columns] = self._shade(data, view, rays, fine)
+        return np.asarray(picture, np.uint8)
 
-    def _directions(self, view: View) -> FloatArray:
-        """(height, width, 3) in the camera's own axes, one unit deep."""
-        key = (view.focal_px, view.width, view.height)
+    def _directions(self, view: View, step_px: int = 1) -> FloatArray:
+        """Rays through every `step_px`-th pixel, in the camera's own axes, one unit deep.
+
+        (height, width, 3) for a step of 1; else the grid reaches over the picture's edge, so that
+        every pixel lies in a cell of it.
+        """
+        key = (view.focal_px, view.width, view.height, step_px)
         if key not in self._rays:
-            x = (np.arange(view.width) + 0.5 - view.width / 2.0) / view.focal_px
-            y = (view.height / 2.0 - np.arange(view.height) - 0.5) / view.focal_px
-            rays = np.empty((view.height, view.width, 3))
-            rays[..., 0], rays[..., 1], rays[..., 2] = x, y[:, None], -1.0
+            beyond = 0 if step_px == 1 else 1
+            column = np.arange(-(-view.width // step_px) + beyond) * step_px
+            row = np.arange(-(-view.height // step_px) + beyond) * step_px
+            rays = np.empty((len(row), len(column), 3))
+            rays[..., 0] = (column + 0.5 - view.width / 2.0) / view.focal_px
+            rays[..., 1] = ((view.height / 2.0 - row - 0.5) / view.focal_px)[:, None]
+            rays[..., 2] = -1.0
             self._rays[key] = rays
         return self._rays[key]
 
@@ -215,15 +223,15 @@ def _outline(model: mujoco.MjModel, geom: int) -> FloatArray:
     return centre + signs * half
 
 
-def _flat_cells(geom: NDArray[np.int32], normal: FloatArray) -> NDArray[np.bool_]:
-    """Cells of a grid of rays whose four corners lie on one flat surface."""
-    corner = (slice(None, -1), slice(None, -1))
-    flat = np.ones((geom.shape[0] - 1, geom.shape[1] - 1), dtype=bool)
-    for other in (
-        (slice(None, -1), slice(1, None)),
-        (slice(1, None), slice(None, -1)),
-        (slice(1, None), slice(1, None)),
-    ):
-        flat &= geom[corner] == geom[other]
-        flat &= np.einsum("ijk,ijk->ij", normal[corner], normal[other]) > FLAT_COSINE
-    return flat | ((geom[corner] < 0) & (geom[1:, 1:] < 0) & (geom[1:, :-1] < 0) & (geom[:-1, 1:] < 0))
+def _smooth_cells(geom: NDArray[np.int32], normal: FloatArray) -> NDArray[np.bool_]:
+    """Cells of a grid of rays whose corners lie on one geom without an edge between them."""
+    first = (slice(None, -1), slice(None, -1))
+    smooth = np.ones((geom.shape[0] - 1, geom.shape[1] - 1), dtype=bool)
+    for row, column in ((0, 1), (1, 0), (1, 1)):
+        other = (
+            slice(row, geom.shape[0] - 1 + row),
+            slice(column, geom.shape[1] - 1 + column),
+        )
+        turn = np.einsum("ijk,ijk->ij", normal[first], normal[other])
+        smooth &= (geom[first] == geom[other]) & ((turn > SMOOTH_COSINE) | (geom[first] < 0))
+    return smooth
