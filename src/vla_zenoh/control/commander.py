@@ -18,7 +18,8 @@ from vla_zenoh.control.acceptance import Lease, Refusal, refuse
 from vla_zenoh.control.actions import step_pose, step_width
 from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
 from vla_zenoh.control.gripper import GripperArbiter
-from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate, worker_node
+from vla_zenoh.control.names import worker_node
+from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
 from vla_zenoh.control.smoothing import Motion, MotionLimits, Smoother
 from vla_zenoh.control.so3 import (
     Pose,

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from vla_zenoh.control.limits import into_workspace
+from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import SpecError
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
@@ -40,11 +41,6 @@ class Surroundings:
     worker_complaints: Mapping[str, str] = field(default_factory=dict)
     camera_ages_s: Mapping[str, float] = field(default_factory=dict)
     camera_nodes: Mapping[str, str] = field(default_factory=dict)
-
-
-def worker_node(worker: str) -> str:
-    """Node name of a worker."""
-    return f"worker-{worker}"
 
 
 def reasons_not_to_activate(

@@ -37,11 +37,13 @@ class Tick(NamedTuple):
 
     Args:
         periods: how many periods have passed since the last turn, at least 1.
-        late_s: how late this turn was woken.
+        behind_s: time since the multiple this turn stands for, less than a period.
+        stall_s: how late this turn was woken in all.
     """
 
     periods: int
-    late_s: float
+    behind_s: float
+    stall_s: float
 
 
 class FixedRate:
@@ -60,7 +62,7 @@ class FixedRate:
         late_ns = max(now_ns - self._next_ns, 0)
         periods = 1 + late_ns // self._period_ns
         self._next_ns += periods * self._period_ns
-        return Tick(int(periods), (late_ns % self._period_ns if periods == 1 else late_ns) / 1e9)
+        return Tick(int(periods), late_ns % self._period_ns / 1e9, late_ns / 1e9)
 
 
 def make_this_thread_realtime() -> bool:

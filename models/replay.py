@@ -1,0 +1,75 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["numpy"]
+# ///
+"""Plays a recorded chunk file: a model whose every answer is known beforehand.
+
+The file is what ``vla-zenoh demo --out`` writes as ``chunks.npz``::
+
+    spec     the ModelSpec as JSON text
+    steps    (N, H, D) float32, one chunk after the other
+    length   (N,) steps in each chunk, the rest of H is not used
+
+Run it with ``vla-zenoh worker replay --set file=runs/.../chunks.npz``.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from vla_zenoh.errors import SpecError
+from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, check_steps
+
+
+class Replay:
+    """See the module.
+
+    Args:
+        file: the recorded chunks.
+    """
+
+    def __init__(self, file: str) -> None:
+        path = Path(file).expanduser()
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                spec = ModelSpec.from_dict(json.loads(str(data["spec"])))
+                steps, length = np.array(data["steps"], np.float32), np.array(data["length"])
+        except (OSError, KeyError, ValueError) as error:
+            raise SpecError(f"{path} is not a chunk file: {error}") from error
+        if steps.ndim != 3 or length.shape != steps.shape[:1]:
+            raise SpecError(f"{path}: steps {steps.shape} and length {length.shape} do not fit")
+        self.spec = spec.model_copy(update={"name": "replay"})
+        self._chunks = [
+            check_steps(spec.action, chunk[: int(n)]) for chunk, n in zip(steps, length, strict=True)
+        ]
+        if not self._chunks:
+            raise SpecError(f"{path} holds no chunk")
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin with the first chunk."""
+        self._next = 0
+
+    def infer(self, observation: Observation) -> ActionSteps:
+        """The next recorded chunk; after the last one, stand still."""
+        if self._next >= len(self._chunks):
+            return ActionSteps(self._stand(), done=True)
+        chunk = self._chunks[self._next]
+        if observation.task.active:
+            self._next += 1
+        return ActionSteps(chunk, self._next >= len(self._chunks))
+
+    def _stand(self) -> np.ndarray:
+        last = self._chunks[-1][-1:].copy()
+        if self.spec.action.kind == "delta":
+            rotation_is_quaternion = self.spec.action.rotation == "quaternion"
+            gripper = last[0, -1] if self.spec.action.gripper not in ("none", "delta_m") else 0.0
+            last[:] = 0.0
+            if rotation_is_quaternion:
+                last[0, 6] = 1.0
+            if self.spec.action.gripper != "none":
+                last[0, -1] = gripper
+        return last

@@ -1,0 +1,121 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["numpy"]
+# ///
+"""Fixed motions on command, without any learning: what a bridge is tested with.
+
+Prompts, one step per request, as in the thesis this package grew from::
+
+    HARD: go up | go down                    +-0.01 m along z of the base
+    HARD: rol(l) left | right                +-0.05 rad about x
+    HARD: pitch up | down                    +-0.05 rad about y
+    HARD: yaw left | right                   +-0.05 rad about z
+    HARD: open gripper | close gripper       +-0.05 m of width
+    hold                                     stands still
+
+``HARD: go up x50`` does 50 steps, then says it is done and stands still.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+import time
+
+import numpy as np
+
+from vla_zenoh.errors import SpecError
+from vla_zenoh.policy import (
+    ActionSpec,
+    ActionSteps,
+    CameraSpec,
+    ModelSpec,
+    Observation,
+    ObservationSpec,
+)
+
+STEP_M, STEP_RAD, STEP_WIDTH_M = 0.01, 0.05, 0.05
+MOTIONS: dict[str, tuple[int, float]] = {
+    "go up": (2, STEP_M),
+    "go down": (2, -STEP_M),
+    "roll right": (3, STEP_RAD),
+    "roll left": (3, -STEP_RAD),
+    "pitch down": (4, STEP_RAD),
+    "pitch up": (4, -STEP_RAD),
+    "yaw left": (5, STEP_RAD),
+    "yaw right": (5, -STEP_RAD),
+    "open gripper": (6, STEP_WIDTH_M),
+    "close gripper": (6, -STEP_WIDTH_M),
+}
+_PROMPT = re.compile(r"(?:hard:)?\s*(?P<motion>[a-z ]+?)\s*(?:[x×]\s*(?P<count>\d{1,6}))?", re.I)
+
+
+def parse(prompt: str) -> tuple[str, int | None]:
+    """The motion a prompt names, and how many steps of it (None: no end).
+
+    Raises:
+        SpecError: it names none; lists those there are.
+    """
+    match = _PROMPT.fullmatch(" ".join(prompt.split()))
+    motion = match["motion"].lower().replace("rol ", "roll ") if match else ""
+    if match is None or (motion != "hold" and motion not in MOTIONS):
+        raise SpecError(
+            f"scripted does not know the prompt {prompt!r}; it knows: hold, "
+            + ", ".join(f"'HARD: {name}'" for name in MOTIONS)
+            + ", each with an optional count as in 'HARD: go up x50'"
+        )
+    return motion, int(match["count"]) if match["count"] else None
+
+
+class Scripted:
+    """See the module.
+
+    Args:
+        camera: picture every request waits for, as a real model would; empty: none.
+        horizon: steps in one chunk.
+        dt_s: duration of a step.
+        delay_ms: pretend an inference takes this long.
+        jitter: vary that by up to this fraction either way.
+    """
+
+    def __init__(
+        self,
+        camera: str = "front",
+        horizon: str = "1",
+        dt_s: str = "0.1",
+        delay_ms: str = "0",
+        jitter: str = "0",
+    ) -> None:
+        cameras = (CameraSpec(camera=camera),) if camera else ()
+        self.spec = ModelSpec(
+            name="scripted",
+            observation=ObservationSpec(cameras=cameras, state=("pose", "gripper"), prompt=True),
+            action=ActionSpec(
+                horizon=int(horizon), dt_s=float(dt_s), rotation="rpy", gripper="delta_m"
+            ),
+        )
+        self._delay_s, self._jitter = float(delay_ms) / 1e3, float(jitter)
+        self._random = random.Random(0)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin to count anew."""
+        self._given = 0
+
+    def infer(self, observation: Observation) -> ActionSteps:
+        """The next chunk of the motion the prompt names."""
+        motion, count = parse(observation.prompt)
+        if self._delay_s:
+            time.sleep(self._delay_s * (1 + self._jitter * self._random.uniform(-1, 1)))
+        # Before the arm is given to us nothing is counted: nobody carries it out.
+        active = observation.task.active
+        left = self.spec.action.horizon if count is None else max(count - self._given, 0)
+        steps = np.zeros((self.spec.action.horizon, self.spec.action.dimension), np.float32)
+        length = min(left, len(steps))
+        if motion != "hold":
+            axis, step = MOTIONS[motion]
+            steps[:length, axis] = step
+            if active:
+                self._given += length
+        done = motion == "hold" or (count is not None and self._given >= count)
+        return ActionSteps(steps[: max(length, 1)], done)

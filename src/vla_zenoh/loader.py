@@ -1,0 +1,138 @@
+"""Turns a file into a model: finds it, reads its PEP 723 header, makes its class."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import inspect
+import re
+import sys
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vla_zenoh import resources
+from vla_zenoh.errors import ResourceError, WorkerError
+from vla_zenoh.policy import ModelSpec, Policy
+
+_HEADER = re.compile(r"(?m)^# /// script\s*$\s(?P<body>(?:^#(?:| .*)$\s)+?)^# ///\s*$")
+ENTRY_FILE = "model.py"
+
+
+@dataclass(frozen=True, slots=True)
+class ModelFile:
+    """A model on disk.
+
+    Args:
+        name: what its keys are called by.
+        path: the file to run.
+        dependencies: what its PEP 723 header asks for.
+        requires_python: likewise, or None.
+    """
+
+    name: str
+    path: Path
+    dependencies: tuple[str, ...] = ()
+    requires_python: str | None = None
+
+    def missing(self) -> list[str]:
+        """Dependencies that this environment does not have (by name; uv checks versions)."""
+        absent: list[str] = []
+        for requirement in self.dependencies:
+            name = re.split(r"[\s<>=!~;\[@(]", requirement, maxsplit=1)[0]
+            try:
+                importlib.metadata.version(name)
+            except importlib.metadata.PackageNotFoundError:
+                absent.append(requirement)
+        return absent
+
+
+def find_model(name: str) -> ModelFile:
+    """The model called `name`, which may be a path to a file or a folder with a model.py.
+
+    Raises:
+        ResourceError: nothing of that name.
+        WorkerError: its header cannot be read.
+    """
+    path = resources.find("models", name)
+    if path.is_dir():
+        path = path / ENTRY_FILE
+        if not path.is_file():
+            raise ResourceError(f"{path.parent} is a folder without a {ENTRY_FILE}")
+    stem = path.parent.name if path.name == ENTRY_FILE else path.stem
+    header = _read_header(path)
+    dependencies = header.get("dependencies", [])
+    requires = header.get("requires-python")
+    if not isinstance(dependencies, list) or not all(isinstance(d, str) for d in dependencies):
+        raise WorkerError(f"{path}: dependencies in the script header must be a list of texts")
+    return ModelFile(stem, path, tuple(dependencies), requires)
+
+
+def _read_header(path: Path) -> Mapping[str, Any]:
+    try:
+        found = _HEADER.search(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise WorkerError(f"{path} cannot be read: {error}") from error
+    if found is None:
+        return {}
+    body = "".join(
+        line[2:] if line.startswith("# ") else line[1:]
+        for line in found["body"].splitlines(keepends=True)
+    )
+    try:
+        return tomllib.loads(body)
+    except tomllib.TOMLDecodeError as error:
+        raise WorkerError(f"{path}: its script header is not valid TOML: {error}") from error
+
+
+def make_policy(model: ModelFile, options: Mapping[str, str] | None = None) -> Policy:
+    """Import the file and make its model, without loading weights.
+
+    The model is the one class in the file that has ``infer``; where there are several, the name
+    ``MODEL`` says which. `options` are given to its constructor by name, as text.
+
+    Raises:
+        WorkerError: the file does not import, has no such class, or refuses the options.
+    """
+    found = importlib.util.spec_from_file_location(f"vla_zenoh_model_{model.name}", model.path)
+    if found is None or found.loader is None:
+        raise WorkerError(f"{model.path} is not a Python file")
+    module = importlib.util.module_from_spec(found)
+    sys.modules[found.name] = module
+    try:
+        found.loader.exec_module(module)
+    except Exception as error:
+        raise WorkerError(f"{model.path} cannot be imported: {type(error).__name__}: {error}") from error
+    maker = getattr(module, "MODEL", None) or _only_model(module, model.path)
+    try:
+        policy = maker(**(options or {}))
+    except Exception as error:
+        accepted = ", ".join(inspect.signature(maker).parameters) or "none"
+        raise WorkerError(
+            f"{model.path}: {maker.__name__} cannot be made: {error} (options it takes: {accepted})"
+        ) from error
+    if not isinstance(policy, Policy) or not isinstance(policy.spec, ModelSpec):
+        raise WorkerError(
+            f"{model.path}: {maker.__name__} needs a property `spec` (a vla_zenoh.policy.ModelSpec) "
+            "and a method `infer(observation)`"
+        )
+    return policy
+
+
+def _only_model(module: Any, path: Path) -> type:
+    candidates = [
+        value
+        for value in vars(module).values()
+        if inspect.isclass(value)
+        and value.__module__ == module.__name__
+        and callable(getattr(value, "infer", None))
+    ]
+    if len(candidates) != 1:
+        found = ", ".join(c.__name__ for c in candidates) or "none"
+        raise WorkerError(
+            f"{path}: wanted one class with a method infer, found: {found}; "
+            "name the right one with MODEL = ClassName"
+        )
+    return candidates[0]

@@ -1,0 +1,278 @@
+"""The command node: owns clock and session around `vla_zenoh.control.commander`."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+
+from vla_zenoh import keys as key_names
+from vla_zenoh.codec import records, settings
+from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
+from vla_zenoh.control.so3 import quat_from_rotation
+from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.clock import FixedRate, make_this_thread_realtime
+from vla_zenoh.nodes.meter import Percentiles, RateMeter
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.slots import Inbox, Latest
+from vla_zenoh.nodes.surroundings import Neighbours
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import ActionChunk, Cause, GripperState, PoseState, Stamped
+
+TASK_PERIOD_S = 0.2
+CLOCK_PERIOD_S = 0.1
+BRAKE_BEFORE_EXIT_S = 1.0
+SWITCH_INTERVAL_S = 5e-4
+STAGES = ("capture_to_worker", "inference", "worker_to_command", "command_to_pose", "end_to_end")
+
+
+class CommandNode:
+    """See the module.
+
+    Args:
+        profile: limits, timing, first settings.
+        session: open session.
+        dry_run: compute everything, publish no command.
+    """
+
+    def __init__(self, profile: Profile, session: zenoh.Session, *, dry_run: bool = False) -> None:
+        node = self.node = Node("command", profile, session)
+        self.commander = Commander(profile, dry_run=dry_run)
+        keys = node.keys
+        self._neighbours = Neighbours(node)
+        self._chunks = node.listen(keys.all_deltas, Inbox(64))
+        self._pose_slot = node.listen(keys.state_pose, Latest())
+        self._gripper_slot = node.listen(keys.state_gripper, Latest())
+        self._settings: list[tuple[str, Inbox, Callable[[bytes], Any]]] = [
+            ("stop", node.listen(keys.stop, Inbox(8)), lambda _: None),
+            ("reset", node.listen(keys.reset, Inbox(8)), lambda _: None),
+            ("prompt", node.listen(keys.prompt, Inbox(16)), settings.decode_text),
+            ("worker", node.listen(keys.worker, Inbox(16)), settings.decode_name),
+            ("rate", node.listen(keys.rate, Inbox(16)), settings.decode_rate),
+            ("active", node.listen(keys.active, Inbox(16)), settings.decode_bool),
+        ]
+        self._pose_out = node.stream(keys.command_pose, Kind.CONTROL)
+        self._gripper_out = node.stream(keys.command_gripper, Kind.ORDER)
+        self._task_out = node.stream(keys.task, Kind.ORDER)
+        self._seen: dict[str, tuple[str, int]] = {}
+        self._latency = {stage: Percentiles() for stage in STAGES}
+        self._cost_us = Percentiles(2048)
+        self._rate = RateMeter()
+        self._last_task = self._last_clock = 0.0
+        self._realtime = False
+        self._answer_settings()
+
+    def _answer_settings(self) -> None:
+        task = self.commander
+        keys = self.node.keys
+        for key, value in (
+            (keys.prompt, lambda: task.task.prompt),
+            (keys.worker, lambda: task.task.worker),
+            (keys.rate, lambda: f"{task.task.rate_hz:g}"),
+            (keys.active, lambda: "true" if task.task.active else "false"),
+        ):
+            self.node.answer(key, self._text_reply(key, value))
+        self.node.answer(
+            keys.task, lambda query: query.reply(keys.task, records.encode(task.task))
+        )
+
+    @staticmethod
+    def _text_reply(key: str, value: Callable[[], str]) -> Callable[[zenoh.Query], None]:
+        return lambda query: query.reply(key, value().encode())
+
+    # -- running ------------------------------------------------------------------------------
+    def run(self, stop: threading.Event) -> None:
+        """Command until `stop` is set, then brake, then end."""
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        self._realtime = make_this_thread_realtime()
+        gc.collect()
+        gc.freeze()
+        loop = FixedRate(self.node.profile.timing.command_hz)
+        give_up = 0.0
+        while True:
+            tick = loop.wait()
+            extra: list[Setting] = []
+            if tick.periods > 1:
+                self.node.counters["command.missed_ticks"] += tick.periods - 1
+                extra += self._after_a_stall(tick.stall_s)
+            if stop.is_set():
+                give_up = give_up or time.monotonic() + BRAKE_BEFORE_EXIT_S
+                extra.append(Setting("active", False))
+                if not self.commander.streaming or time.monotonic() > give_up:
+                    break
+            self._turn(extra, tick.periods, tick.behind_s)
+        self.node.report("stopped", now=True)
+        self.node.close()
+
+    def _after_a_stall(self, stall_s: float) -> list[Setting]:
+        if stall_s <= self.node.profile.timing.command_timeout_s:
+            return []
+        return [Setting("lose", f"the command loop stood still for {stall_s:.3f} s")]
+
+    def _turn(self, extra: list[Setting], periods: int, behind_s: float) -> None:
+        began = time.perf_counter()
+        now_ns = self.node.clock.wall_ns() - int(behind_s * 1e9)
+        inputs = self._gather(now_ns)
+        inputs.settings = [*inputs.settings, *extra]
+        limit = max(1, int(self.node.profile.timing.command_timeout_s * self._hz))
+        out = self.commander.step(inputs, now_ns, min(periods, limit))
+        self._publish(out, now_ns)
+        self._rate.tick()
+        self._cost_us.add((time.perf_counter() - began) * 1e6)
+        self._report(out)
+
+    @property
+    def _hz(self) -> float:
+        return self.node.profile.timing.command_hz
+
+    # -- in -----------------------------------------------------------------------------------
+    def _gather(self, now_ns: int) -> Inputs:
+        put: list[Setting] = []
+        for name, inbox, decode in self._settings:
+            for arrival in inbox.take_all():
+                if name in ("stop", "reset"):
+                    put.append(Setting(name))
+                    continue
+                value = self.node.read_text(decode, arrival)
+                if value is not None:
+                    put.append(Setting(name, value))
+        chunks: list[Stamped[ActionChunk]] = []
+        for arrival in self._chunks.take_all():
+            chunk = self.node.read(ActionChunk, arrival)
+            if chunk is None:
+                continue
+            if key_names.last(str(arrival.sample.key_expr)) != chunk.record.worker:
+                self.node.refuse("foreign", "a chunk on another worker's delta key")
+                continue
+            chunks.append(chunk)
+        clock = self._check_clock()
+        return Inputs(
+            [*put, *clock],
+            chunks,
+            self._state(PoseState, self._pose_slot),
+            self._state(GripperState, self._gripper_slot),
+            self._neighbours.look(now_ns),
+        )
+
+    def _state(self, kind: type[Any], slot: Latest) -> Stamped[Any] | None:
+        """The newest state, if it is new and by the writer that speaks for the robot."""
+        arrival = slot.take()
+        if arrival is None:
+            return None
+        stamped = self.node.read(kind, arrival)
+        if stamped is None:
+            return None
+        name, source, seq = kind.__name__, stamped.header.source, stamped.header.seq
+        known = self._seen.get(name)
+        silent_ns = self._silence_ns(name, stamped.received_ns)
+        if known is not None and silent_ns < self.node.profile.timing.state_timeout_s * 1e9:
+            if known[0] != source:
+                self.node.refuse("foreign", f"{name} by {source[:60]!r}, while {known[0]!r} speaks")
+                return None
+            if seq <= known[1]:
+                self.node.refuse("replayed", f"{name} {seq} came again or late")
+                return None
+        self._seen[name] = (source, seq)
+        return stamped
+
+    def _silence_ns(self, name: str, now_ns: int) -> int:
+        last = self.commander.pose if name == "PoseState" else self.commander.gripper_state
+        return now_ns - last.received_ns if last else 1 << 62
+
+    def _check_clock(self) -> list[Setting]:
+        if time.monotonic() - self._last_clock < CLOCK_PERIOD_S:
+            return []
+        self._last_clock = time.monotonic()
+        step_s = self.node.clock.follow()
+        if abs(step_s) <= self.node.profile.timing.max_clock_step_s:
+            return []
+        self.node.refuse("clock_step", f"the wall clock was set by {step_s:+.3f} s")
+        return [Setting("lose", f"the wall clock was set by {step_s:+.3f} s")]
+
+    # -- out ----------------------------------------------------------------------------------
+    def _publish(self, out: Outputs, now_ns: int) -> None:
+        if out.pose is not None:
+            self._pose_out.put(out.pose, stamp_wall_ns=now_ns)
+        if out.gripper is not None:
+            self._gripper_out.put(out.gripper)
+        for refusal in out.refusals:
+            self.node.counters[f"refused.{refusal.reason}"] += 1
+        for event in out.events:
+            self.node.tell(event)
+        if out.accepted is not None:
+            self._measure(out.accepted)
+        due = time.monotonic() - self._last_task >= TASK_PERIOD_S
+        if out.task_changed or due:
+            self._last_task = time.monotonic()
+            self._task_out.put(self.commander.task)
+
+    def _measure(self, cause: Cause) -> None:
+        published_ns = self.node.clock.wall_ns()
+        steps_ms = (
+            cause.observed_ns - cause.observation_stamp_ns,
+            cause.inference_end_ns - cause.inference_start_ns,
+            cause.received_ns - cause.published_ns,
+            published_ns - cause.received_ns,
+            published_ns - cause.observation_stamp_ns,
+        )
+        for stage, nanoseconds in zip(STAGES, steps_ms, strict=True):
+            self._latency[stage].add(nanoseconds / 1e6)
+
+    def _report(self, out: Outputs) -> None:
+        mind = self.commander
+        # An event is news of a change, so status says the same at once.
+        now = any(event.kind == "transition" for event in out.events) or out.task_changed
+        if not now and not self.node.report_due(mind.state.value):
+            return
+        task = mind.task
+        wall_ns = self.node.clock.wall_ns()
+        ages_s = {
+            name: (wall_ns - stamped.received_ns) / 1e9
+            for name, stamped in (("pose", mind.pose), ("gripper", mind.gripper_state))
+            if stamped is not None
+        }
+        latency = {name: meter.summary() for name, meter in self._latency.items()}
+        cost = self._cost_us.summary() or (0.0, 0.0)
+        self.node.counters["command.smoothing_failures"] = mind.smoothing_failures
+        self.node.counters["command.gripper_timeouts"] = mind.gripper.timeouts
+        self.node.counters["command.chunks_dropped"] = self._chunks.dropped
+        self.node.report(
+            mind.state.value,
+            detail={
+                "why": mind.why,
+                "prompt": task.prompt,
+                "worker": task.worker,
+                "rate_hz": task.rate_hz,
+                "episode": task.episode,
+                "accepted_chunks": mind.accepted_chunks,
+                "accepted_steps": mind.accepted_steps,
+                "policy_done": mind.policy_done,
+                "at_rest": mind.at_rest,
+                "streaming": mind.streaming,
+                "tracking_mm": round(mind.tracking_m * 1e3, 3),
+                "tracking_mrad": round(mind.tracking_rad * 1e3, 3),
+                "tick_us": [round(cost[0], 1), round(cost[1], 1)],
+                "realtime": self._realtime,
+                "dry_run": mind.dry_run,
+                **self._goal(),
+            },
+            ages_s=ages_s,
+            rates_hz={"loop": self._rate.rate_hz},
+            latency_ms={name: values for name, values in latency.items() if values},
+            now=now,
+        )
+
+    def _goal(self) -> dict[str, Any]:
+        goal = self.commander.goal
+        if goal is None:
+            return {}
+        return {
+            "goal_m": [round(float(value), 6) for value in goal.pose.position_m],
+            "goal_quat_xyzw": [round(float(v), 6) for v in quat_from_rotation(goal.pose.rotation)],
+            "goal_width_m": round(goal.width_m, 5),
+        }

@@ -1,0 +1,308 @@
+"""The simulated robot on the bus: takes poses and widths, gives state, at 1 kHz inside.
+
+Real time by default: the world is stepped against the wall clock, and time lost to a busy computer
+is caught up (at most `CATCH_UP_NS`), then given up and counted. In lockstep mode time stands still
+until somebody queries ``sim/step``.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+import zenoh
+
+from vla_zenoh.codec import message, records, settings
+from vla_zenoh.control.impedance import ImpedanceGains, Reference
+from vla_zenoh.control.reference import GuardLimits, ReferenceGuard
+from vla_zenoh.control.smoothing import Motion, MotionLimits
+from vla_zenoh.control.so3 import Pose
+from vla_zenoh.errors import CodecError, NodeError
+from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.clock import make_this_thread_realtime
+from vla_zenoh.nodes.meter import RateMeter
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.slots import Inbox
+from vla_zenoh.profile import Profile
+from vla_zenoh.simulation.robot_model import RobotModel
+from vla_zenoh.simulation.world import STEP_NS, World
+from vla_zenoh.types import GripperCommand, ObjectPoses, PoseCommand, SceneState
+
+CATCH_UP_NS = 50_000_000
+SCENE_HZ, OBJECTS_HZ, WATCH_HZ = 60.0, 10.0, 4.0
+MAX_LOCKSTEP_NS = 60_000_000_000
+SWITCH_INTERVAL_S = 1e-4
+GUARD_MARGIN = 2.0
+"""The robot's own stop may use this multiple of the profile's acceleration and jerk."""
+
+
+def build_world(profile: Profile) -> World:
+    """The world a profile describes.
+
+    Raises:
+        ResourceError: scene or robot description are not there.
+    """
+    robot = RobotModel(
+        description=profile.robot.description,
+        arm_joints=profile.robot.arm_joints,
+        tcp_link=profile.robot.tcp_frame,
+    )
+    gains = {"stiff": ImpedanceGains.stiff, "compliant": ImpedanceGains.compliant}
+    return World(
+        profile.sim.scene,
+        robot,
+        home_rad=profile.robot.home_rad,
+        gains=gains[profile.sim.gains](),
+        joint_friction_nm=profile.sim.joint_friction_nm,
+        seed=profile.sim.seed,
+    )
+
+
+def build_guard(profile: Profile, world: World) -> ReferenceGuard:
+    """The robot side's guard of the pose stream, standing where the arm stands."""
+    translation, rotation = profile.limits.translation, profile.limits.rotation
+    limits = MotionLimits(
+        (
+            translation.velocity_m_s * GUARD_MARGIN,
+            translation.acceleration_m_s2 * GUARD_MARGIN,
+            translation.jerk_m_s3 * GUARD_MARGIN,
+        ),
+        (
+            rotation.velocity_rad_s * GUARD_MARGIN,
+            rotation.acceleration_rad_s2 * GUARD_MARGIN,
+            rotation.jerk_rad_s3 * GUARD_MARGIN,
+        ),
+    )
+    return ReferenceGuard(
+        Pose(*world.tcp()),
+        STEP_NS / 1e9,
+        GuardLimits(profile.timing.command_timeout_s, limits),
+    )
+
+
+class SimNode:
+    """See the module."""
+
+    def __init__(self, profile: Profile, session: zenoh.Session, *, lockstep: bool = False) -> None:
+        self.world = build_world(profile)
+        self.guard = build_guard(profile, self.world)
+        node = self.node = Node("sim", profile, session)
+        self.lockstep = lockstep
+        keys = node.keys
+        self._poses = node.listen(keys.command_pose, Inbox(64))
+        self._widths = node.listen(keys.command_gripper, Inbox(16))
+        self._resets = node.listen(keys.sim_reset, Inbox(4))
+        self._joint = node.stream(keys.state_joint, Kind.STATE)
+        self._pose = node.stream(keys.state_pose, Kind.STATE)
+        self._gripper = node.stream(keys.state_gripper, Kind.STATE)
+        self._scene = node.stream(keys.sim_scene, Kind.STATE)
+        self._objects = node.stream(keys.sim_objects, Kind.NEWS)
+        self._reference = self._as_reference(self.guard.motion)
+        self._base_ns = 0
+        self._ticks = 0
+        self._rate = RateMeter()
+        self._overruns = 0
+        self._realtime = False
+        self._blown_up = ""
+        self._scene_wanted = self._objects_wanted = False
+        self._step_lock = threading.Lock()
+        self._every = {
+            name: max(1, round(1e9 / STEP_NS / rate_hz))
+            for name, rate_hz in (
+                ("state", profile.timing.state_hz),
+                ("scene", SCENE_HZ),
+                ("objects", OBJECTS_HZ),
+                ("watch", WATCH_HZ),
+            )
+        }
+
+    # -- running ------------------------------------------------------------------------------
+    def run(self, stop: threading.Event) -> None:
+        """Simulate until `stop` is set."""
+        if self.lockstep:
+            self._run_lockstep(stop)
+        else:
+            self._run_in_real_time(stop)
+        self.node.report("stopped", now=True)
+        self.node.close()
+
+    def _run_in_real_time(self, stop: threading.Event) -> None:
+        # Nothing else of ours runs in this process; what Zenoh calls back must not wait long.
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        self._realtime = make_this_thread_realtime()
+        gc.collect()
+        gc.freeze()
+        next_ns = time.monotonic_ns()
+        while not stop.is_set():
+            next_ns += STEP_NS
+            late_ns = time.monotonic_ns() - next_ns
+            if late_ns < 0:
+                time.sleep(-late_ns / 1e9)
+            elif late_ns > CATCH_UP_NS:
+                self.node.counters["sim.time_given_up_ms"] += late_ns // 1_000_000
+                next_ns += late_ns
+            elif late_ns > STEP_NS:
+                self._overruns += 1
+            wall_ns = self.node.clock.wall_ns()
+            self._tick(wall_ns - (time.monotonic_ns() - next_ns))
+
+    def _run_lockstep(self, stop: threading.Event) -> None:
+        self._base_ns = 0
+        self._publish_state(0)
+        self.node.answer(self.node.keys.sim_step, self._answer_step)
+        while not stop.wait(0.2):
+            with self._step_lock:
+                self._watch()
+
+    def _answer_step(self, query: zenoh.Query) -> None:
+        """Advance as asked: a msgpack map ``{"ns": ..}``, with ``pose`` and ``gripper`` to follow."""
+        payload = query.payload
+        try:
+            asked = message.unpack(payload.to_bytes()) if payload is not None else {}
+            if not isinstance(asked, dict) or not isinstance(asked.get("ns"), int):
+                raise CodecError("malformed", 'wanted a map {"ns": nanoseconds to advance}')
+            duration_ns = asked["ns"]
+            if not 0 < duration_ns <= MAX_LOCKSTEP_NS or duration_ns % STEP_NS:
+                raise CodecError("invalid", f"ns: wanted a multiple of {STEP_NS}, at most 60 s")
+        except CodecError as error:
+            self.node.refuse(error.reason, f"sim/step: {error}")
+            query.reply_err(str(error).encode())
+            return
+        with self._step_lock:
+            for _ in range(duration_ns // STEP_NS):
+                self._tick((self._ticks + 1) * STEP_NS)
+            state = {
+                "time_ns": self._ticks * STEP_NS,
+                "joint": records.encode(self.world.joint_state()),
+                "pose": records.encode(self.world.pose_state(self._reference)),
+                "gripper": records.encode(self.world.gripper_state()),
+            }
+        query.reply(self.node.keys.sim_step, message.pack(state))
+
+    # -- one millisecond ----------------------------------------------------------------------
+    def _tick(self, now_ns: int) -> None:
+        self._take_orders(now_ns)
+        self._ticks += 1
+        if not self._blown_up:
+            self._reference = self._as_reference(self.guard.tick(now_ns))
+            try:
+                self.world.tick(self._reference)
+            except NodeError as error:
+                self._blown_up = str(error)
+                self.node.refuse("simulation_fault", str(error))
+        self._rate.tick()
+        if self._ticks % self._every["state"] == 0:
+            self._publish_state(now_ns)
+        if self._ticks % self._every["scene"] == 0 and self._scene_wanted:
+            self._scene.put(
+                SceneState(self.node.profile.sim.scene, self.world.qpos()), stamp_wall_ns=now_ns
+            )
+        if self._ticks % self._every["objects"] == 0 and self._objects_wanted:
+            self._publish_objects(now_ns)
+        if self._ticks % self._every["watch"] == 0:
+            self._watch()
+
+    def _take_orders(self, now_ns: int) -> None:
+        for arrival in self._poses.take_all():
+            command = self.node.read(PoseCommand, arrival)
+            if command is None:
+                continue
+            reason = self.guard.offer(command, now_ns)
+            if reason is not None:
+                self.node.refuse(
+                    f"pose_{reason}", f"command/pose by {command.header.source[:60]!r}: {reason}"
+                )
+        for arrival in self._widths.take_all():
+            width = self.node.read(GripperCommand, arrival)
+            if width is not None:
+                order = width.record
+                gripper = self.node.profile.robot.gripper
+                self.world.set_gripper(
+                    min(order.width_m, gripper.max_width_m),
+                    order.speed_m_s,
+                    max(order.force_n, 0.1),
+                )
+        for arrival in self._resets.take_all():
+            seed = self.node.read_text(_seed_or_default, arrival)
+            if seed is not None:
+                self._reset(seed.value)
+
+    def _reset(self, seed: int | None) -> None:
+        if self.guard.following and not self._blown_up:
+            self.node.refuse("reset_refused", "sim/reset: the arm is being commanded; deactivate first")
+            return
+        self.world.reset(self.node.profile.sim.seed if seed is None else seed)
+        self.guard.restart(Pose(*self.world.tcp()))
+        self._blown_up = ""
+        self.node.counters["sim.resets"] += 1
+        self.node.report("running", detail=self._detail(), now=True)
+
+    @staticmethod
+    def _as_reference(motion: Motion) -> Reference:
+        return Reference(
+            motion.pose.position_m, motion.pose.rotation, motion.twist, motion.acceleration
+        )
+
+    # -- what is published --------------------------------------------------------------------
+    def _publish_state(self, now_ns: int) -> None:
+        seq = self._joint.seq
+        gripper = self.world.gripper_state()
+        if self._blown_up or self.guard.braking:
+            gripper = replace(
+                gripper,
+                mode="braking" if self.guard.braking else gripper.mode,
+                faults=(self._blown_up,) if self._blown_up else (),
+            )
+        self._joint.put(self.world.joint_state(), stamp_wall_ns=now_ns, seq=seq)
+        self._pose.put(self.world.pose_state(self._reference), stamp_wall_ns=now_ns, seq=seq)
+        self._gripper.put(gripper, stamp_wall_ns=now_ns, seq=seq)
+
+    def _publish_objects(self, now_ns: int) -> None:
+        objects = self.world.objects()
+        self._objects.put(
+            ObjectPoses(
+                tuple(objects),
+                np.array([place[0] for place in objects.values()]).reshape(-1, 3),
+                np.array([place[1] for place in objects.values()]).reshape(-1, 4),
+            ),
+            stamp_wall_ns=now_ns,
+        )
+
+    def _watch(self) -> None:
+        self._scene_wanted, self._objects_wanted = self._scene.wanted, self._objects.wanted
+        step_s = self.node.clock.follow()
+        if step_s:
+            self.node.refuse("clock_step", f"the wall clock was set by {step_s:+.3f} s")
+        state = "fault" if self._blown_up else "braking" if self.guard.braking else "running"
+        self.node.report(
+            state,
+            detail=self._detail(),
+            rates_hz={"control": self._rate.rate_hz},
+        )
+
+    def _detail(self) -> dict[str, object]:
+        self.node.counters["sim.overruns"] = self._overruns
+        self.node.counters["sim.stream_silences"] = self.guard.silences
+        self.node.counters["sim.torque_saturated"] = self.world.saturated
+        return {
+            "scene": self.node.profile.sim.scene,
+            "following": self.guard.following,
+            "realtime": self._realtime,
+            "lockstep": self.lockstep,
+            "fault": self._blown_up,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class _Seed:
+    """A seed, or None for the profile's own."""
+
+    value: int | None
+
+
+def _seed_or_default(payload: bytes) -> _Seed:
+    return _Seed(settings.decode_seed(payload))

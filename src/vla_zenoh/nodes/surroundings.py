@@ -1,0 +1,106 @@
+"""What the command node hears of the other nodes: who is alive, specs, camera ages."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from vla_zenoh import keys as key_names
+from vla_zenoh.control.names import worker_node
+from vla_zenoh.control.preflight import Surroundings
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.slots import Inbox
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.types import NodeStatus
+
+MAX_WORKERS = 32
+
+
+class Neighbours:
+    """Collects status, specs and liveliness into a `Surroundings`."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._lock = threading.Lock()
+        self._alive: set[str] = set()
+        self._changed = True
+        self._specs: dict[str, ModelSpec] = {}
+        self._spec_sources: dict[str, str] = {}
+        self._complaints: dict[str, str] = {}
+        self._cameras: dict[str, tuple[str, float, int]] = {}
+        self._statuses = node.listen(node.keys.all_status, Inbox(64))
+        self._new_specs = node.listen(node.keys.all_specs, Inbox(32))
+        node.on_alive(self._on_alive)
+        self._robot_node = "sim" if node.profile.robot.driver == "sim" else node.profile.robot.driver
+
+    def _on_alive(self, name: str, alive: bool) -> None:
+        with self._lock:
+            (self._alive.add if alive else self._alive.discard)(name)
+            self._changed = True
+            if not alive and name.startswith("worker-"):
+                worker = name.removeprefix("worker-")
+                self._specs.pop(worker, None)
+                self._spec_sources.pop(worker, None)
+                self._complaints.pop(worker, None)
+
+    def look(self, now_ns: int) -> Surroundings | None:
+        """The surroundings now, or None when nothing changed."""
+        for arrival in self._statuses.take_all():
+            stamped = self._node.read(NodeStatus, arrival)
+            if stamped is not None:
+                self._take_status(stamped.record, now_ns)
+        for arrival in self._new_specs.take_all():
+            stamped = self._node.read(ModelSpec, arrival)
+            if stamped is not None:
+                worker = key_names.last(str(arrival.sample.key_expr))
+                self._take_spec(worker, stamped.record, stamped.header.source)
+        with self._lock:
+            if not self._changed:
+                return None
+            self._changed = False
+            return Surroundings(
+                frozenset(self._alive),
+                self._robot_node,
+                dict(self._specs),
+                dict(self._spec_sources),
+                dict(self._complaints),
+                {
+                    camera: age_s + (now_ns - heard_ns) / 1e9
+                    for camera, (_, age_s, heard_ns) in self._cameras.items()
+                },
+                {camera: node for camera, (node, _, _) in self._cameras.items()},
+            )
+
+    def _take_spec(self, worker: str, spec: ModelSpec, source: str) -> None:
+        with self._lock:
+            known = self._spec_sources.get(worker)
+            if worker_node(worker) not in self._alive or (known is not None and known != source):
+                self._node.counters["refused.foreign_spec"] += 1
+                return
+            if known is None and len(self._specs) >= MAX_WORKERS:
+                return
+            if self._specs.get(worker) != spec:
+                self._specs[worker] = spec
+                self._spec_sources[worker] = source
+                self._changed = True
+
+    def _take_status(self, status: NodeStatus, now_ns: int) -> None:
+        with self._lock:
+            if status.node.startswith("worker-"):
+                complaint = status.detail.get("complaint", "")
+                worker = status.node.removeprefix("worker-")
+                if isinstance(complaint, str) and len(self._complaints) < MAX_WORKERS:
+                    self._complaints[worker] = complaint[:300]
+                    self._changed = True
+            cameras = status.detail.get("cameras")
+            if isinstance(cameras, dict):
+                for camera, fields in cameras.items():
+                    self._take_camera(status.node, camera, fields, now_ns)
+
+    def _take_camera(self, node: str, camera: Any, fields: Any, now_ns: int) -> None:
+        if camera not in self._node.profile.cameras or not isinstance(fields, dict):
+            return
+        age_s = fields.get("age_s")
+        if isinstance(age_s, (int, float)) and not isinstance(age_s, bool):
+            self._cameras[camera] = (node, float(age_s), now_ns)
+            self._changed = True

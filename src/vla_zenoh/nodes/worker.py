@@ -1,0 +1,273 @@
+"""A model worker: newest coherent observation in, action chunk out, at the task's rate.
+
+Inference never runs in a Zenoh callback and nothing is queued: each inference takes the newest
+observation that was captured after the worker's last chunk was published. The worker infers whether
+or not it is obeyed, so that it can be looked at, compared and checked before it gets the arm.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any, Literal
+
+import zenoh
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import image as image_codec
+from vla_zenoh.codec import records
+from vla_zenoh.control.names import worker_node
+from vla_zenoh.errors import CodecError, SpecError
+from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.meter import Percentiles, RateMeter
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
+from vla_zenoh.observe import History, NotYet, assemble
+from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import (
+    ActionChunk,
+    Event,
+    GripperState,
+    Image,
+    JointState,
+    PoseState,
+    Stamped,
+    Task,
+)
+
+SPEC_PERIOD_S = 1.0
+TASK_PATIENCE_S = 1.5
+LOOK_PERIOD_S = 0.25
+AFTER_A_FAILURE_S = 0.5
+STATE_KINDS: dict[str, type[Any]] = {
+    "joint": JointState,
+    "pose": PoseState,
+    "gripper": GripperState,
+}
+
+
+class WorkerNode:
+    """See the module.
+
+    Args:
+        profile: cameras, timing, session.
+        session: open session.
+        policy: the model, not loaded yet.
+        name: of the worker.
+        images: which form of pictures to listen to. Between processes of one host raw ones travel
+            through shared memory and cost least; between hosts JPEG is a tenth of the bytes.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        session: zenoh.Session,
+        policy: Policy,
+        name: str,
+        *,
+        images: Literal["raw", "jpeg"] = "raw",
+    ) -> None:
+        node = self.node = Node(worker_node(name), profile, session)
+        self.policy, self.name, self.spec = policy, name, policy.spec
+        keys = node.keys
+        self._chunk_out = node.stream(keys.delta(name), Kind.ORDER)
+        self._spec_out = node.stream(keys.spec(name), Kind.NEWS)
+        node.answer(
+            keys.spec(name),
+            lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
+        )
+        self._task_slot = node.listen(keys.task, Latest())
+        self._jpeg = images == "jpeg"
+        key_of = keys.camera_jpeg if self._jpeg else keys.camera_raw
+        self._image_slots = {
+            camera.camera: node.listen(key_of(camera.camera), Latest())
+            for camera in self.spec.observation.cameras
+        }
+        self._state_slots = {
+            part: node.listen(self._state_key(part), Inbox(256))
+            for part in self.spec.observation.state
+        }
+        self._images: dict[str, Stamped[Image]] = {}
+        self._states = {part: History() for part in self.spec.observation.state}
+        self._task: Task | None = None
+        self._task_heard_s = -1e9
+        self._episode = -1
+        self._not_before_ns = 0
+        self._rate = RateMeter(window_s=5.0)
+        self._inference_ms = Percentiles(128)
+        self._last_spec_s = -1e9
+        self._complaint = "loading"
+
+    def _state_key(self, part: str) -> str:
+        keys = self.node.keys
+        return {"joint": keys.state_joint, "pose": keys.state_pose, "gripper": keys.state_gripper}[
+            part
+        ]
+
+    # -- running ------------------------------------------------------------------------------
+    def run(self, stop: threading.Event) -> None:
+        """Load the model, then infer until `stop` is set."""
+        self._report(now=True)
+        load = getattr(self.policy, "load", None)
+        if callable(load):
+            began = time.monotonic()
+            load()
+            self.node.tell(Event("info", "notice", "loaded", f"in {time.monotonic() - began:.1f} s"))
+        self._complaint = ""
+        next_s = time.monotonic()
+        while not stop.is_set():
+            now_s = time.monotonic()
+            if now_s < next_s:
+                self._listen()
+                stop.wait(min(next_s - now_s, LOOK_PERIOD_S))
+                self._report()
+                continue
+            observed = self._observe()
+            if observed is None:
+                self._report()
+                self._wait_for_news(stop)
+                continue
+            period_s = 1.0 / observed.rate_hz
+            next_s = max(next_s + period_s, now_s)
+            if not self._infer(observed):
+                next_s = time.monotonic() + AFTER_A_FAILURE_S
+            self._report()
+        self.node.report("stopped", now=True)
+        self.node.close()
+
+    def _wait_for_news(self, stop: threading.Event) -> None:
+        """Sleep until the slowest input brings something, or a little while."""
+        if self._image_slots:
+            slot = next(iter(self._image_slots.values()))
+            slot.wait(0.02)
+        else:
+            stop.wait(0.002 if self._task is not None else 0.02)
+
+    # -- in -----------------------------------------------------------------------------------
+    def _listen(self) -> None:
+        arrival = self._task_slot.take()
+        if arrival is not None:
+            task = self.node.read(Task, arrival)
+            if task is not None:
+                self._task, self._task_heard_s = task.record, time.monotonic()
+        for camera, slot in self._image_slots.items():
+            arrival = slot.take()
+            image = self._read_image(camera, arrival) if arrival is not None else None
+            if image is not None:
+                self._images[camera] = image
+        for part, inbox in self._state_slots.items():
+            for arrival in inbox.take_all():
+                state = self.node.read(STATE_KINDS[part], arrival)
+                if state is not None:
+                    self._states[part].add(state)
+
+    def _read_image(self, camera: str, arrival: Arrival) -> Stamped[Image] | None:
+        sample = arrival.sample
+        try:
+            attachment = sample.attachment
+            header = header_codec.decode(attachment.to_bytes() if attachment is not None else None)
+            payload = sample.payload.to_bytes()
+            if self._jpeg:
+                image = image_codec.decode_jpeg(payload)
+            else:
+                _, _, schema = str(sample.encoding).partition(";")
+                image = image_codec.decode_raw(payload, schema)
+        except CodecError as error:
+            self.node.refuse(error.reason, f"camera {camera}: {error}")
+            return None
+        return Stamped(header, image, self.node.wall_of(arrival))
+
+    def _observe(self) -> Observation | None:
+        self._listen()
+        self.node.clock.follow()
+        if self._task is None or time.monotonic() - self._task_heard_s > TASK_PATIENCE_S:
+            self._complaint = "no command node is heard"
+            return None
+        if self._task.episode != self._episode:
+            self._episode = self._task.episode
+            self._not_before_ns = 0
+            reset = getattr(self.policy, "reset", None)
+            if callable(reset):
+                reset()
+        try:
+            observation = assemble(
+                self.spec,
+                self._task,
+                self._images,
+                self._states,
+                not_before_ns=self._not_before_ns,
+                now_ns=self.node.clock.wall_ns(),
+            )
+        except ValueError as error:
+            self._complaint = str(error)
+            return None
+        if isinstance(observation, NotYet):
+            if not observation.waiting:
+                self._complaint = observation.why
+            return None
+        self._complaint = ""
+        return observation
+
+    # -- out ----------------------------------------------------------------------------------
+    def _infer(self, observation: Observation) -> bool:
+        observed_ns = self.node.clock.wall_ns()
+        start_ns = self.node.clock.wall_ns()
+        try:
+            result = self.policy.infer(observation)
+            answer = result if isinstance(result, ActionSteps) else ActionSteps(result)
+            steps = check_steps(self.spec.action, answer.steps)
+        except SpecError as error:
+            return self._failed("contract", str(error))
+        except Exception as error:
+            return self._failed("inference_failed", f"{type(error).__name__}: {error}")
+        end_ns = self.node.clock.wall_ns()
+        self._inference_ms.add((end_ns - start_ns) / 1e6)
+        horizon_ns = int(len(steps) * self.spec.action.dt_s * 1e9)
+        patience_ns = int(self.node.profile.timing.max_observation_age_s * 1e9)
+        header = self._chunk_out.put(
+            ActionChunk(
+                worker=self.name,
+                spec_hash=self.spec.hash,
+                episode=observation.task.episode,
+                observation_stamp_ns=observation.stamp_wall_ns,
+                observation_seq=observation.seq,
+                valid_until_ns=observation.stamp_wall_ns + horizon_ns + patience_ns,
+                steps=steps,
+                observed_ns=observed_ns,
+                inference_start_ns=start_ns,
+                inference_end_ns=end_ns,
+                done=answer.done,
+            )
+        )
+        self._not_before_ns = header.stamp_wall_ns
+        self._rate.tick()
+        return True
+
+    def _failed(self, reason: str, why: str) -> bool:
+        self._complaint = f"{reason}: {why}"
+        self.node.refuse(reason, why)
+        return False
+
+    def _report(self, *, now: bool = False) -> None:
+        if now or time.monotonic() - self._last_spec_s > SPEC_PERIOD_S:
+            self._last_spec_s = time.monotonic()
+            self._spec_out.put(self.spec)
+        state = "waiting" if self._complaint else "inferring"
+        if not now and not self.node.report_due(state):
+            return
+        task = self._task
+        inference = self._inference_ms.summary()
+        self.node.report(
+            state,
+            detail={
+                "complaint": self._complaint,
+                "spec": self.spec.hash,
+                "episode": self._episode,
+                "prompt": task.prompt if task else "",
+                "obeyed": bool(task and task.active and task.worker == self.name),
+            },
+            rates_hz={"chunks": self._rate.rate_hz},
+            latency_ms={"inference": inference} if inference else {},
+            now=now,
+        )

@@ -1,0 +1,151 @@
+"""One coherent look at the world out of many streams: the newest, near in time, in the form asked."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.policy import CameraSpec, ModelSpec, Observation
+from vla_zenoh.types import Image, Stamped, Task
+
+
+@dataclass(slots=True)
+class History:
+    """The last states of one kind, oldest first, to find the one nearest to a picture."""
+
+    size: int = 128
+    entries: list[Stamped[Any]] = field(default_factory=list)
+
+    def add(self, entry: Stamped[Any]) -> None:
+        """Take one; one that is older than the newest starts the history anew (its writer did)."""
+        if self.entries and entry.header.stamp_wall_ns < self.entries[-1].header.stamp_wall_ns:
+            self.entries.clear()
+        self.entries.append(entry)
+        if len(self.entries) > 2 * self.size:
+            del self.entries[: -self.size]
+
+    def nearest(self, stamp_ns: int) -> Stamped[Any] | None:
+        """The entry whose stamp is nearest."""
+        if not self.entries:
+            return None
+        stamps = [entry.header.stamp_wall_ns for entry in self.entries]
+        right = bisect_left(stamps, stamp_ns)
+        around = self.entries[max(right - 1, 0) : right + 1]
+        return min(around, key=lambda entry: abs(entry.header.stamp_wall_ns - stamp_ns))
+
+
+@dataclass(frozen=True, slots=True)
+class NotYet:
+    """Why there is no observation now. `waiting` is about being early, not about something wrong."""
+
+    why: str
+    waiting: bool = False
+
+
+def assemble(
+    spec: ModelSpec,
+    task: Task,
+    images: Mapping[str, Stamped[Image]],
+    states: Mapping[str, History],
+    *,
+    not_before_ns: int,
+    now_ns: int,
+) -> Observation | NotYet:
+    """The newest observation that fits the spec, or why there is none.
+
+    Args:
+        spec: what the model needs.
+        task: prompt and episode.
+        images: newest picture of each camera.
+        states: part (``joint``, ``pose``, ``gripper``) -> its history.
+        not_before_ns: an observation from before this time is not wanted: it cannot show what the
+            last chunk did.
+        now_ns: wall clock.
+    """
+    wanted = spec.observation
+    if wanted.prompt and not task.prompt:
+        return NotYet("there is no prompt", waiting=True)
+    missing = [f"camera {c.camera!r}" for c in wanted.cameras if c.camera not in images]
+    missing += [f"state/{p}" for p in wanted.state if p not in states or not states[p].entries]
+    if missing:
+        return NotYet(f"nothing heard yet of {', '.join(missing)}")
+    oldest = _oldest([images[camera.camera] for camera in wanted.cameras])
+    if oldest is None and wanted.state:
+        oldest = _oldest([states[part].entries[-1] for part in wanted.state])
+    stamp_ns = oldest.header.stamp_wall_ns if oldest else now_ns
+    seq = oldest.header.seq if oldest else 0
+    age_s = (now_ns - stamp_ns) / 1e9
+    if age_s > wanted.max_age_s:
+        return NotYet(f"the newest observation is {age_s:.2f} s old, at most {wanted.max_age_s:g} s")
+    if stamp_ns < not_before_ns:
+        return NotYet("no observation since the last chunk", waiting=True)
+    parts: dict[str, Any] = {}
+    for part in wanted.state:
+        near = states[part].nearest(stamp_ns)
+        assert near is not None
+        skew_s = abs(near.header.stamp_wall_ns - stamp_ns) / 1e9
+        if skew_s > wanted.max_skew_s:
+            return NotYet(f"state/{part} is {skew_s:.3f} s apart from the pictures")
+        parts[part] = near.record
+    for camera in wanted.cameras:
+        skew_s = (images[camera.camera].header.stamp_wall_ns - stamp_ns) / 1e9
+        if skew_s > wanted.max_skew_s:
+            return NotYet(f"camera {camera.camera!r} is {skew_s:.3f} s apart from the others")
+    return Observation(
+        stamp_wall_ns=stamp_ns,
+        seq=seq,
+        task=task,
+        images={c.camera: prepare(images[c.camera].record, c) for c in wanted.cameras},
+        **parts,
+    )
+
+
+def _oldest(entries: Sequence[Stamped[Any]]) -> Stamped[Any] | None:
+    return min(entries, key=lambda entry: entry.header.stamp_wall_ns, default=None)
+
+
+def prepare(image: Image, spec: CameraSpec) -> NDArray[np.uint8]:
+    """A picture in the size and channel order the model declared."""
+    rgb = image.rgb
+    if spec.width is not None and spec.height is not None:
+        rgb = _resize(rgb, spec)
+    if spec.colour == "bgr":
+        rgb = np.ascontiguousarray(rgb[..., ::-1])
+    return rgb
+
+
+def _resize(rgb: NDArray[np.uint8], spec: CameraSpec) -> NDArray[np.uint8]:
+    assert spec.width is not None and spec.height is not None
+    height, width = rgb.shape[:2]
+    if (height, width) == (spec.height, spec.width):
+        return rgb
+    if spec.resize == "none":
+        raise ValueError(
+            f"camera {spec.camera!r} sends {width}x{height}, the spec asks for "
+            f"{spec.width}x{spec.height} and says resize: none"
+        )
+    if spec.resize == "stretch":
+        return _scale(rgb, spec.width, spec.height)
+    fit = min if spec.resize == "pad" else max
+    factor = fit(spec.width / width, spec.height / height)
+    scaled = _scale(
+        rgb, max(1, round(width * factor)), max(1, round(height * factor))
+    )
+    out = np.zeros((spec.height, spec.width, 3), np.uint8)
+    top, left = (spec.height - scaled.shape[0]) // 2, (spec.width - scaled.shape[1]) // 2
+    cut = scaled[max(-top, 0) :, max(-left, 0) :][: spec.height, : spec.width]
+    top, left = max(top, 0), max(left, 0)
+    out[top : top + cut.shape[0], left : left + cut.shape[1]] = cut
+    return out
+
+
+def _scale(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    smaller = width < rgb.shape[1] or height < rgb.shape[0]
+    method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(rgb, (width, height), interpolation=method), np.uint8)
