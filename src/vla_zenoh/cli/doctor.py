@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from typing import Annotated
 
@@ -13,23 +14,19 @@ from rich.markup import escape
 from rich.table import Table
 
 from vla_zenoh.doctor import Finding, Needs, examine, needs_of
-from vla_zenoh.profile import load_profile
+from vla_zenoh.errors import SessionError
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.profile import SessionProfile, load_profile
 
-ANSWER_LIMIT_MS = 1000
 COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
 
 
-def try_zenoh(endpoint: str) -> str:
+def try_zenoh(profile: SessionProfile, endpoint: str) -> str:
     """Opens a Zenoh session at `endpoint` and closes it; returns the reason if it cannot."""
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("transport/unicast/open_timeout", str(ANSWER_LIMIT_MS))
     try:
-        zenoh.open(config).close()
-    except zenoh.ZError as error:
-        return str(error).split(" at ", maxsplit=1)[0].rstrip("! ")
+        open_session(profile, mode="client", connect=(endpoint,)).close()
+    except SessionError as error:
+        return str(error.__cause__ or error).split(" at ", maxsplit=1)[0].rstrip("! ")
     return ""
 
 
@@ -51,10 +48,12 @@ def doctor(
     if host is not None and profile is None:
         raise typer.BadParameter("it is the name of a host in a profile: give --profile too")
     zenoh.init_log_from_env_or("off")
-    needs = Needs() if profile is None else needs_of(load_profile(profile), host)
-    findings = []
+    needs, session = Needs(), SessionProfile()
+    if profile is not None:
+        loaded = load_profile(profile)
+        needs, session = needs_of(loaded, host), loaded.session
     with Console(stderr=True).status("Looking at this computer"):
-        findings.extend(examine(needs, try_zenoh))
+        findings = list(examine(needs, functools.partial(try_zenoh, session)))
     if as_json:
         print(json.dumps([dataclasses.asdict(finding) for finding in findings], indent=2))
     else:

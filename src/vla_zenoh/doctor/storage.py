@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 from pathlib import Path
@@ -15,7 +16,6 @@ DISK_WANTED_MIB = 2048
 DISK_NEEDED_MIB = 200
 
 SHARED_MEMORY = Path("/dev/shm")
-PROC = Path("/proc")
 
 
 def shared_memory(
@@ -35,26 +35,20 @@ def shared_memory(
     return Finding("shared memory", "ok", found)
 
 
-def left_segments(folder: Path = SHARED_MEMORY, proc: Path = PROC) -> Finding:
-    """No killed process has left its Zenoh shared memory behind."""
-    segments = {path: _size(path) for path in folder.glob("*.zenoh")}
-    used, all_seen = _mapped(proc)
-    left = {path: size for path, size in segments.items() if str(path) not in used}
+def left_segments(folder: Path = SHARED_MEMORY) -> Finding:
+    """No killed process of this user has left its Zenoh shared memory behind."""
+    segments = sorted(folder.glob("*.zenoh"))
+    left = [path for path in segments if _is_left(path)]
     if not left:
-        return Finding("left shared memory", "ok", f"none; {len(segments)} segments in use")
-    found = f"{len(left)} Zenoh segments, {sum(left.values()) // MIB} MiB"
-    if not all_seen:
-        return Finding(
-            "left shared memory",
-            "ok",
-            f"{found} belong to nobody or to processes of other users",
-        )
+        in_use = f"{len(segments)} segments in use" if segments else "no segments at all"
+        return Finding("left shared memory", "ok", f"none; {in_use}")
+    size_mib = sum(_size(path) for path in left) // MIB
     return Finding(
         "left shared memory",
         "warn",
-        f"{found}, left by processes that were killed",
-        "the next Zenoh session on this host removes them; by hand: "
-        f"rm {' '.join(str(path) for path in sorted(left))}",
+        f"{len(left)} Zenoh segments, {size_mib} MiB, left by processes that were killed",
+        "the next Zenoh session on this host removes them; by hand: rm "
+        + " ".join(str(path) for path in left),
     )
 
 
@@ -76,17 +70,11 @@ def _size(path: Path) -> int:
         return 0
 
 
-def _mapped(proc: Path) -> tuple[set[str], bool]:
-    """Zenoh segments that processes have mapped, and whether all processes could be read."""
-    used: set[str] = set()
-    all_seen = True
-    for maps in proc.glob("[0-9]*/maps"):
-        try:
-            lines = maps.read_text(errors="replace").splitlines()
-        except PermissionError:
-            all_seen = False
-            continue
-        except OSError:  # it ended while we looked
-            continue
-        used.update(line[line.index("/") :] for line in lines if ".zenoh" in line and "/" in line)
-    return used, all_seen
+def _is_left(segment: Path) -> bool:
+    """Whether no process holds `segment`: each that uses it keeps a shared lock on it."""
+    try:
+        with segment.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:  # in use, gone meanwhile, or another user's
+        return False
+    return True
