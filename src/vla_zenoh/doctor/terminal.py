@@ -20,7 +20,7 @@ def terminal(
 ) -> Finding:
     """The terminal shows UTF-8 and is wide enough; arguments stand in for what is really there."""
     environ = os.environ if environ is None else environ
-    encoding = encoding or sys.stdout.encoding or "ascii"
+    encoding = encoding or str(sys.stdout.encoding or "ascii")
     columns = columns or shutil.get_terminal_size().columns
     found = f"{environ.get('TERM') or 'no TERM'}, {encoding}, {columns} columns"
     if codecs.lookup(encoding).name != "utf-8":
