@@ -176,7 +176,8 @@ def main() -> None:
     uv = find_uv()
     missing = missing_packages(has_uv=uv is not None)
     if missing:
-        fail("a part of the system is missing. On Debian and Ubuntu: sudo apt install " + " ".join(missing))
+        packages = " ".join(missing)
+        fail("a part of the system is missing. On Debian and Ubuntu: sudo apt install " + packages)
     uv = uv or install_uv()
     make_venv(uv)
     say("installing the package and its libraries into .venv (once; 2 GB on disk)")

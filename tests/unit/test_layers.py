@@ -34,6 +34,8 @@ HEAVY = ("zenoh", "typer", "torch", "mujoco", "matplotlib", "av")
 
 def room(path: Path) -> str:
     parts = path.relative_to(PACKAGE).parts
+    if parts == ("__main__.py",):
+        return "cli"
     return parts[0] if len(parts) > 1 else "."
 
 
@@ -78,7 +80,7 @@ def loaded_after(module: str) -> set[str]:
 
 
 def core_modules() -> list[str]:
-    beside = [path.stem for path in PACKAGE.glob("*.py") if path.stem != "__init__"]
+    beside = [path.stem for path in PACKAGE.glob("*.py") if not path.stem.startswith("__")]
     folders = [path.parent.name for path in PACKAGE.glob("*/__init__.py")]
     core = [name for name in beside + folders if name not in ("nodes", "cli", "simulation")]
     return sorted(core)
