@@ -51,9 +51,7 @@ class OpenGlCanvas:
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._size = (0, 0)
 
-    def draw(
-        self, data: mujoco.MjData, camera: str, width: int, height: int
-    ) -> NDArray[np.uint8]:
+    def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> NDArray[np.uint8]:
         """Draw what `camera` sees, (height, width, 3) RGB."""
         if self._size != (width, height):
             mujoco.mjr_resizeOffscreen(width, height, self._gl)

@@ -23,9 +23,7 @@ if TYPE_CHECKING:
 class Canvas(Protocol):
     """Something that draws what a camera of a model sees."""
 
-    def draw(
-        self, data: mujoco.MjData, camera: str, width: int, height: int
-    ) -> NDArray[np.uint8]:
+    def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> NDArray[np.uint8]:
         """Draw (height, width, 3) RGB; positions in `data` are up to date."""
         ...
 

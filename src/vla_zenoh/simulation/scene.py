@@ -45,9 +45,7 @@ def scene_file(scene: str) -> Path:
     return path
 
 
-def build_model(
-    scene: str, robot: RobotModel, *, joint_friction_nm: float = 0.0
-) -> mujoco.MjModel:
+def build_model(scene: str, robot: RobotModel, *, joint_friction_nm: float = 0.0) -> mujoco.MjModel:
     """Compile `scene` with `robot` standing at the world's origin.
 
     Args:
@@ -130,9 +128,7 @@ def _add_camera(link: mujoco.MjsBody, camera: MountedCamera) -> None:
     rotation = np.column_stack([right, np.cross(back, right), back])
     quat_wxyz = np.empty(4)
     mujoco.mju_mat2Quat(quat_wxyz, rotation.ravel())
-    link.add_camera(
-        name=camera.name, pos=eye, quat=quat_wxyz, fovy=math.degrees(camera.fovy_rad)
-    )
+    link.add_camera(name=camera.name, pos=eye, quat=quat_wxyz, fovy=math.degrees(camera.fovy_rad))
 
 
 def _add_actuators(spec: mujoco.MjSpec, robot: RobotModel) -> None:

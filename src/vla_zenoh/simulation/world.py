@@ -213,6 +213,11 @@ class World:
         width, _ = self._opening()
         return GripperState(width, moving=self._gripper.moving, holding=self._gripper.holding)
 
+    @property
+    def grip_force_n(self) -> float:
+        """What either finger presses with, inwards positive."""
+        return -float(self._data.actuator_force[self._gripper_actuator])
+
     # -- objects and pictures ------------------------------------------------------------------
 
     def objects(self) -> dict[str, tuple[FloatArray, FloatArray]]:
