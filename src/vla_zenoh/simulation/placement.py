@@ -97,7 +97,7 @@ def draw_places(model: mujoco.MjModel, seed: int) -> dict[str, Place]:
     radii = {name: footprint_m(model, body) for name, body in bodies.items()}
     gap = float(model.numeric(GAP).data[0]) if _has_numeric(model, GAP) else 0.0
     fixed = {
-        name: Place(*model.body_pos[body, :2].tolist(), 0.0)
+        name: Place(float(model.body_pos[body, 0]), float(model.body_pos[body, 1]), 0.0)
         for name, body in bodies.items()
         if name not in regions
     }

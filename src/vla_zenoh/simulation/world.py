@@ -8,13 +8,14 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vla_zenoh.control.impedance import ArmState, ImpedanceController, ImpedanceGains, Reference
+from vla_zenoh.control.impedance import ImpedanceController, ImpedanceGains, Reference
 from vla_zenoh.errors import NodeError, ResourceError
+from vla_zenoh.simulation.arm import SimulatedArm
 from vla_zenoh.simulation.gripper import GripperServo
 from vla_zenoh.simulation.placement import draw_places, objects_of
 from vla_zenoh.simulation.pose_vector import read_pose_vector, write_pose_vector
 from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.scene import GRIPPER, PREFIX, STEP_S, TCP_SITE, build_model
+from vla_zenoh.simulation.scene import GRIPPER, PREFIX, STEP_S, build_model
 from vla_zenoh.types import GripperState, JointState, PoseState, vector
 
 FloatArray = NDArray[np.float64]
@@ -56,48 +57,24 @@ class World:
         self.model = build_model(scene, robot, joint_friction_nm=joint_friction_nm)
         self._data = mujoco.MjData(self.model)
         self._home_rad = vector("home_rad", home_rad, len(robot.arm_joints))
-        self._bind()
+        self._arm = SimulatedArm(self.model, self._data, robot)
+        self._objects = objects_of(self.model)
         self._controller = ImpedanceController(
             gains,
-            lower_rad=self._lower_rad,
-            upper_rad=self._upper_rad,
-            effort_nm=self.model.actuator_ctrlrange[self._arm_actuators, 1],
+            lower_rad=self._arm.lower_rad,
+            upper_rad=self._arm.upper_rad,
+            effort_nm=self._arm.effort_limit_nm,
             posture_rad=self._home_rad,
             period_s=STEP_S,
         )
-        fingers = [self.model.joint(PREFIX + name).range[1] for name in robot.finger_joints]
-        self._gripper = GripperServo(float(sum(fingers)), STEP_S, MAX_GRIPPER_FORCE_N)
-        self._finger_open_m = fingers
-        self.saturated = 0
-        self.reset(seed)
-
-    def _bind(self) -> None:
-        """Look up every address once; the views into `_data` stay valid for its life."""
-        model, data = self.model, self._data
-        joints = [model.joint(PREFIX + name) for name in self.robot.arm_joints]
-        fingers = [model.joint(PREFIX + name) for name in self.robot.finger_joints]
-        first_dof, first_q = joints[0].dofadr[0], joints[0].qposadr[0]
-        if [joint.dofadr[0] - first_dof for joint in joints] != list(range(len(joints))):
-            raise ResourceError("the arm's joints do not follow each other in the URDF")
-        self._dofs = slice(first_dof, first_dof + len(joints))
-        arm_q = slice(first_q, first_q + len(joints))
-        self._lower_rad = np.array([joint.range[0] for joint in joints])
-        self._upper_rad = np.array([joint.range[1] for joint in joints])
-        self._q, self._qd = data.qpos[arm_q], data.qvel[self._dofs]
-        self._bias, self._effort = data.qfrc_bias[self._dofs], data.qfrc_actuator[self._dofs]
+        fingers = [self.model.joint(PREFIX + name) for name in robot.finger_joints]
         self._finger_q = [int(joint.qposadr[0]) for joint in fingers]
         self._finger_dofs = [int(joint.dofadr[0]) for joint in fingers]
-        self._arm_actuators = [model.actuator(PREFIX + j).id for j in self.robot.arm_joints]
-        self._gripper_actuator = model.actuator(PREFIX + GRIPPER).id
-        self._tcp = model.site(PREFIX + TCP_SITE).id
-        self._tcp_body = int(model.site_bodyid[self._tcp])
-        self._tcp_position = data.site_xpos[self._tcp]
-        self._tcp_rotation = data.site_xmat[self._tcp].reshape(3, 3)
-        self._objects = objects_of(model)
-        tcp_root = model.body_rootid[model.site_bodyid[self._tcp]]
-        self._of_robot = model.body_rootid[model.geom_bodyid] == tcp_root
-        self._linear, self._angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-        self._inertia = np.zeros((model.nv, model.nv))
+        self._finger_open_m = [float(joint.range[1]) for joint in fingers]
+        self._gripper_actuator = int(self.model.actuator(PREFIX + GRIPPER).id)
+        self._gripper = GripperServo(sum(self._finger_open_m), STEP_S, MAX_GRIPPER_FORCE_N)
+        self.saturated = 0
+        self.reset(seed)
 
     # -- time ----------------------------------------------------------------------------------
 
@@ -110,7 +87,7 @@ class World:
         """
         model, data = self.model, self._data
         mujoco.mj_resetData(model, data)
-        self._q[:] = self._home_rad
+        self._arm.position_rad[:] = self._home_rad
         data.qpos[self._finger_q] = self._finger_open_m
         if seed is not None:
             for name, place in draw_places(model, seed).items():
@@ -134,11 +111,11 @@ class World:
         """
         model, data = self.model, self._data
         mujoco.mj_step1(model, data)
-        output = self._controller.torque(reference, self._arm_state())
+        output = self._controller.torque(reference, self._arm.state())
         if not math.isfinite(output.torque_nm.sum()):
             raise NodeError(f"the impedance controller got a bad reference: {reference}")
         self.saturated += output.saturated
-        data.ctrl[self._arm_actuators] = output.torque_nm
+        data.ctrl[self._arm.actuators] = output.torque_nm
         data.ctrl[self._gripper_actuator] = self._gripper.step(*self._opening())
         mujoco.mj_step2(model, data)
         self._ticks += 1
@@ -171,30 +148,19 @@ class World:
     def wrench(self) -> FloatArray:
         """(6,) what the surroundings exert on the robot at the TCP: N, Nm about the TCP."""
         self._refresh()
-        model, data = self.model, self._data
-        total, local = np.zeros(6), np.zeros(6)
-        for index in range(data.ncon):
-            contact = data.contact[index]
-            first, second = self._of_robot[contact.geom]
-            if first == second:
-                continue
-            mujoco.mj_contactForce(model, data, index, local)
-            axes = contact.frame.reshape(3, 3)  # rows; the force acts on the second geom
-            sign = 1.0 if second else -1.0
-            force, moment = sign * (local[:3] @ axes), sign * (local[3:] @ axes)
-            arm = contact.pos - self._tcp_position
-            total[:3] += force
-            total[3:] += moment + np.cross(arm, force)
-        return total
+        return self._arm.contact_wrench()
 
     def joint_state(self) -> JointState:
         """Arm joints; the effort is what the motors apply."""
-        return JointState(self.robot.arm_joints, self._q, self._qd, self._effort)
+        arm = self._arm
+        return JointState(
+            self.robot.arm_joints, arm.position_rad, arm.velocity_rad_s, arm.effort_nm
+        )
 
     def tcp(self) -> tuple[FloatArray, FloatArray]:
         """Measured TCP: position (3,) in metres and rotation (3, 3), copies."""
         self._refresh()
-        return self._tcp_position.copy(), self._tcp_rotation.copy()
+        return self._arm.tcp_position_m.copy(), self._arm.tcp_rotation.copy()
 
     def pose_state(self, reference: Reference) -> PoseState:
         """Measured TCP pose, twist and wrench beside the reference held now."""
@@ -202,7 +168,7 @@ class World:
         return PoseState(
             position_m=position,
             quat_xyzw=_quat_xyzw(rotation),
-            twist=self._jacobian() @ self._qd,
+            twist=self._arm.jacobian() @ self._arm.velocity_rad_s,
             wrench=self.wrench,
             reference_position_m=reference.position_m,
             reference_quat_xyzw=_quat_xyzw(reference.rotation),
@@ -258,31 +224,6 @@ class World:
         self._fresh = True
 
     # -- inside --------------------------------------------------------------------------------
-
-    def _arm_state(self) -> ArmState:
-        jacobian = self._jacobian()
-        mujoco.mj_fullM(self.model, self._data, self._inertia)
-        return ArmState(
-            position_rad=self._q,
-            velocity_rad_s=self._qd,
-            tcp_position_m=self._tcp_position,
-            tcp_rotation=self._tcp_rotation,
-            jacobian=jacobian,
-            drift=self._jacobian_rate() @ self._qd,
-            inertia=self._inertia[self._dofs, self._dofs],
-            bias_nm=self._bias,
-        )
-
-    def _jacobian(self) -> FloatArray:
-        mujoco.mj_jacSite(self.model, self._data, self._linear, self._angular, self._tcp)
-        return np.concatenate([self._linear[:, self._dofs], self._angular[:, self._dofs]])
-
-    def _jacobian_rate(self) -> FloatArray:
-        linear, angular = self._linear, self._angular
-        mujoco.mj_jacDot(
-            self.model, self._data, linear, angular, self._tcp_position, self._tcp_body
-        )
-        return np.concatenate([linear[:, self._dofs], angular[:, self._dofs]])
 
     def _refresh(self) -> None:
         """Bring positions up to the last step; contacts and forces stay those of that step."""
