@@ -150,7 +150,7 @@ class WorkerNode:
         if arrival is not None:
             task = self.node.read(Task, arrival)
             if task is not None:
-                self._task, self._task_heard_s = task.record, time.monotonic()
+                self._take_task(task)
         for camera, slot in self._image_slots.items():
             arrival = slot.take()
             image = self._read_image(camera, arrival) if arrival is not None else None
@@ -161,6 +161,17 @@ class WorkerNode:
                 state = self.node.read(STATE_KINDS[part], arrival)
                 if state is not None:
                     self._states[part].add(state)
+
+    def _take_task(self, task: Stamped[Task]) -> None:
+        self._task, self._task_heard_s = task.record, time.monotonic()
+        if task.record.episode == self._episode:
+            return
+        self._episode = task.record.episode
+        # What was seen before the episode began does not belong to it.
+        self._not_before_ns = task.header.stamp_wall_ns
+        reset = getattr(self.policy, "reset", None)
+        if callable(reset):
+            reset()
 
     def _read_image(self, camera: str, arrival: Arrival) -> Stamped[Image] | None:
         sample = arrival.sample
@@ -184,12 +195,6 @@ class WorkerNode:
         if self._task is None or time.monotonic() - self._task_heard_s > TASK_PATIENCE_S:
             self._complaint = "no command node is heard"
             return None
-        if self._task.episode != self._episode:
-            self._episode = self._task.episode
-            self._not_before_ns = 0
-            reset = getattr(self.policy, "reset", None)
-            if callable(reset):
-                reset()
         try:
             observation = assemble(
                 self.spec,

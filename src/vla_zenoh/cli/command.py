@@ -1,0 +1,31 @@
+"""vla-zenoh command."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    ConnectOption,
+    ProfileOption,
+    effective_profile,
+)
+from vla_zenoh.nodes.process import run_node
+
+
+def command(
+    profile: ProfileOption = DEFAULT_PROFILE,
+    connect: ConnectOption = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Compute and check everything, command nothing.")
+    ] = False,
+) -> None:
+    """Run the command node: turns chunks into a bounded, smooth pose stream."""
+    from vla_zenoh.nodes.command import CommandNode
+
+    loaded = effective_profile(profile, connect)
+    run_node(
+        loaded, lambda session, stop: CommandNode(loaded, session, dry_run=dry_run).run(stop)
+    )

@@ -1,0 +1,61 @@
+"""What is on a key, as a person reads it. Used by echo and keys."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import message
+from vla_zenoh.errors import CodecError
+
+MAX_TEXT = 400
+
+
+def plain(value: Any) -> Any:
+    """Arrays as lists, bytes as their number, so that JSON can carry it."""
+    if isinstance(value, np.ndarray):
+        return [round(float(v), 6) for v in value] if value.ndim == 1 else value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, bytes):
+        return f"<{len(value)} bytes>"
+    return value
+
+
+def encoding_of(sample: zenoh.Sample) -> str:
+    """Encoding as text, the way Zenoh writes it."""
+    return str(sample.encoding)
+
+
+def content(sample: zenoh.Sample) -> Any:
+    """The payload decoded as its encoding says, else as text, else its size."""
+    payload, encoding = sample.payload.to_bytes(), encoding_of(sample)
+    if encoding.startswith("application/msgpack"):
+        try:
+            return plain(message.unpack(payload))
+        except CodecError as error:
+            return f"<{error}>"
+    if "rgb8" in encoding or encoding.startswith("image/"):
+        return f"<{encoding}, {len(payload)} bytes>"
+    try:
+        return payload[:MAX_TEXT].decode("utf-8")
+    except UnicodeDecodeError:
+        return f"<{len(payload)} bytes>"
+
+
+def head(sample: zenoh.Sample) -> dict[str, Any] | None:
+    """The header, None where there is none that can be read."""
+    attachment = sample.attachment
+    try:
+        header = header_codec.decode(attachment.to_bytes() if attachment is not None else None)
+    except CodecError:
+        return None
+    return dataclasses.asdict(header)

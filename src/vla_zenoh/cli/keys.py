@@ -1,0 +1,136 @@
+"""vla-zenoh keys."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Annotated
+
+import typer
+import zenoh
+from rich.table import Table
+
+from vla_zenoh.cli import decode
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    ConnectOption,
+    JsonOption,
+    ProfileOption,
+    client,
+)
+from vla_zenoh.cli.output import console, fail, print_json
+from vla_zenoh.nodes.client import Client
+
+SETTINGS = ("prompt", "active", "worker", "rate")
+
+
+@dataclass(slots=True)
+class _Seen:
+    key: str
+    type: str
+    writer: str
+    count: int = 0
+    bytes: int = 0
+    rate_hz: float = 0.0
+    bytes_s: float = 0.0
+
+
+def keys(
+    profile: ProfileOption = DEFAULT_PROFILE,
+    connect: ConnectOption = None,
+    seconds: Annotated[float, typer.Option("--seconds", "-s", help="How long to listen.")] = 2.0,
+    pictures: Annotated[
+        bool,
+        typer.Option(
+            "--pictures", help="Listen to pictures too; without it their rates are the cameras' word."
+        ),
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Show which keys exist, who writes them, their type and rate."""
+    with client(profile, connect) as robot:
+        found = _listen(robot, seconds, pictures)
+        found += _settings(robot)
+        if not pictures:
+            found += _pictures(robot)
+    found.sort(key=lambda seen: seen.key)
+    if as_json:
+        print_json([asdict(seen) for seen in found])
+    else:
+        table = Table(header_style="bold")
+        for column in ("key", "type", "writer", "rate", "bytes/s"):
+            table.add_column(column, overflow="fold")
+        for seen in found:
+            table.add_row(
+                seen.key,
+                seen.type,
+                seen.writer,
+                f"{seen.rate_hz:.1f} Hz" if seen.rate_hz else "",
+                f"{seen.bytes_s:,.0f}" if seen.bytes_s else "",
+            )
+        console().print(table)
+    if not found:
+        fail("nothing is written; is a robot up? (`vla-zenoh up`)")
+
+
+def _listen(robot: Client, seconds: float, pictures: bool) -> list[_Seen]:
+    seen: dict[str, _Seen] = {}
+    lock = threading.Lock()
+
+    def take(sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        with lock:
+            entry = seen.get(key)
+            if entry is None:
+                header = decode.head(sample)
+                entry = seen[key] = _Seen(
+                    key, decode.encoding_of(sample), header["source"] if header else "?"
+                )
+            entry.count += 1
+            entry.bytes += len(sample.payload)
+
+    listening = [
+        robot.session.declare_subscriber(key, zenoh.handlers.Callback(take, indirect=False))
+        for key in _expressions(robot, pictures)
+    ]
+    began = time.monotonic()
+    time.sleep(seconds)
+    took = time.monotonic() - began
+    for subscriber in listening:
+        subscriber.undeclare()
+    for entry in seen.values():
+        entry.rate_hz, entry.bytes_s = round(entry.count / took, 2), round(entry.bytes / took)
+    return list(seen.values())
+
+
+def _expressions(robot: Client, pictures: bool) -> Iterable[str]:
+    if pictures:
+        return [robot.keys.everything]
+    # One expression a group, without the pictures: listening makes cameras encode and send.
+    below = robot.keys.everything.removesuffix("**")
+    groups = ("state/*", "command/*", "delta/*", "spec/*", "status/*", "event/*", "sim/*", "task")
+    return [below + group for group in groups]
+
+
+def _settings(robot: Client) -> list[_Seen]:
+    out: list[_Seen] = []
+    for name in SETTINGS:
+        key = getattr(robot.keys, name)
+        for reply in robot.session.get(key, timeout=1.0):
+            if reply.ok is not None:
+                value = reply.ok.payload.to_string()
+                out.append(_Seen(key, f"text, now {value!r}", "anyone; kept by command"))
+    return out
+
+
+def _pictures(robot: Client) -> list[_Seen]:
+    out: list[_Seen] = []
+    for name, (found, _, _) in robot.snapshot().items():
+        cameras = found.detail.get("cameras")
+        for camera in cameras if isinstance(cameras, dict) else ():
+            rate_hz = round(float(found.rates_hz.get(camera, 0.0)), 2)
+            out.append(_Seen(robot.keys.camera_raw(camera), "pixels, on demand", name, rate_hz=rate_hz))
+            out.append(_Seen(robot.keys.camera_jpeg(camera), "image/jpeg, on demand", name))
+    return out

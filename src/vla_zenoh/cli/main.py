@@ -1,0 +1,90 @@
+"""``vla-zenoh``: puts the commands together. One file a command."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import typer
+import zenoh
+
+from vla_zenoh import __version__
+from vla_zenoh.cli import (
+    camera,
+    command,
+    doctor,
+    echo,
+    keys,
+    router,
+    set_prompt,
+    sim,
+    status,
+    switches,
+    up,
+    worker,
+)
+from vla_zenoh.cli.output import errors
+from vla_zenoh.errors import VlaZenohError
+
+RUN, DRIVE, LOOK = "Run", "Drive the robot", "Look"
+
+app = typer.Typer(
+    name="vla-zenoh",
+    help="Connects vision-language-action models to robots over Zenoh.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    add_completion=True,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"vla-zenoh {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version."
+    ),
+) -> None:
+    zenoh.init_log_from_env_or(os.environ.get("RUST_LOG", "error"))
+
+
+for panel, name, function in (
+    (RUN, "up", up.up),
+    (RUN, "router", router.router),
+    (RUN, "sim", sim.sim),
+    (RUN, "camera", camera.camera),
+    (RUN, "worker", worker.worker),
+    (RUN, "command", command.command),
+    (DRIVE, "prompt", set_prompt.prompt),
+    (DRIVE, "activate", switches.activate),
+    (DRIVE, "deactivate", switches.deactivate),
+    (DRIVE, "use", switches.use),
+    (DRIVE, "rate", switches.rate),
+    (DRIVE, "stop", switches.stop),
+    (DRIVE, "reset", switches.reset),
+    (LOOK, "status", status.status),
+    (LOOK, "echo", echo.echo),
+    (LOOK, "keys", keys.keys),
+    (LOOK, "doctor", doctor.doctor),
+):
+    app.command(name, rich_help_panel=panel)(function)
+
+
+def app_entry() -> None:
+    """Run the command line. Our own errors become one clear line and exit code 1."""
+    try:
+        app()
+    except VlaZenohError as error:
+        errors().print(f"[bold red]error:[/] {_plain(str(error))}", highlight=False, soft_wrap=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _plain(message: str) -> str:
+    return message.replace("[", "\\[")

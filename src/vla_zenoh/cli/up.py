@@ -1,0 +1,54 @@
+"""vla-zenoh up."""
+
+from __future__ import annotations
+
+import threading
+import zlib
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    ConnectOption,
+    HostOption,
+    ListenOption,
+    effective_profile,
+)
+from vla_zenoh.cli.output import console
+from vla_zenoh.nodes.launch import Host
+from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
+
+COLOURS = ("cyan", "magenta", "green", "yellow", "blue", "bright_cyan", "bright_magenta")
+
+
+def up(
+    profile: Annotated[str, typer.Argument(help="Name or path of a profile.")] = DEFAULT_PROFILE,
+    host: HostOption = None,
+    connect: ConnectOption = None,
+    listen: ListenOption = None,
+) -> None:
+    """Start and supervise all nodes that belong on this host. Ctrl-C brakes the arm first."""
+    stop = stop_on_signals()
+    die_with_parent()
+    loaded = effective_profile(profile, connect, listen)
+    out = console()
+    lock = threading.Lock()
+
+    def log(node: str, line: str, style: str = "") -> None:
+        colour = COLOURS[zlib.crc32(node.encode()) % len(COLOURS)]
+        text = f"[{style}]{escape(line)}[/]" if style else escape(line)
+        with lock:
+            out.print(f"[{colour}]{node:>16}[/] | {text}", highlight=False, soft_wrap=True)
+
+    def tell(node: str, sentence: str) -> None:
+        log(node, sentence, "bold")
+
+    with Host(loaded, host, log=log, tell=tell) as running:
+        where = ", ".join(loaded.session.connect)
+        tell("up", f"profile {loaded.name}, host {running.host}, router at {where}")
+        tell("up", "look: vla-zenoh status; drive: vla-zenoh prompt/activate; end: Ctrl-C")
+        running.serve(stop)
+        tell("up", "braking the arm, then ending every node")
+    tell("up", "all nodes have ended")

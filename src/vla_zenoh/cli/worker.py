@@ -1,0 +1,76 @@
+"""vla-zenoh worker."""
+
+from __future__ import annotations
+
+import os
+from typing import Annotated, Literal
+
+import typer
+
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    ConnectOption,
+    HostOption,
+    ProfileOption,
+    effective_profile,
+)
+from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.nodes.environment import run_in_own_environment
+from vla_zenoh.nodes.process import run_node
+from vla_zenoh.nodes.worker import WorkerNode
+from vla_zenoh.profile import Profile
+
+
+def worker(
+    model: Annotated[str, typer.Argument(help="Name of a model, or path to a file with one.")],
+    profile: ProfileOption = DEFAULT_PROFILE,
+    connect: ConnectOption = None,
+    name: Annotated[
+        str | None, typer.Option("--name", help="What its keys are called; the model's name else.")
+    ] = None,
+    options: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Option of the model as name=value; may be repeated."),
+    ] = None,
+    images: Annotated[
+        Literal["auto", "raw", "jpeg"],
+        typer.Option(help="Pictures to listen to; auto: raw when the cameras are on this host."),
+    ] = "auto",
+    host: HostOption = None,
+    python: Annotated[
+        str | None, typer.Option("--python", help="Interpreter of a prepared environment.")
+    ] = None,
+) -> None:
+    """Run a model: observations in, action chunks out on its delta key."""
+    loaded = effective_profile(profile, connect)
+    found = find_model(model)
+    chosen = _options(options or [])
+    # Comes back only where this environment has what the model's header asks for.
+    run_in_own_environment(found, python)
+    policy = make_policy(found, chosen)
+    form = _image_form(loaded, host) if images == "auto" else images
+    run_node(
+        loaded,
+        lambda session, stop: WorkerNode(
+            loaded, session, policy, name or found.name, images=form
+        ).run(stop),
+    )
+    # A model's library may leave threads behind that would keep the process.
+    os._exit(0)
+
+
+def _options(given: list[str]) -> dict[str, str]:
+    out: dict[str, str] = {}
+    for option in given:
+        key, equals, value = option.partition("=")
+        if not equals or not key.isidentifier():
+            raise typer.BadParameter(f"--set wants name=value, not {option!r}")
+        out[key] = value
+    return out
+
+
+def _image_form(profile: Profile, host: str | None) -> Literal["raw", "jpeg"]:
+    """Raw pictures within a host, JPEG from another one."""
+    if host is None or host not in profile.hosts:
+        return "raw"
+    return "raw" if "camera" in profile.hosts[host].nodes else "jpeg"

@@ -1,0 +1,200 @@
+"""A person's side of the bus: puts settings, reads what nodes say. What the CLI is made of."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import zenoh
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
+from vla_zenoh.errors import CodecError, SessionError
+from vla_zenoh.keys import Kind, last
+from vla_zenoh.nodes.session import QOS
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import Event, Header, NodeStatus, Task
+
+Value = TypeVar("Value")
+POLL_S = 0.02
+
+
+class Client:
+    """Puts plain text on setting keys and keeps the newest status of every node.
+
+    Args:
+        profile: for its keys.
+        session: open session.
+    """
+
+    def __init__(self, profile: Profile, session: zenoh.Session) -> None:
+        self.profile, self.session, self.keys = profile, session, profile.keys
+        self._lock = threading.Lock()
+        self.statuses: dict[str, tuple[NodeStatus, float]] = {}
+        self.alive: set[str] = set()
+        self.events: deque[tuple[str, Header, Event]] = deque(maxlen=4096)
+        self.task: Task | None = None
+        self._subscriptions: list[Any] = []
+
+    def follow(self) -> Client:
+        """Begin to listen to status, events, liveliness and the task."""
+        liveliness = self.session.liveliness()
+        self._subscriptions += [
+            self._subscribe(self.keys.all_status, self._on_status),
+            self._subscribe(self.keys.all_events, self._on_event),
+            self._subscribe(self.keys.task, self._on_task),
+            liveliness.declare_subscriber(
+                self.keys.all_alive,
+                zenoh.handlers.Callback(self._on_alive, indirect=False),
+                history=True,
+            ),
+        ]
+        return self
+
+    def _subscribe(self, key: str, callback: Callable[[zenoh.Sample], None]) -> Any:
+        return self.session.declare_subscriber(
+            key, zenoh.handlers.Callback(callback, indirect=False)
+        )
+
+    @staticmethod
+    def _decode(kind: type[Value], sample: zenoh.Sample) -> tuple[Header, Value] | None:
+        try:
+            attachment = sample.attachment
+            header = header_codec.decode(attachment.to_bytes() if attachment else None)
+            return header, records.decode(kind, sample.payload.to_bytes())
+        except CodecError:
+            return None  # a stranger's bytes; the nodes count and tell them
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        found = self._decode(NodeStatus, sample)
+        if found is not None:
+            with self._lock:
+                self.statuses[last(str(sample.key_expr))] = (found[1], time.monotonic())
+
+    def _on_event(self, sample: zenoh.Sample) -> None:
+        found = self._decode(Event, sample)
+        if found is not None:
+            with self._lock:
+                self.events.append((last(str(sample.key_expr)), *found))
+
+    def _on_task(self, sample: zenoh.Sample) -> None:
+        found = self._decode(Task, sample)
+        if found is not None:
+            self.task = found[1]
+
+    def _on_alive(self, sample: zenoh.Sample) -> None:
+        name = last(str(sample.key_expr))
+        with self._lock:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self.alive.add(name)
+            else:
+                self.alive.discard(name)
+
+    # -- reading ------------------------------------------------------------------------------
+    def status(self, node: str) -> NodeStatus | None:
+        """The newest status of a node, None before the first."""
+        with self._lock:
+            found = self.statuses.get(node)
+        return found[0] if found else None
+
+    def snapshot(self) -> dict[str, tuple[NodeStatus, float, bool]]:
+        """Node -> (status, seconds since it came, alive)."""
+        now = time.monotonic()
+        with self._lock:
+            return {
+                name: (status, now - heard, name in self.alive)
+                for name, (status, heard) in sorted(self.statuses.items())
+            }
+
+    def take_events(self) -> list[tuple[str, Header, Event]]:
+        """Events since the last call, oldest first."""
+        with self._lock:
+            events = list(self.events)
+            self.events.clear()
+        return events
+
+    def wait_for(
+        self, condition: Callable[[], Value | None], timeout_s: float
+    ) -> Value | None:
+        """Poll until `condition` gives something true, at most so long."""
+        give_up = time.monotonic() + timeout_s
+        while True:
+            found = condition()
+            if found or time.monotonic() > give_up:
+                return found or None
+            time.sleep(POLL_S)
+
+    # -- writing ------------------------------------------------------------------------------
+    def put(self, key: str, text: str) -> None:
+        """Put plain text, as any Zenoh client would."""
+        self.session.put(key, text, encoding=zenoh.Encoding.TEXT_PLAIN, **QOS[Kind.ORDER])
+
+    def set_prompt(self, prompt: str, timeout_s: float = 2.0) -> Task:
+        """Put a prompt and wait until the command node has taken it.
+
+        Raises:
+            SessionError: it did not; says why where it said so.
+        """
+        self.put(self.keys.prompt, prompt)
+        wanted = prompt.strip()
+        return self._settled(lambda: self.task and self.task.prompt == wanted, "prompt", timeout_s)
+
+    def set_rate(self, rate_hz: float, timeout_s: float = 2.0) -> Task:
+        """Likewise for the rate."""
+        self.put(self.keys.rate, f"{rate_hz:g}")
+        return self._settled(
+            lambda: self.task and abs(self.task.rate_hz - rate_hz) < 1e-6, "rate", timeout_s
+        )
+
+    def set_worker(self, worker: str, timeout_s: float = 2.0) -> Task:
+        """Likewise for the worker."""
+        self.put(self.keys.worker, worker)
+        return self._settled(lambda: self.task and self.task.worker == worker, "worker", timeout_s)
+
+    def activate(self, timeout_s: float = 3.0) -> Task:
+        """Activate and wait until the arm obeys.
+
+        Raises:
+            SessionError: it was refused, with every reason.
+        """
+        self.take_events()
+        self.put(self.keys.active, "true")
+        return self._settled(lambda: self.task and self.task.active, "activate", timeout_s)
+
+    def deactivate(self, timeout_s: float = 3.0) -> bool:
+        """Deactivate; True when the arm stands within `timeout_s`."""
+        self.put(self.keys.active, "false")
+        return bool(self.wait_for(self._stands, timeout_s))
+
+    def _stands(self) -> bool:
+        status = self.status("command")
+        return (
+            status is not None
+            and status.state not in ("active", "holding")
+            and status.detail.get("at_rest") is True
+        )
+
+    def _settled(self, condition: Callable[[], Any], what: str, timeout_s: float) -> Task:
+        reasons: list[str] = []
+
+        def look() -> bool:
+            for _, _, event in self.take_events():
+                if event.kind == "refusal" and event.what == f"{what}_refused":
+                    reasons.append(event.why)
+            return bool(reasons) or bool(condition())
+
+        self.wait_for(look, timeout_s)
+        if reasons:
+            time.sleep(0.1)  # the other reasons come right behind the first
+            look()
+            raise SessionError(f"{what} refused:\n  - " + "\n  - ".join(dict.fromkeys(reasons)))
+        if not condition() or self.task is None:
+            if "command" not in self.alive:
+                raise SessionError(f"{what}: no command node of robot {self.keys.robot!r} is alive")
+            status = self.status("command")
+            why = f"; it says: {status.detail.get('why', '')}" if status else ""
+            raise SessionError(f"{what}: the command node did not take it in {timeout_s:g} s{why}")
+        return self.task

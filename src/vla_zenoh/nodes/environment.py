@@ -1,0 +1,74 @@
+"""Runs a model in an environment of its own, as its PEP 723 header asks.
+
+Pins of different models cannot live in one environment, so a model whose dependencies are not here
+is started again by uv, which makes (and keeps) an environment with the model's pins and this very
+package in it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import sysconfig
+from pathlib import Path
+
+from vla_zenoh import __version__
+from vla_zenoh.errors import WorkerError
+from vla_zenoh.loader import ModelFile
+
+INSIDE_VARIABLE = "VLA_ZENOH_WORKER_ENVIRONMENT"
+
+
+def run_in_own_environment(model: ModelFile, python: str | None) -> None:
+    """Replace this process by one in the right environment; returns where this one is right.
+
+    Args:
+        model: the file.
+        python: interpreter of a prepared environment, which must have this package.
+
+    Raises:
+        WorkerError: another environment is needed and cannot be made.
+    """
+    missing = model.missing()
+    if INSIDE_VARIABLE in os.environ:
+        if missing:
+            raise WorkerError(
+                f"{model.path}: its environment lacks {', '.join(missing)}; is the header right?"
+            )
+        return
+    if python is None and not missing:
+        return
+    arguments = ["-m", "vla_zenoh", *sys.argv[1:]]
+    environment = {**os.environ, INSIDE_VARIABLE: str(model.path)}
+    if python is not None:
+        if shutil.which(python) is None:
+            raise WorkerError(f"--python {python!r} is not an interpreter")
+        os.execvpe(python, [python, *arguments], environment)
+    uv = _uv()
+    if uv is None:
+        raise WorkerError(
+            f"model {model.name!r} needs {', '.join(missing)}. Install uv (pip install uv) and it gets "
+            "an environment of its own, or name a prepared one with --python"
+        )
+    print(f"preparing an environment for {model.name}: {', '.join(model.dependencies)}", flush=True)
+    command = [uv, "run", "--no-project", "--quiet"]
+    if model.requires_python:
+        command += ["--python", model.requires_python]
+    for requirement in model.dependencies:
+        command += ["--with", requirement]
+    command += [*_this_package(), "python", *arguments]
+    os.execve(uv, command, environment)
+
+
+def _uv() -> str | None:
+    beside = Path(sysconfig.get_path("scripts")) / "uv"
+    return str(beside) if beside.is_file() else shutil.which("uv")
+
+
+def _this_package() -> list[str]:
+    """How uv gets the package that is running now: the checkout, else the same version."""
+    checkout = Path(__file__).resolve().parents[3]
+    if (checkout / "pyproject.toml").is_file() and (checkout / "src" / "vla_zenoh").is_dir():
+        return ["--with-editable", str(checkout)]
+    return ["--with", f"vla-zenoh=={__version__}"]

@@ -1,0 +1,181 @@
+"""Which nodes of a profile run on which host, and how a whole host is brought up and down."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+
+import zenoh
+
+from vla_zenoh.control.names import worker_node
+from vla_zenoh.errors import NodeError, ProfileError, SessionError
+from vla_zenoh.nodes.client import Client
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.nodes.supervisor import NodeCommand, Supervisor
+from vla_zenoh.profile import HostProfile, Profile, to_yaml
+
+START_ORDER = ("router", "sim", "command", "camera", "worker")
+ROUTER_PATIENCE_S = 10.0
+BRAKE_PATIENCE_S = 1.0
+STOP_BUDGET_S = 2.9
+
+
+def choose_host(profile: Profile, host: str | None) -> tuple[str, HostProfile]:
+    """The part of the profile for this computer.
+
+    Raises:
+        ProfileError: no such host, or several and none named.
+    """
+    if host is None:
+        if len(profile.hosts) == 1:
+            return next(iter(profile.hosts.items()))
+        raise ProfileError(
+            f"profile {profile.name} has hosts {', '.join(profile.hosts)}: say which one this is "
+            "with --host"
+        )
+    if host not in profile.hosts:
+        raise ProfileError(
+            f"profile {profile.name} has no host {host!r}; it has: {', '.join(profile.hosts)}"
+        )
+    return host, profile.hosts[host]
+
+
+def node_commands(
+    profile: Profile,
+    host: str,
+    profile_file: Path,
+    worker_options: Mapping[str, Sequence[str]] | None = None,
+) -> list[NodeCommand]:
+    """Command lines of all nodes of `host`, in the order to start them."""
+    part = profile.hosts[host]
+    common = ("--profile", str(profile_file))
+    commands: list[NodeCommand] = []
+    for kind in sorted(part.nodes, key=START_ORDER.index):
+        if kind == "worker":
+            for worker in part.workers or profile.workers:
+                options = [
+                    word for option in (worker_options or {}).get(worker, ()) for word in ("--set", option)
+                ]
+                arguments = ("worker", worker, *common, "--host", host, *options)
+                commands.append(NodeCommand(worker_node(worker), kind, arguments))
+        elif kind == "camera":
+            commands.append(NodeCommand(kind, kind, ("camera", *(part.cameras or ()), *common)))
+        else:
+            commands.append(NodeCommand(kind, kind, (kind, *common)))
+    return commands
+
+
+class Host:
+    """All nodes of one host, up while the context lasts.
+
+    Args:
+        profile: the effective profile.
+        host: which host; None where there is only one.
+        log: (node, line) for what nodes write.
+        tell: (node, sentence) for what happens to them.
+        own_router: refuse to use a router that answers already.
+        worker_options: worker -> ``name=value`` options.
+
+    Raises:
+        NodeError: a router answers although `own_router`.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        host: str | None,
+        *,
+        log: Callable[[str, str], None],
+        tell: Callable[[str, str], None],
+        own_router: bool = False,
+        worker_options: Mapping[str, Sequence[str]] | None = None,
+    ) -> None:
+        self.host, part = choose_host(profile, host)
+        if part.connect is not None:
+            data = profile.model_dump()
+            data["session"]["connect"] = part.connect
+            profile = Profile.model_validate(data)
+        self.profile, self._part, self._tell = profile, part, tell
+        self._folder = tempfile.TemporaryDirectory(prefix="vla-zenoh-")
+        # Children read the very profile that is in force here, whatever its options were.
+        self.profile_file = Path(self._folder.name) / f"{profile.name}.yaml"
+        self.profile_file.write_text(to_yaml(profile), "utf-8")
+        self.supervisor = Supervisor(
+            node_commands(profile, self.host, self.profile_file, worker_options), log=log, tell=tell
+        )
+        self._own_router = own_router
+        self.session: zenoh.Session | None = None
+        self.client: Client | None = None
+
+    def __enter__(self) -> Host:
+        try:
+            self._start()
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def _start(self) -> None:
+        answers = self._router_answers()
+        if answers and self._own_router:
+            raise NodeError(f"a router answers already at {', '.join(self.profile.session.connect)}")
+        if "router" in self._part.nodes:
+            if answers:
+                self._tell("router", "one answers already; using it")
+                self.supervisor.children = [
+                    child for child in self.supervisor.children if child.command.kind != "router"
+                ]
+            else:
+                self.supervisor.start(["router"])
+        self.session = open_session(self.profile.session, wait_s=ROUTER_PATIENCE_S)
+        self.client = Client(self.profile, self.session).follow()
+        self.supervisor.start()
+
+    def _router_answers(self) -> bool:
+        try:
+            open_session(self.profile.session).close()
+        except SessionError:
+            return False
+        return True
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """Brake the arm, then end every node; within `STOP_BUDGET_S` in all."""
+        deadline_s = time.monotonic() + STOP_BUDGET_S
+        if self.client is not None and "command" in self.supervisor.pids():
+            self._brake(self.client)
+        if self.session is not None:
+            self.session.close()
+            self.session = self.client = None
+        self.supervisor.stop(deadline_s)
+        self._folder.cleanup()
+
+    def _brake(self, client: Client) -> None:
+        try:
+            if not client.deactivate(BRAKE_PATIENCE_S):
+                self._tell("command", "does not say that the arm stands")
+        except zenoh.ZError as error:
+            self._tell("command", f"cannot be told to brake ({error}); ending it brakes too")
+
+    def serve(self, stop: threading.Event) -> None:
+        """Watch over the nodes until `stop` is set.
+
+        Raises:
+            NodeError: a node dies again and again.
+        """
+        while not stop.wait(0.1):
+            if not self.supervisor.watch():
+                given_up = self.supervisor.given_up
+                name = given_up.command.name if given_up else "a node"
+                raise NodeError(f"{name} dies again and again; its last lines above say why")

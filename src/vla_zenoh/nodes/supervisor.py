@@ -1,0 +1,175 @@
+"""Starts a host's nodes, restarts those that die, and ends them all in an order that is safe."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from vla_zenoh.nodes.process import PARENT_VARIABLE
+
+BACKOFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
+STABLE_S = 10.0
+"""A node that ran this long starts with the shortest backoff again."""
+GIVE_UP_AFTER = 6
+"""Deaths in a row, each before `STABLE_S`."""
+TERM_PATIENCE_S = 1.6
+STOP_ORDER = ("worker", "camera", "command", "sim", "router")
+POLL_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class NodeCommand:
+    """A node to run.
+
+    Args:
+        name: as in logs and status.
+        kind: router, sim, camera, command or worker.
+        arguments: of the command line, after ``vla-zenoh``.
+    """
+
+    name: str
+    kind: str
+    arguments: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class Child:
+    """A running node."""
+
+    command: NodeCommand
+    process: subprocess.Popen[str] | None = None
+    started_s: float = 0.0
+    deaths_in_a_row: int = 0
+    restarts: int = 0
+    start_again_s: float = 0.0
+    threads: list[threading.Thread] = field(default_factory=list)
+
+
+class Supervisor:
+    """See the module. Start and stop from one thread that lives as long as the nodes.
+
+    Args:
+        commands: in the order to start them.
+        log: called with (node name, line) for every line a node writes.
+        tell: called with (node name, sentence) for what the supervisor does.
+    """
+
+    def __init__(
+        self,
+        commands: Sequence[NodeCommand],
+        *,
+        log: Callable[[str, str], None],
+        tell: Callable[[str, str], None],
+    ) -> None:
+        self.children = [Child(command) for command in commands]
+        self._log, self._tell = log, tell
+        self.given_up: Child | None = None
+
+    def start(self, kinds: Sequence[str] | None = None) -> None:
+        """Start those of `kinds` (None: all) that do not run yet."""
+        for child in self.children:
+            if child.process is None and (kinds is None or child.command.kind in kinds):
+                self._spawn(child)
+
+    def watch(self) -> bool:
+        """Restart what died. False: a node dies again and again, and it makes no sense to go on."""
+        now = time.monotonic()
+        for child in self.children:
+            if child.process is not None and child.process.poll() is not None:
+                self._mourn(child, child.process.returncode, now)
+            elif child.process is None and child.start_again_s and now >= child.start_again_s:
+                child.restarts += 1
+                self._spawn(child)
+            if child.deaths_in_a_row >= GIVE_UP_AFTER:
+                self.given_up = child
+                self._tell(child.command.name, f"died {GIVE_UP_AFTER} times in a row; giving up")
+                return False
+        return True
+
+    def stop(self, deadline_s: float) -> None:
+        """End all nodes, commanding ones before the robot, the router last, by `deadline_s`.
+
+        Args:
+            deadline_s: on the monotonic clock; what still runs then is killed.
+        """
+        for kind in STOP_ORDER[:-1]:
+            self._signal(kind, signal.SIGTERM)
+        last = max(time.monotonic(), min(deadline_s - 0.4, time.monotonic() + TERM_PATIENCE_S))
+        self._await([c for c in self.children if c.command.kind != "router"], last)
+        self._signal("router", signal.SIGTERM)
+        self._await(self.children, min(deadline_s, last + 0.4))
+        self.kill()
+        for child in self.children:
+            for thread in child.threads:
+                thread.join(0.2)
+
+    def kill(self) -> None:
+        """End whatever still runs, at once."""
+        for child in self.children:
+            if child.process is not None and child.process.poll() is None:
+                child.process.kill()
+                child.process.wait()
+
+    def pids(self) -> dict[str, int]:
+        """Node name -> process number of those that run."""
+        return {
+            child.command.name: child.process.pid
+            for child in self.children
+            if child.process is not None and child.process.poll() is None
+        }
+
+    def _spawn(self, child: Child) -> None:
+        environment = dict(os.environ)
+        environment[PARENT_VARIABLE] = str(os.getpid())
+        environment["PYTHONUNBUFFERED"] = "1"
+        child.process = subprocess.Popen(
+            [sys.executable, "-m", "vla_zenoh", *child.command.arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env=environment,
+            # Ctrl-C in the terminal must reach the supervisor alone: it brakes the arm first.
+            start_new_session=True,
+        )
+        child.started_s, child.start_again_s = time.monotonic(), 0.0
+        thread = threading.Thread(
+            target=self._forward, args=(child.command.name, child.process), daemon=True
+        )
+        thread.start()
+        child.threads = [thread]
+        self._tell(child.command.name, f"started (pid {child.process.pid})")
+
+    def _forward(self, name: str, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        with process.stdout as lines:
+            for line in lines:
+                self._log(name, line.rstrip("\n"))
+
+    def _mourn(self, child: Child, code: int, now: float) -> None:
+        stable = now - child.started_s > STABLE_S
+        child.deaths_in_a_row = 1 if stable else child.deaths_in_a_row + 1
+        wait_s = BACKOFF_S[min(child.deaths_in_a_row, len(BACKOFF_S)) - 1]
+        child.process, child.start_again_s = None, now + wait_s
+        how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+        self._tell(child.command.name, f"{how}; starting again in {wait_s:g} s")
+
+    def _signal(self, kind: str, number: signal.Signals) -> None:
+        for child in self.children:
+            running = child.process is not None and child.process.poll() is None
+            if child.command.kind == kind and running and child.process is not None:
+                child.process.send_signal(number)
+
+    @staticmethod
+    def _await(children: Sequence[Child], deadline_s: float) -> None:
+        while time.monotonic() < deadline_s:
+            if all(c.process is None or c.process.poll() is not None for c in children):
+                return
+            time.sleep(POLL_S)
