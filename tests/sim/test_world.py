@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -165,6 +166,46 @@ def test_a_simulation_that_blows_up_raises_and_can_be_reset() -> None:
         wait(world, reference, 0.01)
     world.reset()
     wait(world, reference, 0.01)
+
+
+TWO_BRICKS = """
+<mujoco>
+  <custom>
+    <numeric name="place/blue" data="0.4 0.5 -0.2 0.2 0 0"/>
+    <numeric name="place/red" data="0.4 0.5 -0.2 0.2 0 0"/>
+  </custom>
+  <worldbody>
+    <geom type="plane" size="2 2 0.1"/>
+    <body name="blue" pos="0.4 0.1 0.02"><freejoint/><geom type="box" size="0.02 0.02 0.02"/></body>
+    <body name="red" pos="0.4 -0.1 0.02"><freejoint/><geom type="box" size="0.02 0.02 0.02"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_another_scene_is_only_another_folder(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text(TWO_BRICKS)
+    world = World(
+        str(tmp_path), RobotModel(), home_rad=HOME_RAD, gains=ImpedanceGains.stiff(), seed=1
+    )
+    objects = world.objects()
+    assert list(objects) == ["blue", "red"]
+    assert np.linalg.norm(objects["blue"][0] - objects["red"][0]) > 0.04 * np.sqrt(2)
+    wait(world, world.hold_reference(), 0.1)
+
+
+def test_a_region_for_an_unknown_object_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text(TWO_BRICKS.replace("place/red", "place/green"))
+    with pytest.raises(ResourceError, match="places 'green', but can only place: blue, red"):
+        World(str(tmp_path), RobotModel(), home_rad=HOME_RAD, gains=ImpedanceGains(), seed=1)
+
+
+def test_regions_too_small_for_their_objects_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text(
+        TWO_BRICKS.replace("-0.2 0.2 0 0", "0 0.01 0 0").replace("0.4 0.5", "0.4 0.41")
+    )
+    with pytest.raises(ResourceError, match="no room for blue, red"):
+        World(str(tmp_path), RobotModel(), home_rad=HOME_RAD, gains=ImpedanceGains(), seed=1)
 
 
 def test_a_scene_that_does_not_exist_is_refused() -> None:
