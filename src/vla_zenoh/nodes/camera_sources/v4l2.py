@@ -1,0 +1,98 @@
+"""Cameras of this computer, through Video4Linux."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+
+import cv2
+
+from vla_zenoh.errors import NodeError
+from vla_zenoh.nodes.camera_sources.opencv import Capture
+from vla_zenoh.nodes.camera_sources.source import STALL_S, Pixels
+from vla_zenoh.profile.schema import CameraProfile
+
+DEV = Path("/dev")
+MAX_UNCOMPRESSED_PX = 640 * 480
+"""USB 2 carries this many pixels 30 times a second uncompressed, and no more."""
+SANE_AGE_S = 1.0
+
+
+class V4l2Source:
+    """A device such as ``/dev/video0`` or ``/dev/v4l/by-id/...``, or its number.
+
+    Args:
+        device: path or number.
+        profile: asks the device for this size and rate; it may give another.
+    """
+
+    def __init__(self, device: str, profile: CameraProfile) -> None:
+        self._path = DEV / f"video{device}" if device.isdecimal() else Path(device)
+        self._profile = profile
+        self._capture = Capture()
+
+    @property
+    def backend(self) -> str:
+        return self._capture.backend
+
+    def open(self) -> None:
+        why = why_not(self._path)
+        if why:
+            raise NodeError(why)
+        width, height = self._profile.width, self._profile.height
+        options = [
+            *(cv2.CAP_PROP_FRAME_WIDTH, width),
+            *(cv2.CAP_PROP_FRAME_HEIGHT, height),
+            *(cv2.CAP_PROP_FPS, max(1, round(self._profile.rate_hz))),
+        ]
+        if width * height > MAX_UNCOMPRESSED_PX:
+            options = [cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"), *options]
+        # A device that cannot be set so refuses to open with options, and may do without.
+        if not self._capture.open(str(self._path), cv2.CAP_V4L2, options) and not (
+            self._capture.open(str(self._path), cv2.CAP_V4L2)
+        ):
+            raise NodeError(
+                f"{self._path} is there but cannot be opened as a camera: does another program use "
+                f"it (fuser -v {self._path})? Where one camera has several devices, only the first "
+                "gives pictures"
+            )
+
+    def grab(self, stop: threading.Event) -> int | None:
+        if not self._capture.grab():
+            raise NodeError(f"{self._path} gave no picture for {STALL_S:g} s, or was pulled out")
+        return captured_ns(self._capture.get(cv2.CAP_PROP_POS_MSEC), time.monotonic_ns())
+
+    def retrieve(self) -> Pixels | None:
+        return self._capture.retrieve()
+
+    def close(self) -> None:
+        self._capture.close()
+
+
+def captured_ns(position_ms: float, now_ns: int) -> int:
+    """Time of capture, from the kernel's stamp where that is of the monotonic clock.
+
+    Args:
+        position_ms: what the driver says; some say 0, or wall time.
+        now_ns: monotonic time right after the picture was grabbed.
+    """
+    stamp_ns = round(position_ms * 1e6)
+    return stamp_ns if 0 <= now_ns - stamp_ns < SANE_AGE_S * 1e9 else now_ns
+
+
+def why_not(path: Path) -> str:
+    """Why this user cannot open `path`, and what to do; empty when nothing speaks against it."""
+    if not path.exists():
+        there = ", ".join(map(str, sorted(DEV.glob("video[0-9]*")))) or "none"
+        return (
+            f"there is no {path}; cameras here: {there}. Plug it in, or correct its source in the "
+            f"profile; in a container: --device={path}"
+        )
+    if not os.access(path, os.R_OK | os.W_OK):
+        return (
+            f"no permission for {path}: sudo usermod --append --groups video $USER, then log in "
+            "again"
+        )
+    return ""
