@@ -17,6 +17,9 @@ SCHEMA = 1
 
 DEFAULT_ROOT = "vla"
 
+MAX_CHUNK = 64
+"""Characters between two slashes."""
+
 _CHUNK = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
 
@@ -36,10 +39,11 @@ def chunk(name: str, what: str) -> str:
     Raises:
         ProfileError: it cannot; says what is allowed.
     """
-    if not _CHUNK.fullmatch(name):
+    if len(name) > MAX_CHUNK or not _CHUNK.fullmatch(name):
+        shown = name if len(name) <= MAX_CHUNK else f"{name[:MAX_CHUNK]}..."
         raise ProfileError(
-            f"{what} {name!r} cannot be part of a key: use letters, digits, '_', '-' and '.', "
-            "starting with a letter, digit or '_'"
+            f"{what} {shown!r} cannot be part of a key: use letters, digits, '_', '-' and '.', "
+            f"starting with a letter, digit or '_', at most {MAX_CHUNK} of them"
         )
     return name
 
@@ -211,7 +215,6 @@ class Keys:
     def short(self, key: str) -> str:
         """`key` without the root and robot, as people say it; other keys as they are."""
         return key.removeprefix(f"{self.root}/{self.robot}/")
-
 
 
 def last(key: str) -> str:

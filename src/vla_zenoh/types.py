@@ -12,6 +12,7 @@ frame's axes and the TCP's origin. Quaternions are stored ``x, y, z, w``.
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
@@ -25,19 +26,53 @@ FloatArray = NDArray[np.float64]
 
 QUATERNION_NORM_TOLERANCE = 1e-3
 MAX_TEXT = 4096
+MAX_VECTOR = 10_000
+MAX_CHUNK_NUMBERS = 100_000
+MAX_NAMES = 1024
+MAX_ENTRIES = 1024
+MAX_DETAIL_TEXT = 65_536
+MAX_DETAIL_DEPTH = 4
+EVENT_LEVELS = ("info", "warning", "error")
+EVENT_KINDS = ("refusal", "transition", "limit", "fault", "notice")
+_NUMBER_KINDS = "iuf"
+
+
+def shown(value: Any) -> str:
+    """`value` in short, for an error message: it may be huge, nested, or refuse to be printed."""
+    if isinstance(value, (str, bytes)):
+        value = value[:80]
+    return reprlib.repr(value)
+
+
+def _numbers(name: str, value: ArrayLike) -> NDArray[Any]:
+    """`value` as an array that numpy did not have to read out of text, truth values or objects."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise RecordError(f"{name} is not a list of numbers: {error}") from error
+    if array.dtype.kind not in _NUMBER_KINDS or _holds_bool(value):
+        raise RecordError(f"{name} is not a list of numbers: {shown(value)}")
+    return array
+
+
+def _holds_bool(value: Any) -> bool:
+    """Whether a list that became an array of numbers had a truth value among them."""
+    if isinstance(value, (list, tuple)):
+        return any(_holds_bool(item) for item in value)
+    return isinstance(value, (bool, np.bool_))
 
 
 def vector(name: str, value: ArrayLike, size: int | None) -> FloatArray:
     """Copy `value` into a finite, read-only float64 vector of `size` (None: any size)."""
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise RecordError(f"{name} is not a list of numbers: {error}") from error
+    array = _numbers(name, value)
     if array.ndim != 1 or (size is not None and array.shape[0] != size):
         wanted = "(n,)" if size is None else f"({size},)"
         raise RecordError(f"{name} has shape {array.shape}, wanted {wanted}")
+    if len(array) > MAX_VECTOR:
+        raise RecordError(f"{name} has {len(array)} numbers, at most {MAX_VECTOR} are allowed")
+    array = np.array(array, dtype=np.float64, order="C")
     if not np.isfinite(array).all():
-        raise RecordError(f"{name} is not finite: {array.tolist()}")
+        raise RecordError(f"{name} is not finite: {shown(array.tolist())}")
     array.setflags(write=False)
     return array
 
@@ -53,40 +88,91 @@ def unit_quaternion(name: str, value: ArrayLike) -> FloatArray:
     return array
 
 
-def number(
-    name: str, value: Any, minimum: float = -math.inf, maximum: float = math.inf
-) -> float:
+def number(name: str, value: Any, minimum: float = -math.inf, maximum: float = math.inf) -> float:
     """A finite float within ``[minimum, maximum]``."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise RecordError(f"{name} is not a number: {value!r}")
-    if not math.isfinite(value) or not minimum <= value <= maximum:
-        raise RecordError(f"{name} is {value!r}, wanted a number in [{minimum:g}, {maximum:g}]")
-    return float(value)
+        raise RecordError(f"{name} is not a number: {shown(value)}")
+    try:
+        result = float(value)
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result) or not minimum <= result <= maximum:
+        raise RecordError(
+            f"{name} is {shown(value)}, wanted a number in [{minimum:g}, {maximum:g}]"
+        )
+    return result
 
 
 def integer(name: str, value: Any, minimum: int = 0, maximum: int = 2**63 - 1) -> int:
     """An int within ``[minimum, maximum]``."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise RecordError(f"{name} is not a whole number: {value!r}")
+        raise RecordError(f"{name} is not a whole number: {shown(value)}")
     if not minimum <= value <= maximum:
-        raise RecordError(f"{name} is {value!r}, wanted a whole number in [{minimum}, {maximum}]")
+        raise RecordError(
+            f"{name} is {shown(value)}, wanted a whole number in [{minimum}, {maximum}]"
+        )
     return int(value)
 
 
 def text(name: str, value: Any, limit: int = MAX_TEXT) -> str:
-    """A str of at most `limit` characters."""
+    """A str of at most `limit` characters, all of which UTF-8 can carry."""
     if not isinstance(value, str):
         raise RecordError(f"{name} is not text: {type(value).__name__}")
     if len(value) > limit:
         raise RecordError(f"{name} has {len(value)} characters, at most {limit} are allowed")
+    if not value.isascii():
+        try:
+            value.encode("utf-8")
+        except UnicodeEncodeError as error:
+            raise RecordError(f"{name} holds half a character (a surrogate)") from error
     return value
+
+
+def texts(name: str, value: Any, limit: int) -> tuple[str, ...]:
+    """A tuple of texts, of a list or tuple; a single str is not a list of its letters."""
+    if not isinstance(value, (list, tuple)):
+        raise RecordError(f"{name} is not a list of texts: {shown(value)}")
+    if len(value) > MAX_NAMES:
+        raise RecordError(f"{name} has {len(value)} entries, at most {MAX_NAMES} are allowed")
+    return tuple(text(name, item, limit) for item in value)
 
 
 def boolean(name: str, value: Any) -> bool:
     """A bool, and nothing that merely looks like one."""
     if not isinstance(value, (bool, np.bool_)):
-        raise RecordError(f"{name} is not true or false: {value!r}")
+        raise RecordError(f"{name} is not true or false: {shown(value)}")
     return bool(value)
+
+
+def entries(name: str, value: Any) -> dict[str, Any]:
+    """A copy of a map from short names to anything."""
+    if not isinstance(value, Mapping):
+        raise RecordError(f"{name} is not a map: {shown(value)}")
+    if len(value) > MAX_ENTRIES:
+        raise RecordError(f"{name} has {len(value)} entries, at most {MAX_ENTRIES} are allowed")
+    return {text(f"a name in {name}", key, 256): item for key, item in value.items()}
+
+
+def details(name: str, value: Any, depth: int = MAX_DETAIL_DEPTH) -> Any:
+    """Text, finite numbers, bools and None, in lists and maps that are not nested deep."""
+    if value is None or isinstance(value, (bool, np.bool_)):
+        return value if value is None else bool(value)
+    if isinstance(value, str):
+        return text(name, value, MAX_DETAIL_TEXT)
+    if isinstance(value, (int, np.integer)):
+        return integer(name, value, -(2**63))
+    if isinstance(value, (float, np.floating)):
+        return number(name, value)
+    if depth == 0:
+        raise RecordError(f"{name} is nested too deep")
+    if isinstance(value, Mapping):
+        return {
+            key: details(f"{name}.{key}", item, depth - 1)
+            for key, item in entries(name, value).items()
+        }
+    if isinstance(value, (list, tuple)) and len(value) <= MAX_ENTRIES:
+        return [details(name, item, depth - 1) for item in value]
+    raise RecordError(f"{name} is not text, a number, a bool, a list or a map: {shown(value)}")
 
 
 def _set(record: Any, name: str, value: Any) -> None:
@@ -108,8 +194,8 @@ class Header:
     source: str
 
     def __post_init__(self) -> None:
-        integer("stamp_wall_ns", self.stamp_wall_ns)
-        integer("seq", self.seq)
+        _set(self, "stamp_wall_ns", integer("stamp_wall_ns", self.stamp_wall_ns))
+        _set(self, "seq", integer("seq", self.seq))
         text("source", self.source, 128)
 
 
@@ -143,6 +229,9 @@ class Image:
             raise RecordError("an image must be a uint8 array (H, W, 3) in RGB order")
         if rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape:
             raise RecordError(f"an image has shape {rgb.shape}, wanted (H, W, 3)")
+        rgb = np.ascontiguousarray(rgb).view()  # the maker's own array stays as writable as it was
+        rgb.setflags(write=False)
+        _set(self, "rgb", rgb)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,9 +244,9 @@ class JointState:
     effort_nm: FloatArray
 
     def __post_init__(self) -> None:
-        names = tuple(text("names", name, 128) for name in self.names)
+        names = texts("names", self.names, 128)
         if not names or len(set(names)) != len(names):
-            raise RecordError(f"joint names must be present and differ: {names}")
+            raise RecordError(f"joint names must be present and differ: {shown(names)}")
         _set(self, "names", names)
         for name in ("position_rad", "velocity_rad_s", "effort_nm"):
             _set(self, name, vector(name, getattr(self, name), len(names)))
@@ -223,11 +312,11 @@ class GripperState:
     faults: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        number("width_m", self.width_m, -0.01, 1.0)
-        boolean("moving", self.moving)
-        boolean("holding", self.holding)
+        _set(self, "width_m", number("width_m", self.width_m, -0.01, 1.0))
+        _set(self, "moving", boolean("moving", self.moving))
+        _set(self, "holding", boolean("holding", self.holding))
         text("mode", self.mode, 128)
-        _set(self, "faults", tuple(text("faults", fault, 512) for fault in self.faults))
+        _set(self, "faults", texts("faults", self.faults, 512))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -272,14 +361,15 @@ class ActionChunk:
             "inference_start_ns",
             "inference_end_ns",
         ):
-            integer(name, getattr(self, name))
-        boolean("done", self.done)
-        try:
-            steps = np.array(self.steps, dtype=np.float32, order="C")
-        except (TypeError, ValueError) as error:
-            raise RecordError(f"steps is not an array of numbers: {error}") from error
+            _set(self, name, integer(name, getattr(self, name)))
+        _set(self, "done", boolean("done", self.done))
+        steps = _numbers("steps", self.steps)
         if steps.ndim != 2 or 0 in steps.shape:
             raise RecordError(f"steps has shape {steps.shape}, wanted (H, D)")
+        if steps.size > MAX_CHUNK_NUMBERS:
+            raise RecordError(f"steps has {steps.size} numbers, at most {MAX_CHUNK_NUMBERS}")
+        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, seen below
+            steps = np.array(steps, dtype=np.float32, order="C")
         if not np.isfinite(steps).all():
             raise RecordError("steps holds NaN or infinity")
         steps.setflags(write=False)
@@ -303,7 +393,7 @@ class Cause:
         text("worker", self.worker, 128)
         for name in self.__dataclass_fields__:
             if name != "worker":
-                integer(name, getattr(self, name))
+                _set(self, name, integer(name, getattr(self, name)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -338,6 +428,8 @@ class PoseCommand:
         for name in ("twist", "acceleration"):
             _set(self, name, vector(name, getattr(self, name), 6))
         text("state", self.state, 32)
+        if self.cause is not None and not isinstance(self.cause, Cause):
+            raise RecordError(f"cause is not a Cause: {shown(self.cause)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -349,9 +441,9 @@ class GripperCommand:
     force_n: float
 
     def __post_init__(self) -> None:
-        number("width_m", self.width_m, 0.0, 1.0)
-        number("speed_m_s", self.speed_m_s, 1e-4, 10.0)
-        number("force_n", self.force_n, 0.0, 1000.0)
+        _set(self, "width_m", number("width_m", self.width_m, 0.0, 1.0))
+        _set(self, "speed_m_s", number("speed_m_s", self.speed_m_s, 1e-4, 10.0))
+        _set(self, "force_n", number("force_n", self.force_n, 0.0, 1000.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,11 +466,11 @@ class Task:
     rate_hz: float
 
     def __post_init__(self) -> None:
-        integer("episode", self.episode)
-        boolean("active", self.active)
+        _set(self, "episode", integer("episode", self.episode))
+        _set(self, "active", boolean("active", self.active))
         text("prompt", self.prompt)
         text("worker", self.worker, 128)
-        number("rate_hz", self.rate_hz, 0.01, 1000.0)
+        _set(self, "rate_hz", number("rate_hz", self.rate_hz, 0.01, 1000.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -395,7 +487,8 @@ class NodeStatus:
         rates_hz: of what it writes and loops.
         latency_ms: stage -> ``[p50, p95]``.
         counters: everything counted; refusals as ``refused.<reason>``.
-        detail: whatever else a person wants to know; values are str, int, float, bool or lists.
+        detail: whatever else a person wants to know: text, finite numbers, bools and None, in
+            lists and maps that are not nested deep.
     """
 
     node: str
@@ -412,11 +505,21 @@ class NodeStatus:
     def __post_init__(self) -> None:
         for name in ("node", "state", "host"):
             text(name, getattr(self, name), 256)
-        integer("pid", self.pid)
-        integer("started_wall_ns", self.started_wall_ns)
-        for name in ("ages_s", "rates_hz", "latency_ms", "counters", "detail"):
-            if not isinstance(getattr(self, name), Mapping):
-                raise RecordError(f"{name} is not a map")
+        _set(self, "pid", integer("pid", self.pid))
+        _set(self, "started_wall_ns", integer("started_wall_ns", self.started_wall_ns))
+        for name in ("ages_s", "rates_hz"):
+            given = entries(name, getattr(self, name))
+            _set(self, name, {key: number(f"{name}.{key}", v) for key, v in given.items()})
+        given = entries("counters", self.counters)
+        _set(self, "counters", {key: integer(f"counters.{key}", v) for key, v in given.items()})
+        given = entries("latency_ms", self.latency_ms)
+        _set(self, "latency_ms", {key: _pair(f"latency_ms.{key}", v) for key, v in given.items()})
+        _set(self, "detail", details("detail", entries("detail", self.detail)))
+
+
+def _pair(name: str, value: Any) -> tuple[float, float]:
+    low, high = vector(name, value, 2).tolist()
+    return low, high
 
 
 @dataclass(frozen=True, slots=True)
@@ -444,7 +547,11 @@ class Event:
     def __post_init__(self) -> None:
         for name in ("level", "kind", "what", "why"):
             text(name, getattr(self, name))
-        integer("count", self.count, 1)
+        for name, allowed in (("level", EVENT_LEVELS), ("kind", EVENT_KINDS)):
+            if getattr(self, name) not in allowed:
+                given = shown(getattr(self, name))
+                raise RecordError(f"{name} is {given}, allowed: {', '.join(allowed)}")
+        _set(self, "count", integer("count", self.count, 1))
         for name in ("value", "limit"):
             if getattr(self, name) is not None:
                 _set(self, name, number(name, getattr(self, name)))
@@ -482,7 +589,19 @@ class ObjectPoses:
     quat_xyzw: FloatArray
 
     def __post_init__(self) -> None:
-        _set(self, "names", tuple(text("names", name, 128) for name in self.names))
+        names = texts("names", self.names, 128)
+        _set(self, "names", names)
         for name, size in (("position_m", 3), ("quat_xyzw", 4)):
-            flat = vector(name, np.ravel(getattr(self, name)), len(self.names) * size)
-            _set(self, name, flat.reshape(len(self.names), size))
+            rows = _numbers(name, getattr(self, name))
+            if not names and rows.size == 0:  # an empty list does not say how wide it is
+                rows = rows.reshape(0, size)
+            if rows.shape != (len(names), size):
+                raise RecordError(f"{name} has shape {rows.shape}, wanted ({len(names)}, {size})")
+            check = unit_quaternion if name == "quat_xyzw" else _point
+            array = np.array([check(name, row) for row in rows]).reshape(len(names), size)
+            array.setflags(write=False)
+            _set(self, name, array)
+
+
+def _point(name: str, value: ArrayLike) -> FloatArray:
+    return vector(name, value, 3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from vla_zenoh import keys
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, RecordError
-from vla_zenoh.types import Header
+from vla_zenoh.types import Header, shown
 
 MAX_HEADER_BYTES = 1024
 
@@ -26,7 +26,8 @@ def decode(attachment: bytes | None) -> Header:
     """Read an attachment.
 
     Raises:
-        CodecError: ``no_header``, ``malformed``, or ``schema`` for another version.
+        CodecError: ``no_header``, ``malformed``, ``schema`` for another version, or ``invalid``
+            for a value out of range. Fields that a later version may add are passed over.
     """
     if attachment is None:
         raise CodecError("no_header", "the sample has no attachment; streams carry a header there")
@@ -35,9 +36,10 @@ def decode(attachment: bytes | None) -> Header:
     data = message.unpack(attachment)
     if not isinstance(data, dict):
         raise CodecError("malformed", f"the header is a {type(data).__name__}, wanted a map")
-    if data.get("schema") != keys.SCHEMA:
+    schema = data.get("schema")
+    if type(schema) is not int or schema != keys.SCHEMA:
         raise CodecError(
-            "schema", f"schema {data.get('schema')!r} is not ours ({keys.SCHEMA}); update one side"
+            "schema", f"schema {shown(schema)} is not ours ({keys.SCHEMA}); update one side"
         )
     try:
         return Header(data["stamp_wall_ns"], data["seq"], data["source"])

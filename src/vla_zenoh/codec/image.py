@@ -13,13 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import CodecError
-from vla_zenoh.types import Image
+from vla_zenoh.types import Image, shown
 
 MAX_SIDE = 8192
+MAX_PIXELS = 8192 * 4096
+"""A few forged bytes of JPEG can ask for this many pixels; three bytes of memory each."""
 MAX_JPEG_BYTES = 32 * 1024 * 1024
 DEFAULT_JPEG_QUALITY = 90
 
-_RAW_SCHEMA = re.compile(r"rgb8;(\d{1,5})x(\d{1,5})")
+_RAW_SCHEMA = re.compile(r"rgb8;([0-9]{1,5})x([0-9]{1,5})")
+# JPEG markers: frame headers carry the size; some others have no length field behind them.
+_FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_WITHOUT_LENGTH = frozenset({0x00, 0x01}) | frozenset(range(0xD0, 0xDA))
 
 
 def raw_schema(image: Image) -> str:
@@ -41,19 +46,22 @@ def decode_raw(payload: bytes, schema: str) -> Image:
     """
     match = _RAW_SCHEMA.fullmatch(schema)
     if match is None:
-        raise CodecError("malformed", f"raw image schema {schema!r}, wanted rgb8;HEIGHTxWIDTH")
+        raise CodecError("malformed", f"raw image schema {shown(schema)}, wanted rgb8;HEIGHTxWIDTH")
     height, width = int(match[1]), int(match[2])
-    if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
-        raise CodecError("invalid", f"an image of {height}x{width}, sides are 1 to {MAX_SIDE}")
+    _check_size(height, width)
     if len(payload) != height * width * 3:
-        raise CodecError(
-            "truncated", f"{len(payload)} bytes for an rgb8 image of {height}x{width}"
-        )
+        raise CodecError("truncated", f"{len(payload)} bytes for an rgb8 image of {height}x{width}")
     return Image(np.frombuffer(payload, np.uint8).reshape(height, width, 3))
 
 
 def encode_jpeg(image: Image, quality: int = DEFAULT_JPEG_QUALITY) -> bytes:
-    """A JPEG file."""
+    """A JPEG file.
+
+    Raises:
+        CodecError: the picture is larger than `decode_jpeg` reads.
+    """
+    height, width, _ = image.rgb.shape
+    _check_size(height, width)
     ok, data = cv2.imencode(
         ".jpg", cv2.cvtColor(image.rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
     )
@@ -74,21 +82,33 @@ def decode_jpeg(payload: bytes) -> Image:
         raise CodecError("malformed", "not a JPEG file")
     if payload.rstrip(b"\0")[-2:] != b"\xff\xd9":
         raise CodecError("truncated", "a JPEG file without its end")
-    height, width = _jpeg_size(payload)
-    if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
-        raise CodecError("invalid", f"a JPEG of {height}x{width}, sides are 1 to {MAX_SIDE}")
+    _check_size(*_jpeg_size(payload))
     try:
         bgr = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error as error:
         raise CodecError("malformed", f"not a JPEG file: {error.err}") from error
     if bgr is None:
         raise CodecError("malformed", "not a JPEG file that can be decoded")
-    rgb: NDArray[np.uint8] = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+    # In place: a large picture is not held twice.
+    rgb: NDArray[np.uint8] = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB, dst=bgr), np.uint8)
     return Image(rgb)
 
 
+def _check_size(height: int, width: int) -> None:
+    sides_fit = 1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE
+    if not sides_fit or height * width > MAX_PIXELS:
+        raise CodecError(
+            "invalid",
+            f"an image of {height}x{width}: sides are 1 to {MAX_SIDE}, pixels at most {MAX_PIXELS}",
+        )
+
+
 def _jpeg_size(payload: bytes) -> tuple[int, int]:
-    """Height and width from the frame header, read before any memory is taken for pixels."""
+    """Height and width from the frame header, read before any memory is taken for pixels.
+
+    Stricter than decoders are: where they would pass over something that this walk reads in another
+    way, a second frame header could hide.
+    """
     at = 2
     while at + 9 <= len(payload):
         if payload[at] != 0xFF:
@@ -97,10 +117,15 @@ def _jpeg_size(payload: bytes) -> tuple[int, int]:
         if marker == 0xFF:  # fill byte
             at += 1
             continue
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+        if marker in _WITHOUT_LENGTH:
+            break
+        if marker in _FRAME_HEADERS:
             return (
                 int.from_bytes(payload[at + 5 : at + 7], "big"),
                 int.from_bytes(payload[at + 7 : at + 9], "big"),
             )
-        at += 2 + int.from_bytes(payload[at + 2 : at + 4], "big")
+        length = int.from_bytes(payload[at + 2 : at + 4], "big")
+        if length < 2:
+            break
+        at += 2 + length
     raise CodecError("malformed", "a JPEG file without a frame header")

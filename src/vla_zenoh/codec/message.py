@@ -2,23 +2,44 @@
 
 An array is a map with the *bytes* keys ``__ndarray__``, ``data``, ``dtype``, ``shape``, a numpy
 scalar one with ``__npgeneric__``, ``data``, ``dtype``; this is what openpi-client writes, so its
-users' tools read our keys. Object, void and complex types are refused both ways, nothing is ever
-unpickled, and sizes are checked before memory is taken.
+users' tools read our keys. Only arrays of bools, whole numbers, floats and text are carried both
+ways, nothing is ever unpickled, and sizes are checked before memory is taken.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import msgpack
 import numpy as np
 
 from vla_zenoh.errors import CodecError
+from vla_zenoh.types import shown
 
 MAX_PAYLOAD_BYTES = 64 * 1024 * 1024
 MAX_DEPTH = 32
-_REFUSED_KINDS = "OVc"
+MAX_ITEMS = 10_000
+"""Entries of one list or map. msgpack takes memory for as many as a list claims to have, at each of
+its levels, before it sees that they are not there."""
+MAX_DIMENSIONS = 32
+
+_CARRIED_KINDS = "biufSU"
+_DTYPE = re.compile(
+    r"[<>|=]?(?:b1|[iu][1248]|f[248]|[SU][1-9][0-9]{0,6})"
+    r"|bool|u?int(?:8|16|32|64)|float(?:16|32|64)"
+)
+_MAX_FLOAT_BYTES = 8  # long doubles differ from machine to machine
+_LAST_CODE_POINT = 0x10FFFF
+_SCALARS: dict[str, tuple[type, ...]] = {
+    "b": (bool,),
+    "i": (int,),
+    "u": (int,),
+    "f": (int, float),
+    "S": (bytes,),
+    "U": (str,),
+}
 
 
 def pack(value: Any) -> bytes:
@@ -36,7 +57,7 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(payload: bytes) -> Any:
-    """Decode what `pack` (or openpi) wrote.
+    """Decode what `pack` (or openpi) wrote. Arrays are views into `payload` and read-only.
 
     Raises:
         CodecError: whatever else the bytes are.
@@ -46,15 +67,39 @@ def unpack(payload: bytes) -> Any:
             "oversize", f"payload of {len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are read"
         )
     try:
-        return msgpack.unpackb(
-            payload, object_hook=_from_map, raw=False, strict_map_key=False, use_list=True
+        value = msgpack.unpackb(
+            payload,
+            object_hook=_from_map,
+            ext_hook=_refuse_extension,
+            raw=False,
+            strict_map_key=True,
+            max_array_len=MAX_ITEMS,
+            max_map_len=MAX_ITEMS,
         )
     except CodecError:
         raise
-    except (ValueError, TypeError, UnicodeDecodeError, RecursionError, OverflowError) as error:
-        raise CodecError("malformed", f"not valid msgpack: {error or type(error).__name__}") from error
+    # ValueError includes text that is not UTF-8; the last one is a map nested deeper than C allows.
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
+        reason = str(error) or type(error).__name__
+        raise CodecError("malformed", f"not valid msgpack: {reason[:200]}") from error
     except msgpack.exceptions.UnpackException as error:
         raise CodecError("malformed", f"not valid msgpack: {error}") from error
+    _check_plain(value, MAX_DEPTH)
+    return value
+
+
+def _check_plain(value: Any, depth: int) -> None:
+    if isinstance(value, (dict, list)):
+        if depth == 0:
+            raise CodecError("malformed", f"nested deeper than {MAX_DEPTH}")
+        for item in value.values() if isinstance(value, dict) else value:
+            _check_plain(item, depth - 1)
+    elif isinstance(value, msgpack.Timestamp):
+        raise CodecError("malformed", "msgpack timestamps are not carried; use nanoseconds")
+
+
+def _refuse_extension(code: int, data: bytes) -> Any:
+    raise CodecError("malformed", f"msgpack extension {code} ({len(data)} bytes) is not carried")
 
 
 def _to_map(value: Any) -> dict[bytes, Any]:
@@ -74,42 +119,49 @@ def _to_map(value: Any) -> dict[bytes, Any]:
 
 def _from_map(value: dict[Any, Any]) -> Any:
     if b"__ndarray__" in value:
-        dtype = _dtype(value)
-        data, shape = value.get(b"data"), value.get(b"shape")
-        if not isinstance(data, bytes) or not isinstance(shape, (list, tuple)):
-            raise CodecError("malformed", "an array needs bytes 'data' and a list 'shape'")
-        if len(shape) > MAX_DEPTH or not all(
-            isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in shape
-        ):
-            raise CodecError("malformed", f"an array with shape {shape!r}")
-        if math.prod(shape) * dtype.itemsize != len(data):
-            raise CodecError(
-                "malformed", f"an array of {dtype} {tuple(shape)} cannot have {len(data)} bytes"
-            )
-        return np.frombuffer(data, dtype=dtype).reshape(shape)
+        return _array(value)
     if b"__npgeneric__" in value:
-        try:
-            return _dtype(value).type(value.get(b"data"))
-        except (TypeError, ValueError, OverflowError) as error:
-            raise CodecError("malformed", f"not a numpy scalar: {error}") from error
+        return _scalar(value)
     return value
+
+
+def _array(value: dict[Any, Any]) -> np.ndarray[Any, Any]:
+    dtype = _dtype(value)
+    data, shape = value.get(b"data"), value.get(b"shape")
+    if not isinstance(data, bytes) or not isinstance(shape, list):
+        raise CodecError("malformed", "an array needs bytes 'data' and a list 'shape'")
+    if len(shape) > MAX_DIMENSIONS or not all(type(n) is int and n >= 0 for n in shape):
+        raise CodecError("malformed", f"an array with shape {shown(shape)}")
+    if math.prod(shape) * dtype.itemsize != len(data):
+        raise CodecError(
+            "malformed", f"an array of {dtype} {shown(tuple(shape))} cannot have {len(data)} bytes"
+        )
+    if dtype.kind == "U" and data:
+        points = np.frombuffer(data, dtype=np.dtype(np.uint32).newbyteorder(dtype.byteorder))
+        if int(points.max()) > _LAST_CODE_POINT:
+            raise CodecError("malformed", "an array of text with characters that do not exist")
+    return np.frombuffer(data, dtype=dtype).reshape(shape)
+
+
+def _scalar(value: dict[Any, Any]) -> np.generic:
+    dtype, data = _dtype(value), value.get(b"data")
+    if type(data) not in _SCALARS[dtype.kind]:
+        raise CodecError("malformed", f"a numpy scalar {dtype} of a {type(data).__name__}")
+    try:
+        with np.errstate(over="raise"):
+            return dtype.type(data)
+    except (TypeError, ValueError, OverflowError, FloatingPointError) as error:
+        raise CodecError("malformed", f"a numpy scalar {dtype}: {error}") from error
 
 
 def _dtype(value: dict[Any, Any]) -> np.dtype[Any]:
     name = value.get(b"dtype")
-    if not isinstance(name, str) or len(name) > 16:
-        raise CodecError("malformed", f"an array with dtype {name!r}")
-    try:
-        dtype = np.dtype(name)
-    except (TypeError, ValueError, SyntaxError) as error:
-        raise CodecError("malformed", f"an array with dtype {name!r}") from error
-    try:
-        _check_kind(dtype)
-    except TypeError as error:
-        raise CodecError("malformed", str(error)) from error
-    return dtype
+    if not isinstance(name, str) or not _DTYPE.fullmatch(name):
+        raise CodecError("malformed", f"an array with dtype {shown(name)} is not carried")
+    return np.dtype(name)
 
 
 def _check_kind(dtype: np.dtype[Any]) -> None:
-    if dtype.kind in _REFUSED_KINDS or dtype.itemsize == 0:
+    too_long = dtype.kind == "f" and dtype.itemsize > _MAX_FLOAT_BYTES
+    if dtype.kind not in _CARRIED_KINDS or dtype.itemsize == 0 or too_long:
         raise TypeError(f"arrays of {dtype} are not carried")

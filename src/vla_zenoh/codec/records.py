@@ -9,36 +9,49 @@ from typing import Any, TypeVar
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, RecordError, SpecError
 from vla_zenoh.policy import ModelSpec
-from vla_zenoh.types import Cause
+from vla_zenoh.types import Cause, shown
 
 Record = TypeVar("Record")
 
+MAX_RECORD_BYTES = 4 * 1024 * 1024
+
 
 def encode(record: Any) -> bytes:
-    """Bytes of a record dataclass or a `ModelSpec`."""
-    if isinstance(record, ModelSpec):
-        return message.pack(record.to_dict())
-    return message.pack(_fields(record))
+    """Bytes of a record dataclass or a `ModelSpec`.
+
+    Raises:
+        CodecError: larger than `MAX_RECORD_BYTES`: nobody would read it.
+    """
+    fields = record.to_dict() if isinstance(record, ModelSpec) else _fields(record)
+    payload = message.pack(fields)
+    _check_length(type(record), payload)
+    return payload
 
 
 def decode(kind: type[Record], payload: bytes) -> Record:
     """Read a record of `kind`.
 
     Raises:
-        CodecError: reason ``malformed`` (not such a map) or ``invalid`` (a value that the record
-            refuses: NaN, wrong shape, out of range).
+        CodecError: reason ``oversize``, ``malformed`` (not such a map) or ``invalid`` (a value that
+            the record refuses: NaN, wrong shape, out of range).
     """
+    _check_length(kind, payload)
     data = message.unpack(payload)
     if not isinstance(data, dict):
-        raise CodecError(
-            "malformed", f"{kind.__name__} is a map, this is a {type(data).__name__}"
-        )
+        raise CodecError("malformed", f"{kind.__name__} is a map, this is a {type(data).__name__}")
     if kind is ModelSpec:
         try:
             return ModelSpec.from_dict(data)  # pyright: ignore[reportReturnType]
         except SpecError as error:
             raise CodecError("invalid", str(error)) from error
     return _record(kind, data)
+
+
+def _check_length(kind: type, payload: bytes) -> None:
+    if len(payload) > MAX_RECORD_BYTES:
+        raise CodecError(
+            "oversize", f"{kind.__name__} of {len(payload)} bytes, at most {MAX_RECORD_BYTES}"
+        )
 
 
 def _fields(record: Any) -> dict[str, Any]:
@@ -55,9 +68,9 @@ def _fields(record: Any) -> dict[str, Any]:
 
 def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
     fields = {field.name: field for field in dataclasses.fields(kind)}  # pyright: ignore
-    unknown = [str(name) for name in data if name not in fields]
+    unknown = sorted(shown(name) for name in data if name not in fields)
     if unknown:
-        raise CodecError("malformed", f"{kind.__name__} has no field {', '.join(sorted(unknown))}")
+        raise CodecError("malformed", f"{kind.__name__} has no field {', '.join(unknown[:8])}")
     missing = [
         name
         for name, field in fields.items()

@@ -5,15 +5,20 @@ No envelope, no header: ``true`` on ``active`` is all it takes from any language
 
 from __future__ import annotations
 
-import math
+import re
+import unicodedata
 
-from vla_zenoh.errors import CodecError
+from vla_zenoh import keys
+from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.types import MAX_TEXT
 
 MAX_SETTING_BYTES = 4 * MAX_TEXT
 TRUE_WORDS = frozenset({"true", "1", "on", "yes"})
 FALSE_WORDS = frozenset({"false", "0", "off", "no"})
 MIN_RATE_HZ, MAX_RATE_HZ = 0.05, 100.0
+
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?")
+_SEED = re.compile(r"[0-9]{1,10}")
 
 
 def decode_text(payload: bytes) -> str:
@@ -30,14 +35,19 @@ def decode_text(payload: bytes) -> str:
         raise CodecError("malformed", f"not UTF-8 text: {error.reason}") from error
     if len(value) > MAX_TEXT:
         raise CodecError("oversize", f"{len(value)} characters, at most {MAX_TEXT} are read")
-    if any(ord(c) < 32 and c not in "\t\n\r" for c in value) or "\x7f" in value:
+    # The C1 ones are among them: 0x9b alone steers a terminal.
+    if any(unicodedata.category(c) == "Cc" and c not in "\t\n\r" for c in value):
         raise CodecError("invalid", "text holds control characters")
     return value
 
 
 def decode_bool(payload: bytes) -> bool:
-    """true/false, 1/0, on/off, yes/no in any case; JSON booleans are among them."""
-    word = decode_text(payload).strip('"').lower()
+    """true/false, 1/0, on/off, yes/no in any case; JSON booleans are among them.
+
+    Raises:
+        CodecError: anything else.
+    """
+    word = decode_text(payload).lower()
     if word in TRUE_WORDS:
         return True
     if word in FALSE_WORDS:
@@ -46,13 +56,16 @@ def decode_bool(payload: bytes) -> bool:
 
 
 def decode_rate(payload: bytes) -> float:
-    """Chunks per second within `MIN_RATE_HZ` and `MAX_RATE_HZ`."""
+    """Chunks per second within `MIN_RATE_HZ` and `MAX_RATE_HZ`.
+
+    Raises:
+        CodecError: not a plain number, or outside.
+    """
     word = decode_text(payload)
-    try:
-        rate_hz = float(word)
-    except ValueError as error:
-        raise CodecError("invalid", f"{word[:40]!r} is not a number of Hz") from error
-    if not math.isfinite(rate_hz) or not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
+    if not _NUMBER.fullmatch(word):
+        raise CodecError("invalid", f"{word[:40]!r} is not a number of Hz")
+    rate_hz = float(word)
+    if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
         raise CodecError(
             "invalid", f"rate {word[:40]!r} Hz is outside [{MIN_RATE_HZ:g}, {MAX_RATE_HZ:g}]"
         )
@@ -60,19 +73,28 @@ def decode_rate(payload: bytes) -> float:
 
 
 def decode_name(payload: bytes) -> str:
-    """A worker's name: one word that can stand in a key."""
+    """A worker's name: one word that can stand in a key.
+
+    Raises:
+        CodecError: it cannot; says what is allowed.
+    """
     word = decode_text(payload)
-    if not word or len(word) > 128 or not all(c.isascii() and (c.isalnum() or c in "_.-") for c in word):
-        raise CodecError("invalid", f"{word[:40]!r} is not a worker's name")
-    return word
+    try:
+        return keys.chunk(word, "worker name")
+    except ProfileError as error:
+        raise CodecError("invalid", str(error)) from error
 
 
 def decode_seed(payload: bytes) -> int | None:
-    """Empty, or a whole number: the seed of the simulator's next placement."""
+    """Empty, or a whole number: the seed of the simulator's next placement.
+
+    Raises:
+        CodecError: anything else.
+    """
     word = decode_text(payload)
     if not word:
         return None
-    if not word.isascii() or not word.isdigit() or len(word) > 10:
+    if not _SEED.fullmatch(word):
         raise CodecError("invalid", f"{word[:40]!r} is not a seed: give nothing or a whole number")
     return int(word)
 
