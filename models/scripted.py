@@ -19,12 +19,11 @@ Prompts, one step per request, as in the thesis this package grew from::
 from __future__ import annotations
 
 import random
-import re
 import time
 
 import numpy as np
 
-from vla_zenoh.errors import SpecError
+from vla_zenoh.motions import parse_hard
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -33,39 +32,6 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
 )
-
-STEP_M, STEP_RAD, STEP_WIDTH_M = 0.01, 0.05, 0.05
-MOTIONS: dict[str, tuple[int, float]] = {
-    "go up": (2, STEP_M),
-    "go down": (2, -STEP_M),
-    "roll right": (3, STEP_RAD),
-    "roll left": (3, -STEP_RAD),
-    "pitch down": (4, STEP_RAD),
-    "pitch up": (4, -STEP_RAD),
-    "yaw left": (5, STEP_RAD),
-    "yaw right": (5, -STEP_RAD),
-    "open gripper": (6, STEP_WIDTH_M),
-    "close gripper": (6, -STEP_WIDTH_M),
-}
-_PROMPT = re.compile(r"(?:hard:)?\s*(?P<motion>[a-z ]+?)\s*(?:[x×]\s*(?P<count>\d{1,6}))?", re.I)
-
-
-def parse(prompt: str) -> tuple[str, int | None]:
-    """The motion a prompt names, and how many steps of it (None: no end).
-
-    Raises:
-        SpecError: it names none; lists those there are.
-    """
-    match = _PROMPT.fullmatch(" ".join(prompt.split()))
-    motion = match["motion"].lower().replace("rol ", "roll ") if match else ""
-    if match is None or (motion != "hold" and motion not in MOTIONS):
-        raise SpecError(
-            f"scripted does not know the prompt {prompt!r}; it knows: hold, "
-            + ", ".join(f"'HARD: {name}'" for name in MOTIONS)
-            + ", each with an optional count as in 'HARD: go up x50'"
-        )
-    return motion, int(match["count"]) if match["count"] else None
-
 
 class Scripted:
     """See the module.
@@ -104,7 +70,7 @@ class Scripted:
 
     def infer(self, observation: Observation) -> ActionSteps:
         """The next chunk of the motion the prompt names."""
-        motion, count = parse(observation.prompt)
+        motion, count = parse_hard(observation.prompt)
         if self._delay_s:
             time.sleep(self._delay_s * (1 + self._jitter * self._random.uniform(-1, 1)))
         # Before the arm is given to us nothing is counted: nobody carries it out.
@@ -112,10 +78,9 @@ class Scripted:
         left = self.spec.action.horizon if count is None else max(count - self._given, 0)
         steps = np.zeros((self.spec.action.horizon, self.spec.action.dimension), np.float32)
         length = min(left, len(steps))
-        if motion != "hold":
-            axis, step = MOTIONS[motion]
-            steps[:length, axis] = step
+        if motion is not None:
+            steps[:length, motion.axis] = motion.step
             if active:
                 self._given += length
-        done = motion == "hold" or (count is not None and self._given >= count)
+        done = motion is None or (count is not None and self._given >= count)
         return ActionSteps(steps[: max(length, 1)], done)

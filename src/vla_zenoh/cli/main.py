@@ -12,6 +12,7 @@ from vla_zenoh import __version__
 from vla_zenoh.cli import (
     camera,
     command,
+    demo,
     doctor,
     echo,
     keys,
@@ -54,6 +55,7 @@ def _main(
 
 
 for panel, name, function in (
+    (RUN, "demo", demo.demo),
     (RUN, "up", up.up),
     (RUN, "router", router.router),
     (RUN, "sim", sim.sim),

@@ -340,7 +340,8 @@ class Commander:
         self._shadow[worker] = chunk
         self.lease.last_observation_ns = chunk.record.observation_stamp_ns
         self.accepted_chunks += 1
-        self.accepted_steps += len(chunk.record.steps)
+        if not self.policy_done:  # what comes after that only keeps the arm where it is
+            self.accepted_steps += len(chunk.record.steps)
         self.policy_done = chunk.record.done
         self._change(Trigger.FRESH, "fresh chunk")
 

@@ -1,0 +1,240 @@
+"""Carries the segments of a demo out through plain puts, and measures the arm before and after."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.control.so3 import Pose, exp3, log3, rotation_from_quat
+from vla_zenoh.demo.analysis import Outcome, Standing, judge
+from vla_zenoh.demo.segments import Segment
+from vla_zenoh.errors import NodeError
+from vla_zenoh.nodes.client import Client
+from vla_zenoh.nodes.recording import Recorder
+from vla_zenoh.types import Cause, NodeStatus
+
+READY_PATIENCE_S = 40.0
+ACTIVATE_PATIENCE_S = 15.0
+SETTLE_S = 0.8
+"""The commanded motion has ended; the arm itself and its integral action come to rest after it."""
+STAND_WINDOW_NS = 150_000_000
+SLACK_S = 15.0
+
+
+class Interrupted(Exception):
+    """Ctrl-C: brake and write what there is."""
+
+
+@dataclass(slots=True)
+class DemoResult:
+    """What a demo found out.
+
+    Args:
+        outcomes: one per segment that ended.
+        statuses: last status of every node.
+        interrupted: it was cut short by a person.
+    """
+
+    outcomes: list[Outcome] = field(default_factory=list)
+    statuses: dict[str, NodeStatus] = field(default_factory=dict)
+    interrupted: bool = False
+
+
+class DemoRun:
+    """See the module.
+
+    Args:
+        client: hears the nodes.
+        recorder: hears the streams.
+        stop: set by Ctrl-C.
+        watch: called often; raises when the nodes cannot be kept alive.
+        progress: called with (segment index, steps carried out).
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        recorder: Recorder,
+        stop: threading.Event,
+        watch: Callable[[], None],
+        progress: Callable[[int, int], None],
+    ) -> None:
+        self._client, self._recorder, self._stop = client, recorder, stop
+        self._watch, self._progress = watch, progress
+
+    def run(self, segments: Sequence[Segment], rate_hz: float, seconds: float | None) -> DemoResult:
+        """Activate, carry out, brake.
+
+        Raises:
+            NodeError: the chain does not come up, or the arm is not obeyed to the end.
+        """
+        result = DemoResult()
+        try:
+            self._wait(self._ready, READY_PATIENCE_S, "the nodes did not come up")
+            self._client.set_prompt("hold")
+            self._client.set_rate(rate_hz)
+            self._activate()
+            for index, segment in enumerate(segments):
+                result.outcomes.append(self._carry_out(index, segment, rate_hz, seconds))
+        except Interrupted:
+            result.interrupted = True
+        result.statuses = {name: found[0] for name, found in self._client.snapshot().items()}
+        self._client.deactivate()
+        return result
+
+    def _ready(self) -> bool:
+        worker = f"worker-{self._client.profile.task.worker}"
+        status = self._client.status(worker)
+        heard = self._recorder.recording
+        return bool(
+            status is not None
+            and status.state == "inferring"
+            and "command" in self._client.alive
+            and heard.poses
+            and heard.grippers
+        )
+
+    def _activate(self) -> None:
+        """The nodes come up one after the other; what is missing for a moment is waited for."""
+        give_up = time.monotonic() + ACTIVATE_PATIENCE_S
+        while True:
+            try:
+                self._client.activate()
+                return
+            except Exception:
+                if time.monotonic() > give_up:
+                    raise
+                self._pause(0.3)
+
+    def _carry_out(
+        self, index: int, segment: Segment, rate_hz: float, seconds: float | None
+    ) -> Outcome:
+        before = self._standing()
+        self._recorder.recording.mark(segment.prompt)
+        began = time.monotonic()
+        if seconds is None:
+            task = self._client.set_prompt(segment.prompt_with_count)
+            patience_s = segment.steps / rate_hz * 2 + SLACK_S
+            self._wait(
+                lambda: self._finished(task.episode, segment.steps, index),
+                patience_s,
+                f"{segment.prompt_with_count!r} did not end in {patience_s:.0f} s",
+            )
+        else:
+            task = self._client.set_prompt(segment.prompt)
+            self._pause(seconds)
+        steps_done = self._steps_of(task.episode)
+        if seconds is not None:
+            self._client.set_prompt("hold")
+            self._wait(self._at_rest, SLACK_S, "the arm does not come to rest")
+            steps_done = self._steps_heard(task.episode)
+            segment = Segment(segment.prompt, steps_done, segment.motion)
+        self._pause(SETTLE_S)
+        duration_s = time.monotonic() - began - SETTLE_S
+        return judge(
+            segment,
+            before,
+            self._standing(),
+            max_width_m=self._client.profile.robot.gripper.max_width_m,
+            steps_done=steps_done,
+            duration_s=duration_s,
+        )
+
+    # -- watching -----------------------------------------------------------------------------
+    def _command(self) -> dict[str, Any]:
+        status = self._client.status("command")
+        if status is None:
+            return {}
+        if status.state not in ("active", "holding"):
+            raise NodeError(f"the arm is {status.state}: {status.detail.get('why', '')}")
+        return dict(status.detail)
+
+    def _steps_of(self, episode: int) -> int:
+        detail = self._command()
+        return int(detail.get("accepted_steps", 0)) if detail.get("episode") == episode else 0
+
+    def _steps_heard(self, episode: int) -> int:
+        """Steps of the chunks of `episode` that a pose command named as its cause."""
+        obeyed = {cause.chunk_seq for cause, _ in first_commands(self._recorder)}
+        return sum(
+            len(entry.record.steps)
+            for entry in self._recorder.recording.chunks
+            if entry.record.episode == episode and entry.header.seq in obeyed
+        )
+
+    def _finished(self, episode: int, steps: int, index: int) -> bool:
+        detail = self._command()
+        if detail.get("episode") != episode:
+            return False
+        self._progress(index, min(self._steps_of(episode), steps))
+        return bool(detail.get("policy_done")) and self._at_rest()
+
+    def _at_rest(self) -> bool:
+        heard = self._recorder.recording
+        command = heard.commands[-1].record if heard.commands else None
+        gripper = heard.grippers[-1].record if heard.grippers else None
+        return bool(
+            command is not None
+            and float(np.abs(command.twist).max()) < 1e-5
+            and float(np.linalg.norm(command.goal_position_m - command.position_m)) < 1e-5
+            and gripper is not None
+            and not gripper.moving
+        )
+
+    def _standing(self) -> Standing:
+        """Mean measured pose of the last moments."""
+        self._wait(self._at_rest_measured, SLACK_S, "the arm does not come to rest")
+        heard = self._recorder.recording
+        since_ns = heard.poses[-1].heard_ns - STAND_WINDOW_NS
+        poses = [entry.record for entry in heard.poses[-200:] if entry.heard_ns >= since_ns]
+        position = np.mean([pose.position_m for pose in poses], axis=0)
+        first = rotation_from_quat(poses[0].quat_xyzw)
+        turns = [log3(rotation_from_quat(pose.quat_xyzw) @ first.T) for pose in poses]
+        rotation = exp3(np.mean(turns, axis=0)) @ first
+        return Standing(Pose(position, rotation), heard.grippers[-1].record.width_m)
+
+    def _at_rest_measured(self) -> bool:
+        pose = self._recorder.recording.newest_pose()
+        return pose is not None and float(np.abs(pose.twist).max()) < 1e-3
+
+    def _wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
+        give_up = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > give_up:
+                raise NodeError(f"{otherwise}; {self._story()}")
+            self._pause(0.03)
+
+    def _pause(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while True:
+            self._watch()
+            left = end - time.monotonic()
+            if left <= 0:
+                return
+            if self._stop.wait(min(left, 0.1)):
+                raise Interrupted
+
+    def _story(self) -> str:
+        said = [
+            f"{name} is {found.state}"
+            + (f" ({word})" if (word := found.detail.get("complaint") or found.detail.get("why")) else "")
+            for name, (found, _, _) in self._client.snapshot().items()
+        ]
+        return "; ".join(said) or "no node says anything"
+
+
+def first_commands(recorder: Recorder) -> list[tuple[Cause, int]]:
+    """For each chunk the first pose command that carries it out, and when it was heard."""
+    out: list[tuple[Cause, int]] = []
+    last: tuple[str, int] | None = None
+    for entry in recorder.recording.commands:
+        cause = entry.record.cause
+        if cause is not None and (cause.worker, cause.chunk_seq) != last:
+            last = (cause.worker, cause.chunk_seq)
+            out.append((cause, entry.heard_ns))
+    return out
