@@ -266,7 +266,7 @@ class Commander:
         self.why = f"{what} refused: {'; '.join(reasons)}"
         for reason in reasons:
             self._tell("warning", "refusal", f"{what}_refused", reason)
-            self._out.refusals.append(Refusal(f"{what}_refused", reason, quiet=True))
+            self._out.refusals.append(Refusal(f"{what}_refused", reason))
 
     def _anchor(self, measured: PoseState, gripper: GripperState, now_ns: int) -> None:
         """Begin where the robot's own controller stands, so that nothing jumps."""
@@ -317,7 +317,10 @@ class Commander:
     def _take_chunk(self, chunk: Stamped[ActionChunk], now_ns: int) -> None:
         worker = chunk.record.worker
         owner = self._around.spec_sources.get(worker)
-        if owner is None or chunk.header.source != owner:
+        if owner is None:
+            self._refuse(Refusal("unknown_worker", "its spec is not known yet", quiet=True), worker)
+            return
+        if chunk.header.source != owner:
             self._refuse(
                 Refusal(
                     "foreign",

@@ -63,7 +63,8 @@ def plot_run(
         position.plot(t_commanded, commanded[:, axis], color=colour, lw=2.2, alpha=0.35)
         position.plot(t_measured, measured[:, axis], color=colour, lw=0.9, label=name)
     position.set(ylabel="TCP position (m)", title="position: thick commanded, thin measured")
-    position.legend(loc="upper right", ncols=3, fontsize=8)
+    position.legend(loc="center right", fontsize=8)
+    position.margins(y=0.25)
     first = rotation_from_quat(poses[0].record.quat_xyzw)
     for entries, times, width, alpha in ((commands, t_commanded, 2.2, 0.35), (poses, t_measured, 0.9, 1)):
         turns = np.array(
@@ -158,6 +159,6 @@ def _draw_latency(axes: Any, first_commands: Sequence[tuple[Cause, int]]) -> Non
         ]
     )
     names = ("picture waits for worker", "inference", "worker to command", "command to pose")
-    axes.stackplot(range(len(stages)), np.maximum(stages.T, 0) / 1e6, labels=names, alpha=0.8)
+    axes.stackplot(range(len(stages)), np.maximum(stages.T, 0) / 1e6, labels=names, alpha=0.8, lw=0)
     axes.set_ylim(0, float(np.percentile(stages.sum(axis=1), 99)) / 1e6 * 1.5)
     axes.legend(loc="upper left", fontsize=7)

@@ -15,6 +15,7 @@ from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import CodecError, MissingExtraError
 
 VIDEO_HZ = 15
+STRIP_PX = 36
 QUALITY = "24"  # x264's constant rate factor: visually good, some 100 KB a second at most
 
 
@@ -83,7 +84,8 @@ def _write_prompt(picture: NDArray[np.uint8], prompt: str) -> NDArray[np.uint8]:
     if not prompt:
         return picture
     out = picture.copy()
-    at = (12, out.shape[0] - 14)
-    for colour, width in (((0, 0, 0), 4), ((255, 255, 255), 1)):
-        cv2.putText(out, prompt, at, cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, width, cv2.LINE_AA)
+    strip = out[-STRIP_PX:]
+    strip[:] = strip // 3
+    at = (12, out.shape[0] - STRIP_PX // 3)
+    cv2.putText(out, prompt, at, cv2.FONT_HERSHEY_SIMPLEX, 0.7, (255, 255, 255), 1, cv2.LINE_AA)
     return out

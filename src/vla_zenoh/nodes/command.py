@@ -201,7 +201,8 @@ class CommandNode:
         if out.gripper is not None:
             self._gripper_out.put(out.gripper)
         for refusal in out.refusals:
-            self.node.counters[f"refused.{refusal.reason}"] += 1
+            kind = "skipped" if refusal.quiet else "refused"
+            self.node.counters[f"{kind}.{refusal.reason}"] += 1
         for event in out.events:
             self.node.tell(event)
         if out.accepted is not None:

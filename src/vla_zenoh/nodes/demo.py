@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from vla_zenoh.control.names import worker_node
 from vla_zenoh.control.so3 import Pose, exp3, log3, rotation_from_quat
 from vla_zenoh.demo.analysis import Outcome, Standing, judge
 from vla_zenoh.demo.segments import Segment
@@ -20,6 +21,8 @@ from vla_zenoh.types import Cause, NodeStatus
 
 READY_PATIENCE_S = 40.0
 ACTIVATE_PATIENCE_S = 15.0
+WELL_FOR_S = 0.7
+"""Status comes twice a second."""
 SETTLE_S = 0.8
 """The commanded motion has ended; the arm itself and its integral action come to rest after it."""
 STAND_WINDOW_NS = 150_000_000
@@ -66,6 +69,7 @@ class DemoRun:
     ) -> None:
         self._client, self._recorder, self._stop = client, recorder, stop
         self._watch, self._progress = watch, progress
+        self._well_since_s = 0.0
 
     def run(self, segments: Sequence[Segment], rate_hz: float, seconds: float | None) -> DemoResult:
         """Activate, carry out, brake.
@@ -88,16 +92,19 @@ class DemoRun:
         return result
 
     def _ready(self) -> bool:
-        worker = f"worker-{self._client.profile.task.worker}"
-        status = self._client.status(worker)
+        """Everybody has been well for long enough that the command node has heard it too."""
+        worker = self._client.status(worker_node(self._client.profile.task.worker))
         heard = self._recorder.recording
-        return bool(
-            status is not None
-            and status.state == "inferring"
-            and "command" in self._client.alive
+        well = bool(
+            worker is not None
+            and worker.state == "inferring"
+            and self._client.status("command") is not None
             and heard.poses
             and heard.grippers
         )
+        now = time.monotonic()
+        self._well_since_s = self._well_since_s or now if well else 0.0
+        return well and now - self._well_since_s > WELL_FOR_S
 
     def _activate(self) -> None:
         """The nodes come up one after the other; what is missing for a moment is waited for."""

@@ -40,6 +40,8 @@ SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5
 LOOK_PERIOD_S = 0.25
 AFTER_A_FAILURE_S = 0.5
+FRESH_PATIENCE_S = 0.05
+FRESH_TOLERANCE_S = 0.005
 STATE_KINDS: dict[str, type[Any]] = {
     "joint": JointState,
     "pose": PoseState,
@@ -89,6 +91,7 @@ class WorkerNode:
             for part in self.spec.observation.state
         }
         self._images: dict[str, Stamped[Image]] = {}
+        self._pictures_s: dict[str, float] = {}
         self._states = {part: History() for part in self.spec.observation.state}
         self._task: Task | None = None
         self._task_heard_s = -1e9
@@ -123,7 +126,7 @@ class WorkerNode:
                 stop.wait(min(next_s - now_s, LOOK_PERIOD_S))
                 self._report()
                 continue
-            observed = self._observe()
+            observed = self._observe(next_s)
             if observed is None:
                 self._report()
                 self._wait_for_news(stop)
@@ -154,8 +157,9 @@ class WorkerNode:
         for camera, slot in self._image_slots.items():
             arrival = slot.take()
             image = self._read_image(camera, arrival) if arrival is not None else None
-            if image is not None:
+            if arrival is not None and image is not None:
                 self._images[camera] = image
+                self._pictures_s[camera] = arrival.mono_ns / 1e9
         for part, inbox in self._state_slots.items():
             for arrival in inbox.take_all():
                 state = self.node.read(STATE_KINDS[part], arrival)
@@ -189,7 +193,12 @@ class WorkerNode:
             return None
         return Stamped(header, image, self.node.wall_of(arrival))
 
-    def _observe(self) -> Observation | None:
+    def _observe(self, due_s: float) -> Observation | None:
+        """An observation, None when there is none yet.
+
+        A picture that arrives after the request is due is worth a little patience: the one at hand
+        is already half a camera period old on average, and all that time would be latency.
+        """
         self._listen()
         self.node.clock.follow()
         if self._task is None or time.monotonic() - self._task_heard_s > TASK_PATIENCE_S:
@@ -212,6 +221,10 @@ class WorkerNode:
                 self._complaint = observation.why
             return None
         self._complaint = ""
+        if self._pictures_s and time.monotonic() - due_s < FRESH_PATIENCE_S:
+            tolerance_s = min(FRESH_TOLERANCE_S, 0.25 / observation.rate_hz)
+            if min(self._pictures_s.values()) < due_s - tolerance_s:
+                return None
         return observation
 
     # -- out ----------------------------------------------------------------------------------
