@@ -62,12 +62,20 @@ class Outlet:
 
     # -- state --------------------------------------------------------------------------------
     def change(self, state: str, why: str = "") -> None:
-        """Be in `state`; news are told."""
+        """Be in `state`; a new state, or another reason for a bad one, is told."""
         if (state, why) == (self.state, self.why):
             return
         was, self.state, self.why = self.state, state, why
         level = "info" if state in (OK, ENDED) else "warning"
-        self._tell(Event(level, "transition", f"{self.name}:{was}->{state}", why[:1000]))
+        if state != was:
+            self._tell(Event(level, "transition", f"{self.name}:{was}->{state}", why[:1000]))
+        else:
+            self._tell(Event(level, "fault", f"{self.name}:{state}", why[:1000]))
+
+    def wait(self, why: str) -> None:
+        """Wait for something that is about to come: nothing to be told."""
+        if self.state == WAITING:
+            self.why = why
 
     def lose(self, why: str) -> None:
         """No picture can be had for now."""

@@ -106,7 +106,7 @@ class SimCameras:
         key = self._profile.keys.short(self._profile.keys.sim_scene)
         self._heard_ns = max(self._heard_ns, time.monotonic_ns())
         for _, outlet in views:
-            outlet.lose(f"no scene on {key} yet")
+            outlet.wait(f"no scene on {key} yet")
         while not stop.is_set():
             if not self._slot.wait(WAKE_S):
                 if time.monotonic_ns() - self._heard_ns > STALL_S * 1e9:
