@@ -15,6 +15,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -28,10 +29,10 @@ CONSTRAINTS = ROOT / "constraints.txt"
 OLDEST_PYTHON = (3, 11)
 OLDEST_UV = (0, 8)
 
-LIBRARIES = {
-    # what a wheel needs from the system and does not bring: Debian and Ubuntu package
-    "libgomp.so.1": "libgomp1",  # Pinocchio
-}
+OPENMP = "libgomp.so.1"
+"""Pinocchio needs it and no wheel of ours brings it; a bare Debian has no package that does."""
+OPENMP_CARRIER = "scikit-learn"
+"""A wheel that has the library inside, from where it can be taken without root."""
 
 PIP_TO_UV = {
     # pip's name: uv's variable, what stands between several values there
@@ -107,16 +108,37 @@ def run(*command: object) -> None:
 
 def missing_packages(has_uv: bool) -> list[str]:
     """Debian packages without which nothing will work here."""
-    packages = []
     if not has_uv and not any(map(importlib.util.find_spec, ("ensurepip", "pip"))):
-        packages.append("python3-venv")
-    for library, package in LIBRARIES.items():
-        try:
-            if sys.platform == "linux":
-                ctypes.CDLL(library)
-        except OSError:
-            packages.append(package)
-    return packages
+        return ["python3-venv"]
+    return []
+
+
+def loads(library: str) -> bool:
+    """Whether the system has a shared library."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+def bring_openmp(uv: Path, python: Path) -> None:
+    """Puts the OpenMP library beside Pinocchio's own libraries, where those look for it."""
+    if sys.platform != "linux" or loads(OPENMP):
+        return
+    code = "import sysconfig; print(sysconfig.get_path('platlib'))"
+    packages = subprocess.run([python, "-c", code], capture_output=True, text=True, check=True)
+    place = Path(packages.stdout.strip()) / "cmeel.prefix" / "lib"
+    if (place / OPENMP).exists() or not place.is_dir():
+        return
+    say(f"this system has no {OPENMP}; taking it from the wheel of {OPENMP_CARRIER}")
+    with tempfile.TemporaryDirectory() as folder:
+        target = ["--python", python, "--target", folder, "--no-deps"]
+        run(uv, "--quiet", "pip", "install", *target, OPENMP_CARRIER)
+        found = sorted(Path(folder).glob("*.libs/libgomp*.so*"))
+        if not found:
+            fail("no OpenMP library to be had. On Debian and Ubuntu: sudo apt install libgomp1")
+        shutil.copy(found[0], place / OPENMP)
 
 
 def works(uv: Path) -> bool:
@@ -184,6 +206,7 @@ def main() -> None:
     quiet = [] if sys.stderr.isatty() else ["--quiet"]
     target = ["--python", VENV / "bin" / "python", "--constraint", CONSTRAINTS]
     run(uv, *quiet, "pip", "install", *target, "--editable", ".[all,dev]")
+    bring_openmp(uv, VENV / "bin" / "python")
     say("done; the command is .venv/bin/vla-zenoh")
 
 

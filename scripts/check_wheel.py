@@ -10,7 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from bootstrap import CONSTRAINTS, ROOT, uv_environment
+from bootstrap import CONSTRAINTS, ROOT, bring_openmp, uv_environment
 
 DIST = ROOT / "dist"
 UV = Path(sys.executable).parent / "uv"
@@ -57,6 +57,7 @@ def try_out(archive: Path, extra: str) -> None:
         python = folder / "venv" / "bin" / "python"
         target = ["--python", python, "--constraint", CONSTRAINTS]
         run(UV, "--quiet", "pip", "install", *target, f"vla-zenoh[{extra}] @ {archive.as_uri()}")
+        bring_openmp(UV, python)
         for trial in TRIALS:
             run(folder / "venv" / "bin" / "vla-zenoh", *trial, cwd=work)
         if not any((work / "runs").rglob("*")):

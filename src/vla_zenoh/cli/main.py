@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
+from typing import NoReturn
 
 import typer
 import zenoh
+from rich.text import Text
 
 from vla_zenoh import __version__
 from vla_zenoh.cli import (
@@ -24,9 +26,17 @@ from vla_zenoh.cli import (
     up,
     worker,
 )
-from vla_zenoh.cli.output import errors
+from vla_zenoh.cli.output import errors, printable
 from vla_zenoh.errors import VlaZenohError
 
+EXTRA_OF = {
+    "pinocchio": "control",
+    "ruckig": "control",
+    "mujoco": "sim",
+    "matplotlib": "sim",
+    "av": "sim",
+}
+"""Modules of the extras, for whoever starts a node whose extra is not installed."""
 RUN, DRIVE, LOOK = "Run", "Drive the robot", "Look"
 
 app = typer.Typer(
@@ -82,11 +92,21 @@ def app_entry() -> None:
     try:
         app()
     except VlaZenohError as error:
-        errors().print(f"[bold red]error:[/] {_plain(str(error))}", highlight=False, soft_wrap=True)
-        sys.exit(1)
+        _complain(str(error))
+    except ImportError as error:
+        extra = EXTRA_OF.get((error.name or "").partition(".")[0])
+        if extra is None and ".so" not in str(error):
+            raise
+        _complain(
+            f"{error}; install it with: pip install 'vla-zenoh[{extra}]'"
+            if extra
+            else f"{error}; `vla-zenoh doctor` names the system package"
+        )
     except KeyboardInterrupt:
         sys.exit(130)
 
 
-def _plain(message: str) -> str:
-    return message.replace("[", "\\[")
+def _complain(message: str) -> NoReturn:
+    text = Text("error: ", style="bold red").append(printable(message), style="not bold default")
+    errors().print(text, soft_wrap=True)
+    sys.exit(1)

@@ -27,7 +27,11 @@ class RateMeter:
             self._times.popleft()
         if len(self._times) < 2:
             return 0.0
-        return (len(self._times) - 1) / max(now - self._times[0], 1e-6)
+        span_s = self._times[-1] - self._times[0]
+        mean_s = span_s / (len(self._times) - 1)
+        # Between two events the rate does not sink; when the next one is overdue it does.
+        overdue_s = max(now - self._times[-1] - 1.5 * mean_s, 0.0)
+        return (len(self._times) - 1) / max(span_s + overdue_s, 1e-6)
 
 
 class Percentiles:

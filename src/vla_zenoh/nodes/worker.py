@@ -97,7 +97,7 @@ class WorkerNode:
         self._task_heard_s = -1e9
         self._episode = -1
         self._not_before_ns = 0
-        self._rate = RateMeter(window_s=5.0)
+        self._rate = RateMeter(window_s=10.0)
         self._inference_ms = Percentiles(128)
         self._last_spec_s = -1e9
         self._complaint = "loading"
