@@ -43,7 +43,8 @@ class Replay:
             raise SpecError(f"{path}: steps {steps.shape} and length {length.shape} do not fit")
         self.spec = spec.model_copy(update={"name": "replay"})
         self._chunks = [
-            check_steps(spec.action, chunk[: int(n)]) for chunk, n in zip(steps, length, strict=True)
+            check_steps(spec.action, chunk[: int(n)])
+            for chunk, n in zip(steps, length, strict=True)
         ]
         if not self._chunks:
             raise SpecError(f"{path} holds no chunk")

@@ -33,6 +33,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 
+
 class Scripted:
     """See the module.
 

@@ -32,7 +32,8 @@ def camera(
     for wanted in cameras or ():
         if wanted not in loaded.cameras:
             raise typer.BadParameter(
-                f"no camera {wanted!r} in profile {loaded.name}; it has: {', '.join(loaded.cameras)}"
+                f"no camera {wanted!r} in profile {loaded.name}; it has: "
+                + ", ".join(loaded.cameras)
             )
     chosen = tuple(cameras) if cameras else None
     run_node(

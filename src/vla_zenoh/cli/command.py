@@ -26,6 +26,4 @@ def command(
     from vla_zenoh.nodes.command import CommandNode
 
     loaded = effective_profile(profile, connect)
-    run_node(
-        loaded, lambda session, stop: CommandNode(loaded, session, dry_run=dry_run).run(stop)
-    )
+    run_node(loaded, lambda session, stop: CommandNode(loaded, session, dry_run=dry_run).run(stop))

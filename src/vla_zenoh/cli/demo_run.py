@@ -67,7 +67,7 @@ def run_demo(
 
 
 def _own_address(profile: Profile) -> Profile:
-    """The profile on an address where nobody answers: a demo must never reach a lab's real robot."""
+    """The profile where nobody answers: a demo must never reach a lab's real robot."""
     if profile.robot.driver != "sim":
         raise typer.BadParameter(f"profile {profile.name} is of a real robot; demos are simulated")
     data = profile.model_dump()

@@ -29,12 +29,14 @@ POLL_S = 0.02
 def echo(
     key: Annotated[
         str,
-        typer.Argument(help="Below <root>/<robot>/, for example state/pose or 'event/*'; or whole."),
+        typer.Argument(help="Below <root>/<robot>/, such as state/pose or 'event/*'; or whole."),
     ],
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
     count: Annotated[int | None, typer.Option("--count", "-n", help="End after so many.")] = None,
-    seconds: Annotated[float | None, typer.Option("--seconds", "-s", help="End after so long.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", "-s", help="End after so long.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Print what is written on a key, decoded."""
@@ -64,7 +66,8 @@ def echo(
 def _show(sample: zenoh.Sample, as_json: bool) -> None:
     header, content = decode.head(sample), decode.content(sample)
     if as_json:
-        print(json.dumps({"key": str(sample.key_expr), "header": header, "value": content}), flush=True)
+        line = {"key": str(sample.key_expr), "header": header, "value": content}
+        print(json.dumps(line), flush=True)
         return
     stamp = f" seq {header['seq']} by {header['source']}" if header else ""
     console().print(f"[bold cyan]{sample.key_expr}[/][dim]{escape(stamp)}[/]", highlight=False)

@@ -44,7 +44,7 @@ def keys(
     pictures: Annotated[
         bool,
         typer.Option(
-            "--pictures", help="Listen to pictures too; without it their rates are the cameras' word."
+            "--pictures", help="Listen to pictures too; else their rates are the cameras' word."
         ),
     ] = False,
     as_json: JsonOption = False,
@@ -131,6 +131,7 @@ def _pictures(robot: Client) -> list[_Seen]:
         cameras = found.detail.get("cameras")
         for camera in cameras if isinstance(cameras, dict) else ():
             rate_hz = round(float(found.rates_hz.get(camera, 0.0)), 2)
-            out.append(_Seen(robot.keys.camera_raw(camera), "pixels, on demand", name, rate_hz=rate_hz))
-            out.append(_Seen(robot.keys.camera_jpeg(camera), "image/jpeg, on demand", name))
+            raw, jpeg = robot.keys.camera_raw(camera), robot.keys.camera_jpeg(camera)
+            out.append(_Seen(raw, "pixels, on demand", name, rate_hz=rate_hz))
+            out.append(_Seen(jpeg, "image/jpeg, on demand", name))
     return out

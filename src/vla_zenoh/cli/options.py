@@ -16,9 +16,7 @@ DEFAULT_PROFILE = "panda_sim"
 
 ProfileOption = Annotated[
     str,
-    typer.Option(
-        "--profile", "-p", envvar="VLA_ZENOH_PROFILE", help="Name or path of a profile.", show_default=True
-    ),
+    typer.Option("--profile", "-p", envvar="VLA_ZENOH_PROFILE", help="Name or path of a profile."),
 ]
 ConnectOption = Annotated[
     list[str] | None,

@@ -95,12 +95,13 @@ def _picture(robot: Client, events: list[tuple[str, Header, Event]]) -> Group:
             _refused(found),
             escape(_word(found)),
         )
-    return Group(table, *(_event(node, header, event) for node, header, event in events[-MAX_EVENTS:]))
+    return Group(table, *(_event(*happened) for happened in events[-MAX_EVENTS:]))
 
 
 def _latency(found: NodeStatus) -> str:
     return "\n".join(
-        f"{stage} {values[0]:.1f} / {values[1]:.1f} ms" for stage, values in found.latency_ms.items()
+        f"{stage} {values[0]:.1f} / {values[1]:.1f} ms"
+        for stage, values in found.latency_ms.items()
     )
 
 

@@ -16,7 +16,9 @@ def activate(profile: ProfileOption = DEFAULT_PROFILE, connect: ConnectOption = 
     """Give the arm to the worker. Refused with every reason while something is not right."""
     with client(profile, connect) as robot:
         task = robot.activate()
-        console().print(f"active: worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz")
+        console().print(
+            f"active: worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz"
+        )
 
 
 def deactivate(profile: ProfileOption = DEFAULT_PROFILE, connect: ConnectOption = None) -> None:

@@ -12,14 +12,11 @@ import numpy as np
 
 from vla_zenoh.policy import ModelSpec
 
-COMMAND_COLUMNS = (
-    "heard_wall_ns,stamp_wall_ns,seq,x_m,y_m,z_m,qx,qy,qz,qw,vx_m_s,vy_m_s,vz_m_s,"
-    "wx_rad_s,wy_rad_s,wz_rad_s,goal_x_m,goal_y_m,goal_z_m,state,chunk_seq"
-).split(",")
-POSE_COLUMNS = (
-    "heard_wall_ns,stamp_wall_ns,seq,x_m,y_m,z_m,qx,qy,qz,qw,vx_m_s,vy_m_s,vz_m_s,"
-    "wx_rad_s,wy_rad_s,wz_rad_s"
-).split(",")
+_TIMES = ("heard_wall_ns", "stamp_wall_ns", "seq")
+_POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+_TWIST = ("vx_m_s", "vy_m_s", "vz_m_s", "wx_rad_s", "wy_rad_s", "wz_rad_s")
+POSE_COLUMNS = (*_TIMES, *_POSE, *_TWIST)
+COMMAND_COLUMNS = (*POSE_COLUMNS, "goal_x_m", "goal_y_m", "goal_z_m", "state", "chunk_seq")
 
 
 def write_commands(path: Path, commands: Iterable[Any]) -> None:
