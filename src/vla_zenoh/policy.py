@@ -11,14 +11,22 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
-from vla_zenoh.errors import SpecError
-from vla_zenoh.types import GripperState, JointState, PoseState, Task
+from vla_zenoh.errors import RecordError, SpecError
+from vla_zenoh.faults import in_words
+from vla_zenoh.types import GripperState, JointState, PoseState, Task, text
 
 StatePart = Literal["joint", "pose", "gripper"]
 Resize = Literal["none", "stretch", "pad", "crop"]
@@ -30,8 +38,30 @@ GripperMeaning = Literal["none", "delta_m", "absolute_m", "open_fraction", "bina
 ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
 
 
+MAX_CAMERAS = 16
+MAX_FAULTS = 20
+
+Text = Annotated[str, Field(min_length=1, max_length=128), AfterValidator(lambda v: _utf8(v))]
+
+
+def _utf8(value: str) -> str:
+    """Text that can travel, so that a spec that exists can be published."""
+    try:
+        return text("it", value)
+    except RecordError as error:
+        raise ValueError(str(error)) from error
+
+
+def _differ(values: tuple[Any, ...]) -> tuple[Any, ...]:
+    if len(set(values)) != len(values):
+        raise ValueError(f"every entry may be given once: {', '.join(map(str, values))}")
+    return values
+
+
 class _Spec(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    """Strict: neither ``"8"`` nor ``true`` is a number, so a slip is not read as a meaning."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
 
 class CameraSpec(_Spec):
@@ -46,7 +76,7 @@ class CameraSpec(_Spec):
         colour: channel order the model is given.
     """
 
-    camera: str
+    camera: Text
     width: int | None = Field(default=None, ge=8, le=8192)
     height: int | None = Field(default=None, ge=8, le=8192)
     resize: Resize = "none"
@@ -72,11 +102,18 @@ class ObservationSpec(_Spec):
         max_age_s: an older observation is not given to the model.
     """
 
-    cameras: tuple[CameraSpec, ...] = ()
-    state: tuple[StatePart, ...] = ("pose", "gripper")
+    cameras: tuple[CameraSpec, ...] = Field(default=(), max_length=MAX_CAMERAS, strict=False)
+    state: Annotated[tuple[StatePart, ...], AfterValidator(_differ)] = Field(
+        default=("pose", "gripper"), strict=False
+    )
     prompt: bool = True
     max_skew_s: float = Field(default=0.1, gt=0, le=10)
     max_age_s: float = Field(default=0.5, gt=0, le=10)
+
+    @model_validator(mode="after")
+    def _one_picture_of_a_camera(self) -> ObservationSpec:
+        _differ(tuple(camera.camera for camera in self.cameras))
+        return self
 
 
 class ActionSpec(_Spec):
@@ -108,7 +145,7 @@ class ActionSpec(_Spec):
     gripper: GripperMeaning = "absolute_m"
     gripper_open_is_high: bool = True
     gripper_threshold: float = 0.5
-    normalisation: str | None = None
+    normalisation: Text | None = None
 
     @property
     def dimension(self) -> int:
@@ -125,7 +162,7 @@ class ActionSpec(_Spec):
 class ModelSpec(_Spec):
     """Everything a command node has to know of a model before it obeys it."""
 
-    name: str
+    name: Text
     observation: ObservationSpec = ObservationSpec()
     action: ActionSpec
 
@@ -150,8 +187,8 @@ class ModelSpec(_Spec):
             return ModelSpec.model_validate(data)
         except ValidationError as error:
             faults = "; ".join(
-                f"{'.'.join(map(str, fault['loc'])) or 'spec'}: {fault['msg']}"
-                for fault in error.errors()
+                f"{'.'.join(map(str, fault['loc'])) or 'spec'}: {in_words(fault)}"[:300]
+                for fault in error.errors(include_url=False)[:MAX_FAULTS]
             )
             raise SpecError(f"not a valid model spec: {faults}") from error
 
@@ -220,9 +257,13 @@ def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
         SpecError: says what is wrong and what was declared.
     """
     try:
-        array = np.array(steps, dtype=np.float32, order="C")
-    except (TypeError, ValueError) as error:
+        given = np.asarray(steps)
+    except (TypeError, ValueError, OverflowError) as error:
         raise SpecError(f"steps are not numbers: {error}") from error
+    if given.dtype.kind not in "iuf":
+        raise SpecError(f"steps are not numbers but {given.dtype}")
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, seen below
+        array = np.array(given, dtype=np.float32, order="C")
     if array.ndim == 1 and array.shape[0] == spec.dimension:
         array = array[None]
     if array.ndim != 2 or array.shape[1] != spec.dimension:
@@ -234,8 +275,14 @@ def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
     return array
 
 
-def example_observation(spec: ModelSpec, *, prompt: str = "put the red brick in the box") -> Observation:
-    """A valid observation of the declared form, gray pictures and an arm at rest: for dry runs."""
+def example_observation(
+    spec: ModelSpec, *, prompt: str = "put the red brick in the box"
+) -> Observation:
+    """A valid observation of the declared form, gray pictures and an arm at rest: for dry runs.
+
+    It has the parts of the state that the spec asks for, and no others.
+    """
+    asked = spec.observation.state
     images = {
         camera.camera: np.full((camera.height or 480, camera.width or 640, 3), 128, np.uint8)
         for camera in spec.observation.cameras
@@ -246,7 +293,13 @@ def example_observation(spec: ModelSpec, *, prompt: str = "put the red brick in 
         seq=0,
         task=Task(episode=0, active=False, prompt=prompt, worker=spec.name, rate_hz=5.0),
         images=images,
-        joint=JointState(tuple(f"joint{i}" for i in range(1, 8)), zeros, zeros, zeros),
-        pose=PoseState(np.array([0.45, 0.0, 0.3]), np.array([1.0, 0, 0, 0]), np.zeros(6)),
-        gripper=GripperState(width_m=0.08, moving=False, holding=False),
+        joint=JointState(tuple(f"joint{i}" for i in range(1, 8)), zeros, zeros, zeros)
+        if "joint" in asked
+        else None,
+        pose=PoseState(np.array([0.45, 0.0, 0.3]), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(6))
+        if "pose" in asked
+        else None,
+        gripper=GripperState(width_m=0.08, moving=False, holding=False)
+        if "gripper" in asked
+        else None,
     )

@@ -1,6 +1,7 @@
 """Profiles: one YAML file says everything about a robot, its lab and its limits."""
 
-from vla_zenoh.profile.load import load_profile, profile_names, to_yaml
+from vla_zenoh.profile.advice import advice
+from vla_zenoh.profile.load import load_profile, override, profile_file, profile_names, to_yaml
 from vla_zenoh.profile.schema import (
     CameraProfile,
     GripperProfile,
@@ -8,9 +9,9 @@ from vla_zenoh.profile.schema import (
     Limits,
     Profile,
     RobotProfile,
-    SessionProfile,
     Timing,
 )
+from vla_zenoh.profile.session import SessionProfile
 
 __all__ = [
     "CameraProfile",
@@ -21,7 +22,10 @@ __all__ = [
     "RobotProfile",
     "SessionProfile",
     "Timing",
+    "advice",
     "load_profile",
+    "override",
+    "profile_file",
     "profile_names",
     "to_yaml",
 ]

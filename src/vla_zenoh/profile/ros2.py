@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
-Topic = Annotated[str, Field(pattern=r"^/[A-Za-z0-9_/~{}]+$")]
+from vla_zenoh.profile.section import Name, Section, Word
 
-
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+_TOPIC = re.compile(r"(?:/[A-Za-z_{}~][A-Za-z0-9_{}~]*)+")
 
 
-class Ros2Camera(_Section):
+def _topic(value: str) -> str:
+    if not _TOPIC.fullmatch(value):
+        raise ValueError(
+            f"{value[:80]!r} is not a ROS topic: write its full name, as /joint_states"
+        )
+    return value
+
+
+Topic = Annotated[str, Field(max_length=256), AfterValidator(_topic)]
+
+
+class Ros2Camera(Section):
     """A camera topic."""
 
     topic: Topic
@@ -22,14 +32,14 @@ class Ros2Camera(_Section):
     )
 
 
-class Ros2Output(_Section):
+class Ros2Output(Section):
     """A topic or action the robot is commanded by."""
 
     topic: Topic
-    type: str
+    type: Word
 
 
-class Ros2Profile(_Section):
+class Ros2Profile(Section):
     """Topics of a ROS 2 robot.
 
     Args:
@@ -44,6 +54,6 @@ class Ros2Profile(_Section):
     bridge: Literal["ros2dds", "rmw_zenoh"] = "ros2dds"
     domain: int = Field(default=0, ge=0, le=232)
     joint_states: Topic = "/joint_states"
-    cameras: dict[str, Ros2Camera] = {}
+    cameras: dict[Name, Ros2Camera] = Field(default_factory=dict)
     pose_command: Ros2Output
     gripper: Ros2Output | None = None

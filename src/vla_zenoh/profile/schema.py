@@ -5,40 +5,63 @@ Defaults are the safe choice, so a profile that says nothing about limits has li
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import Keys
+from vla_zenoh.profile import fit
 from vla_zenoh.profile.ros2 import Ros2Profile
+from vla_zenoh.profile.section import (
+    Distinct,
+    Name,
+    Names,
+    Range,
+    Section,
+    Text,
+    Word,
+    Words,
+    refuse,
+)
+from vla_zenoh.profile.session import Endpoints, SessionProfile
 
-NODE_KINDS = ("router", "sim", "camera", "command", "worker")
+NodeKind = Literal["router", "sim", "camera", "command", "worker"]
+NODE_KINDS: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")
+CAMERA_SOURCES = ("sim:CAMERA", "v4l2:DEVICE", "rtsp://...", "file:PATH", "ros2:TOPIC")
+REACH_M = 3.0
+"""No arm that fits a table reaches further: a workspace beyond it is in other units."""
+MIN_PERIODS = 3
+"""A silence shorter than this many periods happens on a healthy link."""
 
 
-class Section(BaseModel):
-    """A part of a profile: frozen, unknown keys refused, finite numbers only."""
+def _source(value: str) -> str:
+    kind, colon, rest = value.partition(":")
+    if not colon or not rest or kind not in ("sim", "v4l2", "rtsp", "rtsps", "file", "ros2"):
+        raise ValueError(f"{value!r} is not a camera: write one of {', '.join(CAMERA_SOURCES)}")
+    if kind in ("rtsp", "rtsps") and not rest.removeprefix("//"):
+        raise ValueError(f"{value!r} lacks the host: write rtsp://HOST/PATH")
+    return value
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-
-def _key_part(value: str) -> str:
+def _root(value: str) -> str:
     try:
-        return keys.chunk(value, "name")
+        for part in value.split("/"):
+            keys.chunk(part, "root")
     except ProfileError as error:
         raise ValueError(str(error)) from error
+    return value
 
 
-Name = Annotated[str, AfterValidator(_key_part)]
-Positive = Annotated[float, Field(gt=0)]
-Range = Annotated[tuple[float, float], AfterValidator(lambda pair: _ordered(pair))]
-
-
-def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
-    if pair[0] >= pair[1]:
-        raise ValueError(f"[{pair[0]:g}, {pair[1]:g}] is empty: give [smallest, largest]")
+def _within_reach(pair: tuple[float, float]) -> tuple[float, float]:
+    if max(map(abs, pair)) > REACH_M:
+        raise ValueError(f"[{pair[0]:g}, {pair[1]:g}] is further than {REACH_M:g} m; give metres")
     return pair
+
+
+Reach = Annotated[Range, AfterValidator(_within_reach)]
 
 
 class GripperProfile(Section):
@@ -56,29 +79,43 @@ class RobotProfile(Section):
 
     name: Name
     driver: Literal["sim", "ros2"] = "sim"
-    description: str
-    base_frame: str
-    tcp_frame: str
-    arm_joints: tuple[str, ...] = Field(min_length=1)
-    finger_joints: tuple[str, ...] = ()
-    home_rad: tuple[float, ...]
+    description: Word
+    base_frame: Word
+    tcp_frame: Word
+    arm_joints: Words = Field(min_length=1)
+    finger_joints: Words = ()
+    home_rad: tuple[float, ...] = Field(strict=False)
     gripper: GripperProfile = GripperProfile()
 
     @model_validator(mode="after")
-    def _one_home_angle_a_joint(self) -> RobotProfile:
+    def _joints_fit(self) -> RobotProfile:
+        faults = []
         if len(self.home_rad) != len(self.arm_joints):
-            raise ValueError(
-                f"home_rad has {len(self.home_rad)} angles for {len(self.arm_joints)} arm_joints"
+            why = f"has {len(self.home_rad)} angles for {len(self.arm_joints)} arm_joints"
+            faults.append((("home_rad",), why))
+        faults += [
+            (("home_rad", str(index)), f"is {angle:g}: more than a turn; give radians")
+            for index, angle in enumerate(self.home_rad)
+            if abs(angle) > 2 * math.pi
+        ]
+        shared = sorted(set(self.arm_joints) & set(self.finger_joints))
+        if shared:
+            faults.append((("finger_joints",), f"repeats arm_joints: {', '.join(shared)}"))
+        if self.gripper.dead_band_m >= self.gripper.max_width_m:
+            why = (
+                f"must be less than max_width_m ({self.gripper.max_width_m:g}): nothing would move"
             )
+            faults.append((("gripper", "dead_band_m"), why))
+        refuse(faults)
         return self
 
 
 class Workspace(Section):
     """Box in the base frame that the TCP must not leave, in m."""
 
-    x_m: Range = (0.2, 0.75)
-    y_m: Range = (-0.45, 0.45)
-    z_m: Range = (0.012, 0.9)
+    x_m: Reach = (0.2, 0.75)
+    y_m: Reach = (-0.45, 0.45)
+    z_m: Reach = (0.012, 0.9)
 
 
 class TranslationLimits(Section):
@@ -124,6 +161,20 @@ class Limits(Section):
     tracking_m: float = Field(default=0.05, gt=0, le=0.2)
     tracking_rad: float = Field(default=0.3, gt=0, le=1.0)
 
+    @model_validator(mode="after")
+    def _a_step_fits_the_leash(self) -> Limits:
+        refuse(
+            [
+                ((step,), f"is {value:g}, longer than the leash {lead} ({limit:g})")
+                for step, value, lead, limit in (
+                    ("step_m", self.step_m, "lead_m", self.lead_m),
+                    ("step_rad", self.step_rad, "lead_rad", self.lead_rad),
+                )
+                if value > limit
+            ]
+        )
+        return self
+
 
 class Timing(Section):
     """Rates and patience.
@@ -146,6 +197,21 @@ class Timing(Section):
     max_observation_age_s: float = Field(default=1.0, gt=0, le=10)
     max_clock_step_s: float = Field(default=0.05, gt=0, le=1)
 
+    @model_validator(mode="after")
+    def _patience_outlasts_the_rate(self) -> Timing:
+        refuse(
+            [
+                ((name,), f"is {wait_s:g}, less than {MIN_PERIODS} periods of {rate} ({rate_hz:g})")
+                for name, wait_s, rate, rate_hz in (
+                    ("command_timeout_s", self.command_timeout_s, "command_hz", self.command_hz),
+                    ("watchdog_s", self.watchdog_s, "command_hz", self.command_hz),
+                    ("state_timeout_s", self.state_timeout_s, "state_hz", self.state_hz),
+                )
+                if wait_s * rate_hz < MIN_PERIODS - 1e-9
+            ]
+        )
+        return self
+
 
 class CameraProfile(Section):
     """A camera.
@@ -160,7 +226,7 @@ class CameraProfile(Section):
         loop: a file starts again at its end.
     """
 
-    source: str = Field(pattern=r"^(sim|v4l2|file|ros2):.+|^rtsps?://.+")
+    source: Annotated[Word, AfterValidator(_source)]
     width: int = Field(default=640, ge=16, le=8192)
     height: int = Field(default=480, ge=16, le=8192)
     rate_hz: float = Field(default=30.0, gt=0, le=240)
@@ -179,7 +245,7 @@ class SimProfile(Section):
         renderer: ``auto`` takes OpenGL where it works, else ray casting.
     """
 
-    scene: str = "table"
+    scene: Word = "table"
     gains: Literal["stiff", "compliant"] = "stiff"
     joint_friction_nm: float = Field(default=0.0, ge=0, le=10)
     seed: int = Field(default=0, ge=0)
@@ -189,56 +255,44 @@ class SimProfile(Section):
 class TaskProfile(Section):
     """What the settings are until somebody puts others."""
 
-    prompt: str = "hold"
+    prompt: Text = "hold"
     rate_hz: float = Field(default=5.0, ge=0.05, le=100)
     worker: Name = "scripted"
 
 
-class SessionProfile(Section):
-    """How nodes of this profile reach each other.
+class HostProfile(Section):
+    """One computer: which nodes run there, and how it reaches the router from there.
 
     Args:
-        mode: ``client`` of a router (peers are not forwarded to each other by a router), or
-            ``peer`` for a direct pair on one host.
-        connect: where clients look for the router.
-        listen: where the router listens.
-        shared_memory: move large payloads through shared memory between processes of one host.
-        lease_ms: a silent link is given up after this.
+        nodes: kinds of nodes.
+        connect: where the router is seen from there; None: as session.connect says.
+        cameras: those of its camera node; None: all.
+        workers: those it runs; None: all.
     """
 
-    mode: Literal["client", "peer"] = "client"
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    shared_memory: bool = True
-    lease_ms: int = Field(default=1000, ge=200, le=60000)
-
-
-class HostProfile(Section):
-    """One computer: which nodes run there, and how it reaches the router from there."""
-
-    nodes: tuple[Literal["router", "sim", "camera", "command", "worker"], ...]
-    connect: tuple[str, ...] | None = None
-    cameras: tuple[Name, ...] | None = None
-    workers: tuple[Name, ...] | None = None
+    nodes: Annotated[tuple[NodeKind, ...], Field(strict=False, min_length=1), Distinct]
+    connect: Endpoints | None = None
+    cameras: Names | None = None
+    workers: Names | None = None
 
 
 class Profile(Section):
     """Everything about one robot and its lab."""
 
     name: Name
-    about: str = ""
-    root: str = keys.DEFAULT_ROOT
+    about: Text = ""
+    root: Annotated[Word, AfterValidator(_root)] = keys.DEFAULT_ROOT
     robot: RobotProfile
     limits: Limits = Limits()
     timing: Timing = Timing()
-    cameras: dict[Name, CameraProfile] = {}
+    cameras: dict[Name, CameraProfile] = Field(default_factory=dict)
     sim: SimProfile = SimProfile()
-    workers: tuple[Name, ...] = ("scripted",)
+    workers: Names = ("scripted",)
     task: TaskProfile = TaskProfile()
     session: SessionProfile = SessionProfile()
-    hosts: dict[Name, HostProfile] = {
-        "here": HostProfile(nodes=("router", "sim", "camera", "command", "worker"))
-    }
+    hosts: dict[Name, HostProfile] = Field(
+        default_factory=lambda: {"here": HostProfile(nodes=NODE_KINDS)}
+    )
     ros2: Ros2Profile | None = None
 
     @property
@@ -248,22 +302,5 @@ class Profile(Section):
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Profile:
-        if self.robot.driver == "ros2" and self.ros2 is None:
-            raise ValueError("robot.driver is ros2, so a section ros2 is needed")
-        if self.task.worker not in self.workers:
-            raise ValueError(
-                f"task.worker {self.task.worker!r} is not among workers: {', '.join(self.workers)}"
-            )
-        for host, part in self.hosts.items():
-            for what, named, known in (
-                ("cameras", part.cameras, tuple(self.cameras)),
-                ("workers", part.workers, self.workers),
-            ):
-                for name in named or ():
-                    if name not in known:
-                        raise ValueError(
-                            f"hosts.{host}.{what}: {name!r} is not among {what}: {', '.join(known)}"
-                        )
-        if not self.hosts:
-            raise ValueError("hosts is empty: name at least one host and its nodes")
+        refuse(fit.faults(self))
         return self

@@ -1,0 +1,100 @@
+"""vla-zenoh profile: the profiles there are, what one comes to, and whether it is right."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.syntax import Syntax
+from rich.table import Table
+
+from vla_zenoh.cli.output import console, errors, fail, print_json, printable
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.profile import advice, load_profile, profile_file, profile_names, to_yaml
+
+profile_app = typer.Typer(
+    help="Profiles: what there is, what one comes to, and whether it is right.",
+    no_args_is_help=True,
+)
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for a script.")]
+
+
+@profile_app.command("list")
+def list_profiles(as_json: JsonOption = False) -> None:
+    """List the profiles that can be found: your own of VLA_ZENOH_PATH, then the shipped ones."""
+    rows = [_row(name) for name in profile_names()]
+    if as_json:
+        print_json(rows)
+        return
+    table = Table("name", "about", "robot", "driver", "hosts", "file", header_style="bold")
+    for row in rows:
+        if "fault" in row:
+            wrong = f"[red]{escape(printable(row['fault']))}[/]"
+            table.add_row(escape(row["name"]), wrong, "", "", "", escape(row["file"]))
+        else:
+            told = ("name", "about", "robot", "driver")
+            cells = [*(row[key] for key in told), ", ".join(row["hosts"]), row["file"]]
+            table.add_row(*(escape(printable(cell)) for cell in cells))
+    console().print(table)
+
+
+@profile_app.command("show")
+def show(
+    name: Annotated[str, typer.Argument(help="Name or path of a profile.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Print a profile as it is in force, with what it extends and every default written out."""
+    try:
+        profile = load_profile(name)
+    except ProfileError as error:
+        fail(str(error))
+    if as_json:
+        print_json(profile)
+        return
+    text, out = to_yaml(profile), console()
+    if out.is_terminal:
+        out.print(Syntax(text.rstrip("\n"), "yaml", background_color="default", word_wrap=True))
+    else:
+        print(text, end="")
+
+
+@profile_app.command("check")
+def check(
+    names: Annotated[list[str], typer.Argument(help="Names or paths of profiles.", metavar="NAME")],
+) -> None:
+    """Check profiles: every fault with file and line, then what is worth a second look.
+
+    Exits with 1 when one of them is wrong. Advice alone leaves the exit code at 0.
+    """
+    wrong = False
+    for name in names:
+        try:
+            profile = load_profile(name)
+        except ProfileError as error:
+            wrong = True
+            for line in str(error).splitlines():
+                errors().print(f"[red]{escape(printable(line))}[/]", soft_wrap=True)
+            continue
+        console().print(f"[green]ok[/] {escape(printable(name))}", soft_wrap=True)
+        for line in advice(profile):
+            errors().print(f"[yellow]advice[/] {escape(printable(line))}", soft_wrap=True)
+    if wrong:
+        raise typer.Exit(1)
+
+
+def _row(name: str) -> dict[str, Any]:
+    file = str(profile_file(name))
+    try:
+        profile = load_profile(name)
+    except ProfileError as error:
+        return {"name": name, "file": file, "fault": str(error)}
+    return {
+        "name": name,
+        "about": profile.about,
+        "robot": profile.robot.name,
+        "driver": profile.robot.driver,
+        "hosts": list(profile.hosts),
+        "file": file,
+    }

@@ -1,0 +1,94 @@
+"""What is allowed in a profile and yet worth a second look."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from vla_zenoh import resources
+from vla_zenoh.errors import MissingExtraError, ResourceError
+from vla_zenoh.profile.fit import cameras_of, workers_of
+from vla_zenoh.profile.schema import Profile
+from vla_zenoh.profile.session import ANYWHERE, address_of, is_loopback
+
+
+def advice(profile: Profile) -> list[str]:
+    """Sentences, each beginning with the path it is about."""
+    return [*_network(profile), *_placement(profile), *_found_here(profile), *_timing(profile)]
+
+
+def _network(profile: Profile) -> Iterator[str]:
+    session = profile.session
+    if any(address_of(endpoint).startswith(ANYWHERE) for endpoint in session.listen):
+        yield (
+            "session.listen: everybody on the network can command this robot; "
+            "give the address of one network only, or use a firewall"
+        )
+    if len(profile.hosts) < 2:
+        return
+    if session.mode == "peer":
+        yield "session.mode: peers on several hosts must all name each other; client is simpler"
+    routers = [name for name, host in profile.hosts.items() if "router" in host.nodes]
+    if routers and all(is_loopback(endpoint) for endpoint in session.listen):
+        yield (
+            f"session.listen: the router on {routers[0]} is heard on that computer only; "
+            "give its address on the network"
+        )
+    for name, host in profile.hosts.items():
+        endpoints = session.connect if host.connect is None else host.connect
+        if routers and name not in routers and all(is_loopback(e) for e in endpoints):
+            yield (
+                f"hosts.{name}: looks for the router on itself, and it runs on {routers[0]}; "
+                f"give that computer's address in hosts.{name}.connect (a tunnel excepted)"
+            )
+
+
+def _placement(profile: Profile) -> Iterator[str]:
+    hosts = profile.hosts.values()
+    running = {kind for host in hosts for kind in host.nodes}
+    if "router" not in running and profile.session.mode == "client":
+        yield "hosts: none runs the router; start one elsewhere, at session.connect"
+    if "command" not in running:
+        yield "hosts: none runs the command node; nothing will move"
+    if "sim" not in running and profile.robot.driver == "sim":
+        yield "hosts: none runs the simulator, and robot.driver is sim"
+    for what, known, used in (
+        (
+            "cameras",
+            tuple(profile.cameras),
+            {c for host in hosts for c in cameras_of(profile, host)},
+        ),
+        ("workers", profile.workers, {w for host in hosts for w in workers_of(profile, host)}),
+    ):
+        from_ros2 = {n for n, c in profile.cameras.items() if c.source.startswith("ros2:")}
+        idle = [name for name in known if name not in used and name not in from_ros2]
+        if idle:
+            yield f"{what}: no host runs {', '.join(idle)}"
+    for name, host in profile.hosts.items():
+        for kind, named in (("camera", host.cameras), ("worker", host.workers)):
+            if named is not None and kind not in host.nodes:
+                yield f"hosts.{name}.{kind}s: has no effect without {kind} in hosts.{name}.nodes"
+
+
+def _found_here(profile: Profile) -> Iterator[str]:
+    try:
+        resources.robot_urdf(profile.robot.description)
+    except (ResourceError, MissingExtraError) as error:
+        yield f"robot.description: {error}"
+    running = {kind for host in profile.hosts.values() for kind in host.nodes}
+    wanted = [("workers", "models", worker) for worker in profile.workers]
+    if "sim" in running:
+        wanted.insert(0, ("sim.scene", "sim", profile.sim.scene))
+    for where, kind, name in wanted:
+        try:
+            resources.find(kind, name)
+        except ResourceError as error:
+            yield f"{where}: on this computer there is {error}"
+
+
+def _timing(profile: Profile) -> Iterator[str]:
+    for name, camera in profile.cameras.items():
+        if camera.rate_hz * profile.timing.max_observation_age_s < 1:
+            yield (
+                f"cameras.{name}.rate_hz: a picture every {1 / camera.rate_hz:.3g} s is older than "
+                "timing.max_observation_age_s before the next one comes"
+            )

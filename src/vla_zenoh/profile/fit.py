@@ -1,0 +1,109 @@
+"""Whether the sections of a profile fit each other."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
+
+from vla_zenoh.faults import nearest
+from vla_zenoh.profile.section import Place
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile.schema import HostProfile, Profile
+
+Fault = tuple[Place, str]
+
+ONLY_ONE = {
+    "router": "routers do not find each other",
+    "command": "the robot obeys one command node",
+    "sim": "there is one simulated robot",
+}
+
+
+def faults(profile: Profile) -> list[Fault]:
+    """(place, sentence) of everything that does not fit."""
+    return [*_robot(profile), *_cameras(profile), *_task(profile), *_hosts(profile)]
+
+
+def cameras_of(profile: Profile, host: HostProfile) -> tuple[str, ...]:
+    """Names of the cameras that `host` runs."""
+    if "camera" not in host.nodes:
+        return ()
+    return tuple(profile.cameras) if host.cameras is None else host.cameras
+
+
+def workers_of(profile: Profile, host: HostProfile) -> tuple[str, ...]:
+    """Names of the workers that `host` runs."""
+    if "worker" not in host.nodes:
+        return ()
+    return profile.workers if host.workers is None else host.workers
+
+
+def _robot(profile: Profile) -> Iterator[Fault]:
+    if profile.robot.driver == "ros2" and profile.ros2 is None:
+        yield ("ros2",), "is missing: robot.driver is ros2"
+
+
+def _cameras(profile: Profile) -> Iterator[Fault]:
+    for name, camera in profile.cameras.items():
+        place = ("cameras", name, "source")
+        if camera.source.startswith("ros2:") and profile.ros2 is None:
+            yield place, f"is {camera.source!r}, which needs a section ros2"
+        if camera.source.startswith("sim:") and profile.robot.driver != "sim":
+            yield (
+                place,
+                f"is {camera.source!r}, and robot.driver is {profile.robot.driver}: nothing is "
+                f"simulated. Give another source, or leave an inherited camera out: {name}: null",
+            )
+    if profile.ros2 is not None:
+        yield from _unknown(("ros2", "cameras"), profile.ros2.cameras, "cameras", profile.cameras)
+
+
+def _task(profile: Profile) -> Iterator[Fault]:
+    if profile.task.worker not in profile.workers:
+        yield (
+            ("task", "worker"),
+            f"{profile.task.worker!r} is not among workers"
+            f"{nearest(profile.task.worker, profile.workers)} "
+            f"Known: {', '.join(profile.workers) or 'none'}",
+        )
+
+
+def _hosts(profile: Profile) -> Iterator[Fault]:
+    if not profile.hosts:
+        yield ("hosts",), "is empty: name at least one host and its nodes"
+    runs: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for name, host in profile.hosts.items():
+        place = ("hosts", name)
+        yield from _unknown((*place, "cameras"), host.cameras or (), "cameras", profile.cameras)
+        yield from _unknown((*place, "workers"), host.workers or (), "workers", profile.workers)
+        if "sim" in host.nodes and profile.robot.driver != "sim":
+            yield (*place, "nodes"), f"has sim, and robot.driver is {profile.robot.driver}"
+        for kind in host.nodes:
+            if kind in ONLY_ONE:
+                runs["nodes", kind].append(name)
+        for camera in cameras_of(profile, host):
+            runs["cameras", camera].append(name)
+        for worker in workers_of(profile, host):
+            runs["workers", worker].append(name)
+    for (what, name), hosts in runs.items():
+        if len(hosts) > 1:
+            why = ONLY_ONE.get(name) if what == "nodes" else "each key has one writer"
+            hint = "" if what == "nodes" else f". Say on each host which {what} it runs"
+            yield (
+                ("hosts", hosts[-1], what),
+                f"{name} runs on {' and '.join(hosts)}: {why}{hint}",
+            )
+
+
+def _unknown(
+    place: Place, named: Iterable[str], what: str, known: Iterable[str]
+) -> Iterator[Fault]:
+    for name in named:
+        if name not in known:
+            yield (
+                place,
+                f"{name!r} is not among {what}{nearest(name, known)} "
+                f"Known: {', '.join(known) or 'none'}",
+            )
