@@ -1,7 +1,7 @@
 """The thesis's ten HARD prompts: fixed deltas whose outcome is known beforehand.
 
 ``HARD: go up`` asks for one step of 0.01 m per request; ``HARD: go up x50`` for 50 of them, after
-which the arm is to stand still. Source: "Building a ROS2-VLA Bridge", set points of its experiments.
+which the arm is to stand still. Source: the set points of "Building a ROS2-VLA Bridge".
 """
 
 from __future__ import annotations

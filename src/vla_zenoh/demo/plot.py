@@ -66,33 +66,21 @@ def plot_run(
     position.legend(loc="center right", fontsize=8)
     position.margins(y=0.25)
     first = rotation_from_quat(poses[0].record.quat_xyzw)
-    for entries, times, width, alpha in (
-        (commands, t_commanded, 2.2, 0.35),
-        (poses, t_measured, 0.9, 1),
-    ):
+    thick, thin = {"lw": 2.2, "alpha": 0.35}, {"lw": 0.9}
+    for entries, times, look in ((commands, t_commanded, thick), (poses, t_measured, thin)):
         turns = np.array(
             [log3(rotation_from_quat(entry.record.quat_xyzw) @ first.T) for entry in entries]
         )
-        for axis, (name, colour) in enumerate(AXES):
-            turning.plot(
-                times,
-                turns[:, axis],
-                color=colour,
-                lw=width,
-                alpha=alpha,
-                label=name if alpha == 1 else None,
-            )
-    turning.set(
-        ylabel="rotation since start (rad)", title="orientation, rotation vector in the base"
-    )
+        for axis, (_, colour) in enumerate(AXES):
+            turning.plot(times, turns[:, axis], color=colour, **look)
+    turning.set(ylabel="since start (rad)", title="orientation, rotation vector in the base")
     norms = np.linalg.norm([entry.record.twist[:3] for entry in commands], axis=1)
     speed.plot(t_commanded, norms, color="black", lw=1, label="commanded speed")
     limit = profile.limits.translation.velocity_m_s
     if norms.max() > 0.3 * limit:
         speed.axhline(limit, color="tab:red", ls="--", lw=1, label="limit per axis")
-    speed.set(
-        ylabel="speed (m/s)", xlabel="time (s)", title=f"speed (limit {limit:g} m/s per axis)"
-    )
+    title = f"speed (limit {limit:g} m/s per axis)"
+    speed.set(ylabel="speed (m/s)", xlabel="time (s)", title=title)
     speed.legend(loc="upper right", fontsize=8)
     for axes in (position, turning, speed):
         _draw_marks(axes, marks, zero_ns, labels=axes is position)
