@@ -18,6 +18,7 @@ from vla_zenoh.cli import (
     doctor,
     echo,
     keys,
+    profile,
     router,
     set_prompt,
     sim,
@@ -85,6 +86,8 @@ for panel, name, function in (
     (LOOK, "doctor", doctor.doctor),
 ):
     app.command(name, rich_help_panel=panel)(function)
+
+app.add_typer(profile.profile_app, name="profile", rich_help_panel=LOOK)
 
 
 def app_entry() -> None:
