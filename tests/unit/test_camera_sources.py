@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -298,3 +300,29 @@ def test_all_cameras_but_those_of_ros2_are_served_unless_some_are_named() -> Non
 def test_an_unknown_kind_of_source_lists_the_known_ones() -> None:
     with pytest.raises(NodeError, match="there are: v4l2, rtsp, rtsps, file, sim"):
         make_source(CameraProfile(source="ros2:/image"))
+
+
+def test_what_opencv_says_of_broken_sources_does_not_reach_the_terminal(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"not a video" * 100)
+    (tmp_path / "a.png").write_bytes(cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1][:40])
+    program = f"""
+import threading
+from vla_zenoh.errors import NodeError
+from vla_zenoh.nodes.camera_sources.choose import make_source
+from vla_zenoh.nodes.camera_sources.opencv import prepare
+from vla_zenoh.profile.schema import CameraProfile
+prepare()
+for source in ("file:{tmp_path}/a.mp4", "file:{tmp_path}/a.png", "v4l2:{tmp_path}/a.mp4",
+               "rtsp://127.0.0.1:1/a"):
+    source = make_source(CameraProfile(source=source))
+    try:
+        source.open()
+        source.grab(threading.Event())
+        assert source.retrieve() is None
+    except NodeError:
+        pass
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
