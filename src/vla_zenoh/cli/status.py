@@ -82,7 +82,7 @@ def _plain(robot: Client) -> dict[str, object]:
 
 def _picture(robot: Client, events: list[tuple[str, Header, Event]]) -> Group:
     table = Table(header_style="bold", title=f"robot {robot.keys.robot}", title_justify="left")
-    for column in ("node", "state", "age", "rate", "latency p50 / p95", "refused", "what it says"):
+    for column in ("node", "state", "age", "rate", "refused", "what it says"):
         table.add_column(column, overflow="fold")
     for name, (found, age_s, alive) in robot.snapshot().items():
         state = found.state if alive else "dead"
@@ -91,18 +91,22 @@ def _picture(robot: Client, events: list[tuple[str, Header, Event]]) -> Group:
             f"[{STYLES.get(state, 'white')}]{escape(state)}[/]",
             f"[{'red' if age_s > STALE_S else 'white'}]{age_s:.1f} s[/]",
             "\n".join(f"{key} {value:.0f} Hz" for key, value in found.rates_hz.items()),
-            _latency(found),
             _refused(found),
             escape(_word(found)),
         )
-    return Group(table, *(_event(*happened) for happened in events[-MAX_EVENTS:]))
+    lines = [_latency(name, found) for name, (found, _, _) in robot.snapshot().items()]
+    news = [_event(*happened) for happened in events[-MAX_EVENTS:]]
+    return Group(table, *(line for line in lines if line), *news)
 
 
-def _latency(found: NodeStatus) -> str:
-    return "\n".join(
-        f"{stage} {values[0]:.1f} / {values[1]:.1f} ms"
+def _latency(name: str, found: NodeStatus) -> Text | None:
+    if not found.latency_ms:
+        return None
+    stages = ", ".join(
+        f"{stage.replace('_', ' ')} {values[0]:.1f}/{values[1]:.1f}"
         for stage, values in found.latency_ms.items()
     )
+    return Text(f"{name}, ms p50/p95: {stages}", style="dim")
 
 
 def _refused(found: NodeStatus) -> str:
