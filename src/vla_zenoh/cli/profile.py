@@ -28,7 +28,9 @@ def list_profiles(as_json: JsonOption = False) -> None:
     if as_json:
         print_json(rows)
         return
-    table = Table("name", "about", "robot", "driver", "hosts", "file", header_style="bold")
+    table = Table(header_style="bold")
+    for column in ("name", "about", "robot", "driver", "hosts", "file"):
+        table.add_column(column, no_wrap=column == "name", overflow="fold")
     for row in rows:
         if "fault" in row:
             wrong = f"[red]{escape(printable(row['fault']))}[/]"

@@ -150,8 +150,8 @@ def _merge(
         out_lines[at] = lines[at]
     for key, value in over.items():
         place, inherited = (*at, key), out.get(key)
-        sections = isinstance(value, Mapping) and isinstance(inherited, Mapping)
-        if sections and place not in REPLACED_WHOLE:
+        merged = isinstance(value, Mapping) and place not in REPLACED_WHOLE
+        if merged and isinstance(inherited, Mapping):
             out[key], out_lines = _merge(inherited, out_lines, value, lines, place)
             continue
         if value is None and at in WITH_REMOVABLE and key in out:

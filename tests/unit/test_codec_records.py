@@ -1,0 +1,295 @@
+"""Every record comes back as it was; whatever else arrives is refused with CodecError alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from random_records import RECORDS, headers, refusal, same
+
+from vla_zenoh.codec import header, message, records
+from vla_zenoh.errors import CodecError
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.types import (
+    Event,
+    GripperState,
+    NodeStatus,
+    ObjectPoses,
+    PoseCommand,
+    PoseState,
+    Task,
+)
+
+# A record drawn at random normalises its quaternion once more when it is read: one bit may differ.
+QUATERNION_TOLERANCE = 1e-15
+MAX_SENTENCE = 8000  # characters of an error message
+KINDS = sorted(RECORDS, key=lambda kind: kind.__name__)
+NOTHING_TAKEN = settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+
+by_kind = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+
+
+def decoded_or_refused(kind: type, payload: bytes) -> bool:
+    error = refusal(records.decode, kind, payload)
+    return error is None or (
+        error.reason in {"malformed", "invalid", "oversize"} and 0 < len(str(error)) < MAX_SENTENCE
+    )
+
+
+def near(one: Any, other: Any) -> bool:
+    for name in one.__dataclass_fields__:
+        a, b = getattr(one, name), getattr(other, name)
+        if "quat" in name and a is not None:
+            if not np.allclose(a, b, rtol=0, atol=QUATERNION_TOLERANCE):
+                return False
+        elif not same(a, b):
+            return False
+    return True
+
+
+@by_kind
+@given(data=st.data())
+@NOTHING_TAKEN
+def test_a_record_comes_back_as_it_was(kind: type, data: st.DataObject) -> None:
+    record = data.draw(RECORDS[kind])
+    back = records.decode(kind, records.encode(record))
+    assert back == record if kind is ModelSpec else near(record, back)
+
+
+@by_kind
+@given(data=st.data())
+@NOTHING_TAKEN
+def test_what_is_read_cannot_be_written_to(kind: type, data: st.DataObject) -> None:
+    back = records.decode(kind, records.encode(data.draw(RECORDS[kind])))
+    fields = list(type(back).model_fields if kind is ModelSpec else back.__dataclass_fields__)
+    for name in fields:
+        value = getattr(back, name)
+        if isinstance(value, np.ndarray):
+            assert not value.flags.writeable
+            assert value.flags.c_contiguous
+        with pytest.raises((dataclasses.FrozenInstanceError, ValueError)):
+            setattr(back, name, value)
+
+
+@by_kind
+@given(payload=st.binary(max_size=300))
+@NOTHING_TAKEN
+def test_arbitrary_bytes_are_refused_or_read(kind: type, payload: bytes) -> None:
+    assert decoded_or_refused(kind, payload)
+
+
+@by_kind
+@given(data=st.data())
+@NOTHING_TAKEN
+def test_a_truncated_record_is_refused(kind: type, data: st.DataObject) -> None:
+    payload = records.encode(data.draw(RECORDS[kind]))
+    cut = data.draw(st.integers(0, len(payload) - 1))
+    with pytest.raises(CodecError):
+        records.decode(kind, payload[:cut])
+
+
+@by_kind
+@given(data=st.data())
+@NOTHING_TAKEN
+def test_flipped_bits_are_refused_or_read(kind: type, data: st.DataObject) -> None:
+    payload = bytearray(records.encode(data.draw(RECORDS[kind])))
+    for _ in range(data.draw(st.integers(1, 4))):
+        payload[data.draw(st.integers(0, len(payload) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    assert decoded_or_refused(kind, bytes(payload))
+
+
+ANY_KEY = st.text(max_size=5) | st.binary(max_size=5)
+ANY_VALUE = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=8)
+    | st.binary(max_size=8)
+    | st.just(np.array([np.nan, 1.0]))
+    | st.just(np.array(["a", "b"]))
+    | st.just(np.array([[True]]))
+    | st.just(np.float32(2)),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(ANY_KEY, inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@by_kind
+@given(data=st.data())
+@NOTHING_TAKEN
+def test_a_field_may_hold_anything_and_is_refused_or_read(kind: type, data: st.DataObject) -> None:
+    fields = message.unpack(records.encode(data.draw(RECORDS[kind])))
+    name = data.draw(st.sampled_from(sorted(fields)))
+    assert decoded_or_refused(kind, message.pack(fields | {name: data.draw(ANY_VALUE)}))
+
+
+def forged(record: Any, **fields: Any) -> bytes:
+    return message.pack(message.unpack(records.encode(record)) | fields)
+
+
+TASK = Task(episode=1, active=True, prompt="go", worker="w", rate_hz=5.0)
+POSE = PoseState(np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(6))
+GRIPPER = GripperState(0.04, moving=False, holding=False)
+STATUS = NodeStatus("n", "s", "h", 1, 1)
+UNIT = np.array([0, 0, 0, 1.0])
+COMMAND = PoseCommand(np.zeros(3), UNIT, np.zeros(6), np.zeros(6), np.zeros(3), UNIT, "active")
+HEADER_REASONS = {"schema", "invalid", "malformed"}
+
+
+@pytest.mark.parametrize(
+    ("record", "fields", "said"),
+    [
+        (TASK, {"rate_hz": True}, "rate_hz is not a number"),
+        (TASK, {"rate_hz": "5"}, "rate_hz is not a number"),
+        (TASK, {"rate_hz": float("nan")}, "rate_hz is nan"),
+        (TASK, {"rate_hz": float("inf")}, "rate_hz is inf"),
+        (TASK, {"episode": 1.0}, "episode is not a whole number"),
+        (TASK, {"episode": 2**63}, "episode is 9223372036854775808"),
+        (TASK, {"episode": -1}, "episode is -1"),
+        (TASK, {"active": 1}, "active is not true or false"),
+        (TASK, {"prompt": b"go"}, "prompt is not text"),
+        (TASK, {"prompt": "x" * 5000}, "prompt has 5000 characters"),
+        (POSE, {"position_m": [True, 0, 0]}, "position_m is not a list of numbers"),
+        (POSE, {"position_m": ["1", "2", "3"]}, "position_m is not a list of numbers"),
+        (POSE, {"position_m": [[1], [2, 3]]}, "position_m is not a list of numbers"),
+        (POSE, {"position_m": {"x": 1}}, "position_m is not a list of numbers"),
+        (POSE, {"position_m": None}, "position_m is not a list of numbers"),
+        (POSE, {"position_m": np.zeros((1, 3))}, r"position_m has shape \(1, 3\)"),
+        (POSE, {"position_m": np.full(3, np.nan)}, "position_m is not finite"),
+        (POSE, {"twist": np.zeros(5)}, r"twist has shape \(5,\), wanted \(6,\)"),
+        (POSE, {"quat_xyzw": [0, 0, 0, 0.9]}, "quat_xyzw has norm 0.9"),
+        (POSE, {"quat_xyzw": [0, 0, 0, 0]}, "quat_xyzw has norm 0"),
+        (POSE, {"reference_position_m": [0, 0, 0]}, "needs both position and quaternion"),
+        (GRIPPER, {"faults": "fire"}, "faults is not a list of texts"),
+        (GRIPPER, {"faults": [b"fire"]}, "faults is not text"),
+        (GRIPPER, {"width_m": 40}, "width_m is 40"),
+        (STATUS, {"rates_hz": {"a": float("nan")}}, "rates_hz.a is nan"),
+        (STATUS, {"counters": {"a": 1.5}}, "counters.a is not a whole number"),
+        (STATUS, {"counters": {b"a": 1}}, "a name in counters is not text"),
+        (STATUS, {"latency_ms": {"a": [1]}}, r"latency_ms.a has shape \(1,\)"),
+        (STATUS, {"detail": {"a": b"x"}}, "detail.a is not text, a number"),
+        (STATUS, {"detail": {"a": {"b": {"c": {"d": {}}}}}}, "detail.a.b.c.d is nested too deep"),
+        (STATUS, {"detail": {"a": np.zeros(2)}}, "detail.a is not text, a number"),
+        (STATUS, {"detail": {"a": float("nan")}}, "detail.a is nan"),
+        (STATUS, {"detail": [1]}, "detail is not a map"),
+        (STATUS, {"detail": {str(n): n for n in range(1025)}}, "detail has 1025 entries"),
+        (Event("info", "notice", "x"), {"level": "loud"}, "level is 'loud', allowed: info"),
+        (Event("info", "notice", "x"), {"kind": "x"}, "kind is 'x', allowed: refusal"),
+        (Event("info", "notice", "x"), {"count": 0}, "count is 0"),
+        (
+            ObjectPoses(("a",), np.zeros((1, 3)), np.array([[0, 0, 0, 1.0]])),
+            {"position_m": np.zeros((3, 1))},
+            r"position_m has shape \(3, 1\), wanted \(1, 3\)",
+        ),
+        (
+            ObjectPoses(("a",), np.zeros((1, 3)), np.array([[0, 0, 0, 1.0]])),
+            {"quat_xyzw": np.ones((1, 4))},
+            "quat_xyzw has norm 2",
+        ),
+    ],
+)
+def test_a_wrong_value_is_refused_by_name(record: Any, fields: Any, said: str) -> None:
+    with pytest.raises(CodecError, match=said) as caught:
+        records.decode(type(record), forged(record, **fields))
+    assert caught.value.reason == "invalid"
+
+
+def test_numbers_of_any_kind_are_read_where_they_fit() -> None:
+    task = records.decode(Task, forged(TASK, rate_hz=5, episode=np.int32(3)))
+    assert type(task.rate_hz) is float
+    assert type(task.episode) is int
+    pose = records.decode(PoseState, forged(POSE, position_m=[1, 2, 3], twist=np.ones(6, np.int8)))
+    assert pose.position_m.tolist() == [1.0, 2.0, 3.0]
+    assert pose.twist.dtype == np.float64
+
+
+def test_fields_that_are_missing_or_unknown_are_named() -> None:
+    with pytest.raises(CodecError, match="Task lacks episode, active, prompt, worker, rate_hz"):
+        records.decode(Task, message.pack({}))
+    with pytest.raises(CodecError, match="Task has no field 'episodes'"):
+        records.decode(Task, forged(TASK, episodes=1))
+    with pytest.raises(CodecError, match="Task is a map, this is a list"):
+        records.decode(Task, message.pack([1]))
+    with pytest.raises(CodecError, match="cause is a map or nothing"):
+        records.decode(PoseCommand, forged(COMMAND, cause=5))
+    with pytest.raises(CodecError, match="Cause lacks worker"):
+        records.decode(PoseCommand, forged(COMMAND, cause={}))
+
+
+def test_an_error_message_stays_short_whatever_is_in_the_field() -> None:
+    for value in ("x" * 100_000, b"x" * 100_000, [[0] * 5000] * 9, np.full(9000, np.nan)):
+        with pytest.raises(CodecError) as caught:
+            records.decode(PoseState, forged(POSE, position_m=value))
+        assert len(str(caught.value)) < 1000
+
+
+def test_an_oversize_record_is_refused_before_it_is_read() -> None:
+    payload = b"\xdf" + b"\xff" * (records.MAX_RECORD_BYTES + 1)
+    with pytest.raises(CodecError) as caught:
+        records.decode(Task, payload)
+    assert caught.value.reason == "oversize"
+
+
+def test_what_a_stranger_says_of_himself_can_be_printed_as_json() -> None:
+    payload = forged(STATUS, detail={"a\x1b[2J": ["\u202e", {"b": None}], "n": 2**62})
+    status = records.decode(NodeStatus, payload)
+    assert json.loads(json.dumps(dataclasses.asdict(status)))["detail"]["n"] == 2**62
+
+
+# -- headers ----------------------------------------------------------------------------------
+@given(headers)
+def test_a_header_comes_back_as_it_was(written: Any) -> None:
+    assert header.decode(header.encode(written)) == written
+
+
+@given(st.binary(max_size=200))
+def test_arbitrary_attachments_are_refused_or_read(attachment: bytes) -> None:
+    error = refusal(header.decode, attachment)
+    assert error is None or error.reason in HEADER_REASONS
+
+
+@given(headers, st.data())
+def test_flipped_bits_in_a_header_are_refused_or_read(written: Any, data: st.DataObject) -> None:
+    payload = bytearray(header.encode(written))
+    payload[data.draw(st.integers(0, len(payload) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    error = refusal(header.decode, bytes(payload))
+    assert error is None or error.reason in HEADER_REASONS
+
+
+@given(st.sampled_from(["schema", "stamp_wall_ns", "seq", "source"]), ANY_VALUE)
+def test_a_header_field_may_hold_anything(name: str, value: Any) -> None:
+    fields = {"schema": 1, "stamp_wall_ns": 1, "seq": 1, "source": "a"} | {name: value}
+    error = refusal(header.decode, message.pack(fields))
+    assert error is None or error.reason in HEADER_REASONS
+
+
+GOOD = {"schema": 1, "stamp_wall_ns": 5, "seq": 6, "source": "sim#1"}
+
+
+@pytest.mark.parametrize(
+    ("attachment", "reason"),
+    [
+        (None, "no_header"),
+        (b"", "malformed"),
+        (b"\xc1", "malformed"),
+        (msgpack.packb([1]), "malformed"),
+        (msgpack.packb(GOOD | {"schema": 2}), "schema"),
+        (msgpack.packb(GOOD | {"schema": True}), "schema"),
+        (msgpack.packb(GOOD | {"schema": 1.0}), "schema"),
+        (msgpack.packb({"schema": 1}), "malformed"),
+        (msgpack.packb(GOOD | {"seq": -1}), "invalid"),
+        (msgpack.packb(GOOD | {"source": "x" * 200}), "invalid"),
+        (msgpack.packb(GOOD | {"padding": b"x" * 2000}), "malformed"),
+    ],
+)
+def test_a_wrong_header_is_refused_with_its_reason(attachment: bytes | None, reason: str) -> None:
+    with pytest.raises(CodecError) as caught:
+        header.decode(attachment)
+    assert caught.value.reason == reason
