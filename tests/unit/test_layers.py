@@ -20,11 +20,13 @@ PURE = frozenset({"zenoh", "typer", "mujoco", "torch", "time", "threading", "asy
 FORBIDDEN = {
     # folder, or "." for the modules beside them: what nothing in it may import
     ".": PURE,
+    "bench": PURE,
     "codec": PURE,
     "control": PURE,
     "interop": PURE,
     "profile": PURE,
     "simulation": PURE - {"mujoco"},
+    "demo": PURE,
     "doctor": PURE,
     "nodes": frozenset({"typer", "torch", "mujoco", "asyncio", "vla_zenoh.cli"}),
     "cli": frozenset({"torch", "mujoco", "asyncio"}),
