@@ -8,7 +8,7 @@ import inspect
 import re
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,8 @@ from vla_zenoh import resources
 from vla_zenoh.errors import ResourceError, WorkerError
 from vla_zenoh.policy import ModelSpec, Policy
 
-_HEADER = re.compile(r"(?m)^# /// script\s*$\s(?P<body>(?:^#(?:| .*)$\s)+?)^# ///\s*$")
+# The pattern of PEP 723: the block ends at the last line that can end it.
+_HEADER = re.compile(r"(?m)^# /// script$\s(?P<body>(?:^#(?:| .*)$\s)+)^# ///$")
 ENTRY_FILE = "model.py"
 
 
@@ -65,6 +66,8 @@ def find_model(name: str) -> ModelFile:
     header = _read_header(path)
     dependencies = header.get("dependencies", [])
     requires = header.get("requires-python")
+    if requires is not None and not isinstance(requires, str):
+        raise WorkerError(f"{path}: requires-python in the script header must be a text")
     if not isinstance(dependencies, list) or not all(isinstance(d, str) for d in dependencies):
         raise WorkerError(f"{path}: dependencies in the script header must be a list of texts")
     return ModelFile(stem, path, tuple(dependencies), requires)
@@ -72,14 +75,16 @@ def find_model(name: str) -> ModelFile:
 
 def _read_header(path: Path) -> Mapping[str, Any]:
     try:
-        found = _HEADER.search(path.read_text("utf-8"))
+        blocks = [found["body"] for found in _HEADER.finditer(path.read_text("utf-8-sig"))]
     except (OSError, UnicodeDecodeError) as error:
         raise WorkerError(f"{path} cannot be read: {error}") from error
-    if found is None:
+    if not blocks:
         return {}
+    if len(blocks) > 1:
+        raise WorkerError(f"{path} has {len(blocks)} script headers; PEP 723 allows one")
     body = "".join(
         line[2:] if line.startswith("# ") else line[1:]
-        for line in found["body"].splitlines(keepends=True)
+        for line in blocks[0].splitlines(keepends=True)
     )
     try:
         return tomllib.loads(body)
@@ -103,22 +108,40 @@ def make_policy(model: ModelFile, options: Mapping[str, str] | None = None) -> P
     sys.modules[found.name] = module
     try:
         found.loader.exec_module(module)
-    except Exception as error:
-        raise WorkerError(f"{model.path} cannot be imported: {type(error).__name__}: {error}") from error
+    except (Exception, SystemExit) as error:
+        del sys.modules[found.name]
+        raise WorkerError(
+            f"{model.path} cannot be imported: {type(error).__name__}: {error}"
+        ) from error
     maker = getattr(module, "MODEL", None) or _only_model(module, model.path)
+    if not callable(maker):
+        raise WorkerError(f"{model.path}: MODEL must be a class, it is a {type(maker).__name__}")
+    name = getattr(maker, "__name__", "MODEL")
     try:
         policy = maker(**(options or {}))
-    except Exception as error:
-        accepted = ", ".join(inspect.signature(maker).parameters) or "none"
+    except (Exception, SystemExit) as error:
         raise WorkerError(
-            f"{model.path}: {maker.__name__} cannot be made: {error} (options it takes: {accepted})"
+            f"{model.path}: {name} cannot be made: {error} (options it takes: {_accepted(maker)})"
         ) from error
-    if not isinstance(policy, Policy) or not isinstance(policy.spec, ModelSpec):
+    try:
+        fits = isinstance(policy, Policy) and isinstance(policy.spec, ModelSpec)
+    except Exception as error:  # a property that fails
         raise WorkerError(
-            f"{model.path}: {maker.__name__} needs a property `spec` (a vla_zenoh.policy.ModelSpec) "
+            f"{model.path}: the spec of {name} cannot be read: {type(error).__name__}: {error}"
+        ) from error
+    if not fits:
+        raise WorkerError(
+            f"{model.path}: {name} needs a property `spec` (a vla_zenoh.policy.ModelSpec) "
             "and a method `infer(observation)`"
         )
     return policy
+
+
+def _accepted(maker: Callable[..., Any]) -> str:
+    try:
+        return ", ".join(inspect.signature(maker).parameters) or "none"
+    except (TypeError, ValueError):
+        return "unknown"
 
 
 def _only_model(module: Any, path: Path) -> type:

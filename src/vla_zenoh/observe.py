@@ -11,8 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_zenoh.errors import SpecError
 from vla_zenoh.policy import CameraSpec, ModelSpec, Observation
 from vla_zenoh.types import Image, Stamped, Task
+
+CLOCK_TOLERANCE_S = 0.05
+"""A picture may seem to come from the future by this much before clocks are said to differ."""
 
 
 @dataclass(slots=True)
@@ -67,6 +71,9 @@ def assemble(
         not_before_ns: an observation from before this time is not wanted: it cannot show what the
             last chunk did.
         now_ns: wall clock.
+
+    Raises:
+        SpecError: a picture does not have the size the spec wants, see `prepare`.
     """
     wanted = spec.observation
     if wanted.prompt and not task.prompt:
@@ -82,7 +89,14 @@ def assemble(
     seq = oldest.header.seq if oldest else 0
     age_s = (now_ns - stamp_ns) / 1e9
     if age_s > wanted.max_age_s:
-        return NotYet(f"the newest observation is {age_s:.2f} s old, at most {wanted.max_age_s:g} s")
+        return NotYet(
+            f"the newest observation is {age_s:.2f} s old, at most {wanted.max_age_s:g} s"
+        )
+    if age_s < -CLOCK_TOLERANCE_S:
+        return NotYet(
+            f"the newest observation is {-age_s:.2f} s in the future; synchronise the clocks "
+            "of camera, robot and worker (chrony or ptp)"
+        )
     if stamp_ns < not_before_ns:
         return NotYet("no observation since the last chunk", waiting=True)
     parts: dict[str, Any] = {}
@@ -111,7 +125,11 @@ def _oldest(entries: Sequence[Stamped[Any]]) -> Stamped[Any] | None:
 
 
 def prepare(image: Image, spec: CameraSpec) -> NDArray[np.uint8]:
-    """A picture in the size and channel order the model declared."""
+    """A picture in the size and channel order the model declared.
+
+    Raises:
+        SpecError: it has another size and the spec does not say how to resize it.
+    """
     rgb = image.rgb
     if spec.width is not None and spec.height is not None:
         rgb = _resize(rgb, spec)
@@ -126,7 +144,7 @@ def _resize(rgb: NDArray[np.uint8], spec: CameraSpec) -> NDArray[np.uint8]:
     if (height, width) == (spec.height, spec.width):
         return rgb
     if spec.resize == "none":
-        raise ValueError(
+        raise SpecError(
             f"camera {spec.camera!r} sends {width}x{height}, the spec asks for "
             f"{spec.width}x{spec.height} and says resize: none"
         )
@@ -134,9 +152,7 @@ def _resize(rgb: NDArray[np.uint8], spec: CameraSpec) -> NDArray[np.uint8]:
         return _scale(rgb, spec.width, spec.height)
     fit = min if spec.resize == "pad" else max
     factor = fit(spec.width / width, spec.height / height)
-    scaled = _scale(
-        rgb, max(1, round(width * factor)), max(1, round(height * factor))
-    )
+    scaled = _scale(rgb, max(1, round(width * factor)), max(1, round(height * factor)))
     out = np.zeros((spec.height, spec.width, 3), np.uint8)
     top, left = (spec.height - scaled.shape[0]) // 2, (spec.width - scaled.shape[1]) // 2
     cut = scaled[max(-top, 0) :, max(-left, 0) :][: spec.height, : spec.width]

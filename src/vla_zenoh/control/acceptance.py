@@ -20,7 +20,7 @@ class Refusal(NamedTuple):
         why: a sentence.
         value: what was found, where it is a number.
         limit: what is allowed.
-        quiet: part of normal running (a chunk under way when the prompt changed): counted, no event.
+        quiet: part of normal running (a chunk under way when the prompt changed): no event.
     """
 
     reason: str
@@ -64,12 +64,15 @@ def refuse(
             f"{lease.source!r}",
         )
     if header.seq <= lease.last_seq:
-        return Refusal("replayed", f"chunk {header.seq} came again or late", header.seq, lease.last_seq)
+        return Refusal(
+            "replayed", f"chunk {header.seq} came again or late", header.seq, lease.last_seq
+        )
     lease.last_seq = header.seq
     agreed = lease.spec.hash
     if record.spec_hash != agreed:
         return Refusal(
-            "spec_mismatch", f"chunk of spec {record.spec_hash!r}, agreed at activation was {agreed}"
+            "spec_mismatch",
+            f"chunk of spec {record.spec_hash!r}, agreed at activation was {agreed}",
         )
     if record.episode != task.episode:
         return Refusal(
@@ -94,7 +97,10 @@ def _refuse_by_time(
         )
     if age_s > max_age_s:
         return Refusal(
-            "stale", f"its observation is {age_s:.3f} s old, at most {max_age_s:g} s", age_s, max_age_s
+            "stale",
+            f"its observation is {age_s:.3f} s old, at most {max_age_s:g} s",
+            age_s,
+            max_age_s,
         )
     if now_ns > record.valid_until_ns:
         late_s = (now_ns - record.valid_until_ns) / 1e9

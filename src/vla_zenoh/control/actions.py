@@ -17,6 +17,8 @@ from vla_zenoh.types import FloatArray, unit_quaternion
 
 GRIPPER_SLACK = 0.25
 """A fraction outside [0, 1] by up to this much is a model's rounding and is clipped."""
+GRIPPER_SLACK_M = 0.05
+"""A width outside what the gripper has by up to this much likewise."""
 
 
 def rotation_of(spec: ActionSpec, numbers: FloatArray) -> FloatArray:
@@ -64,19 +66,24 @@ def step_width(
         return None
     value = float(step[-1])
     if spec.gripper == "delta_m":
-        if abs(value) > max_width_m + GRIPPER_SLACK:
-            raise RecordError(f"gripper delta_m of {value:g} m is more than any gripper opens")
+        if abs(value) > max_width_m + GRIPPER_SLACK_M:
+            raise RecordError(
+                f"gripper delta_m of {value:g} m; this gripper opens to {max_width_m:g} m"
+            )
         wanted_m = before_m + value
     elif spec.gripper == "absolute_m":
-        if not -0.01 <= value <= max_width_m + 0.05:
+        if not -0.01 <= value <= max_width_m + GRIPPER_SLACK_M:
             raise RecordError(
                 f"gripper absolute_m of {value:g} m; this gripper opens to {max_width_m:g} m"
             )
         wanted_m = value
     else:
-        if spec.gripper == "open_fraction" and not -GRIPPER_SLACK <= value <= 1 + GRIPPER_SLACK:
-            raise RecordError(f"gripper open_fraction of {value:g}; wanted a number in [0, 1]")
-        fraction = value if spec.gripper == "open_fraction" else float(value > spec.gripper_threshold)
+        if spec.gripper == "open_fraction":
+            if not -GRIPPER_SLACK <= value <= 1 + GRIPPER_SLACK:
+                raise RecordError(f"gripper open_fraction of {value:g}; wanted a number in [0, 1]")
+            fraction = value
+        else:
+            fraction = float(value > spec.gripper_threshold)
         if not spec.gripper_open_is_high:
             fraction = 1.0 - fraction
         wanted_m = fraction * max_width_m

@@ -7,11 +7,10 @@ a simulator and on the robot.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
-
-import numpy as np
 
 from vla_zenoh.control import limits as bounds
 from vla_zenoh.control.acceptance import Lease, Refusal, refuse
@@ -19,18 +18,24 @@ from vla_zenoh.control.actions import step_pose, step_width
 from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
 from vla_zenoh.control.gripper import GripperArbiter
 from vla_zenoh.control.names import worker_node
-from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
+from vla_zenoh.control.preflight import (
+    CLOCK_TOLERANCE_S,
+    Surroundings,
+    reasons_not_to_activate,
+)
 from vla_zenoh.control.smoothing import Motion, MotionLimits, Smoother
 from vla_zenoh.control.so3 import (
     Pose,
     angle_between,
+    norm3,
     quat_from_rotation,
     rotation_from_quat,
 )
 from vla_zenoh.control.states import OBEYING, State, Trigger, after
 from vla_zenoh.errors import RecordError
-from vla_zenoh.profile import Profile
+from vla_zenoh.profile import Limits, Profile
 from vla_zenoh.types import (
+    MAX_TEXT,
     ActionChunk,
     Cause,
     Event,
@@ -46,6 +51,10 @@ FIRST_CHUNK_PATIENCE_S = 1.0
 """After activation a new observation, an inference and a chunk have to happen first."""
 LINGER_NS = 500_000_000
 """The stream goes on for this long after the arm stands, so that its last pose is not lost."""
+SAME_WIDTH_M = 0.005
+"""A gripper this near to the width last sent has reached it."""
+BACK_OFF_M, BACK_OFF_RAD = 0.005, 0.02
+"""A blocked arm that is led back may stray by this much more before it counts as blocked again."""
 
 
 class Setting(NamedTuple):
@@ -108,9 +117,7 @@ class Commander:
         self.dry_run = dry_run
         self.state = State.INACTIVE
         self.why = "not activated yet"
-        self.task = Task(
-            0, False, profile.task.prompt, profile.task.worker, profile.task.rate_hz
-        )
+        self.task = Task(0, False, profile.task.prompt, profile.task.worker, profile.task.rate_hz)
         self.pose: Stamped[PoseState] | None = None
         self.gripper_state: Stamped[GripperState] | None = None
         self.gripper = GripperArbiter(profile.robot.gripper)
@@ -125,6 +132,7 @@ class Commander:
         self._smoother: Smoother | None = None
         self._timeline: GoalTimeline | None = None
         self._deadline_ns = 0
+        self._excused = (0.0, 0.0)
         self._rest_since_ns: int | None = None
         self._streaming = False
         self._target: Goal | None = None
@@ -143,8 +151,11 @@ class Commander:
         self._out = Outputs()
         task_before, state_before = self.task, self.state
         self._take_state(inputs)
+        stopped = any(setting.name == "stop" for setting in inputs.settings)
+        if stopped:
+            self._change(Trigger.STOP, "emergency stop")
         for setting in inputs.settings:
-            self._take_setting(setting, now_ns)
+            self._take_setting(setting, now_ns, stopped)
         for chunk in inputs.chunks:
             self._take_chunk(chunk, now_ns)
         self._watch(now_ns)
@@ -188,27 +199,36 @@ class Commander:
             elif mode != "ready":
                 self._change(Trigger.LOSE, f"the robot is not ready but {mode!r}")
 
-    def _take_setting(self, setting: Setting, now_ns: int) -> None:
+    def _take_setting(self, setting: Setting, now_ns: int, stopped: bool) -> None:
         name, value = setting.name, setting.value
+        if stopped and (name == "reset" or (name == "active" and value is True)):
+            # Which of them was put first cannot be told within a tick: the stop wins.
+            self._refuse_setting(name, ["an emergency stop came at the same time"])
+            return
+        try:
+            self._set(name, value, now_ns)
+        except RecordError as error:
+            self._refuse_setting(name, [str(error)])
+
+    def _set(self, name: str, value: str | bool | float | None, now_ns: int) -> None:
         if name == "prompt" and isinstance(value, str):
             if value != self.task.prompt:
                 self._new_episode(now_ns, prompt=value)
         elif name == "worker" and isinstance(value, str):
             if value != self.task.worker:
                 self._change_worker(value, now_ns)
-        elif name == "rate" and isinstance(value, float):
+        elif name == "rate" and isinstance(value, (int, float)):
             self.task = replace(self.task, rate_hz=value)
-        elif name == "active":
-            if value:
-                self._activate(now_ns)
-            else:
-                self._change(Trigger.DEACTIVATE, "deactivated")
-        elif name == "stop":
-            self._change(Trigger.STOP, "emergency stop")
+        elif name == "active" and value is True:
+            self._activate(now_ns)
+        elif name == "active" and value is False:
+            self._change(Trigger.DEACTIVATE, "deactivated")
         elif name == "reset":
             self._reset()
         elif name == "lose":
             self._change(Trigger.LOSE, str(value))
+        elif name != "stop":
+            raise RecordError(f"{value!r} is nothing that {name!r} can be set to")
 
     def _new_episode(self, now_ns: int, **changes: str) -> None:
         # The wall clock, so that an episode number never comes again after a restart.
@@ -256,6 +276,7 @@ class Commander:
             self.gripper_state,
             chunk,
             now_ns,
+            self.task.rate_hz,
         )
         if reasons or chunk is None:
             return None, reasons
@@ -277,35 +298,37 @@ class Commander:
                 measured.reference_position_m, rotation_from_quat(measured.reference_quat_xyzw)
             )
         apart_m, apart_rad = _distance(start, actual)
-        blocked = (
-            apart_m > self.profile.limits.tracking_m or apart_rad > self.profile.limits.tracking_rad
-        )
+        limits = self.profile.limits
+        blocked = apart_m > limits.tracking_m or apart_rad > limits.tracking_rad
+        self._excused = (apart_m, apart_rad) if blocked else (0.0, 0.0)
         if self._smoother is None:
-            translation, rotation = (
-                self.profile.limits.translation,
-                self.profile.limits.rotation,
-            )
             self._smoother = Smoother(
-                start,
-                1.0 / self.profile.timing.command_hz,
-                MotionLimits(
-                    (translation.velocity_m_s, translation.acceleration_m_s2, translation.jerk_m_s3),
-                    (rotation.velocity_rad_s, rotation.acceleration_rad_s2, rotation.jerk_rad_s3),
-                ),
+                start, 1.0 / self.profile.timing.command_hz, motion_limits(limits)
             )
         elif not self._streaming:
             self._smoother.reset(start)
-        width_m = self.gripper.sent_m
-        if width_m is None or not (gripper.holding or abs(width_m - gripper.width_m) < 0.005):
-            width_m = min(max(gripper.width_m, 0.0), self.profile.robot.gripper.max_width_m)
+        width_m = self._width_to_keep(gripper)
         self.gripper.restart(width_m)
-        goal = Goal(actual if blocked else self._smoother.motion.pose, width_m)
+        # A blocked arm's controller is led back to where the arm is. Otherwise a brake under way
+        # goes on to its end, and the goal is where it ends.
+        resting = self._smoother.resting_pose()
+        goal = Goal(actual if blocked else resting, width_m)
         if self._timeline is None:
             self._timeline = GoalTimeline(goal, now_ns)
         else:
             self._timeline.restart(goal, now_ns)
-        self._target = None
+        self._target = None if blocked else goal
         self._deadline_ns = now_ns + self._patience_ns(FIRST_CHUNK_PATIENCE_S)
+
+    def _width_to_keep(self, gripper: GripperState) -> float:
+        """The width last sent while the gripper obeys it, because a grip ends with another."""
+        sent_m, max_m = self.gripper.sent_m, self.gripper_max_m
+        if sent_m is not None and (
+            abs(sent_m - gripper.width_m) < SAME_WIDTH_M
+            or (gripper.holding and sent_m < gripper.width_m)
+        ):
+            return sent_m
+        return min(max(gripper.width_m, 0.0), max_m)
 
     def _reset(self) -> None:
         faults = self.gripper_state.record.faults if self.gripper_state else ()
@@ -324,7 +347,8 @@ class Commander:
             self._refuse(
                 Refusal(
                     "foreign",
-                    f"a chunk by {chunk.header.source[:60]!r}, who did not publish this worker's spec",
+                    f"a chunk by {chunk.header.source[:60]!r}, who did not publish this worker's "
+                    "spec",
                 ),
                 worker,
             )
@@ -365,8 +389,8 @@ class Commander:
                 if hit.fatal:
                     return Refusal(
                         hit.name,
-                        f"a step of {hit.value:.4g} is over {bounds.REFUSE_FACTOR:g} times its limit; "
-                        "is its unit right?",
+                        f"a step of {hit.value:.4g} is over {bounds.REFUSE_FACTOR:g} times its "
+                        "limit; is its unit right?",
                         hit.value,
                         hit.limit,
                     )
@@ -389,8 +413,13 @@ class Commander:
             chunk.header.stamp_wall_ns,
             chunk.received_ns,
         )
-        dt_ns = int(action.dt_s * 1e9)
-        plan = Plan(chunk.header.stamp_wall_ns, record.observation_stamp_ns, dt_ns, goals, cause)
+        plan = Plan(
+            max(chunk.header.stamp_wall_ns, record.observation_stamp_ns),
+            record.observation_stamp_ns,
+            max(int(action.dt_s * 1e9), 1),
+            goals,
+            cause,
+        )
         self._timeline.add(plan, now_ns)
         self._deadline_ns = max(plan.end_ns, now_ns) + self._patience_ns(0.0)
         self._out.accepted = cause
@@ -438,12 +467,17 @@ class Commander:
         self.tracking_m, self.tracking_rad = _distance(reference, actual)
 
     def _what_is_lost(self, now_ns: int) -> str:
-        assert self.pose is not None and self.lease is not None
-        limits, timing = self.profile.limits, self.profile.timing
-        age_s = (now_ns - self.pose.received_ns) / 1e9
-        if age_s > timing.state_timeout_s:
-            return f"robot state lost: {age_s:.3f} s old, at most {timing.state_timeout_s:g} s"
-        needed = [self._around.robot_node, worker_node(self.task.worker)]
+        assert self.pose is not None and self.gripper_state is not None and self.lease is not None
+        patience_s = self.profile.timing.state_timeout_s
+        for what, state in (("pose", self.pose), ("gripper", self.gripper_state)):
+            silent_s = (now_ns - state.received_ns) / 1e9
+            if silent_s > patience_s:
+                return f"robot state lost: {what} {silent_s:.3f} s old, at most {patience_s:g} s"
+            late_s = (now_ns - state.header.stamp_wall_ns) / 1e9 - CLOCK_TOLERANCE_S
+            if late_s > patience_s:
+                return f"robot state comes late: {what} by {late_s:.3f} s, at most {patience_s:g} s"
+        worker = self.task.worker
+        needed = [self._around.robot_node, worker_node(worker)]
         needed += [
             self._around.camera_nodes.get(camera.camera, "camera")
             for camera in self.lease.spec.observation.cameras
@@ -451,18 +485,27 @@ class Commander:
         for node in needed:
             if node not in self._around.alive:
                 return f"node {node!r} is gone"
-        if self.dry_run:
-            return ""
-        if self.tracking_m > limits.tracking_m:
-            return (
-                f"the arm does not follow: {self.tracking_m:.3f} m from its command, "
-                f"at most {limits.tracking_m:g} m (is it blocked?)"
-            )
-        if self.tracking_rad > limits.tracking_rad:
-            return (
-                f"the arm does not follow: {self.tracking_rad:.3f} rad from its command, "
-                f"at most {limits.tracking_rad:g} rad (is it blocked?)"
-            )
+        if self._around.spec_sources.get(worker) != self.lease.source:
+            return f"worker {worker!r} was started anew"
+        return "" if self.dry_run else self._blocked()
+
+    def _blocked(self) -> str:
+        limits = self.profile.limits
+        for apart, limit, excused, back_off, unit in (
+            (self.tracking_m, limits.tracking_m, self._excused[0], BACK_OFF_M, "m"),
+            (self.tracking_rad, limits.tracking_rad, self._excused[1], BACK_OFF_RAD, "rad"),
+        ):
+            allowed = max(limit, excused + back_off if excused else 0.0)
+            if apart > allowed:
+                return (
+                    f"the arm does not follow: {apart:.3f} {unit} from its command, "
+                    f"at most {allowed:.3g} {unit} (is it blocked?)"
+                )
+        # What was won back on the way out of a blockade is not given away again.
+        self._excused = (
+            min(self._excused[0], self.tracking_m),
+            min(self._excused[1], self.tracking_rad),
+        )
         return ""
 
     def _change(self, trigger: Trigger, why: str) -> None:
@@ -470,7 +513,11 @@ class Commander:
         if new is self.state:
             return
         old, self.state, self.why = self.state, new, why
-        level = "info" if new in OBEYING or trigger in (Trigger.DEACTIVATE, Trigger.RESET) else "warning"
+        level = (
+            "info"
+            if new in OBEYING or trigger in (Trigger.DEACTIVATE, Trigger.RESET)
+            else "warning"
+        )
         self._tell(level, "transition", f"{old.value}->{new.value}", why)
 
     def _tell(
@@ -482,7 +529,9 @@ class Commander:
         value: float | None = None,
         limit: float | None = None,
     ) -> None:
-        self._out.events.append(Event(level, kind, what, why, value, limit))
+        if value is not None and not math.isfinite(value):
+            value = None
+        self._out.events.append(Event(level, kind, what, why[:MAX_TEXT], value, limit))
 
     # -- motion -------------------------------------------------------------------------------
     def _move(self, now_ns: int, ticks: int) -> None:
@@ -516,7 +565,7 @@ class Commander:
             pose, hits = bounds.leash(self.profile.limits, goal.pose, smoother.motion.pose)
             if hits:
                 goal = Goal(pose, goal.width_m)
-                timeline.shift_rest(index, goal)
+                timeline.shift_rest(index, goal, self.profile.limits)
                 self._tell("warning", "limit", hits[0].name, "leash", hits[0].value, hits[0].limit)
             smoother.target(goal.pose)
             self._target = goal
@@ -552,8 +601,17 @@ class Commander:
         )
 
 
+def motion_limits(limits: Limits) -> MotionLimits:
+    """The profile's limits of the smoothed motion."""
+    translation, rotation = limits.translation, limits.rotation
+    return MotionLimits(
+        (translation.velocity_m_s, translation.acceleration_m_s2, translation.jerk_m_s3),
+        (rotation.velocity_rad_s, rotation.acceleration_rad_s2, rotation.jerk_rad_s3),
+    )
+
+
 def _distance(a: Pose, b: Pose) -> tuple[float, float]:
     return (
-        float(np.linalg.norm(a.position_m - b.position_m)),
+        norm3(a.position_m - b.position_m),
         angle_between(a.rotation, b.rotation),
     )

@@ -2,22 +2,29 @@
 
 A chunk whose observation was taken at ``t_o`` asks for waypoints ``W_1 .. W_H``::
 
-    W_0 = G(t_o)                   the goal in force when the observation was taken
+    W_0 = G(t_o)                   what was asked for until the observation was taken
     W_k = W_(k-1) o step_k         k = 1 .. H
     in force at t: W_k, k = floor((t - t_o) / dt) + 1, at least 1 and at most H
+
+    G(t) = W_s, s = (t - t_o) / dt, at least 1 and at most H, between two waypoints interpolated
 
 ``G`` is the same function of every plan before it. A plan is in force from the moment its chunk was
 *published*: an observation taken later shows its effect, so the next delta stands on top of it; one
 taken earlier does not, so the next delta replaces it. Nothing is counted twice and nothing is lost,
 whatever the latency. Steps whose time has passed when a chunk arrives are skipped, never replayed:
 waypoints are sums, so skipping them loses no way.
+
+A chunk that is replaced half-way counts for the time it had, and for its first step at least: the
+speed a model asks for is the speed it gets however often it is asked, and a single step is a step.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vla_zenoh.control.so3 import Pose
+from vla_zenoh.control.limits import into_workspace
+from vla_zenoh.control.so3 import Pose, between, orthonormal
+from vla_zenoh.profile import Limits
 from vla_zenoh.types import Cause
 
 HISTORY_NS = 15_000_000_000
@@ -53,6 +60,19 @@ class Plan:
     def index_at(self, t_ns: int) -> int:
         """Index of the step in force at `t_ns`."""
         return min(max((t_ns - self.start_ns) // self.dt_ns, 0), len(self.goals) - 1)
+
+    def asked_until(self, t_ns: int) -> Goal:
+        """What its steps have asked for until `t_ns`, its first step at least."""
+        done, part_ns = divmod(t_ns - self.start_ns, self.dt_ns)
+        if done < 1:
+            return self.goals[0]
+        if done >= len(self.goals) or part_ns == 0:
+            return self.goals[min(done, len(self.goals)) - 1]
+        last, coming, share = self.goals[done - 1], self.goals[done], part_ns / self.dt_ns
+        return Goal(
+            between(last.pose, coming.pose, share),
+            last.width_m + share * (coming.width_m - last.width_m),
+        )
 
     @property
     def end_ns(self) -> int:
@@ -90,29 +110,28 @@ class GoalTimeline:
         return self._plans[-1]
 
     def at(self, t_ns: int) -> Goal:
-        """G(t): the goal that was in force at `t_ns`."""
+        """G(t): what the plan that was in force at `t_ns` had asked for by then."""
         chosen = self._plans[0]
         for plan in reversed(self._plans):
             if plan.effective_ns <= t_ns:
                 chosen = plan
                 break
-        return chosen.goals[chosen.index_at(t_ns)]
+        return chosen.asked_until(t_ns)
 
-    def shift_rest(self, index: int, goal: Goal) -> None:
+    def shift_rest(self, index: int, goal: Goal, limits: Limits) -> None:
         """Replace the newest plan's goal `index`, moving the later ones along with it.
 
         A leash that shortened the goal in force has to be known to every later composition, or
-        the cut way would come back.
+        the cut way would come back. What is moved out of the workspace stays at its border.
         """
         plan = self.plan
         old = plan.goals[index].pose
+        way_m = goal.pose.position_m - old.position_m
+        turn = old.rotation.T @ goal.pose.rotation
         for later in range(index + 1, len(plan.goals)):
             pose = plan.goals[later].pose
+            inside, _ = into_workspace(limits, pose.position_m + way_m)
             plan.goals[later] = Goal(
-                Pose(
-                    pose.position_m + goal.pose.position_m - old.position_m,
-                    pose.rotation @ old.rotation.T @ goal.pose.rotation,
-                ),
-                plan.goals[later].width_m,
+                Pose(inside, orthonormal(pose.rotation @ turn)), plan.goals[later].width_m
             )
         plan.goals[index] = goal

@@ -53,7 +53,10 @@ class GripperArbiter:
                 self.timeouts += int(late and not settled)
         if self._in_flight or self.wanted_m is None:
             return None
-        if self.sent_m is not None and abs(self.wanted_m - self.sent_m) <= self._profile.dead_band_m:
+        if (
+            self.sent_m is not None
+            and abs(self.wanted_m - self.sent_m) <= self._profile.dead_band_m
+        ):
             return None
         self.sent_m, self._sent_ns, self._in_flight = self.wanted_m, now_ns, True
         return GripperCommand(self.wanted_m, self._profile.speed_m_s, self._profile.force_n)

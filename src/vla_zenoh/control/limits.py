@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.so3 import Pose, exp3, log3, orthonormal
+from vla_zenoh.control.so3 import Pose, exp3, log3, norm3, orthonormal
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
@@ -43,29 +44,34 @@ def bound_step(limits: Limits, before: Pose, asked: Pose) -> tuple[Pose, list[Li
     hits += hit
     rotvec, hit = _bound_norm("step_rad", rotvec, limits.step_rad)
     hits += hit
-    position_m = before.position_m + translation
-    inside, overshoot_m = into_workspace(limits, position_m)
+    inside, overshoot_m = into_workspace(limits, before.position_m + translation)
     if overshoot_m > 0:
         hits.append(LimitHit("workspace", overshoot_m, 0.0))
     if not hits:
-        return asked, hits
+        return Pose(inside, asked.rotation), hits
     return Pose(inside, orthonormal(exp3(rotvec) @ before.rotation)), hits
 
 
 def _bound_norm(name: str, vector: FloatArray, limit: float) -> tuple[FloatArray, list[LimitHit]]:
-    norm = float(np.linalg.norm(vector))
+    norm = norm3(vector)
     if norm <= limit * (1 + 1e-6):  # float32 steps of exactly the limit are within it
         return vector, []
+    if not math.isfinite(norm):  # a product of numbers that were finite each
+        return np.zeros(3), [LimitHit(name, math.inf, limit, fatal=True)]
     return vector * (limit / norm), [LimitHit(name, norm, limit, norm > REFUSE_FACTOR * limit)]
 
 
 def into_workspace(limits: Limits, position_m: FloatArray) -> tuple[FloatArray, float]:
     """The nearest position inside the workspace box, and how far that is (m)."""
     box = limits.workspace
-    low = np.array([box.x_m[0], box.y_m[0], box.z_m[0]])
-    high = np.array([box.x_m[1], box.y_m[1], box.z_m[1]])
-    inside = np.clip(position_m, low, high)
-    return inside, float(np.linalg.norm(position_m - inside))
+    x, y, z = position_m.tolist()
+    (x_low, x_high), (y_low, y_high), (z_low, z_high) = box.x_m, box.y_m, box.z_m
+    if x_low <= x <= x_high and y_low <= y <= y_high and z_low <= z <= z_high:
+        return position_m, 0.0
+    inside = np.array(
+        [min(max(x, x_low), x_high), min(max(y, y_low), y_high), min(max(z, z_low), z_high)]
+    )
+    return inside, norm3(position_m - inside)
 
 
 def leash(limits: Limits, goal: Pose, commanded: Pose) -> tuple[Pose, list[LimitHit]]:
@@ -77,7 +83,7 @@ def leash(limits: Limits, goal: Pose, commanded: Pose) -> tuple[Pose, list[Limit
         ("lead_m", ahead, limits.lead_m),
         ("lead_rad", turn, limits.lead_rad),
     ):
-        norm = float(np.linalg.norm(vector))
+        norm = norm3(vector)
         if norm > limit:
             hits.append(LimitHit(name, norm, limit))
             vector *= limit / norm

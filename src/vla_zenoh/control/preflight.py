@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.names import worker_node
@@ -14,7 +15,8 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, GripperState, PoseState, Stamped
 
 CHUNK_PATIENCE_S = 2.0
-"""A worker that runs beside the robot publishes chunks all the time; the newest may be this old."""
+"""A worker that runs beside the robot publishes chunks all the time; the newest may be this old,
+and one period more."""
 CLOCK_TOLERANCE_S = 0.02
 """A state may seem to come from the future by this much before clocks are said to differ."""
 CAMERA_PATIENCE_S = 1.0
@@ -52,6 +54,7 @@ def reasons_not_to_activate(
     gripper: Stamped[GripperState] | None,
     chunk: Stamped[ActionChunk] | None,
     now_ns: int,
+    rate_hz: float = 1.0,
 ) -> list[str]:
     """All of them as sentences, empty when the arm may move.
 
@@ -64,10 +67,12 @@ def reasons_not_to_activate(
         gripper: newest gripper state.
         chunk: newest chunk of that worker, made while it was not obeyed.
         now_ns: same clock as the records' ``received_ns``.
+        rate_hz: chunks per second asked of the worker.
     """
     return [
         *_robot(profile, around, pose, gripper, now_ns),
-        *_worker(worker, prompt, around, chunk, now_ns),
+        *_worker(worker, prompt, around),
+        *_chunk(profile, worker, around, chunk, now_ns, rate_hz),
         *_cameras(profile, worker, around),
     ]
 
@@ -84,16 +89,12 @@ def _robot(
         reasons.append(f"the robot's node {around.robot_node!r} is not alive")
     if pose is None:
         return [*reasons, "the TCP pose is not known: nothing was heard on state/pose"]
-    age_s = (now_ns - pose.received_ns) / 1e9
-    if age_s > profile.timing.state_timeout_s:
-        reasons.append(
-            f"the TCP pose is {age_s:.2f} s old, at most {profile.timing.state_timeout_s:g} s is allowed"
-        )
+    reasons += _too_old("TCP pose", pose, profile, now_ns)
     delay_s = (pose.received_ns - pose.header.stamp_wall_ns) / 1e9
     if not -CLOCK_TOLERANCE_S <= delay_s <= CLOCK_TOLERANCE_S + profile.timing.state_timeout_s:
         reasons.append(
-            f"the robot's clock and this one differ: its newest state arrived {delay_s:+.3f} s after "
-            "its stamp; synchronise the clocks of both hosts (chrony or ptp)"
+            f"the robot's clock and this one differ: its newest state arrived {delay_s:+.3f} s "
+            "after its stamp; synchronise the clocks of both hosts (chrony or ptp)"
         )
     _, outside_m = into_workspace(profile.limits, pose.record.position_m)
     if outside_m > profile.limits.step_m:
@@ -105,20 +106,23 @@ def _robot(
         )
     if gripper is None:
         reasons.append("the gripper is not known: nothing was heard on state/gripper")
-    elif gripper.record.faults:
+        return reasons
+    reasons += _too_old("gripper's state", gripper, profile, now_ns)
+    if gripper.record.faults:
         reasons.append(f"the robot reports: {'; '.join(gripper.record.faults)}")
     elif gripper.record.mode != "ready":
         reasons.append(f"the robot is not ready but {gripper.record.mode!r}")
     return reasons
 
 
-def _worker(
-    worker: str,
-    prompt: str,
-    around: Surroundings,
-    chunk: Stamped[ActionChunk] | None,
-    now_ns: int,
-) -> list[str]:
+def _too_old(what: str, state: Stamped[Any], profile: Profile, now_ns: int) -> list[str]:
+    age_s, limit_s = (now_ns - state.received_ns) / 1e9, profile.timing.state_timeout_s
+    if age_s <= limit_s:
+        return []
+    return [f"the {what} is {age_s:.2f} s old, at most {limit_s:g} s is allowed"]
+
+
+def _worker(worker: str, prompt: str, around: Surroundings) -> list[str]:
     node = worker_node(worker)
     if node not in around.alive:
         others = sorted(
@@ -134,16 +138,44 @@ def _worker(
     complaint = around.worker_complaints.get(worker)
     if complaint:
         reasons.append(f"worker {worker!r} says: {complaint}")
-    if chunk is None or now_ns - chunk.received_ns > CHUNK_PATIENCE_S * 1e9:
-        reasons.append(f"worker {worker!r} has published no chunk in the last {CHUNK_PATIENCE_S:g} s")
-    elif chunk.record.spec_hash != spec.hash:
-        reasons.append(f"worker {worker!r} publishes chunks of another spec than its own")
-    else:
-        try:
-            check_steps(spec.action, chunk.record.steps)
-        except SpecError as error:
-            reasons.append(f"worker {worker!r}: its newest chunk is not sane: {error}")
     return reasons
+
+
+def _chunk(
+    profile: Profile,
+    worker: str,
+    around: Surroundings,
+    chunk: Stamped[ActionChunk] | None,
+    now_ns: int,
+    rate_hz: float,
+) -> list[str]:
+    spec = around.specs.get(worker)
+    if spec is None or worker_node(worker) not in around.alive:
+        return []
+    oldest_s = profile.timing.max_observation_age_s
+    patience_s = max(CHUNK_PATIENCE_S, oldest_s) + 1.0 / rate_hz
+    # What a worker that was restarted had published before says nothing about it.
+    ours = chunk is not None and chunk.header.source == around.spec_sources.get(worker)
+    if chunk is None or not ours or now_ns - chunk.received_ns > patience_s * 1e9:
+        return [f"worker {worker!r} has published no chunk in the last {patience_s:g} s"]
+    if chunk.record.spec_hash != spec.hash:
+        return [f"worker {worker!r} publishes chunks of another spec than its own"]
+    delay_s = (chunk.received_ns - chunk.record.observation_stamp_ns) / 1e9
+    if delay_s > oldest_s:
+        return [
+            f"worker {worker!r} is too slow: its newest chunk came {delay_s:.2f} s after its "
+            f"observation, at most {oldest_s:g} s is allowed (timing.max_observation_age_s)"
+        ]
+    if delay_s < -CLOCK_TOLERANCE_S:
+        return [
+            f"the clocks of camera and command node differ: worker {worker!r} saw something "
+            f"{-delay_s:.3f} s before it happened; synchronise them (chrony or ptp)"
+        ]
+    try:
+        check_steps(spec.action, chunk.record.steps)
+    except SpecError as error:
+        return [f"worker {worker!r}: its newest chunk is not sane: {error}"]
+    return []
 
 
 def _cameras(profile: Profile, worker: str, around: Surroundings) -> list[str]:

@@ -13,11 +13,18 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.smoothing import Motion, MotionLimits, Smoother
-from vla_zenoh.control.so3 import Pose, angle_between, exp3, orthonormal, rotation_from_quat
+from vla_zenoh.control.so3 import (
+    Pose,
+    angle_between,
+    exp3,
+    norm3,
+    orthonormal,
+    rotation_from_quat,
+)
 from vla_zenoh.types import PoseCommand, Stamped
 
-STAMP_TRUST_NS = 20_000_000
-"""Stamps this near to our clock are from the same host: better than arrival times, which jitter."""
+CLOCK_DRIFT = 1e-3
+"""Share by which two clocks may drift apart; a real one does by a tenth of that."""
 ACCELERATE_S = 0.02
 """For how long a command's acceleration is believed; its velocity is until the stream times out."""
 STILL = 1e-4
@@ -58,6 +65,7 @@ class ReferenceGuard:
         self._source: str | None = None
         self._last_seq = -1
         self._base_ns = 0
+        self._delay_ns = 0
         self.braking = False
         self.silences = 0
         self.motion = self._smoother.motion
@@ -86,7 +94,7 @@ class ReferenceGuard:
         rotation = rotation_from_quat(record.quat_xyzw)
         here = self.motion.pose
         if (
-            float(np.linalg.norm(record.position_m - here.position_m)) > self._limits.jump_m
+            norm3(record.position_m - here.position_m) > self._limits.jump_m
             or angle_between(here.rotation, rotation) > self._limits.jump_rad
         ):
             return "jump"
@@ -95,10 +103,26 @@ class ReferenceGuard:
                 return "too_fast"
             if float(np.linalg.norm(values[3:])) > 2 * self._brake_limits.rotation[order]:
                 return "too_fast"
+        self._place_in_time(command)
         self._command, self._source, self._last_seq = command, header.source, header.seq
-        same_clock = abs(now_ns - header.stamp_wall_ns) < STAMP_TRUST_NS
-        self._base_ns = header.stamp_wall_ns if same_clock else command.received_ns
         return None
+
+    def _place_in_time(self, command: Stamped[PoseCommand]) -> None:
+        """Put `command` on our clock by its stamp, because arrival times jitter.
+
+        The difference of both clocks is the shortest delay seen: a command that was held up on its
+        way is not taken for one that is meant later.
+        """
+        stamp_ns = command.header.stamp_wall_ns
+        delay_ns = command.received_ns - stamp_ns
+        if self._command is not None:
+            passed_ns = command.received_ns - self._command.received_ns
+            shortest_ns = self._delay_ns + int(CLOCK_DRIFT * passed_ns)
+            # Later than a stream may be silent: not a hold-up, one of the clocks was set.
+            if delay_ns - shortest_ns < self._limits.timeout_s * 1e9:
+                delay_ns = min(delay_ns, shortest_ns)
+        self._delay_ns = delay_ns
+        self._base_ns = stamp_ns + delay_ns
 
     def tick(self, now_ns: int) -> Motion:
         """The reference to follow at `now_ns`."""

@@ -21,6 +21,7 @@ from ruckig import (
     Ruckig,
     RuckigError,
     Synchronization,
+    Trajectory,
 )
 
 from vla_zenoh.control.so3 import Pose, body_rates, exp3, log3, orthonormal
@@ -94,7 +95,9 @@ class Smoother:
         self._input.target_acceleration = zeros
         self.braking = False
         self.motion = Motion(
-            Pose(np.array(pose.position_m, dtype=np.float64), self._anchor), np.zeros(6), np.zeros(6)
+            Pose(np.array(pose.position_m, dtype=np.float64), self._anchor),
+            np.zeros(6),
+            np.zeros(6),
         )
 
     def target(self, pose: Pose) -> None:
@@ -116,6 +119,21 @@ class Smoother:
         self.braking = True
         self._input.control_interface = ControlInterface.Velocity
         self._input.synchronization = Synchronization.No
+
+    def resting_pose(self) -> Pose:
+        """Brake, and foretell where that ends."""
+        if self.at_rest:
+            return self.motion.pose
+        self.brake()
+        path = Trajectory(AXES)
+        try:
+            Ruckig(AXES).calculate(self._input, path)
+            position, _, _ = path.at_time(path.duration)
+        except (RuckigError, ValueError):
+            return self.motion.pose
+        return Pose(
+            np.array(position[:3]), orthonormal(self._anchor @ exp3(np.array(position[3:])))
+        )
 
     def brake_from(self, motion: Motion) -> None:
         """Take over a motion that somebody else made, and brake."""

@@ -56,15 +56,23 @@ def orthonormal(rotation: FloatArray) -> FloatArray:
     return quaternion.matrix()
 
 
+def norm3(vector: FloatArray) -> float:
+    """Length of a vector (3,); `numpy.linalg.norm` costs five times as much."""
+    return math.hypot(*vector.tolist())
+
+
 def angle_between(a: FloatArray, b: FloatArray) -> float:
     """Geodesic distance of two rotation matrices in rad."""
-    return float(np.linalg.norm(log3(b @ a.T)))
+    return norm3(log3(b @ a.T))
 
 
-def shorten(vector: FloatArray, length: float) -> FloatArray:
-    """`vector`, or the same direction with `length` when it is longer."""
-    norm = float(np.linalg.norm(vector))
-    return vector * (length / norm) if norm > length else vector
+def between(start: Pose, end: Pose, share: float) -> Pose:
+    """The pose at `share` (0 to 1) of the way: a straight line and the shortest turn."""
+    turn = log3(end.rotation @ start.rotation.T)
+    return Pose(
+        start.position_m + share * (end.position_m - start.position_m),
+        orthonormal(exp3(share * turn) @ start.rotation),
+    )
 
 
 def body_rates(

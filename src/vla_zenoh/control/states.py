@@ -1,18 +1,18 @@
 """The command node's state machine, as a table. Everything that changes the state is in this file.
 
-    INACTIVE   stands, obeys nobody
-    ACTIVE     carries out chunks
-    HOLDING    nothing fresh came: brakes, stands, goes on with the next fresh chunk
-    STOPPED    emergency stop, latched until reset
-    FAULT      the robot or the command node itself reports a fault, latched until reset
+INACTIVE   stands, obeys nobody
+ACTIVE     carries out chunks
+HOLDING    nothing fresh came: brakes, stands, goes on with the next fresh chunk
+STOPPED    emergency stop, latched until reset
+FAULT      the robot or the command node itself reports a fault, latched until reset
 """
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 
 
-class State(str, Enum):
+class State(StrEnum):
     """See the module."""
 
     INACTIVE = "inactive"
@@ -22,7 +22,7 @@ class State(str, Enum):
     FAULT = "fault"
 
 
-class Trigger(str, Enum):
+class Trigger(StrEnum):
     """What can happen."""
 
     ACTIVATE = "activate"  # asked for, and preflight found nothing
