@@ -48,10 +48,10 @@ _PROMPT = re.compile(r"(?:hard:)?\s*(?P<name>[a-z ]+?)\s*(?:[x\u00d7]\s*(?P<coun
 
 
 class HardPrompt(NamedTuple):
-    """A prompt that was understood: `motion` None is ``hold``; `count` None has no end."""
+    """A prompt that was understood: `motion` None is ``hold``; `steps` None has no end."""
 
     motion: HardMotion | None
-    count: int | None
+    steps: int | None
 
 
 def parse_hard(prompt: str) -> HardPrompt:

@@ -32,8 +32,9 @@ def shipped(kind: str) -> Path:
 
 def folders(kind: str) -> list[Path]:
     """Where things of `kind` are looked for, first match wins."""
-    named = [Path(part) for part in os.environ.get(SEARCH_PATH_VARIABLE, "").split(os.pathsep) if part]
-    return [folder / kind for folder in named if (folder / kind).is_dir()] + [shipped(kind)]
+    parts = os.environ.get(SEARCH_PATH_VARIABLE, "").split(os.pathsep)
+    named = [Path(part) / kind for part in parts if part]
+    return [folder for folder in named if folder.is_dir()] + [shipped(kind)]
 
 
 def names(kind: str) -> list[str]:
@@ -97,7 +98,7 @@ def robot_urdf(description: str) -> Path:
 
 
 def meshes_of(urdf: Path) -> Path:
-    """Folder of the collision meshes beside a URDF of the usual layout (``../meshes/collision``)."""
+    """The collision meshes beside a URDF of the usual layout (``../meshes/collision``)."""
     folder = urdf.parent.parent / "meshes" / "collision"
     if not folder.is_dir():
         raise ResourceError(f"no collision meshes for {urdf.name}: {folder} is not a folder")

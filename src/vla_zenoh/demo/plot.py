@@ -66,13 +66,13 @@ def plot_run(
     position.legend(loc="center right", fontsize=8)
     position.margins(y=0.25)
     first = rotation_from_quat(poses[0].record.quat_xyzw)
-    thick, thin = {"lw": 2.2, "alpha": 0.35}, {"lw": 0.9}
+    thick, thin = (2.2, 0.35), (0.9, 1.0)
     for entries, times, look in ((commands, t_commanded, thick), (poses, t_measured, thin)):
         turns = np.array(
             [log3(rotation_from_quat(entry.record.quat_xyzw) @ first.T) for entry in entries]
         )
         for axis, (_, colour) in enumerate(AXES):
-            turning.plot(times, turns[:, axis], color=colour, **look)
+            turning.plot(times, turns[:, axis], color=colour, lw=look[0], alpha=look[1])
     turning.set(ylabel="since start (rad)", title="orientation, rotation vector in the base")
     norms = np.linalg.norm([entry.record.twist[:3] for entry in commands], axis=1)
     speed.plot(t_commanded, norms, color="black", lw=1, label="commanded speed")

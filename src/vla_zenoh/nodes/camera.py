@@ -139,4 +139,3 @@ def _summary(states: tuple[str, ...]) -> str:
     if all(state == ENDED for state in states):
         return "ended"
     return "running" if all(state in (OK, ENDED) for state in states) else "degraded"
-

@@ -116,9 +116,7 @@ class Client:
             self.events.clear()
         return events
 
-    def wait_for(
-        self, condition: Callable[[], Value | None], timeout_s: float
-    ) -> Value | None:
+    def wait_for(self, condition: Callable[[], Value | None], timeout_s: float) -> Value | None:
         """Poll until `condition` gives something true, at most so long."""
         give_up = time.monotonic() + timeout_s
         while True:

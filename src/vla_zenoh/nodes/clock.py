@@ -66,7 +66,7 @@ class FixedRate:
 
 
 def make_this_thread_realtime() -> bool:
-    """Ask for a real-time scheduler (SCHED_FIFO) for the calling thread; False where not allowed."""
+    """Ask for SCHED_FIFO for the calling thread; False where that is not allowed."""
     library = ctypes.util.find_library("c")
     if library is not None:
         ctypes.CDLL(library, use_errno=True).prctl(TIMER_SLACK_OPTION, 1, 0, 0, 0)

@@ -77,9 +77,7 @@ class CommandNode:
             (keys.active, lambda: "true" if task.task.active else "false"),
         ):
             self.node.answer(key, self._text_reply(key, value))
-        self.node.answer(
-            keys.task, lambda query: query.reply(keys.task, records.encode(task.task))
-        )
+        self.node.answer(keys.task, lambda query: query.reply(keys.task, records.encode(task.task)))
 
     @staticmethod
     def _text_reply(key: str, value: Callable[[], str]) -> Callable[[zenoh.Query], None]:

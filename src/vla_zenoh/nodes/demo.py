@@ -227,11 +227,10 @@ class DemoRun:
                 raise Interrupted
 
     def _story(self) -> str:
-        said = [
-            f"{name} is {found.state}"
-            + (f" ({word})" if (word := found.detail.get("complaint") or found.detail.get("why")) else "")
-            for name, (found, _, _) in self._client.snapshot().items()
-        ]
+        said: list[str] = []
+        for name, (found, _, _) in self._client.snapshot().items():
+            word = found.detail.get("complaint") or found.detail.get("why") or ""
+            said.append(f"{name} is {found.state}" + (f" ({word})" if word else ""))
         return "; ".join(said) or "no node says anything"
 
 

@@ -48,8 +48,8 @@ def run_in_own_environment(model: ModelFile, python: str | None) -> None:
     uv = _uv()
     if uv is None:
         raise WorkerError(
-            f"model {model.name!r} needs {', '.join(missing)}. Install uv (pip install uv) and it gets "
-            "an environment of its own, or name a prepared one with --python"
+            f"model {model.name!r} needs {', '.join(missing)}. Install uv (pip install uv) and it "
+            "gets an environment of its own, or name a prepared one with --python"
         )
     print(f"preparing an environment for {model.name}: {', '.join(model.dependencies)}", flush=True)
     command = [uv, "run", "--no-project", "--quiet"]

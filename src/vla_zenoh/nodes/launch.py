@@ -57,11 +57,10 @@ def node_commands(
     for kind in sorted(part.nodes, key=START_ORDER.index):
         if kind == "worker":
             for worker in part.workers or profile.workers:
-                options = [
-                    word for option in (worker_options or {}).get(worker, ()) for word in ("--set", option)
-                ]
-                arguments = ("worker", worker, *common, "--host", host, *options)
-                commands.append(NodeCommand(worker_node(worker), kind, arguments))
+                arguments = ["worker", worker, *common, "--host", host]
+                for option in (worker_options or {}).get(worker, ()):
+                    arguments += ["--set", option]
+                commands.append(NodeCommand(worker_node(worker), kind, tuple(arguments)))
         elif kind == "camera":
             commands.append(NodeCommand(kind, kind, ("camera", *(part.cameras or ()), *common)))
         else:
@@ -122,7 +121,8 @@ class Host:
     def _start(self) -> None:
         answers = self._router_answers()
         if answers and self._own_router:
-            raise NodeError(f"a router answers already at {', '.join(self.profile.session.connect)}")
+            where = ", ".join(self.profile.session.connect)
+            raise NodeError(f"a router answers already at {where}")
         if "router" in self._part.nodes:
             if answers:
                 self._tell("router", "one answers already; using it")

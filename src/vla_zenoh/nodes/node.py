@@ -45,7 +45,7 @@ class Stream:
     @property
     def wanted(self) -> bool:
         """Somebody listens."""
-        return self._publisher.matching_status.matching
+        return self._publisher.matching_status.matching  # pyright: ignore  # stub says bool
 
     def put(
         self,
@@ -183,15 +183,11 @@ class Node:
         """Call back with (node name, alive) now and at every change, on Zenoh's thread."""
 
         def change(sample: zenoh.Sample) -> None:
-            callback(
-                str(sample.key_expr).rsplit("/", 1)[-1], sample.kind == zenoh.SampleKind.PUT
-            )
+            callback(str(sample.key_expr).rsplit("/", 1)[-1], sample.kind == zenoh.SampleKind.PUT)
 
         handler = zenoh.handlers.Callback(change, indirect=False)
         self._declared.append(
-            self.session.liveliness().declare_subscriber(
-                self.keys.all_alive, handler, history=True
-            )
+            self.session.liveliness().declare_subscriber(self.keys.all_alive, handler, history=True)
         )
 
     def answer(self, key: str, reply: Callable[[zenoh.Query], None]) -> None:

@@ -51,7 +51,10 @@ def _exists(pid: int) -> bool:
 
 
 def run_node(
-    profile: Profile, run: Callable[[zenoh.Session, threading.Event], None], *, wait_s: float | None = None
+    profile: Profile,
+    run: Callable[[zenoh.Session, threading.Event], None],
+    *,
+    wait_s: float | None = None,
 ) -> None:
     """Open a session and run a node in it until a signal comes.
 

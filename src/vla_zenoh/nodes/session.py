@@ -106,6 +106,6 @@ def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
         )
     where = ", ".join(settings["connect"]["endpoints"])
     return SessionError(
-        f"no Zenoh router answers at {where}. Start one with `vla-zenoh router`, or everything with "
-        "`vla-zenoh up`; another address is given with --connect or session.connect"
+        f"no Zenoh router answers at {where}. Start one with `vla-zenoh router`, or everything "
+        "with `vla-zenoh up`; another address is given with --connect or session.connect"
     )

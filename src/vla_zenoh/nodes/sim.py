@@ -159,7 +159,7 @@ class SimNode:
                 self._watch()
 
     def _answer_step(self, query: zenoh.Query) -> None:
-        """Advance as asked: a msgpack map ``{"ns": ..}``, with ``pose`` and ``gripper`` to follow."""
+        """Advance as asked by a msgpack map ``{"ns": ..}``, reply with the state then."""
         payload = query.payload
         try:
             asked = message.unpack(payload.to_bytes()) if payload is not None else {}
@@ -233,7 +233,8 @@ class SimNode:
 
     def _reset(self, seed: int | None) -> None:
         if self.guard.following and not self._blown_up:
-            self.node.refuse("reset_refused", "sim/reset: the arm is being commanded; deactivate first")
+            why = "sim/reset: the arm is being commanded; deactivate first"
+            self.node.refuse("reset_refused", why)
             return
         self.world.reset(self.node.profile.sim.seed if seed is None else seed)
         self.guard.restart(Pose(*self.world.tcp()))

@@ -31,7 +31,7 @@ class Neighbours:
         self._statuses = node.listen(node.keys.all_status, Inbox(64))
         self._new_specs = node.listen(node.keys.all_specs, Inbox(32))
         node.on_alive(self._on_alive)
-        self._robot_node = "sim" if node.profile.robot.driver == "sim" else node.profile.robot.driver
+        self._robot_node = node.profile.robot.driver
 
     def _on_alive(self, name: str, alive: bool) -> None:
         with self._lock:

@@ -116,7 +116,8 @@ class WorkerNode:
         if callable(load):
             began = time.monotonic()
             load()
-            self.node.tell(Event("info", "notice", "loaded", f"in {time.monotonic() - began:.1f} s"))
+            took_s = time.monotonic() - began
+            self.node.tell(Event("info", "notice", "loaded", f"in {took_s:.1f} s"))
         self._complaint = ""
         next_s = time.monotonic()
         while not stop.is_set():
