@@ -118,7 +118,7 @@ def make_policy(model: ModelFile, options: Mapping[str, str] | None = None) -> P
         raise WorkerError(f"{model.path}: MODEL must be a class, it is a {type(maker).__name__}")
     name = getattr(maker, "__name__", "MODEL")
     try:
-        policy = maker(**(options or {}))
+        policy: Any = maker(**(options or {}))
     except (Exception, SystemExit) as error:
         raise WorkerError(
             f"{model.path}: {name} cannot be made: {error} (options it takes: {_accepted(maker)})"

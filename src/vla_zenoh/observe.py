@@ -1,4 +1,4 @@
-"""One coherent look at the world out of many streams: the newest, near in time, in the form asked."""
+"""One coherent look at the world out of many streams: newest, near in time, in the form asked."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class History:
 
 @dataclass(frozen=True, slots=True)
 class NotYet:
-    """Why there is no observation now. `waiting` is about being early, not about something wrong."""
+    """Why there is no observation now; `waiting`: it is early, and nothing is wrong."""
 
     why: str
     waiting: bool = False

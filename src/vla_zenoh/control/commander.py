@@ -23,7 +23,7 @@ from vla_zenoh.control.preflight import (
     Surroundings,
     reasons_not_to_activate,
 )
-from vla_zenoh.control.smoothing import Motion, MotionLimits, Smoother
+from vla_zenoh.control.smoothing import Motion, Smoother, motion_limits
 from vla_zenoh.control.so3 import (
     Pose,
     angle_between,
@@ -33,7 +33,7 @@ from vla_zenoh.control.so3 import (
 )
 from vla_zenoh.control.states import OBEYING, State, Trigger, after
 from vla_zenoh.errors import RecordError
-from vla_zenoh.profile import Limits, Profile
+from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     MAX_TEXT,
     ActionChunk,
@@ -599,15 +599,6 @@ class Commander:
             self.state.value,
             cause,
         )
-
-
-def motion_limits(limits: Limits) -> MotionLimits:
-    """The profile's limits of the smoothed motion."""
-    translation, rotation = limits.translation, limits.rotation
-    return MotionLimits(
-        (translation.velocity_m_s, translation.acceleration_m_s2, translation.jerk_m_s3),
-        (rotation.velocity_rad_s, rotation.acceleration_rad_s2, rotation.jerk_rad_s3),
-    )
 
 
 def _distance(a: Pose, b: Pose) -> tuple[float, float]:

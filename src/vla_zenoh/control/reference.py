@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.smoothing import Motion, MotionLimits, Smoother
+from vla_zenoh.control.smoothing import Motion, MotionLimits, Smoother, motion_limits
 from vla_zenoh.control.so3 import (
     Pose,
     angle_between,
@@ -21,12 +21,15 @@ from vla_zenoh.control.so3 import (
     orthonormal,
     rotation_from_quat,
 )
+from vla_zenoh.profile import Profile
 from vla_zenoh.types import PoseCommand, Stamped
 
 CLOCK_DRIFT = 1e-3
 """Share by which two clocks may drift apart; a real one does by a tenth of that."""
 ACCELERATE_S = 0.02
 """For how long a command's acceleration is believed; its velocity is until the stream times out."""
+BRAKE_MARGIN = 2.0
+"""Its own stop may use this multiple of the stream's limits."""
 STILL = 1e-4
 """m/s and rad/s: a stream that ends slower than this has ended on purpose."""
 
@@ -161,3 +164,15 @@ class ReferenceGuard:
             twist,
             np.zeros(6) if still else record.acceleration,
         )
+
+
+def guard_limits(profile: Profile) -> GuardLimits:
+    """What the robot's side of `profile` allows: its own stop may be harder than the stream."""
+    translation, rotation = motion_limits(profile.limits)
+    velocity, acceleration, jerk = translation
+    spin, spin_change, spin_jerk = rotation
+    m = BRAKE_MARGIN
+    brake = MotionLimits(
+        (m * velocity, m * acceleration, m * jerk), (m * spin, m * spin_change, m * spin_jerk)
+    )
+    return GuardLimits(profile.timing.command_timeout_s, brake)

@@ -25,6 +25,7 @@ from ruckig import (
 )
 
 from vla_zenoh.control.so3 import Pose, body_rates, exp3, log3, orthonormal
+from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
 AXES = 6
@@ -41,6 +42,15 @@ class MotionLimits(NamedTuple):
 
     translation: tuple[float, float, float]
     rotation: tuple[float, float, float]
+
+
+def motion_limits(limits: Limits) -> MotionLimits:
+    """The profile's limits of the smoothed motion."""
+    translation, rotation = limits.translation, limits.rotation
+    return MotionLimits(
+        (translation.velocity_m_s, translation.acceleration_m_s2, translation.jerk_m_s3),
+        (rotation.velocity_rad_s, rotation.acceleration_rad_s2, rotation.jerk_rad_s3),
+    )
 
 
 class Motion(NamedTuple):

@@ -1,0 +1,355 @@
+"""The whole loop in one thread on a virtual clock: robot, cameras, worker, command node.
+
+The same `Commander`, `ReferenceGuard` and `assemble` as in the nodes, and every record goes through
+the codec as on the wire; only sessions, threads and waiting are left out. A run is reproducible to
+the bit and as fast as the computer: for tests, for making data, for measuring what latency does.
+"""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
+from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
+from vla_zenoh.control.impedance import Reference
+from vla_zenoh.control.names import worker_node
+from vla_zenoh.control.preflight import Surroundings
+from vla_zenoh.control.reference import ReferenceGuard, guard_limits
+from vla_zenoh.control.so3 import Pose
+from vla_zenoh.observe import History, NotYet, assemble
+from vla_zenoh.policy import ActionSteps, Policy, check_steps
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import (
+    ActionChunk,
+    Event,
+    FloatArray,
+    GripperCommand,
+    GripperState,
+    Header,
+    Image,
+    JointState,
+    PoseCommand,
+    PoseState,
+    Stamped,
+    Task,
+)
+
+if TYPE_CHECKING:
+    from vla_zenoh.simulation.world import World
+
+TICK_NS = 1_000_000
+"""One step of the world."""
+START_NS = 1_700_000_000_000_000_000
+"""The virtual wall clock begins here; any time that is not zero will do."""
+SIM, CAMERA, COMMAND = "sim", "camera", "command"
+STATE_KINDS: dict[str, type[Any]] = {
+    "joint": JointState,
+    "pose": PoseState,
+    "gripper": GripperState,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Delays:
+    """What takes how long.
+
+    Args:
+        inference_s: from observation to chunk.
+        jitter: share by which an inference varies, either way.
+        camera_s: from capture to the worker.
+        camera_hz: pictures per second.
+        wire_s: everything else on its way.
+    """
+
+    inference_s: float = 0.0
+    jitter: float = 0.0
+    camera_s: float = 0.0
+    camera_hz: float = 30.0
+    wire_s: float = 0.0
+
+
+@dataclass(slots=True)
+class Trace:
+    """What was commanded and where the TCP was, one entry per command tick.
+
+    Args:
+        time_ns: (n,) virtual wall clock.
+        commands: the pose commands; None where nothing was streamed.
+        position_m: measured TCP, (3,) each.
+        rotation: measured TCP, (3, 3) each.
+        width_m: measured opening.
+    """
+
+    time_ns: list[int] = field(default_factory=list)
+    commands: list[PoseCommand | None] = field(default_factory=list)
+    position_m: list[FloatArray] = field(default_factory=list)
+    rotation: list[FloatArray] = field(default_factory=list)
+    width_m: list[float] = field(default_factory=list)
+
+
+class Lockstep:
+    """See the module. Settings are put with `put`; time goes on with `run` and `run_until`.
+
+    Args:
+        profile: limits, timing, cameras.
+        world: the simulated robot.
+        policy: the model; its ``load`` is called here if it has one.
+        delays: see `Delays`.
+        picture: what a camera sees, by name; None: small gray pictures.
+        dry_run: see `Commander`.
+        seed: of the jitter.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        world: World,
+        policy: Policy,
+        *,
+        delays: Delays | None = None,
+        picture: Callable[[str], Image] | None = None,
+        dry_run: bool = False,
+        seed: int = 0,
+    ) -> None:
+        self.profile, self.world = profile, world
+        self.delays = delays or Delays()
+        self.now_ns = START_NS
+        self.commander = Commander(profile, dry_run=dry_run)
+        self.guard = ReferenceGuard(Pose(*world.tcp()), TICK_NS / 1e9, guard_limits(profile))
+        self.alive = {SIM, CAMERA, COMMAND, worker_node(profile.task.worker)}
+        self.trace = Trace()
+        self.events: list[Event] = []
+        self.refused: Counter[str] = Counter()
+        self.guard_refused: Counter[str] = Counter()
+        self.worker = _Worker(profile, policy, self.delays, random.Random(seed))
+        self._picture = picture or _gray
+        self._arrivals: list[tuple[int, int, Callable[[], None]]] = []
+        self._sent = 0
+        self._seq: Counter[str] = Counter()
+        self._inbox = Inputs([], [])
+        self._next_command_ns = self._next_state_ns = self._next_picture_ns = START_NS
+        self._publish_states()
+
+    # -- from outside -------------------------------------------------------------------------
+    def put(self, name: str, value: str | bool | float | None = None) -> None:
+        """Put a setting; it counts from the next tick of the commander on."""
+        self._inbox.settings = [*self._inbox.settings, Setting(name, value)]
+
+    def run(self, duration_s: float) -> None:
+        """Let `duration_s` pass."""
+        end_ns = self.now_ns + round(duration_s * 1e9)
+        while self.now_ns < end_ns:
+            self._tick()
+
+    def run_until(self, condition: Callable[[], bool], limit_s: float) -> bool:
+        """Let time pass until `condition` holds, at most `limit_s`; says whether it does."""
+        end_ns = self.now_ns + round(limit_s * 1e9)
+        while not condition() and self.now_ns < end_ns:
+            self._tick()
+        return condition()
+
+    # -- one millisecond ----------------------------------------------------------------------
+    def _tick(self) -> None:
+        self.now_ns += TICK_NS
+        if self.now_ns >= self._next_state_ns:
+            self._next_state_ns += round(1e9 / self.profile.timing.state_hz)
+            self._publish_states()
+        if self.now_ns >= self._next_picture_ns:
+            self._next_picture_ns += round(1e9 / self.delays.camera_hz)
+            self._publish_pictures()
+        self._receive()
+        chunk = self.worker.turn(self.now_ns)
+        if chunk is not None:
+            # Published when the inference is over, and stamped with that time.
+            self._send(self.worker.source, chunk, self._take_chunk, chunk.inference_end_ns)
+        self._receive()
+        if self.now_ns >= self._next_command_ns:
+            self._next_command_ns += round(1e9 / self.profile.timing.command_hz)
+            self._command()
+        reference = self.guard.tick(self.now_ns)
+        self.world.tick(
+            Reference(reference.pose.position_m, reference.pose.rotation, *reference[1:])
+        )
+
+    def _receive(self) -> None:
+        while self._arrivals and self._arrivals[0][0] <= self.now_ns:
+            heapq.heappop(self._arrivals)[2]()
+
+    def _command(self) -> None:
+        self._inbox.around = Surroundings(
+            alive=frozenset(self.alive),
+            robot_node=SIM,
+            specs={self.worker.name: self.worker.spec},
+            spec_sources={self.worker.name: self.worker.source},
+            camera_ages_s=dict.fromkeys(self.profile.cameras, 0.0),
+            camera_nodes=dict.fromkeys(self.profile.cameras, CAMERA),
+        )
+        inputs, self._inbox = self._inbox, Inputs([], [])
+        out = self.commander.step(inputs, self.now_ns)
+        self._publish(out)
+        position_m, rotation = self.world.tcp()
+        self.trace.time_ns.append(self.now_ns)
+        self.trace.commands.append(out.pose)
+        self.trace.position_m.append(position_m)
+        self.trace.rotation.append(rotation)
+        self.trace.width_m.append(self.world.gripper_state().width_m)
+
+    def _publish(self, out: Outputs) -> None:
+        self.events += out.events
+        self.refused.update(refusal.reason for refusal in out.refusals)
+        if out.pose is not None:
+            self._send(COMMAND, out.pose, self._take_pose_command)
+        if out.gripper is not None:
+            self._send(COMMAND, out.gripper, self._take_gripper_command)
+        if out.task_changed or self.worker.task is None:
+            self._send(COMMAND, self.commander.task, self.worker.take_task)
+
+    def _publish_states(self) -> None:
+        reference = self.guard.motion
+        held = Reference(reference.pose.position_m, reference.pose.rotation, *reference[1:])
+        self._send(SIM, self.world.pose_state(held), self._take_pose_state)
+        self._send(SIM, self.world.gripper_state(), self._take_gripper_state)
+        if "joint" in self.worker.spec.observation.state:
+            self._send(SIM, self.world.joint_state(), self.worker.take_state)
+
+    def _publish_pictures(self) -> None:
+        self._seq[CAMERA] += 1
+        for camera in self.worker.spec.observation.cameras:
+            header = Header(self.now_ns, self._seq[CAMERA], CAMERA)
+            arrival_ns = self.now_ns + round(self.delays.camera_s * 1e9)
+            picture = Stamped(header, self._picture(camera.camera), arrival_ns)
+            self._deliver(arrival_ns, partial(self.worker.take_picture, camera.camera, picture))
+
+    # -- the wire -----------------------------------------------------------------------------
+    def _send(
+        self,
+        source: str,
+        record: Any,
+        take: Callable[[Stamped[Any]], None],
+        stamp_ns: int | None = None,
+    ) -> None:
+        stamp_ns = self.now_ns if stamp_ns is None else stamp_ns
+        self._seq[f"{source} {type(record).__name__}"] += 1
+        seq = self._seq[f"{source} {type(record).__name__}"]
+        attachment = header_codec.encode(Header(stamp_ns, seq, source))
+        payload, kind = records.encode(record), type(record)
+        arrival_ns = stamp_ns + round(self.delays.wire_s * 1e9)
+
+        def arrive() -> None:
+            header = header_codec.decode(attachment)
+            take(Stamped(header, records.decode(kind, payload), arrival_ns))
+
+        self._deliver(arrival_ns, arrive)
+
+    def _deliver(self, arrival_ns: int, arrive: Callable[[], None]) -> None:
+        self._sent += 1
+        heapq.heappush(self._arrivals, (arrival_ns, self._sent, arrive))
+
+    def _take_pose_state(self, state: Stamped[PoseState]) -> None:
+        self._inbox.pose = state
+        self.worker.take_state(state)
+
+    def _take_gripper_state(self, state: Stamped[GripperState]) -> None:
+        self._inbox.gripper = state
+        self.worker.take_state(state)
+
+    def _take_chunk(self, chunk: Stamped[ActionChunk]) -> None:
+        self._inbox.chunks = [*self._inbox.chunks, chunk]
+
+    def _take_pose_command(self, command: Stamped[PoseCommand]) -> None:
+        refusal = self.guard.offer(command, self.now_ns)
+        if refusal is not None:
+            self.guard_refused[refusal] += 1
+
+    def _take_gripper_command(self, command: Stamped[GripperCommand]) -> None:
+        order = command.record
+        self.world.set_gripper(order.width_m, order.speed_m_s, order.force_n)
+
+
+class _Worker:
+    """A worker on the virtual clock: one inference at a time, at the task's rate."""
+
+    def __init__(
+        self, profile: Profile, policy: Policy, delays: Delays, jitter: random.Random
+    ) -> None:
+        self.name = profile.task.worker
+        self.source = worker_node(self.name)
+        self.policy, self.spec = policy, policy.spec
+        self.task: Task | None = None
+        self._patience_ns = int(profile.timing.max_observation_age_s * 1e9)
+        self._delays, self._jitter = delays, jitter
+        self._images: dict[str, Stamped[Image]] = {}
+        self._states = {part: History() for part in self.spec.observation.state}
+        self._not_before_ns = self._due_ns = 0
+        load = getattr(policy, "load", None)
+        if callable(load):
+            load()
+
+    def take_task(self, task: Stamped[Task]) -> None:
+        """The task, as the command node published it."""
+        known, self.task = self.task, task.record
+        if known is None or known.episode != self.task.episode:
+            self._not_before_ns = task.header.stamp_wall_ns
+            reset = getattr(self.policy, "reset", None)
+            if callable(reset):
+                reset()
+
+    def take_state(self, state: Stamped[Any]) -> None:
+        """A state; kept if the model asked for it."""
+        for part, history in self._states.items():
+            if isinstance(state.record, STATE_KINDS[part]):
+                history.add(state)
+
+    def take_picture(self, camera: str, picture: Stamped[Image]) -> None:
+        """The newest picture of a camera."""
+        self._images[camera] = picture
+
+    def turn(self, now_ns: int) -> ActionChunk | None:
+        """Begin an inference if it is time and there is something to see."""
+        if self.task is None or now_ns < max(self._due_ns, self._not_before_ns):
+            return None
+        observation = assemble(
+            self.spec,
+            self.task,
+            self._images,
+            self._states,
+            not_before_ns=self._not_before_ns,
+            now_ns=now_ns,
+        )
+        if isinstance(observation, NotYet):
+            return None
+        result = self.policy.infer(observation)
+        answer = result if isinstance(result, ActionSteps) else ActionSteps(result)
+        steps = check_steps(self.spec.action, answer.steps)
+        share = 1.0 + self._delays.jitter * self._jitter.uniform(-1.0, 1.0)
+        end_ns = now_ns + round(self._delays.inference_s * share * 1e9)
+        self._due_ns = max(self._due_ns + round(1e9 / observation.rate_hz), now_ns)
+        self._not_before_ns = end_ns
+        return ActionChunk(
+            worker=self.name,
+            spec_hash=self.spec.hash,
+            episode=observation.task.episode,
+            observation_stamp_ns=observation.stamp_wall_ns,
+            observation_seq=observation.seq,
+            valid_until_ns=observation.stamp_wall_ns
+            + int(len(steps) * self.spec.action.dt_s * 1e9)
+            + self._patience_ns,
+            steps=steps,
+            observed_ns=now_ns,
+            inference_start_ns=now_ns,
+            inference_end_ns=end_ns,
+            done=answer.done,
+        )
+
+
+def _gray(camera: str) -> Image:
+    return Image(np.full((48, 64, 3), 128, np.uint8))
