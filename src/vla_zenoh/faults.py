@@ -15,6 +15,7 @@ _WORDS = {
     "int_from_float": "wants a whole number",
     "bool_type": "wants true or false",
     "string_type": "wants text",
+    "string_unicode": "holds half a character (a surrogate)",
     "tuple_type": "wants a list",
     "dict_type": "wants a map",
     "model_type": "wants a map",

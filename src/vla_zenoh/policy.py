@@ -24,9 +24,9 @@ from pydantic import (
     model_validator,
 )
 
-from vla_zenoh.errors import RecordError, SpecError
+from vla_zenoh.errors import SpecError
 from vla_zenoh.faults import in_words
-from vla_zenoh.types import GripperState, JointState, PoseState, Task, text
+from vla_zenoh.types import GripperState, JointState, PoseState, Task
 
 StatePart = Literal["joint", "pose", "gripper"]
 Resize = Literal["none", "stretch", "pad", "crop"]
@@ -41,15 +41,7 @@ ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
 MAX_CAMERAS = 16
 MAX_FAULTS = 20
 
-Text = Annotated[str, Field(min_length=1, max_length=128), AfterValidator(lambda v: _utf8(v))]
-
-
-def _utf8(value: str) -> str:
-    """Text that can travel, so that a spec that exists can be published."""
-    try:
-        return text("it", value)
-    except RecordError as error:
-        raise ValueError(str(error)) from error
+Text = Annotated[str, Field(min_length=1, max_length=128)]
 
 
 def _differ(values: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -144,7 +136,8 @@ class ActionSpec(_Spec):
     position_scale_m: float = Field(default=1.0, gt=0, le=10)
     gripper: GripperMeaning = "absolute_m"
     gripper_open_is_high: bool = True
-    gripper_threshold: float = 0.5
+    # Adding zero makes -0.0 zero: they mean the same, and must have the same hash.
+    gripper_threshold: Annotated[float, AfterValidator(lambda value: value + 0.0)] = 0.5
     normalisation: Text | None = None
 
     @property

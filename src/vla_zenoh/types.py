@@ -26,6 +26,7 @@ FloatArray = NDArray[np.float64]
 
 QUATERNION_NORM_TOLERANCE = 1e-3
 MAX_TEXT = 4096
+MAX_SHOWN = 300
 MAX_VECTOR = 10_000
 MAX_CHUNK_NUMBERS = 100_000
 MAX_NAMES = 1024
@@ -41,7 +42,7 @@ def shown(value: Any) -> str:
     """`value` in short, for an error message: it may be huge, nested, or refuse to be printed."""
     if isinstance(value, (str, bytes)):
         value = value[:80]
-    return reprlib.repr(value)
+    return reprlib.repr(value)[:MAX_SHOWN]
 
 
 def _numbers(name: str, value: ArrayLike) -> NDArray[Any]:

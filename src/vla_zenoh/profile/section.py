@@ -8,8 +8,8 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from vla_zenoh import keys
-from vla_zenoh.errors import ProfileError, RecordError
-from vla_zenoh.types import MAX_TEXT, text
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.types import MAX_TEXT
 
 Place = tuple[str, ...]
 
@@ -48,13 +48,6 @@ def _key_part(value: str) -> str:
         raise ValueError(str(error)) from error
 
 
-def _utf8(value: str) -> str:
-    try:
-        return text("it", value)
-    except RecordError as error:
-        raise ValueError(str(error)) from error
-
-
 def _differ(values: tuple[Any, ...]) -> tuple[Any, ...]:
     twice = sorted({str(value) for value in values if values.count(value) > 1})
     if twice:
@@ -69,8 +62,8 @@ def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 Name = Annotated[str, AfterValidator(_key_part)]
-Text = Annotated[str, Field(max_length=MAX_TEXT), AfterValidator(_utf8)]
-Word = Annotated[str, Field(min_length=1, max_length=512), AfterValidator(_utf8)]
+Text = Annotated[str, Field(max_length=MAX_TEXT)]
+Word = Annotated[str, Field(min_length=1, max_length=512)]
 Names = Annotated[tuple[Name, ...], Field(strict=False, max_length=64), AfterValidator(_differ)]
 Words = Annotated[tuple[Word, ...], Field(strict=False, max_length=64), AfterValidator(_differ)]
 Range = Annotated[tuple[float, float], Field(strict=False), AfterValidator(_ordered)]

@@ -1,0 +1,124 @@
+"""All keys of a robot: they differ, can be told apart, and nothing odd gets into them."""
+
+from __future__ import annotations
+
+import inspect
+import re
+
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.keys import DEFAULT_ROOT, MAX_CHUNK, Keys, chunk, last
+
+MAX_SENTENCE = 1000  # characters of an error message
+
+KEYS = Keys("panda")
+SELECTORS = ("everything", "all_deltas", "all_specs", "all_status", "all_events", "all_alive")
+GOOD_CHUNKS = st.from_regex(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,20}", fullmatch=True)
+
+
+def fixed_keys(keys: Keys) -> dict[str, str]:
+    """Every key that needs no name, by the name of its property."""
+    members = inspect.getmembers(Keys, lambda member: isinstance(member, property))
+    return {name: getattr(keys, name) for name, _ in members if name not in SELECTORS}
+
+
+def named_keys(keys: Keys, name: str) -> dict[str, str]:
+    """Every key that takes names, made with `name`."""
+    made: dict[str, str] = {}
+    for method, function in inspect.getmembers(Keys, inspect.isfunction):
+        if method.startswith("_") or method == "short":
+            continue
+        count = len(inspect.signature(function).parameters) - 1
+        made[method] = getattr(keys, method)(*[name] * count)
+    return made
+
+
+def test_there_are_keys_of_both_sorts() -> None:
+    assert len(fixed_keys(KEYS)) > 10
+    assert len(named_keys(KEYS, "x")) > 5
+
+
+@given(GOOD_CHUNKS)
+def test_no_two_keys_are_the_same(name: str) -> None:
+    everything = [*fixed_keys(KEYS).values(), *named_keys(KEYS, name).values()]
+    assert len(set(everything)) == len(everything)
+
+
+@given(GOOD_CHUNKS, GOOD_CHUNKS)
+def test_every_key_is_one_that_zenoh_takes_as_it_is(robot: str, name: str) -> None:
+    keys = Keys(robot, root=f"lab/{name}")
+    for key in [*fixed_keys(keys).values(), *named_keys(keys, name).values()]:
+        assert str(zenoh.KeyExpr(key)) == key
+        assert str(zenoh.KeyExpr.autocanonize(key)) == key
+
+
+def test_selectors_find_their_own_keys_and_no_others() -> None:
+    named = named_keys(KEYS, "scripted")
+    own = {
+        "all_deltas": named["delta"],
+        "all_specs": named["spec"],
+        "all_status": named["status"],
+        "all_events": named["event"],
+        "all_alive": named["alive"],
+    }
+    every = [*fixed_keys(KEYS).values(), *named.values()]
+    for selector, key in own.items():
+        expression = zenoh.KeyExpr(getattr(KEYS, selector))
+        assert [k for k in every if expression.intersects(zenoh.KeyExpr(k))] == [key]
+    assert all(zenoh.KeyExpr(KEYS.everything).includes(zenoh.KeyExpr(k)) for k in every)
+
+
+def test_two_robots_never_meet() -> None:
+    one, other = zenoh.KeyExpr(KEYS.everything), zenoh.KeyExpr(Keys("panda2").everything)
+    assert not one.intersects(other)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        ".",
+        ".a",
+        "-a",
+        "a/b",
+        "a*",
+        "**",
+        "$*",
+        "a?b",
+        "a#b",
+        "@a",
+        "a b",
+        "é",
+        "a\n",
+        "a\0",
+        "x" * 65,
+    ],
+)
+def test_what_would_mean_something_to_zenoh_is_refused(name: str) -> None:
+    with pytest.raises(ProfileError, match=r"camera name .* use letters, digits"):
+        KEYS.camera_raw(name)
+    with pytest.raises(ProfileError, match="cannot be part of a key"):
+        Keys(name)
+    with pytest.raises(ProfileError, match=r"root .* cannot be part of a key"):
+        Keys("panda", root=f"lab/{name}" if name != "a/b" else "lab/*")
+
+
+@given(st.text(max_size=80))
+def test_a_name_is_taken_whole_or_not_at_all(name: str) -> None:
+    if 0 < len(name) <= MAX_CHUNK and name.isascii() and re.fullmatch(r"\w[\w.-]*", name):
+        assert chunk(name, "name") == name
+        return
+    with pytest.raises(ProfileError) as caught:
+        chunk(name, "name")
+    assert len(str(caught.value)) < MAX_SENTENCE
+
+
+def test_a_key_is_shortened_as_people_say_it() -> None:
+    assert KEYS.delta("scripted") == f"{DEFAULT_ROOT}/panda/delta/scripted"
+    assert KEYS.short(KEYS.delta("scripted")) == "delta/scripted"
+    assert KEYS.short("vla/panda2/active") == "vla/panda2/active"
+    assert last(KEYS.delta("scripted")) == "scripted"

@@ -1,0 +1,285 @@
+"""A record that exists is valid, and stays as it is."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vla_zenoh import types
+from vla_zenoh.errors import RecordError
+from vla_zenoh.types import (
+    ActionChunk,
+    Event,
+    GripperCommand,
+    GripperState,
+    Header,
+    Image,
+    JointState,
+    NodeStatus,
+    PoseCommand,
+    PoseState,
+    SceneState,
+    Task,
+)
+
+UNIT = np.array([0.0, 0.0, 0.0, 1.0])
+QUATERNION_TOLERANCE = 1e-15
+
+
+def chunk(steps: Any, **changes: Any) -> ActionChunk:
+    fields = dict.fromkeys(
+        (
+            "episode",
+            "observation_stamp_ns",
+            "observation_seq",
+            "valid_until_ns",
+            "observed_ns",
+            "inference_start_ns",
+            "inference_end_ns",
+        ),
+        1,
+    )
+    return ActionChunk(worker="w", spec_hash="h", steps=steps, **(fields | changes))
+
+
+def test_a_record_keeps_its_own_copy_of_an_array() -> None:
+    mine = np.zeros(3)
+    pose = PoseState(mine, UNIT, np.zeros(6))
+    mine[0] = 5.0
+    assert pose.position_m.tolist() == [0.0, 0.0, 0.0]
+    with pytest.raises(ValueError, match="read-only"):
+        pose.position_m[0] = 1.0
+
+
+def test_a_record_cannot_be_changed() -> None:
+    header = Header(1, 2, "a")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        header.seq = 3  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_a_quaternion_that_is_nearly_unit_is_made_so() -> None:
+    pose = PoseState(np.zeros(3), UNIT * (1 + 0.9 * types.QUATERNION_NORM_TOLERANCE), np.zeros(6))
+    assert abs(np.linalg.norm(pose.quat_xyzw) - 1) < QUATERNION_TOLERANCE
+    with pytest.raises(RecordError, match=r"quat_xyzw has norm 1\.0011"):
+        PoseState(np.zeros(3), UNIT * (1 + 1.1 * types.QUATERNION_NORM_TOLERANCE), np.zeros(6))
+
+
+def test_an_image_does_not_lock_the_array_it_was_made_of() -> None:
+    mine = np.zeros((2, 3, 3), np.uint8)
+    image = Image(mine)
+    assert np.shares_memory(image.rgb, mine)
+    assert not image.rgb.flags.writeable
+    mine[0, 0] = 1
+
+
+def test_an_image_is_laid_out_row_by_row() -> None:
+    assert Image(np.zeros((4, 6, 3), np.uint8)[:, ::2]).rgb.flags.c_contiguous
+
+
+@pytest.mark.parametrize(
+    ("rgb", "said"),
+    [
+        (np.zeros((2, 2, 3)), "must be a uint8 array"),
+        ([[[0, 0, 0]]], "must be a uint8 array"),
+        (np.zeros((2, 2), np.uint8), r"shape \(2, 2\), wanted \(H, W, 3\)"),
+        (np.zeros((2, 2, 4), np.uint8), r"shape \(2, 2, 4\)"),
+        (np.zeros((0, 2, 3), np.uint8), r"shape \(0, 2, 3\)"),
+    ],
+)
+def test_what_is_no_image_is_refused(rgb: Any, said: str) -> None:
+    with pytest.raises(RecordError, match=said):
+        Image(rgb)
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ([1, 2], r"v has shape \(2,\), wanted \(3,\)"),
+        ([[1, 2, 3]], r"v has shape \(1, 3\)"),
+        (5, r"v has shape \(\)"),
+        ([1, 2, np.nan], "v is not finite"),
+        ([1, 2, -np.inf], "v is not finite"),
+        ([1, 2, True], "v is not a list of numbers"),
+        ([True, False, True], "v is not a list of numbers"),
+        (np.array([True, False, True]), "v is not a list of numbers"),
+        (["1", "2", "3"], "v is not a list of numbers"),
+        ([1, 2, None], "v is not a list of numbers"),
+        ([1, 2, 3j], "v is not a list of numbers"),
+        ([1, [2], 3], "v is not a list of numbers"),
+        (np.array(["2020"] * 3, "M8[Y]"), "v is not a list of numbers"),
+        ("123", "v is not a list of numbers"),
+        ({1, 2, 3}, "v is not a list of numbers"),
+        ([10**400, 1, 1], "v is not a list of numbers"),
+    ],
+)
+def test_what_is_no_vector_is_refused(value: Any, said: str) -> None:
+    with pytest.raises(RecordError, match=said):
+        types.vector("v", value, 3)
+
+
+def test_a_vector_has_a_bound_even_where_any_size_will_do() -> None:
+    assert SceneState("table", np.zeros(types.MAX_VECTOR)).qpos.shape == (types.MAX_VECTOR,)
+    with pytest.raises(RecordError, match="qpos has 10001 numbers, at most 10000"):
+        SceneState("table", np.zeros(types.MAX_VECTOR + 1))
+
+
+@pytest.mark.parametrize(
+    "value", [True, np.True_, "1", None, float("nan"), float("inf"), 10**400, [1], 1j, -0.1, 1.1]
+)
+def test_what_is_no_number_within_bounds_is_refused(value: Any) -> None:
+    with pytest.raises(RecordError, match=r"^x is "):
+        types.number("x", value, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("value", [True, np.True_, "1", None, 1.0, np.float64(1), -1, 2**63])
+def test_what_is_no_whole_number_within_bounds_is_refused(value: Any) -> None:
+    with pytest.raises(RecordError, match=r"^x is "):
+        types.integer("x", value)
+
+
+def test_numbers_of_numpy_become_plain_ones() -> None:
+    task = Task(np.int64(1), np.True_, "go", "w", np.float32(5))  # pyright: ignore[reportArgumentType]
+    assert [type(v) for v in (task.episode, task.active, task.rate_hz)] == [int, bool, float]
+    state = GripperState(np.float64(0.04), np.False_, np.True_)  # pyright: ignore[reportArgumentType]
+    assert [type(v) for v in (state.width_m, state.moving)] == [float, bool]
+    assert type(GripperCommand(np.float32(0), 1, 1).width_m) is float  # pyright: ignore[reportArgumentType]
+
+
+def test_text_that_cannot_travel_is_refused() -> None:
+    with pytest.raises(RecordError, match="prompt holds half a character"):
+        Task(1, True, "\ud83e", "w", 5.0)
+    assert Task(1, True, "\U0001f9f1 é", "w", 5.0).prompt == "\U0001f9f1 é"
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        ((), "must be present and differ"),
+        (("a", "a"), "must be present and differ"),
+        ("ab", "names is not a list of texts"),
+        (None, "names is not a list of texts"),
+        ((1, 2), "names is not text: int"),
+        (("x" * 200,), "names has 200 characters"),
+    ],
+)
+def test_joints_need_names_that_differ(names: Any, said: str) -> None:
+    with pytest.raises(RecordError, match=said):
+        JointState(names, np.zeros(2), np.zeros(2), np.zeros(2))
+
+
+def test_every_joint_needs_every_value() -> None:
+    with pytest.raises(RecordError, match=r"velocity_rad_s has shape \(2,\), wanted \(1,\)"):
+        JointState(("a",), np.zeros(1), np.zeros(2), np.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("steps", "said"),
+    [
+        (np.zeros(7), r"steps has shape \(7,\), wanted \(H, D\)"),
+        (np.zeros((0, 7)), r"steps has shape \(0, 7\)"),
+        ([[1.0, True]], "steps is not a list of numbers"),
+        ([["1", "2"]], "steps is not a list of numbers"),
+        ([[1], [1, 2]], "steps is not a list of numbers"),
+        (np.full((1, 7), np.nan), "steps holds NaN or infinity"),
+        ([[1e300]], "steps holds NaN or infinity"),
+        (np.zeros((1000, 1000)), "steps has 1000000 numbers"),
+    ],
+)
+def test_steps_that_mean_nothing_are_refused(steps: Any, said: str) -> None:
+    with pytest.raises(RecordError, match=said):
+        chunk(steps)
+
+
+def test_steps_may_be_lists_and_become_read_only_floats() -> None:
+    steps = chunk([[1, 2.5], [3, 4]]).steps
+    assert steps.dtype == np.float32
+    assert not steps.flags.writeable
+
+
+def test_done_is_a_truth_value() -> None:
+    assert chunk([[1.0]], done=np.True_).done is True
+    with pytest.raises(RecordError, match="done is not true or false: 1"):
+        chunk([[1.0]], done=1)
+
+
+def test_a_command_names_its_cause_or_none() -> None:
+    with pytest.raises(RecordError, match="cause is not a Cause"):
+        PoseCommand(
+            np.zeros(3),
+            UNIT,
+            np.zeros(6),
+            np.zeros(6),
+            np.zeros(3),
+            UNIT,
+            "active",
+            {},  # type: ignore[arg-type]
+        )
+
+
+def test_a_reference_pose_is_whole_or_absent() -> None:
+    with pytest.raises(RecordError, match="needs both position and quaternion"):
+        PoseState(np.zeros(3), UNIT, np.zeros(6), reference_quat_xyzw=UNIT)
+
+
+def test_status_keeps_its_own_copy_of_its_maps() -> None:
+    counters = {"a": 1}
+    status = NodeStatus("n", "s", "h", 1, 1, counters=counters, detail={"list": (1, 2)})
+    counters["b"] = 2
+    assert status.counters == {"a": 1}
+    assert status.detail == {"list": [1, 2]}
+
+
+@pytest.mark.parametrize(
+    ("detail", "said"),
+    [
+        ({1: 2}, "a name in detail is not text"),
+        ({"x" * 300: 1}, "a name in detail has 300 characters"),
+        ({"a": object()}, "detail.a is not text"),
+        ({"a": [[[[1]]]]}, "detail.a is nested too deep"),
+        ({"a": 2**64}, "detail.a is 18446744073709551616"),
+        ({"a": "x" * 70_000}, "detail.a has 70000 characters"),
+        ({"a": list(range(2000))}, "detail.a is not text"),
+    ],
+)
+def test_detail_that_could_not_be_shown_is_refused(detail: Any, said: str) -> None:
+    with pytest.raises(RecordError, match=said):
+        NodeStatus("n", "s", "h", 1, 1, detail=detail)
+
+
+class Unprintable:
+    def __repr__(self) -> str:
+        raise ValueError("no")
+
+
+def deep() -> list[Any]:
+    inner: list[Any] = []
+    for _ in range(50_000):
+        inner = [inner]
+    return inner
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        Unprintable,
+        deep,
+        lambda: "x" * 10**6,
+        lambda: [["x" * 1000] * 1000] * 9,
+        lambda: {1: deep()},
+    ],
+    ids=["unprintable", "deep", "long", "wide", "deep map"],
+)
+def test_an_error_can_always_be_written(make: Callable[[], Any]) -> None:
+    assert len(types.shown(make())) < 400
+
+
+def test_an_event_is_of_a_known_kind_and_level() -> None:
+    for level in types.EVENT_LEVELS:
+        for kind in types.EVENT_KINDS:
+            assert Event(level, kind, "x").level == level
+    with pytest.raises(RecordError, match="level is 'debug', allowed: info, warning, error"):
+        Event("debug", "notice", "x")
