@@ -38,6 +38,7 @@ class IkSettings:
         rotation_tolerance_rad: likewise.
         joint_margin_rad: kept from both ends of every joint's range.
         posture_gain: part of the way to the posture taken in a first iteration, 0 to 1.
+        max_posture_step_rad: and at most this far: a posture is drifted to, not leapt at.
         damping_bias: W of an error of zero.
         max_iterations: after which there is no solution.
         max_joint_step_rad: of one iteration: a far pose is approached, not leapt at.
@@ -47,6 +48,7 @@ class IkSettings:
     rotation_tolerance_rad: float = 1e-6
     joint_margin_rad: float = 0.05
     posture_gain: float = 0.05
+    max_posture_step_rad: float = 0.01
     damping_bias: float = 1e-9
     max_iterations: int = 40
     max_joint_step_rad: float = 0.5
@@ -122,11 +124,17 @@ class InverseKinematics:
         found = self.approach(pose, start_rad)
         return found.joints_rad if found.solved else None
 
-    def approach(self, pose: Pose, start_rad: FloatArray) -> Approach:
-        """Like `solve`, and how near it came where there is no solution."""
+    def approach(self, pose: Pose, start_rad: FloatArray, *, bounded: bool = True) -> Approach:
+        """Like `solve`, and how near it came where there is no solution.
+
+        Args:
+            pose: of the TCP.
+            start_rad: (n,).
+            bounded: keep every joint within its bounds, by the other joints' taking over. Without,
+                the joints go where pose and posture alone put them.
+        """
         settings = self.settings
-        lower = np.minimum(self.lower_rad, start_rad)
-        upper = np.maximum(self.upper_rad, start_rad)
+        lower, upper = self.bounds(start_rad)
         joints = wanted = start_rad
         pull = settings.posture_gain
         last, stalls = math.inf, 0
@@ -146,14 +154,24 @@ class InverseKinematics:
                 return Approach(joints, error_m, error_rad, solved, wanted, jacobian)
             last = squared
             drift = pull * (self.posture_rad - joints)
+            farthest = float(np.abs(drift).max())
+            if farthest > settings.max_posture_step_rad:
+                drift *= settings.max_posture_step_rad / farthest
             pull = pull / 2 if iteration < 2 else 0.0  # the pose has the last word
             step = self._step(error, jacobian, drift, 0.5 * squared + settings.damping_bias)
             largest = float(np.abs(step).max())
             if largest > settings.max_joint_step_rad:
                 step *= settings.max_joint_step_rad / largest
             wanted = joints + step
-            joints = self._inside(wanted, joints, error, jacobian, drift, squared, lower, upper)
+            if bounded:
+                joints = self._inside(wanted, joints, error, jacobian, drift, squared, lower, upper)
+            else:
+                joints = wanted
         raise AssertionError("the last iteration returns")
+
+    def bounds(self, start_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest joints (n,): no joint goes further out than it was."""
+        return np.minimum(self.lower_rad, start_rad), np.maximum(self.upper_rad, start_rad)
 
     @staticmethod
     def _step(

@@ -58,10 +58,10 @@ class Kinematics:
         self.data: Any = self.model.createData()
         self.arm_joints: tuple[str, ...] = tuple(self.model.names)[1:]
         self._tcp = _frame(self.model, urdf, tcp_frame)
-        self._base = _base_placement(self.model, self.data, urdf, base_frame)
+        self.base_placement = _base_placement(self.model, self.data, urdf, base_frame)
         self._base_turn: FloatArray | None = None
-        if not np.allclose(self._base.rotation, np.eye(3), atol=1e-12):
-            self._base_turn = np.kron(np.eye(2), self._base.rotation.T)
+        if not np.allclose(self.base_placement.rotation, np.eye(3), atol=1e-12):
+            self._base_turn = np.kron(np.eye(2), self.base_placement.rotation.T)
         self.lower_rad: FloatArray = np.array(self.model.lowerPositionLimit)
         self.upper_rad: FloatArray = np.array(self.model.upperPositionLimit)
         self.velocity_rad_s: FloatArray = np.array(self.model.upperVelocityLimit)
@@ -125,7 +125,7 @@ class Kinematics:
     def _tcp_pose(self) -> Pose:
         placement = pin.updateFramePlacement(self.model, self.data, self._tcp)
         if self._base_turn is not None:
-            placement = self._base.actInv(placement)
+            placement = self.base_placement.actInv(placement)
         # Copies: the placement is a view into the work space.
         return Pose(placement.translation.copy(), placement.rotation.copy())
 

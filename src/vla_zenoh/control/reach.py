@@ -1,0 +1,362 @@
+"""What the arm can do: a kinematic shadow of the robot walks ahead of every goal.
+
+A step whose end has no joint solution, or comes too near to a singularity, to the arm itself or to
+the table, is shortened to the part of it that is feasible; the rest of the step is not remembered.
+Each barrier is a number ``h`` that must not become negative: singular value or distance minus its
+stop. A step from ``h0`` must end with::
+
+    h >= min(slow - stop, h0 / 2)     where h0 > 0: beyond `slow` it takes half of what is left,
+    h >= h0                           where h0 <= 0: a violated barrier may only be left
+
+which is a control barrier function in discrete time (Agrawal, Sreenath, "Discrete control barrier
+functions for safety-critical control of discrete systems", RSS 2017) with a decay of one half.
+A joint outside of its range may only move inwards. The elbow of a redundant arm is where pose and
+posture put it, because that is what a Cartesian controller does with it: a solution that would need
+the elbow to swing aside is none. `free_elbow` is for arms whose joints are commanded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vla_zenoh.control.collision import TABLE, CollisionModel
+from vla_zenoh.control.ik import Approach, IkSettings, InverseKinematics, pose_error
+from vla_zenoh.control.kinematics import Kinematics, smallest_singular_value
+from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.so3 import Pose, exp3, orthonormal
+from vla_zenoh.errors import RecordError
+from vla_zenoh.types import FloatArray
+
+DECAY = 0.5
+"""Part of the way to a stop that one step may take once it is nearer than `slow`."""
+HALVINGS = 4
+REFINEMENTS = 4
+SOLVER_ITERATIONS = 12
+"""Steps are short and the start is near: who has not arrived by then will not."""
+SAME_POSE = 1e-9
+NOISE = 2e-6
+"""m, and singular value: what distance and solver may differ by between two equal poses."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReachLimits:
+    """Bounds of the shadow.
+
+    Args:
+        joint_margin_rad: kept from both ends of every joint's range.
+        singularity_slow: smallest singular value of the Jacobian below which steps get shorter.
+        singularity_stop: it gets no smaller than this.
+        collision_slow_m: distance of the arm to itself below which steps get shorter.
+        collision_stop_m: it comes no nearer; also the arm, without its hand, to the table.
+        table_z_m: height of the table in the base frame; None: there is none.
+        table_slow_m: likewise for hand and fingers, which have work to do there.
+        table_stop_m: they come no nearer.
+        velocity_m_s: speed of the TCP; a step takes at least as long as that.
+        velocity_rad_s: likewise.
+        free_elbow: a redundant arm may leave its posture where a joint meets its range.
+    """
+
+    joint_margin_rad: float = 0.05
+    singularity_slow: float = 0.025
+    singularity_stop: float = 0.015
+    collision_slow_m: float = 0.05
+    collision_stop_m: float = 0.02
+    table_z_m: float | None = 0.0
+    table_slow_m: float = 0.002
+    table_stop_m: float = 0.001
+    velocity_m_s: float = 0.5
+    velocity_rad_s: float = 1.5
+    free_elbow: bool = False
+
+
+class ReachHit(LimitHit):
+    """A bound that acted, and where.
+
+    Attributes:
+        where: the joint, the pair of links, or the link over the table; empty for ``reach``.
+    """
+
+    where: str
+
+    def __new__(cls, name: str, value: float, limit: float, where: str = "") -> ReachHit:
+        hit = super().__new__(cls, name, value, limit)
+        hit.where = where
+        return hit
+
+
+class Margins(NamedTuple):
+    """How much room the shadow has.
+
+    Args:
+        joint_rad: smallest distance of a joint to the end of its range.
+        joint: its name.
+        singular_value: smallest of the Jacobian.
+        self_m: smallest distance of the arm to itself, inf where nothing can touch.
+        self_pair: the two links.
+        table_m: smallest distance to the table, inf without one.
+        table_link: the link.
+    """
+
+    joint_rad: float
+    joint: str
+    singular_value: float
+    self_m: float
+    self_pair: str
+    table_m: float
+    table_link: str
+
+
+class _Stand(NamedTuple):
+    """The shadow in one place: `pose` was asked for, `barriers` are those at `joints_rad`."""
+
+    pose: Pose
+    joints_rad: FloatArray
+    error: float
+    barriers: FloatArray
+
+
+class Shadow:
+    """See the module. Not a moment of time in it: the same questions get the same answers.
+
+    Args:
+        kinematics: of the arm.
+        joints_rad: (n,) where the robot stands.
+        limits: see `ReachLimits`.
+        posture_rad: (n,) what the robot's controller pulls a redundant arm to; None: where the
+            robot stood at the last `reset`.
+        known_good_rad: configurations known to be free, besides `joints_rad`.
+
+    Raises:
+        RecordError: joints of the wrong number, or a stop above its slow.
+        ResourceError: the URDF's collision shapes cannot be loaded.
+    """
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        joints_rad: ArrayLike,
+        limits: ReachLimits | None = None,
+        *,
+        posture_rad: ArrayLike | None = None,
+        known_good_rad: Sequence[FloatArray] = (),
+    ) -> None:
+        self.kinematics = kinematics
+        self.limits = limits = limits or ReachLimits()
+        for name in ("singularity", "collision", "table"):
+            suffix = "" if name == "singularity" else "_m"
+            slow, stop = getattr(limits, f"{name}_slow{suffix}"), getattr(limits, f"{name}_stop{suffix}")
+            if slow < stop:
+                raise RecordError(f"{name}_slow ({slow:g}) must not be below {name}_stop ({stop:g})")
+        settings = IkSettings(
+            joint_margin_rad=limits.joint_margin_rad, max_iterations=SOLVER_ITERATIONS
+        )
+        self._solver = InverseKinematics(kinematics, posture_rad, settings)
+        self._follow_posture = posture_rad is None
+        self.collisions = CollisionModel(
+            kinematics,
+            near_m=limits.collision_slow_m,
+            touching_m=limits.collision_stop_m,
+            table_z_m=limits.table_z_m,
+            known_good_rad=known_good_rad,
+        )
+        pairs = self.collisions.pairs
+        hand = np.array([pair.second == TABLE and pair.is_hand for pair in pairs], dtype=bool)
+        self._names = ["singularity"] + [
+            "table_distance" if pair.second == TABLE else "self_collision" for pair in pairs
+        ]
+        self._stop = np.array([limits.singularity_stop, *np.where(
+            hand, limits.table_stop_m, limits.collision_stop_m
+        )])  # fmt: skip
+        self._slow = np.array([limits.singularity_slow, *np.where(
+            hand, limits.table_slow_m, limits.collision_slow_m
+        )])  # fmt: skip
+        self.reset(joints_rad)
+
+    def reset(self, joints_rad: ArrayLike) -> None:
+        """The robot is here: stand where it stands.
+
+        Raises:
+            RecordError: not one finite number per arm joint.
+        """
+        joints = np.array(joints_rad, dtype=np.float64)
+        if joints.shape != (self.kinematics.size,) or not np.isfinite(joints).all():
+            raise RecordError(
+                f"joints_rad must be {self.kinematics.size} finite numbers, got {joints!r}"
+            )
+        if self._follow_posture:
+            self._solver.posture_rad = joints.copy()
+        pose, jacobian = self.kinematics.pose_and_jacobian(joints)
+        self._here = _Stand(pose, joints, 0.0, self._barriers(joints, jacobian))
+
+    @property
+    def joints_rad(self) -> FloatArray:
+        """(n,) of the shadow: those of the last bounded pose."""
+        return self._here.joints_rad.copy()
+
+    @property
+    def margins(self) -> Margins:
+        """Room left where the shadow stands."""
+        joints, kinematics = self._here.joints_rad, self.kinematics
+        room = np.minimum(joints - kinematics.lower_rad, kinematics.upper_rad - joints)
+        tightest = int(np.argmin(room))
+        values = self._here.barriers + self._stop
+        nearest = {"self_collision": (np.inf, ""), "table_distance": (np.inf, "")}
+        for index, value in enumerate(values[1:], start=1):
+            name = self._names[index]
+            nearest[name] = min(nearest[name], (float(value), self._where(index)))
+        return Margins(
+            float(room[tightest]),
+            kinematics.arm_joints[tightest],
+            float(values[0]),
+            *nearest["self_collision"],
+            *nearest["table_distance"],
+        )
+
+    def bound(
+        self,
+        before: Pose,
+        asked: Pose,
+        dt_s: float = 0.1,
+        start_rad: FloatArray | None = None,
+    ) -> tuple[Pose, list[LimitHit]]:
+        """The furthest pose on the way from `before` to `asked` that the arm can take.
+
+        Args:
+            before: where the step starts, usually the pose bounded last.
+            asked: where it is to end.
+            dt_s: time the step has.
+            start_rad: joints at `before`, where known; None: those of the last bounded pose.
+
+        Returns:
+            `asked` itself where nothing acted, `before` itself where nothing is left of the step,
+            and what acted. The shadow stands there afterwards.
+        """
+        start = self._stand_at(before, start_rad)
+        end, hits = self._try(start, asked, dt_s)
+        if not hits:
+            self._here = end
+            return asked, []
+        turn = pose_error(asked, before)
+        best, low, high = start, 0.0, 1.0
+        for halving in range(1, HALVINGS + 1):
+            fraction = 0.5**halving
+            end, found = self._try(start, _part(before, turn, fraction), dt_s)
+            if not found:
+                best, low = end, fraction
+                break
+            high, hits = fraction, found
+        if low > 0.0:
+            for _ in range(REFINEMENTS):
+                fraction = 0.5 * (low + high)
+                end, found = self._try(start, _part(before, turn, fraction), dt_s)
+                if found:
+                    high, hits = fraction, found
+                else:
+                    best, low = end, fraction
+        self._here = best
+        return (best.pose if low > 0.0 else before), list(hits)
+
+    # -- one place ----------------------------------------------------------------------------
+    def _stand_at(self, pose: Pose, start_rad: FloatArray | None) -> _Stand:
+        if start_rad is None and _same(pose, self._here.pose):
+            return self._here
+        found = self._approach(pose, self._here.joints_rad if start_rad is None else start_rad)
+        self._here = self._stand(pose, found)
+        return self._here
+
+    def _stand(self, pose: Pose, found: Approach) -> _Stand:
+        error = 0.0 if found.solved else found.error_m + found.error_rad
+        return _Stand(
+            pose, found.joints_rad, error, self._barriers(found.joints_rad, found.jacobian)
+        )
+
+    def _barriers(self, joints_rad: FloatArray, jacobian: FloatArray) -> FloatArray:
+        values = np.empty(len(self._stop))
+        values[0] = smallest_singular_value(jacobian)
+        values[1:] = self.collisions.distances(joints_rad)
+        return values - self._stop
+
+    def _try(self, start: _Stand, pose: Pose, dt_s: float) -> tuple[_Stand, list[ReachHit]]:
+        """Where a step would lead, and what forbids it."""
+        found = self._approach(pose, start.joints_rad)
+        # Where the start has no solution itself, coming nearer to having one is the way out.
+        if not found.solved and found.error_m + found.error_rad >= start.error * (1 - 1e-6):
+            return start, [self._out_of_range(start, found.wanted_rad) or self._out_of_reach(found)]
+        outside = self._out_of_range(start, found.joints_rad)
+        if outside is not None:
+            return start, [outside]
+        end = self._stand(pose, found)
+        floor = np.where(
+            start.barriers > 0,
+            np.minimum(self._slow - self._stop, (1 - DECAY) * start.barriers),
+            start.barriers - NOISE,
+        )
+        hits = [
+            ReachHit(
+                self._names[index],
+                float(end.barriers[index] + self._stop[index]),
+                float(floor[index] + self._stop[index]),
+                self._where(index),
+            )
+            for index in np.flatnonzero(end.barriers < floor)
+        ]
+        leaving = start.barriers[0] < 0 and end.barriers[0] > start.barriers[0]
+        if not hits and not leaving:
+            hits = self._too_fast(start, end, dt_s)
+        return end, hits
+
+    def _approach(self, pose: Pose, start_rad: FloatArray) -> Approach:
+        return self._solver.approach(pose, start_rad, bounded=self.limits.free_elbow)
+
+    def _out_of_range(self, start: _Stand, joints_rad: FloatArray) -> ReachHit | None:
+        lower, upper = self._solver.bounds(start.joints_rad)
+        excess = np.maximum(lower - joints_rad, joints_rad - upper)
+        joint = int(np.argmax(excess))
+        if excess[joint] <= 0:
+            return None
+        value = float(joints_rad[joint])
+        bound = float(lower[joint] if value < lower[joint] else upper[joint])
+        return ReachHit("joint_limit", value, bound, self.kinematics.arm_joints[joint])
+
+    def _out_of_reach(self, found: Approach) -> ReachHit:
+        tolerance = self._solver.settings.position_tolerance_m
+        return ReachHit("reach", found.error_m + found.error_rad, tolerance)
+
+    def _too_fast(self, start: _Stand, end: _Stand, dt_s: float) -> list[ReachHit]:
+        error = pose_error(end.pose, start.pose)
+        time_s = max(
+            dt_s,
+            float(np.linalg.norm(error[:3])) / self.limits.velocity_m_s,
+            float(np.linalg.norm(error[3:])) / self.limits.velocity_rad_s,
+        )
+        speed = np.abs(end.joints_rad - start.joints_rad) / time_s
+        joint = int(np.argmax(speed / self.kinematics.velocity_rad_s))
+        limit = float(self.kinematics.velocity_rad_s[joint])
+        if speed[joint] <= limit:
+            return []
+        name = self.kinematics.arm_joints[joint]
+        return [ReachHit("joint_velocity", float(speed[joint]), limit, name)]
+
+    def _where(self, index: int) -> str:
+        if index == 0:
+            return ""
+        pair = self.collisions.pairs[index - 1]
+        return pair.first if pair.second == TABLE else str(pair)
+
+
+def _same(a: Pose, b: Pose) -> bool:
+    return a is b or (
+        float(np.abs(a.position_m - b.position_m).max()) < SAME_POSE
+        and float(np.abs(a.rotation - b.rotation).max()) < SAME_POSE
+    )
+
+
+def _part(before: Pose, step: FloatArray, fraction: float) -> Pose:
+    """`fraction` of a step (6,) m and rad on the straight line and the shortest turn."""
+    turned = exp3(fraction * step[3:]) @ before.rotation
+    return Pose(before.position_m + fraction * step[:3], orthonormal(turned))
