@@ -12,6 +12,7 @@ from rich.text import Text
 
 from vla_zenoh import __version__
 from vla_zenoh.cli import (
+    bench,
     camera,
     command,
     demo,
@@ -87,6 +88,7 @@ for panel, name, function in (
 ):
     app.command(name, rich_help_panel=panel)(function)
 
+app.add_typer(bench.bench_app, name="bench", rich_help_panel=LOOK)
 app.add_typer(profile.profile_app, name="profile", rich_help_panel=LOOK)
 
 

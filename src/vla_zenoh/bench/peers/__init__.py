@@ -1,0 +1,42 @@
+"""Other ways of serving a policy, each as it is commonly done: a server and its client.
+
+A module here has ``serve(port)``, which ends with its process, and ``Client(port)`` with
+``request(rgb)``, which returns the seven floats.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+MODULES = {"flask": "flask_json", "openpi": "openpi_websocket", "zmq": "zmq_msgpack"}
+ADDRESS = "127.0.0.1"
+ACTION = (0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04)
+"""What every server answers."""
+PROMPT = "put the red brick in the box"
+
+
+class PeerClient(Protocol):
+    """The asking end."""
+
+    def request(self, rgb: NDArray[np.uint8]) -> NDArray[Any]:
+        """A picture (H, W, 3) there, seven floats back."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class Peer(Protocol):
+    """A module of this package."""
+
+    def serve(self, port: int) -> None: ...
+
+    def Client(self, port: int) -> PeerClient: ...
+
+
+def load(name: str) -> Peer:
+    """The module of a way; its libraries are imported here and not before."""
+    return cast(Peer, importlib.import_module(f"{__name__}.{MODULES[name]}"))

@@ -1,0 +1,80 @@
+"""vla-zenoh bench: measures this computer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vla_zenoh.cli.output import console, errors
+
+bench_app = typer.Typer(help="Measure this computer.", no_args_is_help=True)
+
+
+@bench_app.callback()
+def _bench() -> None:
+    pass
+
+
+@bench_app.command("chain")
+def chain(
+    rounds: Annotated[
+        int, typer.Option("--rounds", help="Turns that every way has.", min=1, max=100)
+    ] = 5,
+    requests: Annotated[
+        int, typer.Option("--requests", help="Pictures in every turn.", min=1, max=10_000)
+    ] = 100,
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", help="Measure this way alone; may be given more than once."),
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the result to this file.")
+    ] = None,
+) -> None:
+    """Measure picture to chunk and to pose command, beside other ways of serving a model.
+
+    Every way carries the same picture of 640x480 and seven floats back; the model takes no time.
+    All servers are processes on this computer, started and ended by turns.
+    """
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from vla_zenoh.bench import report
+    from vla_zenoh.bench.ways import WAYS, Way
+    from vla_zenoh.nodes.bench_run import run
+
+    names = [way.name for way in WAYS]
+    unknown = [name for name in only or () if name not in names]
+    if unknown:
+        raise typer.BadParameter(f"{unknown[0]!r} is not a way; there are: {', '.join(names)}")
+    ways = [way for way in WAYS if not only or way.name in only]
+    with Progress(
+        TextColumn("{task.description:<44}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=errors(),
+    ) as bars:
+        turns = rounds * sum(not way.missing() for way in ways)
+        bar = bars.add_task("", total=turns)
+        begun = 0
+
+        def progress(way: Way) -> None:
+            nonlocal begun
+            bars.update(bar, description=way.title, completed=begun)
+            begun += 1
+
+        result = run(ways, rounds, requests, progress)
+        bars.update(bar, description="measured", completed=turns)
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps(result.to_dict(), indent=2) + "\n", "utf-8")
+    out = console()
+    out.print(report.main_table(result))
+    stages = report.stage_table(result)
+    if stages is not None:
+        out.print(stages)
+    for note in report.notes(result):
+        out.print(f"- {note}", markup=False)
