@@ -148,6 +148,11 @@ class Keys:
         return self._at("command", "pose")
 
     @property
+    def command_joint(self) -> str:
+        """`JointCommand` likewise, in place of poses where the profile's robot takes joints."""
+        return self._at("command", "joint")
+
+    @property
     def command_gripper(self) -> str:
         """`GripperCommand`, newest wins."""
         return self._at("command", "gripper")

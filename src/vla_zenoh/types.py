@@ -141,6 +141,14 @@ def texts(name: str, value: Any, limit: int) -> tuple[str, ...]:
     return tuple(text(name, item, limit) for item in value)
 
 
+def joint_names(value: Any) -> tuple[str, ...]:
+    """Names of joints: at least one, none of them twice."""
+    names = texts("names", value, 128)
+    if not names or len(set(names)) != len(names):
+        raise RecordError(f"joint names must be present and differ: {shown(names)}")
+    return names
+
+
 def boolean(name: str, value: Any) -> bool:
     """A bool, and nothing that merely looks like one."""
     if not isinstance(value, (bool, np.bool_)):
@@ -240,20 +248,30 @@ class Image:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointState:
-    """Arm joints, without the fingers: all arrays have one entry per name."""
+    """Arm joints, without the fingers: all arrays have one entry per name.
+
+    Args:
+        names: of the joints.
+        position_rad: (n,) measured.
+        velocity_rad_s: (n,) measured.
+        effort_nm: (n,) what the motors apply.
+        reference_rad: (n,) positions the robot's controller holds right now, or None where it
+            holds none, or the robot does not tell.
+    """
 
     names: tuple[str, ...]
     position_rad: FloatArray
     velocity_rad_s: FloatArray
     effort_nm: FloatArray
+    reference_rad: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        names = texts("names", self.names, 128)
-        if not names or len(set(names)) != len(names):
-            raise RecordError(f"joint names must be present and differ: {shown(names)}")
+        names = joint_names(self.names)
         _set(self, "names", names)
         for name in ("position_rad", "velocity_rad_s", "effort_nm"):
             _set(self, name, vector(name, getattr(self, name), len(names)))
+        if self.reference_rad is not None:
+            _set(self, "reference_rad", vector("reference_rad", self.reference_rad, len(names)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -432,8 +450,41 @@ class PoseCommand:
         for name in ("twist", "acceleration"):
             _set(self, name, vector(name, getattr(self, name), 6))
         text("state", self.state, 32)
-        if self.cause is not None and not isinstance(self.cause, Cause):
-            raise RecordError(f"cause is not a Cause: {shown(self.cause)}")
+        _check_cause(self.cause)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointCommand:
+    """Where the joints have to be now, with feed-forward; all arrays have one entry per name.
+
+    Args:
+        names: of the arm's joints, in any order.
+        position_rad: (n,).
+        velocity_rad_s: (n,).
+        acceleration_rad_s2: (n,).
+        state: the command node's state.
+        cause: the chunk carried out, None while nothing is.
+    """
+
+    names: tuple[str, ...]
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+    acceleration_rad_s2: FloatArray
+    state: str
+    cause: Cause | None = None
+
+    def __post_init__(self) -> None:
+        names = joint_names(self.names)
+        _set(self, "names", names)
+        for name in ("position_rad", "velocity_rad_s", "acceleration_rad_s2"):
+            _set(self, name, vector(name, getattr(self, name), len(names)))
+        text("state", self.state, 32)
+        _check_cause(self.cause)
+
+
+def _check_cause(cause: Any) -> None:
+    if cause is not None and not isinstance(cause, Cause):
+        raise RecordError(f"cause is not a Cause: {shown(cause)}")
 
 
 @dataclass(frozen=True, slots=True)

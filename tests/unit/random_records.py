@@ -27,6 +27,7 @@ from vla_zenoh.types import (
     GripperState,
     Header,
     Image,
+    JointCommand,
     JointState,
     NodeStatus,
     ObjectPoses,
@@ -64,7 +65,13 @@ images = st.tuples(st.integers(1, 24), st.integers(1, 24)).flatmap(
 def joint_states(draw: st.DrawFn) -> JointState:
     names = draw(st.lists(texts, min_size=1, max_size=9, unique=True))
     size = len(names)
-    return JointState(tuple(names), draw(vectors(size)), draw(vectors(size)), draw(vectors(size)))
+    return JointState(
+        tuple(names),
+        draw(vectors(size)),
+        draw(vectors(size)),
+        draw(vectors(size)),
+        draw(st.none() | vectors(size)),
+    )
 
 
 @st.composite
@@ -92,6 +99,20 @@ def pose_commands(draw: st.DrawFn) -> PoseCommand:
         draw(vectors(6)),
         draw(vectors(3)),
         draw(quaternions()),
+        draw(st.sampled_from(["active", "holding"])),
+        draw(st.none() | causes),
+    )
+
+
+@st.composite
+def joint_commands(draw: st.DrawFn) -> JointCommand:
+    names = draw(st.lists(texts, min_size=1, max_size=9, unique=True))
+    size = len(names)
+    return JointCommand(
+        tuple(names),
+        draw(vectors(size)),
+        draw(vectors(size)),
+        draw(vectors(size)),
         draw(st.sampled_from(["active", "holding"])),
         draw(st.none() | causes),
     )
@@ -197,6 +218,7 @@ RECORDS: dict[type, st.SearchStrategy[Any]] = {
     ),
     ActionChunk: action_chunks(),
     PoseCommand: pose_commands(),
+    JointCommand: joint_commands(),
     GripperCommand: st.builds(
         GripperCommand, st.floats(0, 1), st.floats(1e-4, 10), st.floats(0, 1000)
     ),

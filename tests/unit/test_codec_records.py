@@ -19,6 +19,8 @@ from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import (
     Event,
     GripperState,
+    JointCommand,
+    JointState,
     NodeStatus,
     ObjectPoses,
     PoseCommand,
@@ -140,6 +142,8 @@ GRIPPER = GripperState(0.04, moving=False, holding=False)
 STATUS = NodeStatus("n", "s", "h", 1, 1)
 UNIT = np.array([0, 0, 0, 1.0])
 COMMAND = PoseCommand(np.zeros(3), UNIT, np.zeros(6), np.zeros(6), np.zeros(3), UNIT, "active")
+JOINTS = JointState(("a", "b"), np.zeros(2), np.zeros(2), np.zeros(2))
+JOINT_COMMAND = JointCommand(("a", "b"), np.zeros(2), np.zeros(2), np.zeros(2), "active")
 HEADER_REASONS = {"schema", "invalid", "malformed"}
 
 
@@ -167,6 +171,14 @@ HEADER_REASONS = {"schema", "invalid", "malformed"}
         (POSE, {"quat_xyzw": [0, 0, 0, 0.9]}, "quat_xyzw has norm 0.9"),
         (POSE, {"quat_xyzw": [0, 0, 0, 0]}, "quat_xyzw has norm 0"),
         (POSE, {"reference_position_m": [0, 0, 0]}, "needs both position and quaternion"),
+        (JOINTS, {"reference_rad": [0]}, r"reference_rad has shape \(1,\), wanted \(2,\)"),
+        (JOINTS, {"reference_rad": [0, np.nan]}, "reference_rad is not finite"),
+        (JOINT_COMMAND, {"names": ["a", "a"]}, "joint names must be present and differ"),
+        (JOINT_COMMAND, {"names": []}, "joint names must be present and differ"),
+        (JOINT_COMMAND, {"position_rad": [0, np.inf]}, "position_rad is not finite"),
+        (JOINT_COMMAND, {"velocity_rad_s": np.zeros(3)}, r"velocity_rad_s has shape \(3,\)"),
+        (JOINT_COMMAND, {"acceleration_rad_s2": None}, "acceleration_rad_s2 is not a list"),
+        (JOINT_COMMAND, {"state": 1}, "state is not text"),
         (GRIPPER, {"faults": "fire"}, "faults is not a list of texts"),
         (GRIPPER, {"faults": [b"fire"]}, "faults is not text"),
         (GRIPPER, {"width_m": 40}, "width_m is 40"),
@@ -219,8 +231,9 @@ def test_fields_that_are_missing_or_unknown_are_named() -> None:
         records.decode(Task, message.pack([1]))
     with pytest.raises(CodecError, match="cause is a map or nothing"):
         records.decode(PoseCommand, forged(COMMAND, cause=5))
-    with pytest.raises(CodecError, match="Cause lacks worker"):
-        records.decode(PoseCommand, forged(COMMAND, cause={}))
+    for command in (COMMAND, JOINT_COMMAND):
+        with pytest.raises(CodecError, match="Cause lacks worker"):
+            records.decode(type(command), forged(command, cause={}))
 
 
 def test_an_error_message_stays_short_whatever_is_in_the_field() -> None:

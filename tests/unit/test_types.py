@@ -18,6 +18,7 @@ from vla_zenoh.types import (
     GripperState,
     Header,
     Image,
+    JointCommand,
     JointState,
     NodeStatus,
     PoseCommand,
@@ -169,11 +170,17 @@ def test_text_that_cannot_travel_is_refused() -> None:
 def test_joints_need_names_that_differ(names: Any, said: str) -> None:
     with pytest.raises(RecordError, match=said):
         JointState(names, np.zeros(2), np.zeros(2), np.zeros(2))
+    with pytest.raises(RecordError, match=said):
+        JointCommand(names, np.zeros(2), np.zeros(2), np.zeros(2), "active")
 
 
 def test_every_joint_needs_every_value() -> None:
     with pytest.raises(RecordError, match=r"velocity_rad_s has shape \(2,\), wanted \(1,\)"):
         JointState(("a",), np.zeros(1), np.zeros(2), np.zeros(1))
+    with pytest.raises(RecordError, match=r"reference_rad has shape \(2,\), wanted \(1,\)"):
+        JointState(("a",), np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(2))
+    with pytest.raises(RecordError, match=r"position_rad has shape \(2,\), wanted \(1,\)"):
+        JointCommand(("a",), np.zeros(2), np.zeros(1), np.zeros(1), "active")
 
 
 @pytest.mark.parametrize(
@@ -218,6 +225,9 @@ def test_a_command_names_its_cause_or_none() -> None:
             "active",
             {},  # type: ignore[arg-type]
         )
+    zero = np.zeros(1)
+    with pytest.raises(RecordError, match="cause is not a Cause"):
+        JointCommand(("a",), zero, zero, zero, "active", "me")  # type: ignore[arg-type]
 
 
 def test_a_reference_pose_is_whole_or_absent() -> None:
