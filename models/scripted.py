@@ -13,7 +13,8 @@ Prompts, one step per request, as in the thesis this package grew from::
     HARD: open gripper | close gripper       +-0.05 m of width
     hold                                     stands still
 
-``HARD: go up x50`` does 50 steps, then says it is done and stands still.
+``HARD: go up x50`` does 50 steps, then says it is done and stands still; ``HARD: go down x50 within
+0.1`` turns back before it is further than 0.1 m from its start.
 """
 
 from __future__ import annotations
@@ -67,21 +68,35 @@ class Scripted:
 
     def reset(self) -> None:
         """Begin to count anew."""
-        self._given = 0
+        self._begun = 0  # steps before the last chunk
+        self._last_stamp_ns = -1
+        self._last_length = 0
 
     def infer(self, observation: Observation) -> ActionSteps:
         """The next chunk of the motion the prompt names."""
-        motion, count = parse_hard(observation.prompt)
+        asked = parse_hard(observation.prompt)
         if self._delay_s:
             time.sleep(self._delay_s * (1 + self._jitter * self._random.uniform(-1, 1)))
+        done_steps = self._done_steps(observation.stamp_wall_ns)
+        horizon = self.spec.action.horizon
+        left = horizon if asked.steps is None else max(asked.steps - done_steps, 0)
+        steps = np.zeros((horizon, self.spec.action.dimension), np.float32)
+        length = min(left, horizon)
+        if asked.motion is not None:
+            for index in range(length):
+                steps[index, asked.motion.axis] = asked.step(done_steps + index)
         # Before the arm is given to us nothing is counted: nobody carries it out.
-        active = observation.task.active
-        left = self.spec.action.horizon if count is None else max(count - self._given, 0)
-        steps = np.zeros((self.spec.action.horizon, self.spec.action.dimension), np.float32)
-        length = min(left, len(steps))
-        if motion is not None:
-            steps[:length, motion.axis] = motion.step
-            if active:
-                self._given += length
-        done = motion is None or (count is not None and self._given >= count)
+        if observation.task.active:
+            self._begun, self._last_length = done_steps, length
+            self._last_stamp_ns = observation.stamp_wall_ns
+        # The last step of a longer chunk has not begun when the chunk is sent.
+        done = asked.motion is None or (asked.steps is not None and left <= min(horizon, 1))
         return ActionSteps(steps[: max(length, 1)], done)
+
+    def _done_steps(self, stamp_ns: int) -> int:
+        """Steps that were in force when this observation was taken: the next one stands on them."""
+        if self._last_stamp_ns < 0:
+            return self._begun
+        dt_ns = int(self.spec.action.dt_s * 1e9)
+        begun = (stamp_ns - self._last_stamp_ns) // dt_ns + 1
+        return self._begun + min(begun, self._last_length)

@@ -1,7 +1,9 @@
 """The thesis's ten HARD prompts: fixed deltas whose outcome is known beforehand.
 
 ``HARD: go up`` asks for one step of 0.01 m per request; ``HARD: go up x50`` for 50 of them, after
-which the arm is to stand still. Source: the set points of "Building a ROS2-VLA Bridge".
+which the arm is to stand still; ``HARD: go down x50 within 0.1`` turns back before it is further
+than 0.1 m (or rad) from where it began, and again when it is back there. Source: the set points of
+"Building a ROS2-VLA Bridge".
 """
 
 from __future__ import annotations
@@ -44,14 +46,42 @@ HARD: dict[str, HardMotion] = {
         HardMotion("close gripper", 6, -STEP_WIDTH_M),
     )
 }
-_PROMPT = re.compile(r"(?:hard:)?\s*(?P<name>[a-z ]+?)\s*(?:[x\u00d7]\s*(?P<count>\d{1,6}))?", re.I)
+_PROMPT = re.compile(
+    r"(?:hard:)?\s*(?P<name>[a-z ]+?)\s*"
+    r"(?:[x\u00d7]\s*(?P<count>\d{1,6}))?\s*(?:within\s*(?P<within>\d+(?:\.\d+)?))?",
+    re.I,
+)
 
 
 class HardPrompt(NamedTuple):
-    """A prompt that was understood: `motion` None is ``hold``; `steps` None has no end."""
+    """A prompt that was understood.
+
+    Args:
+        motion: None: stand still.
+        steps: how many; None: no end.
+        within: turn back before this distance (m or rad) from the start; None: never.
+    """
 
     motion: HardMotion | None
     steps: int | None
+    within: float | None = None
+
+    def offset(self, steps: int) -> float:
+        """Where the asked axis is after `steps` of them, in m or rad from the start."""
+        if self.motion is None:
+            return 0.0
+        return self._folded(steps) * self.motion.step
+
+    def step(self, index: int) -> float:
+        """What step `index` (from 0) asks for, in m or rad."""
+        return self.offset(index + 1) - self.offset(index)
+
+    def _folded(self, steps: int) -> int:
+        if self.motion is None or self.within is None:
+            return steps
+        leg = max(1, int(self.within / abs(self.motion.step) + 1e-9))
+        turn, along = divmod(steps, leg)
+        return along if turn % 2 == 0 else leg - along
 
 
 def parse_hard(prompt: str) -> HardPrompt:
@@ -63,12 +93,13 @@ def parse_hard(prompt: str) -> HardPrompt:
     match = _PROMPT.fullmatch(" ".join(prompt.split()))
     name = match["name"].lower().replace("rol ", "roll ") if match else ""
     count = int(match["count"]) if match and match["count"] else None
+    within = float(match["within"]) if match and match["within"] else None
     if match is not None and name == "hold":
         return HardPrompt(None, count)
-    if match is None or name not in HARD or (count or 0) > MAX_COUNT:
+    if match is None or name not in HARD or (count or 0) > MAX_COUNT or within == 0.0:
         raise SpecError(
             f"the scripted model does not know the prompt {prompt!r}; it knows: 'hold', "
             + ", ".join(f"'HARD: {known}'" for known in HARD)
-            + "; a count may follow, as in 'HARD: go up x50'"
+            + "; a count and a range may follow, as in 'HARD: go down x50 within 0.1'"
         )
-    return HardPrompt(HARD[name], count)
+    return HardPrompt(HARD[name], count, within)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vla_zenoh.motions import HardMotion, parse_hard
+from vla_zenoh.motions import HardMotion, HardPrompt, parse_hard
 from vla_zenoh.types import FloatArray
 
 TOUR: tuple[tuple[str, int], ...] = (
@@ -32,16 +32,27 @@ class Segment:
         prompt: as put, without the count.
         steps: how many.
         motion: what one step is; None: to stand still.
+        within: turn back before this distance (m or rad) from the start; None: never.
     """
 
     prompt: str
     steps: int
     motion: HardMotion | None
+    within: float | None = None
 
     @property
     def prompt_with_count(self) -> str:
         """The prompt that ends by itself after the steps."""
-        return f"{self.prompt} x{self.steps}"
+        return f"{self.prompt} x{self.steps}{self._turning}"
+
+    @property
+    def prompt_without_end(self) -> str:
+        """The prompt that goes on until another one is put."""
+        return f"{self.prompt}{self._turning}"
+
+    @property
+    def _turning(self) -> str:
+        return "" if self.within is None else f" within {self.within:g}"
 
     @property
     def translation_m(self) -> FloatArray:
@@ -56,15 +67,18 @@ class Segment:
     def width_after_m(self, before_m: float, max_width_m: float) -> float:
         """Gripper width asked for, after `before_m`."""
         width_m = before_m
-        for _ in range(self.steps):
-            change_m = self.motion.step if self.motion and self.motion.axis == 6 else 0.0
-            width_m = min(max(width_m + change_m, 0.0), max_width_m)
+        if self.motion is not None and self.motion.axis == 6:
+            asked = HardPrompt(self.motion, self.steps, self.within)
+            for index in range(self.steps):
+                width_m = min(max(width_m + asked.step(index), 0.0), max_width_m)
         return width_m
 
     def _asked(self) -> FloatArray:
         asked = np.zeros(7)
         if self.motion is not None:
-            asked[self.motion.axis] = self.motion.step * self.steps
+            asked[self.motion.axis] = HardPrompt(self.motion, self.steps, self.within).offset(
+                self.steps
+            )
         return asked
 
 
@@ -74,9 +88,9 @@ def make_segment(prompt: str, steps: int) -> Segment:
     Raises:
         SpecError: not a prompt the scripted model knows.
     """
-    motion, count = parse_hard(prompt)
-    name = f"HARD: {motion.name}" if motion else "hold"
-    return Segment(name, steps if count is None else count, motion)
+    asked = parse_hard(prompt)
+    name = f"HARD: {asked.motion.name}" if asked.motion else "hold"
+    return Segment(name, steps if asked.steps is None else asked.steps, asked.motion, asked.within)
 
 
 def tour() -> list[Segment]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -133,14 +133,14 @@ class DemoRun:
                 f"{segment.prompt_with_count!r} did not end in {patience_s:.0f} s",
             )
         else:
-            task = self._client.set_prompt(segment.prompt)
+            task = self._client.set_prompt(segment.prompt_without_end)
             self._pause(seconds)
         steps_done = self._steps_of(task.episode)
         if seconds is not None:
             self._client.set_prompt("hold")
             self._wait(self._at_rest, SLACK_S, "the arm does not come to rest")
             steps_done = self._steps_heard(task.episode)
-            segment = Segment(segment.prompt, steps_done, segment.motion)
+            segment = replace(segment, steps=steps_done)
         self._pause(SETTLE_S)
         duration_s = time.monotonic() - began - SETTLE_S
         return judge(
