@@ -50,7 +50,7 @@ def quat_from_rotation(rotation: FloatArray) -> FloatArray:
 
 
 def orthonormal(rotation: FloatArray) -> FloatArray:
-    """The rotation matrix nearest to a product of many rotation matrices."""
+    """A product of many rotation matrices without what rounding made of it."""
     quaternion = pin.Quaternion(rotation)
     quaternion.normalize()
     return quaternion.matrix()

@@ -1,0 +1,233 @@
+"""A commander with everything around it made up: clock, arm, gripper, worker, nodes.
+
+The arm is perfect: it stands where it was last commanded to, unless it is `blocked`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
+from vla_zenoh.control.preflight import Surroundings
+from vla_zenoh.control.so3 import exp3, log3, norm3, quat_from_rotation, rotation_from_quat
+from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
+from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.types import (
+    ActionChunk,
+    Event,
+    GripperState,
+    Header,
+    PoseCommand,
+    PoseState,
+    Stamped,
+)
+
+START_NS = 1_700_000_000_000_000_000
+MS = 1_000_000
+WORKER, OTHER = "scripted", "other"
+SOURCE = "worker-scripted-1"
+LIMIT_RTOL = 1e-6
+START_M = np.array([0.43, 0.0, 0.3])
+DOWN = np.array([1.0, 0.0, 0.0, 0.0])  # tool straight down
+
+
+def profile(**parts: dict[str, Any]) -> Profile:
+    """The shipped profile with other numbers: ``profile(timing={"watchdog_s": 1.0})``."""
+    base = load_profile("panda_sim")
+    changes = {name: getattr(base, name).model_copy(update=part) for name, part in parts.items()}
+    return base.model_copy(update=changes)
+
+
+def model_spec(name: str = WORKER, **action: Any) -> ModelSpec:
+    fields = {"horizon": 16, "dt_s": 0.1, "rotation": "rotvec", "gripper": "delta_m", **action}
+    return ModelSpec(
+        name=name,
+        observation=ObservationSpec(cameras=(CameraSpec(camera="front"),)),
+        action=ActionSpec(**fields),
+    )
+
+
+class Rig:
+    """See the module."""
+
+    def __init__(self, of: Profile | None = None, *, dry_run: bool = False, **action: Any) -> None:
+        self.profile = of or profile()
+        self.commander = Commander(self.profile, dry_run=dry_run)
+        self.spec = model_spec(**action)
+        self.now_ns = START_NS
+        self.period_ns = round(1e9 / self.profile.timing.command_hz)
+        self.around = Surroundings(
+            alive=frozenset({"sim", "camera", f"worker-{WORKER}", f"worker-{OTHER}"}),
+            robot_node="sim",
+            specs={WORKER: self.spec, OTHER: self.spec},
+            spec_sources={WORKER: SOURCE, OTHER: "worker-other-1"},
+            camera_ages_s={"front": 0.0},
+            camera_nodes={"front": "camera"},
+        )
+        self.position_m, self.quat_xyzw = START_M.copy(), DOWN.copy()
+        self.reference: PoseCommand | None = None
+        self.blocked = self.silent = False
+        self.gripper = GripperState(0.08, moving=False, holding=False)
+        self.seq: Counter[str] = Counter()
+        self.commands: list[PoseCommand] = []
+        self.times_ns: list[int] = []
+        self.widths_m: list[float] = []
+        self.events: list[Event] = []
+        self.refused: Counter[str] = Counter()
+
+    # -- time ---------------------------------------------------------------------------------
+    def tick(
+        self,
+        *settings: Setting | str,
+        chunks: Sequence[Stamped[ActionChunk]] = (),
+        ticks: int = 1,
+    ) -> Outputs:
+        """One call of the commander, `ticks` periods after the last one."""
+        self.now_ns += ticks * self.period_ns
+        put = [Setting(s) if isinstance(s, str) else s for s in settings]
+        inputs = Inputs(put, list(chunks), around=self.around)
+        if not self.silent:
+            inputs.pose, inputs.gripper = self.pose_state(), self.gripper_state()
+        out = self.commander.step(inputs, self.now_ns, ticks)
+        self.events += out.events
+        self.refused.update(refusal.reason for refusal in out.refusals)
+        if out.pose is not None:
+            self.reference = out.pose
+            self.commands.append(out.pose)
+            self.times_ns.append(self.now_ns)
+            if not self.blocked:
+                self.position_m, self.quat_xyzw = out.pose.position_m, out.pose.quat_xyzw
+        if out.gripper is not None:
+            self.widths_m.append(out.gripper.width_m)
+            self.gripper = replace(self.gripper, width_m=out.gripper.width_m)
+        return out
+
+    def run(self, duration_s: float) -> None:
+        for _ in range(round(duration_s * 1e9 / self.period_ns)):
+            self.tick()
+
+    def put(self, name: str, value: str | bool | float | None = None) -> Outputs:
+        return self.tick(Setting(name, value))
+
+    def activate(self) -> None:
+        """Publish a chunk in the shadow, activate, and see that it worked."""
+        self.tick(chunks=[self.chunk([[0.0] * 7])])
+        self.put("active", True)
+        assert self.state == "active", self.commander.why
+
+    def settle(self, duration_s: float = 3.0) -> None:
+        """Let the arm come to where it is to go."""
+        self.run(duration_s)
+        assert self.commander.at_rest
+
+    # -- what the others say ------------------------------------------------------------------
+    def pose_state(self) -> Stamped[PoseState]:
+        held = self.reference
+        record = PoseState(
+            self.position_m,
+            self.quat_xyzw,
+            np.zeros(6),
+            None,
+            held.position_m if held else self.position_m,
+            held.quat_xyzw if held else self.quat_xyzw,
+        )
+        return Stamped(self.header("sim", "sim-1"), record, self.now_ns)
+
+    def gripper_state(self) -> Stamped[GripperState]:
+        return Stamped(self.header("sim", "sim-1"), self.gripper, self.now_ns)
+
+    def header(self, stream: str, source: str) -> Header:
+        self.seq[stream] += 1
+        return Header(self.now_ns, self.seq[stream], source)
+
+    def chunk(
+        self,
+        steps: Any,
+        *,
+        observed_ago_s: float = 0.0,
+        published_ago_s: float = 0.0,
+        seq: int | None = None,
+        source: str | None = None,
+        **fields: Any,
+    ) -> Stamped[ActionChunk]:
+        """A chunk that arrives with the next tick; times are as seen from then."""
+        now_ns = self.now_ns + self.period_ns
+        observed_ns = now_ns - round(observed_ago_s * 1e9)
+        worker = fields.get("worker", WORKER)
+        self.seq[worker] += 1
+        made = {
+            "worker": worker,
+            "spec_hash": self.spec.hash,
+            "episode": self.commander.task.episode,
+            "observation_stamp_ns": observed_ns,
+            "observation_seq": 0,
+            "valid_until_ns": now_ns + 10**9,
+            "steps": np.asarray(steps, np.float32),
+            "observed_ns": observed_ns,
+            "inference_start_ns": observed_ns,
+            "inference_end_ns": now_ns,
+            **fields,
+        }
+        header = Header(
+            now_ns - round(published_ago_s * 1e9),
+            self.seq[worker] if seq is None else seq,
+            source or self.around.spec_sources.get(worker, SOURCE),
+        )
+        return Stamped(header, ActionChunk(**made), now_ns)
+
+    def send(self, steps: Any, **how: Any) -> Outputs:
+        return self.tick(chunks=[self.chunk(steps, **how)])
+
+    # -- what came of it ----------------------------------------------------------------------
+    @property
+    def state(self) -> str:
+        return self.commander.state.value
+
+    @property
+    def transitions(self) -> list[str]:
+        return [event.what for event in self.events if event.kind == "transition"]
+
+    def moved_m(self) -> np.ndarray:
+        return self.position_m - START_M
+
+    def turned_rad(self) -> np.ndarray:
+        return log3(rotation_from_quat(self.quat_xyzw) @ rotation_from_quat(DOWN).T)
+
+    def assert_smooth(self) -> None:
+        """Limits hold in every command and between any two, and nothing was left out."""
+        limits = self.profile.limits
+        translation, rotation = (
+            list(part.model_dump().values()) for part in (limits.translation, limits.rotation)
+        )
+        for before, now, passed_ns in zip(
+            self.commands, self.commands[1:], np.diff(self.times_ns), strict=False
+        ):
+            dt_s = passed_ns / 1e9
+            if round(passed_ns / self.period_ns) != 1:
+                # The stream paused: it may do that only while the arm stands.
+                assert norm3(now.twist[:3]) < 0.01
+                assert norm3(before.twist[:3]) < 0.01
+                continue
+            jerk = (now.acceleration - before.acceleration) / dt_s
+            for order, values in enumerate((now.twist, now.acceleration, jerk)):
+                assert np.abs(values[:3]).max() <= translation[order] * (1 + LIMIT_RTOL), order
+                assert norm3(values[3:]) <= rotation[order] * (1 + LIMIT_RTOL), order
+            # No pose jumps: it is where its twist led to.
+            mean = (before.twist + now.twist) * (dt_s / 2)
+            np.testing.assert_allclose(
+                now.position_m - before.position_m, mean[:3], atol=translation[2] * dt_s**3 / 4
+            )
+            turned = log3(
+                rotation_from_quat(now.quat_xyzw) @ rotation_from_quat(before.quat_xyzw).T
+            )
+            np.testing.assert_allclose(turned, mean[3:], atol=rotation[2] * dt_s**3)
+
+
+def quat_of(rotvec: Sequence[float]) -> np.ndarray:
+    """Tool down, then turned by `rotvec` in the base frame."""
+    return quat_from_rotation(exp3(np.array(rotvec)) @ rotation_from_quat(DOWN))

@@ -1,0 +1,200 @@
+"""The smoothed motion: within its limits, an integral of its own twist, exactly at its target."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vla_zenoh.control.smoothing import Motion, MotionLimits, Smoother
+from vla_zenoh.control.so3 import Pose, angle_between, exp3, log3, norm3
+
+DT_S = 0.004
+LIMITS = MotionLimits((0.5, 2.0, 20.0), (1.5, 6.0, 60.0))
+START = Pose(np.array([0.43, 0.0, 0.3]), exp3(np.array([3.0, 0.2, -0.4])))
+
+LIMIT_RTOL = 1e-6
+STILL = 1e-6  # m/s and rad/s
+AT_TARGET_M, AT_TARGET_RAD = 1e-9, 1e-7
+# Errors of the trapezium rule over one tick of a motion whose jerk is bounded.
+STEP_ATOL_M, STEP_ATOL_RAD = 2e-7, 1e-6
+SPEED_ATOL = np.array([2e-4] * 3 + [1e-3] * 3)
+
+offsets = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
+targets = st.tuples(offsets, offsets).map(lambda pair: (0.15 * pair[0], 0.6 * pair[1]))
+orders = st.lists(st.tuples(st.integers(1, 90), st.none() | targets), min_size=1, max_size=12)
+
+
+def smoother() -> Smoother:
+    return Smoother(START, DT_S, LIMITS)
+
+
+def ordered(motion: Smoother, order: tuple[np.ndarray, np.ndarray] | None) -> None:
+    if order is None:
+        motion.brake()
+        return
+    here = motion.motion.pose
+    motion.target(Pose(START.position_m + order[0], exp3(order[1]) @ here.rotation))
+
+
+def check_tick(before: Motion, now: Motion) -> None:
+    jerk = (now.acceleration - before.acceleration) / DT_S
+    for order, values in enumerate((now.twist, now.acceleration, jerk)):
+        assert np.abs(values[:3]).max() <= LIMITS.translation[order] * (1 + LIMIT_RTOL)
+        assert norm3(values[3:]) <= LIMITS.rotation[order] * (1 + LIMIT_RTOL)
+    moved = now.pose.position_m - before.pose.position_m
+    mean = (before.twist + now.twist) * (DT_S / 2)
+    np.testing.assert_allclose(moved, mean[:3], atol=STEP_ATOL_M)
+    turned = log3(now.pose.rotation @ before.pose.rotation.T)
+    np.testing.assert_allclose(turned, mean[3:], atol=STEP_ATOL_RAD)
+    quicker = (before.acceleration + now.acceleration) * (DT_S / 2)
+    assert (np.abs(now.twist - before.twist - quicker) <= SPEED_ATOL).all()
+
+
+@settings(max_examples=40)
+@given(orders)
+def test_limits_hold_and_the_pose_is_the_integral_of_the_twist_whatever_is_ordered_when(
+    given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | None]],
+) -> None:
+    motion = smoother()
+    for ticks, order in given_orders:
+        ordered(motion, order)
+        for _ in range(ticks):
+            before = motion.motion
+            check_tick(before, motion.tick())
+    assert motion.failures == 0
+
+
+@settings(max_examples=40)
+@given(orders, targets)
+def test_it_ends_exactly_on_its_last_target(
+    given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | None]],
+    last: tuple[np.ndarray, np.ndarray],
+) -> None:
+    motion = smoother()
+    for ticks, order in given_orders:
+        ordered(motion, order)
+        for _ in range(ticks):
+            motion.tick()
+    goal = Pose(START.position_m + last[0], exp3(last[1]) @ motion.motion.pose.rotation)
+    motion.target(goal)
+    for _ in range(round(4.0 / DT_S)):
+        motion.tick()
+    assert motion.at_rest
+    assert norm3(motion.motion.pose.position_m - goal.position_m) < AT_TARGET_M
+    assert angle_between(motion.motion.pose.rotation, goal.rotation) < AT_TARGET_RAD
+
+
+@settings(max_examples=40)
+@given(orders)
+def test_a_brake_ends_where_it_was_foretold_and_stays_there(
+    given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | None]],
+) -> None:
+    motion = smoother()
+    for ticks, order in given_orders:
+        ordered(motion, order)
+        for _ in range(ticks):
+            motion.tick()
+    foretold = motion.resting_pose()
+    longest_s = max(
+        limit[0] / limit[1] + 2 * limit[1] / limit[2] for limit in (LIMITS.translation, LIMITS[1])
+    )
+    for _ in range(round(2 * longest_s / DT_S)):
+        before = motion.motion
+        check_tick(before, motion.tick())
+    assert motion.at_rest
+    assert norm3(motion.motion.pose.position_m - foretold.position_m) < AT_TARGET_M
+    assert angle_between(motion.motion.pose.rotation, foretold.rotation) < AT_TARGET_RAD
+
+
+def test_a_brake_stops_within_the_jerk_limit_and_never_turns_back() -> None:
+    motion = smoother()
+    motion.target(Pose(START.position_m + [0.3, 0.0, 0.0], START.rotation))
+    for _ in range(100):
+        motion.tick()
+    assert motion.motion.twist[0] > 0.4
+    motion.brake()
+    while not motion.at_rest:
+        before = motion.motion
+        now = motion.tick()
+        check_tick(before, now)
+        assert now.twist[0] >= -STILL
+    assert motion.motion.pose.position_m[0] < START.position_m[0] + 0.3
+
+
+def test_half_a_turn_is_reached_in_small_targets_without_wrapping() -> None:
+    motion = smoother()
+    goal = START.rotation
+    for _ in range(80):
+        goal = exp3(np.array([0.0, 0.0, 0.05])) @ goal
+        motion.target(Pose(START.position_m, goal))
+        for _ in range(25):
+            before = motion.motion
+            check_tick(before, motion.tick())
+    for _ in range(250):
+        motion.tick()
+    assert angle_between(motion.motion.pose.rotation, goal) < AT_TARGET_RAD
+    assert angle_between(START.rotation, goal) == pytest.approx(2 * math.pi - 4.0)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e9])
+def test_an_impossible_target_brakes_and_the_next_good_one_is_reached(bad: float) -> None:
+    motion = smoother()
+    good = Pose(START.position_m + [0.1, 0.0, 0.0], START.rotation)
+    motion.target(good)
+    for _ in range(50):
+        motion.tick()
+    assert motion.motion.twist[0] > 0.1
+    motion.target(Pose(np.array([bad, 0.0, 0.3]), START.rotation))
+    for _ in range(100):
+        before = motion.motion
+        check_tick(before, motion.tick())
+    assert motion.failures == 1
+    assert motion.braking
+    motion.target(good)
+    for _ in range(500):
+        before = motion.motion
+        check_tick(before, motion.tick())
+    assert norm3(motion.motion.pose.position_m - good.position_m) < AT_TARGET_M
+
+
+def test_a_motion_taken_over_goes_on_without_a_step_and_brakes() -> None:
+    leader, follower = smoother(), smoother()
+    leader.target(
+        Pose(START.position_m + [0.1, -0.05, 0.1], exp3([0.3, 0.2, 0.1]) @ START.rotation)
+    )
+    for _ in range(60):
+        leader.tick()
+    follower.brake_from(leader.motion)
+    leader.brake()
+    for _ in range(150):
+        before = follower.motion
+        now = follower.tick()
+        check_tick(before, now)
+        np.testing.assert_allclose(now.pose.position_m, leader.tick().pose.position_m, atol=1e-12)
+    assert follower.at_rest
+
+
+def test_it_stands_still_until_it_is_told_to_move() -> None:
+    motion = smoother()
+    for _ in range(10):
+        now = motion.tick()
+    assert motion.at_rest
+    np.testing.assert_array_equal(now.twist, np.zeros(6))
+    np.testing.assert_array_equal(now.pose.position_m, START.position_m)
+
+
+def test_reset_forgets_all_motion() -> None:
+    motion = smoother()
+    motion.target(Pose(START.position_m + [0.1, 0.0, 0.0], START.rotation))
+    for _ in range(30):
+        motion.tick()
+    there = Pose(np.array([0.5, 0.1, 0.2]), exp3(np.array([0.0, 1.0, 0.0])))
+    motion.reset(there)
+    now = motion.tick()
+    assert motion.at_rest
+    np.testing.assert_allclose(now.pose.position_m, there.position_m, atol=1e-15)
+    np.testing.assert_allclose(now.pose.rotation, there.rotation, atol=1e-12)
