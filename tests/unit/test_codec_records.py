@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from random_records import RECORDS, headers, refusal, same
 
+from vla_zenoh import types
 from vla_zenoh.codec import header, message, records
 from vla_zenoh.errors import CodecError
 from vla_zenoh.policy import ModelSpec
@@ -53,6 +54,16 @@ def near(one: Any, other: Any) -> bool:
         elif not same(a, b):
             return False
     return True
+
+
+def test_every_kind_of_record_is_tested_here() -> None:
+    kinds = {
+        kind
+        for kind in vars(types).values()
+        if dataclasses.is_dataclass(kind) and kind.__module__ == types.__name__
+    }
+    beside = {types.Header, types.Stamped, types.Image, types.Cause}
+    assert kinds - beside == set(RECORDS) - {ModelSpec}
 
 
 @by_kind

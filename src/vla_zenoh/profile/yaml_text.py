@@ -32,6 +32,7 @@ _SCALARS = {
     ),
 }
 _MERGE_KEY = "<<"
+_SPECIAL = re.compile("[\x85\u2028\u2029\ufeff]")
 
 
 class _Reader(yaml.SafeLoader):
@@ -42,6 +43,13 @@ class _Writer(yaml.SafeDumper):
     """Quotes whatever text this reader or one of YAML 1.1 would take for something else."""
 
 
+def _text(writer: _Writer, text: str) -> yaml.ScalarNode:
+    # Line ends of other alphabets are lost unless they are written as escapes.
+    style = '"' if _SPECIAL.search(text) else None
+    return writer.represent_scalar(f"{_PREFIX}str", text, style)
+
+
+_Writer.add_representer(str, _text)
 for _tag, _form in _SCALARS.items():
     _whole = re.compile(f"(?:{_form.pattern})\\Z")
     _Reader.add_implicit_resolver(_tag, _whole, None)
@@ -62,10 +70,10 @@ def read(raw: bytes, file: str) -> tuple[dict[str, Any], Lines]:
     if len(raw) > MAX_PROFILE_BYTES:
         raise ProfileError(f"{file}: {len(raw)} bytes, a profile has at most {MAX_PROFILE_BYTES}")
     node = _compose(raw, file)
-    lines: Lines = {(): f"{file}:1"}
-    if node is None:
-        return {}, lines
-    data = _Plain(file, lines).of(node, ())
+    lines: Lines = {}
+    data = None if node is None else _Plain(file, lines).of(node, ())
+    if data is None:
+        return {}, {(): f"{file}:1"}
     if not isinstance(data, dict):
         what = "a list" if isinstance(data, list) else shown(data)
         raise ProfileError(f"{lines[()]}: a profile is a map of sections, this is {what}")
@@ -121,7 +129,7 @@ class _Plain:
             where, key = self._line(key_node), key_node.value
             if not isinstance(key_node, yaml.ScalarNode):
                 raise ProfileError(f"{where}: a key must be a word")
-            if key == _MERGE_KEY:
+            if key == _MERGE_KEY and key_node.style is None:
                 raise ProfileError(f"{where}: merge keys (<<) are not read; use extends")
             if key in out:
                 raise ProfileError(f"{where}: {'.'.join((*place, key))} is given twice")

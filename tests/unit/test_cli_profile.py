@@ -1,0 +1,109 @@
+"""vla-zenoh profile: list, show and check, as a person and as a script see them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from vla_zenoh import resources
+from vla_zenoh.cli.profile import profile_app
+from vla_zenoh.profile import load_profile, profile_names
+
+RUNNER = CliRunner()
+
+
+@pytest.fixture
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "profiles"
+    folder.mkdir()
+    monkeypatch.setenv(resources.SEARCH_PATH_VARIABLE, str(tmp_path))
+    monkeypatch.setenv("COLUMNS", "200")
+    return folder
+
+
+def test_every_profile_is_listed(own_folder: Path) -> None:
+    (own_folder / "lab.yaml").write_text("extends: panda_sim\nabout: our [lab] \u202e\n")
+    result = RUNNER.invoke(profile_app, ["list"])
+    assert result.exit_code == 0
+    assert all(name in result.stdout for name in profile_names())
+    assert "our [lab] \\u202e" in result.stdout
+
+
+def test_a_profile_that_is_wrong_is_listed_with_its_fault(own_folder: Path) -> None:
+    (own_folder / "lab.yaml").write_text("extends: nobody\n")
+    result = RUNNER.invoke(profile_app, ["list"])
+    assert result.exit_code == 0
+    assert "no profiles called 'nobody'" in result.stdout
+    rows = {
+        row["name"]: row
+        for row in json.loads(RUNNER.invoke(profile_app, ["list", "--json"]).stdout)
+    }
+    assert "lab.yaml:1: extends" in rows["lab"]["fault"]
+    assert rows["panda_sim"]["hosts"] == ["here"]
+    assert set(rows) == set(profile_names())
+
+
+def test_what_is_shown_is_the_effective_profile_and_can_be_read_again(own_folder: Path) -> None:
+    (own_folder / "lab.yaml").write_text("extends: panda_sim\nabout: ours\n")
+    result = RUNNER.invoke(profile_app, ["show", "lab"])
+    assert result.exit_code == 0
+    assert "\x1b" not in result.stdout
+    again = own_folder / "again.yaml"
+    again.write_text(result.stdout)
+    assert load_profile("again") == load_profile("lab")
+
+
+def test_a_script_gets_json() -> None:
+    result = RUNNER.invoke(profile_app, ["show", "panda_sim", "--json"])
+    assert json.loads(result.stdout) == load_profile("panda_sim").model_dump(mode="json")
+
+
+def test_a_terminal_gets_colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    result = RUNNER.invoke(profile_app, ["show", "panda_sim"])
+    assert "\x1b[" in result.stdout
+    assert "arm_joints" in result.stdout
+
+
+def test_nothing_of_that_name_is_one_line_on_stderr() -> None:
+    result = RUNNER.invoke(profile_app, ["show", "panda_simm"])
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert result.stderr.startswith(
+        "error: no profiles called 'panda_simm'; did you mean 'panda_sim'?"
+    )
+
+
+def test_right_profiles_are_ok(own_folder: Path) -> None:
+    result = RUNNER.invoke(profile_app, ["check", "panda_sim", "panda_ros2"])
+    assert result.exit_code == 0
+    assert result.stdout == "ok panda_sim\nok panda_ros2\n"
+    assert result.stderr == ""
+
+
+def test_wrong_ones_are_told_line_by_line_on_stderr(own_folder: Path) -> None:
+    path = own_folder / "lab.yaml"
+    path.write_text("extends: panda_sim\nlimts: {}\nlimits: {step_m: 9}\n")
+    result = RUNNER.invoke(profile_app, ["check", str(path), "panda_sim"])
+    assert result.exit_code == 1
+    assert result.stdout == "ok panda_sim\n"
+    lines = result.stderr.splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith(f"{path}:3: limits.step_m: must be at most 0.2 (given: 9)")
+    assert lines[1].startswith(f"{path}:2: limts: unknown key; did you mean 'limits'?")
+
+
+def test_what_is_questionable_is_advice_and_no_failure() -> None:
+    result = RUNNER.invoke(profile_app, ["check", "panda_sim_two_hosts"])
+    assert result.exit_code == 0
+    assert result.stdout == "ok panda_sim_two_hosts\n"
+    assert (
+        "advice session.listen: the router on robot is heard on that computer only" in result.stderr
+    )
+
+
+def test_check_wants_a_name() -> None:
+    assert RUNNER.invoke(profile_app, ["check"]).exit_code == 2

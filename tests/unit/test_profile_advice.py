@@ -1,0 +1,75 @@
+"""What is allowed and yet worth a second look is said, and nothing else is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from vla_zenoh.profile import advice, load_profile, override
+
+SIM = load_profile("panda_sim")
+ROBOT = {"robot": {"nodes": ["router", "sim", "camera", "command"]}}
+NET = "tcp/10.0.0.2:7447"
+
+
+def gpu(**more: Any) -> dict[str, Any]:
+    return {**ROBOT, "gpu": {"nodes": ["worker"], **more}}
+
+
+def test_a_plain_profile_needs_no_advice() -> None:
+    assert advice(SIM) == []
+
+
+def test_two_hosts_with_real_addresses_need_no_advice() -> None:
+    session = {"listen": [NET], "connect": [NET]}
+    assert advice(override(SIM, {"session": session, "hosts": gpu()})) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"session": {"listen": ["tcp/0.0.0.0:7447"]}}, "session.listen: everybody on the network"),
+        ({"session": {"listen": ["tcp/[::]:7447"]}}, "session.listen: everybody on the network"),
+        ({"hosts": gpu()}, "session.listen: the router on robot is heard on that computer only"),
+        ({"hosts": gpu()}, "hosts.gpu: looks for the router on itself, and it runs on robot"),
+        ({"hosts": gpu(), "session": {"mode": "peer"}}, "session.mode: peers on several hosts"),
+        ({"hosts": {"a": {"nodes": ["command"]}}}, "hosts: none runs the router"),
+        ({"hosts": {"a": {"nodes": ["router"]}}}, "hosts: none runs the command node"),
+        ({"hosts": {"a": {"nodes": ["router"]}}}, "hosts: none runs the simulator"),
+        ({"hosts": {"a": {"nodes": ["router"]}}}, "cameras: no host runs front, wrist"),
+        ({"hosts": {"a": {"nodes": ["router"]}}}, "workers: no host runs scripted"),
+        (
+            {"hosts": {"a": {"nodes": ["router"], "workers": ["scripted"]}}},
+            "hosts.a.workers: has no effect without worker in hosts.a.nodes",
+        ),
+        (
+            {"hosts": {"a": {"nodes": ["router"], "cameras": ["front"]}}},
+            "hosts.a.cameras: has no effect without camera in hosts.a.nodes",
+        ),
+        (
+            {"sim": {"scene": "kitchen"}},
+            "sim.scene: on this computer there is no sim called 'kitchen'",
+        ),
+        (
+            {"workers": ["scripted", "pi9"]},
+            "workers: on this computer there is no models called 'pi9'",
+        ),
+        (
+            {"robot": {"description": "absent.urdf"}},
+            "robot.description: robot description 'absent.urdf'",
+        ),
+        (
+            {"cameras": {"front": {"rate_hz": 0.5}}},
+            "cameras.front.rate_hz: a picture every 2 s is older than timing.max_observation_age_s",
+        ),
+    ],
+)
+def test_what_is_odd_is_told(changes: dict[str, Any], said: str) -> None:
+    found = advice(override(SIM, changes))
+    assert any(line.startswith(said) for line in found), found
+
+
+def test_a_host_that_looks_elsewhere_is_not_warned_about_itself() -> None:
+    found = advice(override(SIM, {"hosts": gpu(connect=[NET])}))
+    assert not any(line.startswith("hosts.gpu") for line in found)
