@@ -70,7 +70,8 @@ def reasons_not_to_activate(
         rate_hz: chunks per second asked of the worker.
     """
     return [
-        *_robot(profile, around, pose, gripper, now_ns),
+        *_robot(profile, around, pose, now_ns),
+        *_gripper(profile, gripper, now_ns),
         *_worker(worker, prompt, around),
         *_chunk(profile, worker, around, chunk, now_ns, rate_hz),
         *_cameras(profile, worker, around),
@@ -81,7 +82,6 @@ def _robot(
     profile: Profile,
     around: Surroundings,
     pose: Stamped[PoseState] | None,
-    gripper: Stamped[GripperState] | None,
     now_ns: int,
 ) -> list[str]:
     reasons: list[str] = []
@@ -104,10 +104,13 @@ def _robot(
             f"the TCP at ({at}) m is {outside_m:.3f} m outside the workspace "
             f"x {box.x_m} y {box.y_m} z {box.z_m}; move it inside"
         )
+    return reasons
+
+
+def _gripper(profile: Profile, gripper: Stamped[GripperState] | None, now_ns: int) -> list[str]:
     if gripper is None:
-        reasons.append("the gripper is not known: nothing was heard on state/gripper")
-        return reasons
-    reasons += _too_old("gripper's state", gripper, profile, now_ns)
+        return ["the gripper is not known: nothing was heard on state/gripper"]
+    reasons = _too_old("gripper's state", gripper, profile, now_ns)
     if gripper.record.faults:
         reasons.append(f"the robot reports: {'; '.join(gripper.record.faults)}")
     elif gripper.record.mode != "ready":
