@@ -1,6 +1,7 @@
 """Profiles: one YAML file says everything about a robot, its lab and its limits."""
 
 from vla_zenoh.profile.advice import advice
+from vla_zenoh.profile.joint_limits import JointLimits
 from vla_zenoh.profile.load import load_profile, override, profile_file, profile_names, to_yaml
 from vla_zenoh.profile.schema import (
     CameraProfile,
@@ -17,6 +18,7 @@ __all__ = [
     "CameraProfile",
     "GripperProfile",
     "HostProfile",
+    "JointLimits",
     "Limits",
     "Profile",
     "RobotProfile",

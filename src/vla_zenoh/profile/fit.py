@@ -43,6 +43,13 @@ def workers_of(profile: Profile, host: HostProfile) -> tuple[str, ...]:
 def _robot(profile: Profile) -> Iterator[Fault]:
     if profile.robot.driver == "ros2" and profile.ros2 is None:
         yield ("ros2",), "is missing: robot.driver is ros2"
+    joints = len(profile.robot.arm_joints)
+    for name, values in profile.limits.joint:
+        if len(values) not in (1, joints):
+            yield (
+                ("limits", "joint", name),
+                f"has {len(values)} numbers for {joints} arm_joints: give one for all, or one each",
+            )
 
 
 def _cameras(profile: Profile) -> Iterator[Fault]:

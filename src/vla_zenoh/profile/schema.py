@@ -14,6 +14,7 @@ from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import fit
+from vla_zenoh.profile.joint_limits import JointLimits
 from vla_zenoh.profile.ros2 import Ros2Profile
 from vla_zenoh.profile.section import (
     Distinct,
@@ -75,10 +76,25 @@ class GripperProfile(Section):
 
 
 class RobotProfile(Section):
-    """The robot and its description (URDF), which serves the simulator and the kinematics."""
+    """The robot and its description (URDF), which serves the simulator and the kinematics.
+
+    Args:
+        name: part of every key.
+        driver: who moves it.
+        command: what it is commanded by: ``pose`` of the TCP, for a Cartesian impedance
+            controller, or ``joint`` positions, for an arm without one.
+        description: path of the URDF, or ``example-robot-data:`` and a path in that package.
+        base_frame: link all poses are given in.
+        tcp_frame: link whose pose is meant.
+        arm_joints: in the order in which every list of joint values in the profile is.
+        finger_joints: of the gripper.
+        home_rad: where a reset puts the simulated arm, and the posture a redundant arm keeps.
+        gripper: its own section.
+    """
 
     name: Name
     driver: Literal["sim", "ros2"] = "sim"
+    command: Literal["pose", "joint"] = "pose"
     description: Word
     base_frame: Word
     tcp_frame: Word
@@ -141,6 +157,7 @@ class Limits(Section):
         workspace: box of the TCP.
         translation: of the smoothed motion.
         rotation: likewise.
+        joint: of a motion commanded by joint positions.
         step_m: largest translation of one model step.
         step_rad: largest rotation of one model step.
         out_of_bounds: ``clamp`` shortens to the bound and tells, ``refuse`` drops the whole chunk.
@@ -153,6 +170,7 @@ class Limits(Section):
     workspace: Workspace = Workspace()
     translation: TranslationLimits = TranslationLimits()
     rotation: RotationLimits = RotationLimits()
+    joint: JointLimits = JointLimits()
     step_m: float = Field(default=0.05, gt=0, le=0.2)
     step_rad: float = Field(default=0.2, gt=0, le=0.8)
     out_of_bounds: Literal["clamp", "refuse"] = "clamp"
