@@ -8,9 +8,13 @@ from typing import Annotated
 
 import typer
 
+from vla_zenoh.cli.bench_motion import motion
 from vla_zenoh.cli.output import console, errors
 
 bench_app = typer.Typer(help="Measure this computer.", no_args_is_help=True)
+
+
+bench_app.command("motion")(motion)
 
 
 @bench_app.callback()

@@ -44,7 +44,7 @@ def run_demo(
     """See ``vla-zenoh demo``."""
     stop = stop_on_signals()
     die_with_parent()
-    loaded = _own_address(effective_profile(profile))
+    loaded = own_address(effective_profile(profile))
     folder = out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
     folder.mkdir(parents=True, exist_ok=True)
     screen = errors()  # progress is no result: stdout stays for the summary
@@ -66,7 +66,7 @@ def run_demo(
         raise typer.Exit(130 if result.interrupted else 1)
 
 
-def _own_address(profile: Profile) -> Profile:
+def own_address(profile: Profile) -> Profile:
     """The profile where nobody answers: a demo must never reach a lab's real robot."""
     if profile.robot.driver != "sim":
         raise typer.BadParameter(f"profile {profile.name} is of a real robot; demos are simulated")

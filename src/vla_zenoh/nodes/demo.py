@@ -79,17 +79,24 @@ class DemoRun:
         """
         result = DemoResult()
         try:
-            self._wait(self._ready, READY_PATIENCE_S, "the nodes did not come up")
-            self._client.set_prompt("hold")
-            self._client.set_rate(rate_hz)
-            self._activate()
+            self.wait_until_ready()
+            self.activate(rate_hz)
             for index, segment in enumerate(segments):
-                result.outcomes.append(self._carry_out(index, segment, rate_hz, seconds))
+                result.outcomes.append(self.carry_out(index, segment, rate_hz, seconds))
         except Interrupted:
             result.interrupted = True
         result.statuses = {name: found[0] for name, found in self._client.snapshot().items()}
         self._client.deactivate()
         return result
+
+    def wait_until_ready(self) -> None:
+        """Until every node is well.
+
+        Raises:
+            NodeError: one is not in time; says what each says.
+        """
+        self._well_since_s = 0.0
+        self._wait(self._ready, READY_PATIENCE_S, "the nodes did not come up")
 
     def _ready(self) -> bool:
         """Everybody has been well for long enough that the command node has heard it too."""
@@ -106,8 +113,10 @@ class DemoRun:
         self._well_since_s = self._well_since_s or now if well else 0.0
         return well and now - self._well_since_s > WELL_FOR_S
 
-    def _activate(self) -> None:
-        """The nodes come up one after the other; what is missing for a moment is waited for."""
+    def activate(self, rate_hz: float) -> None:
+        """Activate, standing; what is missing for a moment (a first picture) is waited for."""
+        self._client.set_prompt("hold")
+        self._client.set_rate(rate_hz)
         give_up = time.monotonic() + ACTIVATE_PATIENCE_S
         while True:
             try:
@@ -118,9 +127,21 @@ class DemoRun:
                     raise
                 self._pause(0.3)
 
-    def _carry_out(
-        self, index: int, segment: Segment, rate_hz: float, seconds: float | None
+    def carry_out(
+        self, index: int, segment: Segment, rate_hz: float, seconds: float | None = None
     ) -> Outcome:
+        """Put a prompt, wait until it has been carried out and the arm stands, and judge.
+
+        Args:
+            index: of the segment, for `progress`.
+            segment: what to ask.
+            rate_hz: at which it is asked.
+            seconds: let the prompt run this long instead of counting steps.
+
+        Raises:
+            NodeError: it does not end.
+            Interrupted: Ctrl-C.
+        """
         before = self._standing()
         self._recorder.recording.mark(segment.prompt)
         began = time.monotonic()

@@ -1,0 +1,170 @@
+"""The thesis's protocol: ten prompts, 50 steps each, at several rates; and how a row is made.
+
+Where 50 steps would leave the arm's reach, the asked path turns back rather than being cut, so that
+all of it can be carried out. A prompt begins where the one named as preparation has put the arm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.demo.analysis import Outcome
+from vla_zenoh.demo.segments import Segment, make_segment
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import FloatArray
+
+STEPS = 50
+RATES_HZ = (1.0, 2.0, 5.0, 10.0)
+PREPARATION_HZ = 10.0
+TOLERANCE_M, TOLERANCE_RAD = 0.001, 0.002
+OFF_AXIS_MM, OFF_AXIS_RAD = 1.0, 0.002
+VELOCITY_STEP_SLACK = 1.02
+"""Velocity may change by acceleration limit times period; this much for rounding."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One prompt of the protocol.
+
+    Args:
+        prompt: HARD prompt, with where to turn back.
+        preparation: prompt that brings the arm to where this one can be carried out, or "".
+    """
+
+    prompt: str
+    preparation: str = ""
+
+    @property
+    def name(self) -> str:
+        """The motion's name."""
+        return self.segment.motion.name if self.segment.motion else "hold"
+
+    @property
+    def segment(self) -> Segment:
+        """What is asked and measured."""
+        return make_segment(self.prompt, STEPS)
+
+
+PROTOCOL: tuple[Trial, ...] = (
+    Trial("HARD: go up"),
+    Trial("HARD: go down", "HARD: go up x50"),
+    Trial("HARD: roll left within 0.9", "HARD: go up x20"),
+    Trial("HARD: roll right within 0.9", "HARD: go up x20"),
+    Trial("HARD: pitch up within 0.9", "HARD: go up x20"),
+    Trial("HARD: pitch down within 0.9", "HARD: go up x20"),
+    Trial("HARD: yaw left", "HARD: go up x20"),
+    Trial("HARD: yaw right within 2.0", "HARD: go up x20"),
+    Trial("HARD: close gripper within 0.08"),
+    Trial("HARD: open gripper within 0.08"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """The commanded motion of a trial.
+
+    Args:
+        time_s: (n,) stamps.
+        twist: (n, 6).
+        acceleration: (n, 6).
+        tracking_m: largest distance between measured and reference pose.
+        e2e_ms: camera stamp to pose command, one per chunk.
+        outbound_ms: camera stamp to chunk received, one per chunk.
+    """
+
+    time_s: FloatArray
+    twist: FloatArray
+    acceleration: FloatArray
+    tracking_m: float
+    e2e_ms: Sequence[float]
+    outbound_ms: Sequence[float]
+
+
+def make_row(
+    trial: Trial, rate_hz: float, profile: Profile, outcome: Outcome, stream: Stream
+) -> dict[str, Any]:
+    """One row of the result."""
+    translation, rotation = profile.limits.translation, profile.limits.rotation
+    step_s = np.diff(stream.time_s)
+    inside = step_s > 0
+    step_s = step_s[inside][:, None]
+    jerk = np.diff(stream.acceleration, axis=0)[inside] / step_s
+    change = np.diff(stream.twist, axis=0)[inside] / step_s
+    row: dict[str, Any] = {
+        "prompt": trial.name,
+        "rate_hz": rate_hz,
+        "steps": outcome.segment.steps,
+        "steps_done": outcome.steps_done,
+        "within": outcome.segment.within,
+        "asked_m": outcome.asked_m,
+        "asked_rad": outcome.asked_rad,
+        "reached_m": outcome.reached_m,
+        "reached_rad": outcome.reached_rad,
+        "off_axis_mm": outcome.drift_mm,
+        "off_axis_rad": outcome.drift_rad,
+        "asked_width_m": outcome.asked_width_m,
+        "reached_width_m": outcome.reached_width_m,
+        "e2e_ms_p50": _percentile(stream.e2e_ms, 50),
+        "e2e_ms_p95": _percentile(stream.e2e_ms, 95),
+        "e2e_ms_mean": _mean(stream.e2e_ms),
+        "outbound_ms_mean": _mean(stream.outbound_ms),
+        "outbound_ms_p95": _percentile(stream.outbound_ms, 95),
+        "tracking_mm": stream.tracking_m * 1e3,
+        "peak_velocity_m_s": _peak(stream.twist[:, :3]),
+        "peak_velocity_rad_s": _peak_norm(stream.twist[:, 3:]),
+        "peak_jerk_over_limit": max(
+            _peak(jerk[:, :3]) / translation.jerk_m_s3,
+            _peak_norm(jerk[:, 3:]) / rotation.jerk_rad_s3,
+        ),
+        "peak_acceleration_over_limit": max(
+            _peak(change[:, :3]) / translation.acceleration_m_s2,
+            _peak_norm(change[:, 3:]) / rotation.acceleration_rad_s2,
+        ),
+    }
+    row["faults"] = faults_of(row, outcome)
+    row["ok"] = not row["faults"]
+    return row
+
+
+def faults_of(row: dict[str, Any], outcome: Outcome) -> list[str]:
+    """What of the protocol's promises a row breaks."""
+    checks = (
+        ("translation", abs(row["reached_m"] - row["asked_m"]), TOLERANCE_M, "m"),
+        ("rotation", abs(row["reached_rad"] - row["asked_rad"]), TOLERANCE_RAD, "rad"),
+        ("off axis", row["off_axis_mm"], OFF_AXIS_MM, "mm"),
+        ("off axis", row["off_axis_rad"], OFF_AXIS_RAD, "rad"),
+        ("gripper", abs(row["reached_width_m"] - row["asked_width_m"]), 0.002, "m"),
+        ("jerk", row["peak_jerk_over_limit"], 1.001, "times its limit"),
+        (
+            "velocity step",
+            row["peak_acceleration_over_limit"],
+            VELOCITY_STEP_SLACK,
+            "times what acceleration allows",
+        ),
+    )
+    out = [
+        f"{name} {value:.4g} {unit}" for name, value, limit, unit in checks if not value <= limit
+    ]
+    if outcome.steps_done != outcome.segment.steps:
+        out.append(f"{outcome.steps_done} of {outcome.segment.steps} steps")
+    return out
+
+
+def _percentile(values: Sequence[float], share: float) -> float | None:
+    return round(float(np.percentile(values, share)), 3) if len(values) else None
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return round(float(np.mean(values)), 3) if len(values) else None
+
+
+def _peak(values: FloatArray) -> float:
+    return float(np.abs(values).max()) if values.size else 0.0
+
+
+def _peak_norm(values: FloatArray) -> float:
+    return float(np.linalg.norm(values, axis=1).max()) if values.size else 0.0

@@ -1,0 +1,113 @@
+"""Runs the motion protocol: through the real chain in real time, or in lockstep."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.bench.motion import PREPARATION_HZ, Stream, Trial, make_row
+from vla_zenoh.demo.segments import make_segment
+from vla_zenoh.errors import NodeError
+from vla_zenoh.nodes.demo import DemoRun, first_commands
+from vla_zenoh.nodes.launch import Host
+from vla_zenoh.nodes.recording import Recorder, Recording
+
+RESET_PATIENCE_S = 3.0
+HOME_TOLERANCE_M = 0.002
+
+
+def run_in_real_time(
+    host: Host,
+    trials: Sequence[Trial],
+    rates_hz: Sequence[float],
+    stop: threading.Event,
+    progress: Callable[[Trial, float, int], None],
+) -> Iterator[tuple[dict[str, Any], Recording]]:
+    """One row after the other, with what was recorded for it.
+
+    Args:
+        host: up, with a simulator.
+        trials: prompts.
+        rates_hz: each prompt at each of these.
+        stop: set by Ctrl-C.
+        progress: called with trial, rate and steps carried out.
+
+    Raises:
+        NodeError: the chain does not come up or the arm is not obeyed to the end.
+        Interrupted: Ctrl-C.
+    """
+    assert host.session is not None and host.client is not None
+    profile = host.profile
+
+    def watch() -> None:
+        if not host.supervisor.watch():
+            raise NodeError("a node dies again and again; look into nodes.log")
+
+    for rate_hz in rates_hz:
+        for trial in trials:
+            recorder = Recorder(host.session, profile.keys, profile.task.worker, camera=None)
+            run = DemoRun(
+                host.client,
+                recorder,
+                stop,
+                watch,
+                lambda _, done, trial=trial, rate_hz=rate_hz: progress(trial, rate_hz, done),
+            )
+            run.wait_until_ready()
+            _go_home(host, recorder)
+            run.activate(PREPARATION_HZ)
+            if trial.preparation:
+                prepared = run.carry_out(0, make_segment(trial.preparation, 1), PREPARATION_HZ)
+                if prepared.faults():
+                    raise NodeError(f"{trial.preparation}: {'; '.join(prepared.faults())}")
+            host.client.set_rate(rate_hz)
+            since_ns = time.time_ns()
+            outcome = run.carry_out(0, trial.segment, rate_hz)
+            host.client.deactivate()
+            recording = recorder.close()
+            stream = stream_of(recording, first_commands(recorder), since_ns)
+            yield make_row(trial, rate_hz, profile, outcome, stream), recording
+
+
+def _go_home(host: Host, recorder: Recorder) -> None:
+    """Put the simulated arm back; the command node is inactive."""
+    assert host.client is not None
+    client = host.client
+    client.deactivate()
+    resets = _resets(host)
+    client.put(client.keys.sim_reset, "")
+    if not client.wait_for(lambda: _resets(host) > resets, RESET_PATIENCE_S):
+        raise NodeError("the simulator did not reset; it says: " + str(client.status("sim")))
+    time.sleep(0.3)
+
+
+def _resets(host: Host) -> int:
+    status = host.client.status("sim") if host.client else None
+    return int(status.counters.get("sim.resets", 0)) if status else 0
+
+
+def stream_of(recording: Recording, first: Sequence[tuple[Any, int]], since_ns: int) -> Stream:
+    """The commanded motion since `since_ns`, as arrays."""
+    commands = [entry for entry in recording.commands if entry.header.stamp_wall_ns >= since_ns]
+    poses = [entry.record for entry in recording.poses if entry.header.stamp_wall_ns >= since_ns]
+    tracking_m = max(
+        (
+            float(np.linalg.norm(pose.position_m - pose.reference_position_m))
+            for pose in poses
+            if pose.reference_position_m is not None
+        ),
+        default=0.0,
+    )
+    mine = [(cause, heard) for cause, heard in first if cause.observation_stamp_ns >= since_ns]
+    return Stream(
+        np.array([entry.header.stamp_wall_ns - since_ns for entry in commands]) / 1e9,
+        np.array([entry.record.twist for entry in commands]).reshape(-1, 6),
+        np.array([entry.record.acceleration for entry in commands]).reshape(-1, 6),
+        tracking_m,
+        [(heard - cause.observation_stamp_ns) / 1e6 for cause, heard in mine],
+        [(cause.received_ns - cause.observation_stamp_ns) / 1e6 for cause, _ in mine],
+    )
