@@ -152,10 +152,8 @@ def notes(result: Result) -> list[str]:
     ]
     for way in result.ways:
         if way.kind == "chain" and not way.missing() and result.standing_cpu(way):
-            told.append(
-                f"{way.title}: its processes take {100 * result.standing_cpu(way):.0f} % of one core "
-                "while no picture comes."
-            )
+            share = 100 * result.standing_cpu(way)
+            told.append(f"{way.title}: takes {share:.0f} % of one core while no picture comes.")
         if result.lost(way):
             told.append(f"{way.title}: {result.lost(way)} requests were not answered.")
     return told

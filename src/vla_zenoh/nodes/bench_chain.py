@@ -49,7 +49,8 @@ def bench_profile(command_hz: float) -> Profile:
     data["timing"]["command_hz"] = command_hz
     data["task"].update(prompt=PROMPT, worker=WORKER, rate_hz=RATE_HZ)
     data["workers"] = (WORKER,)
-    here = HostProfile(nodes=("router", "command", "worker"))
+    # A worker takes raw pictures where the host has the cameras, as here.
+    here = HostProfile(nodes=("router", "camera", "command", "worker"))
     data["hosts"] = {"here": here.model_dump()}
     return Profile.model_validate(data)
 
@@ -75,6 +76,8 @@ class Chain:
             tell=lambda node, what: None,
             own_router=True,
         )
+        supervisor = self._host.supervisor
+        supervisor.children = [c for c in supervisor.children if c.command.kind != "camera"]
         self._period_s = 1.0 / command_hz
 
     def __enter__(self) -> Chain:
