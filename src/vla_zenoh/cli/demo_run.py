@@ -28,7 +28,7 @@ from vla_zenoh.nodes.launch import Host
 from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
 from vla_zenoh.nodes.recording import Recorder
 from vla_zenoh.nodes.session import open_session
-from vla_zenoh.profile import Profile, to_yaml
+from vla_zenoh.profile import Profile, override, to_yaml
 
 MAX_LOG_LINES = 20
 
@@ -70,7 +70,6 @@ def own_address(profile: Profile) -> Profile:
     """The profile where nobody answers: a demo must never reach a lab's real robot."""
     if profile.robot.driver != "sim":
         raise typer.BadParameter(f"profile {profile.name} is of a real robot; demos are simulated")
-    data = profile.model_dump()
     try:
         open_session(profile.session).close()
         port = _free_port()
@@ -78,8 +77,8 @@ def own_address(profile: Profile) -> Profile:
         errors().print("a router answers at the profile's address already; using another port")
     except SessionError:
         endpoints = profile.session.connect
-    data["session"].update(connect=endpoints, listen=endpoints)
-    return Profile.model_validate(data)
+    here = list(endpoints)
+    return override(profile, {"session": {"connect": here, "listen": here}})
 
 
 def _free_port() -> int:

@@ -10,7 +10,7 @@ import typer
 
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.session import open_session
-from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.profile import Profile, load_profile, override
 
 DEFAULT_PROFILE = "panda_sim"
 
@@ -51,16 +51,12 @@ def effective_profile(
         ProfileError: it is wrong.
     """
     profile = load_profile(name)
-    changes: dict[str, tuple[str, ...]] = {}
+    changes: dict[str, list[str]] = {}
     if connect:
-        changes["connect"] = tuple(connect)
+        changes["connect"] = connect
     if listen:
-        changes["listen"] = tuple(listen)
-    if not changes:
-        return profile
-    data = profile.model_dump()
-    data["session"].update(changes)
-    return Profile.model_validate(data)
+        changes["listen"] = listen
+    return override(profile, {"session": changes}) if changes else profile
 
 
 @contextmanager

@@ -215,9 +215,16 @@ class DemoRun:
         )
 
     def _standing(self) -> Standing:
-        """Mean measured pose of the last moments."""
+        """Mean measured pose of the next moments."""
         self._wait(self._at_rest_measured, SLACK_S, "the arm does not come to rest")
         heard = self._recorder.recording
+        # Decoding may lag behind on a busy computer: what was heard before now does not count.
+        until_ns = time.time_ns() + STAND_WINDOW_NS
+        self._wait(
+            lambda: heard.poses[-1].heard_ns > until_ns and heard.grippers[-1].heard_ns > until_ns,
+            SLACK_S,
+            "no state is heard any more",
+        )
         since_ns = heard.poses[-1].heard_ns - STAND_WINDOW_NS
         poses = [entry.record for entry in heard.poses[-200:] if entry.heard_ns >= since_ns]
         position = np.mean([pose.position_m for pose in poses], axis=0)

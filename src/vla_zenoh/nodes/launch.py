@@ -16,7 +16,7 @@ from vla_zenoh.errors import NodeError, ProfileError, SessionError
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.supervisor import NodeCommand, Supervisor
-from vla_zenoh.profile import HostProfile, Profile, to_yaml
+from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
 
 START_ORDER = ("router", "sim", "command", "camera", "worker")
 ROUTER_PATIENCE_S = 10.0
@@ -95,9 +95,7 @@ class Host:
     ) -> None:
         self.host, part = choose_host(profile, host)
         if part.connect is not None:
-            data = profile.model_dump()
-            data["session"]["connect"] = part.connect
-            profile = Profile.model_validate(data)
+            profile = override(profile, {"session": {"connect": list(part.connect)}})
         self.profile, self._part, self._tell = profile, part, tell
         self._folder = tempfile.TemporaryDirectory(prefix="vla-zenoh-")
         # Children read the very profile that is in force here, whatever its options were.

@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import zenoh
 
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
 from vla_zenoh.control.names import worker_node
@@ -22,6 +21,7 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
+from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.observe import History, NotYet, assemble
 from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps
 from vla_zenoh.profile import Profile
@@ -38,9 +38,12 @@ from vla_zenoh.types import (
 
 SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5
+STREAM_PATIENCE_S = 0.5
+"""Another camera or robot is believed when the one before it was silent for so long."""
 LOOK_PERIOD_S = 0.25
 AFTER_A_FAILURE_S = 0.5
 FRESH_PATIENCE_S = 0.05
+MAX_COMPLAINT = 500
 FRESH_TOLERANCE_S = 0.005
 STATE_KINDS: dict[str, type[Any]] = {
     "joint": JointState,
@@ -89,6 +92,10 @@ class WorkerNode:
         self._state_slots = {
             part: node.listen(self._state_key(part), Inbox(256))
             for part in self.spec.observation.state
+        }
+        self._task_speaker = Speaker(TASK_PATIENCE_S)
+        self._speakers = {
+            name: Speaker(STREAM_PATIENCE_S) for name in (*self._image_slots, *self._state_slots)
         }
         self._images: dict[str, Stamped[Image]] = {}
         self._pictures_s: dict[str, float] = {}
@@ -152,7 +159,7 @@ class WorkerNode:
     def _listen(self) -> None:
         arrival = self._task_slot.take()
         if arrival is not None:
-            task = self.node.read(Task, arrival)
+            task = self.node.read(Task, arrival, self._task_speaker)
             if task is not None:
                 self._take_task(task)
         for camera, slot in self._image_slots.items():
@@ -163,7 +170,7 @@ class WorkerNode:
                 self._pictures_s[camera] = arrival.mono_ns / 1e9
         for part, inbox in self._state_slots.items():
             for arrival in inbox.take_all():
-                state = self.node.read(STATE_KINDS[part], arrival)
+                state = self.node.read(STATE_KINDS[part], arrival, self._speakers[part])
                 if state is not None:
                     self._states[part].add(state)
 
@@ -181,8 +188,8 @@ class WorkerNode:
     def _read_image(self, camera: str, arrival: Arrival) -> Stamped[Image] | None:
         sample = arrival.sample
         try:
-            attachment = sample.attachment
-            header = header_codec.decode(attachment.to_bytes() if attachment is not None else None)
+            header = self.node.header(arrival)
+            self._speakers[camera].check(header, arrival.mono_ns)
             payload = sample.payload.to_bytes()
             if self._jpeg:
                 image = image_codec.decode_jpeg(payload)
@@ -192,6 +199,7 @@ class WorkerNode:
         except CodecError as error:
             self.node.refuse(error.reason, f"camera {camera}: {error}")
             return None
+        self._speakers[camera].heard(header, arrival.mono_ns)
         return Stamped(header, image, self.node.wall_of(arrival))
 
     def _observe(self, due_s: float) -> Observation | None:
@@ -256,7 +264,7 @@ class WorkerNode:
                 observed_ns=observed_ns,
                 inference_start_ns=start_ns,
                 inference_end_ns=end_ns,
-                done=answer.done,
+                done=bool(answer.done),
             )
         )
         self._not_before_ns = header.stamp_wall_ns
@@ -280,7 +288,7 @@ class WorkerNode:
         self.node.report(
             state,
             detail={
-                "complaint": self._complaint,
+                "complaint": self._complaint[:MAX_COMPLAINT].encode("utf-8", "replace").decode(),
                 "spec": self.spec.hash,
                 "episode": self._episode,
                 "prompt": task.prompt if task else "",
