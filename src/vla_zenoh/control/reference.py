@@ -21,15 +21,10 @@ from vla_zenoh.control.so3 import (
     orthonormal,
     rotation_from_quat,
 )
+from vla_zenoh.control.stream import ACCELERATE_S, BRAKE_MARGIN, CommandStream
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import PoseCommand, Stamped
 
-CLOCK_DRIFT = 1e-3
-"""Share by which two clocks may drift apart; a real one does by a tenth of that."""
-ACCELERATE_S = 0.02
-"""For how long a command's acceleration is believed; its velocity is until the stream times out."""
-BRAKE_MARGIN = 2.0
-"""Its own stop may use this multiple of the stream's limits."""
 STILL = 1e-4
 """m/s and rad/s: a stream that ends slower than this has ended on purpose."""
 
@@ -64,18 +59,19 @@ class ReferenceGuard:
         self._dt_s = dt_s
         self._smoother = Smoother(pose, dt_s, limits.brake)
         self._brake_limits = limits.brake
-        self._command: Stamped[PoseCommand] | None = None
-        self._source: str | None = None
-        self._last_seq = -1
-        self._base_ns = 0
-        self._delay_ns = 0
+        self._stream: CommandStream[PoseCommand] = CommandStream(limits.timeout_s)
         self.braking = False
         self.silences = 0
         self.motion = self._smoother.motion
 
     def restart(self, pose: Pose) -> None:
         """The robot was put elsewhere; follow nobody and stand."""
-        self._command, self._source, self._last_seq = None, None, -1
+        self.anchor(pose)
+        self._stream.forget()
+
+    def anchor(self, pose: Pose) -> None:
+        """Somebody else moved the robot; follow nobody and stand. Commands heard stay heard."""
+        self._stream.end()
         self.braking = False
         self._smoother.reset(pose)
         self.motion = self._smoother.motion
@@ -83,15 +79,18 @@ class ReferenceGuard:
     @property
     def following(self) -> bool:
         """A command stream is being followed."""
-        return self._command is not None
+        return self._stream.newest is not None
 
     def offer(self, command: Stamped[PoseCommand], now_ns: int) -> str | None:
-        """Take a command, or say in one word why not: ``foreign``, ``replayed``, ``jump``."""
-        header, record = command.header, command.record
-        if self._command is not None and header.source != self._source:
-            return "foreign"
-        if header.source == self._source and header.seq <= self._last_seq:
-            return "replayed"
+        """Take a command, or say in one word why not.
+
+        Returns:
+            None, or ``foreign``, ``replayed``, ``braking``, ``jump``, ``too_fast``.
+        """
+        record = command.record
+        objection = self._stream.objection(command.header)
+        if objection is not None:
+            return objection
         if self.braking:
             return "braking"
         rotation = rotation_from_quat(record.quat_xyzw)
@@ -106,34 +105,16 @@ class ReferenceGuard:
                 return "too_fast"
             if float(np.linalg.norm(values[3:])) > 2 * self._brake_limits.rotation[order]:
                 return "too_fast"
-        self._place_in_time(command)
-        self._command, self._source, self._last_seq = command, header.source, header.seq
+        self._stream.take(command)
         return None
-
-    def _place_in_time(self, command: Stamped[PoseCommand]) -> None:
-        """Put `command` on our clock by its stamp, because arrival times jitter.
-
-        The difference of both clocks is the shortest delay seen: a command that was held up on its
-        way is not taken for one that is meant later.
-        """
-        stamp_ns = command.header.stamp_wall_ns
-        delay_ns = command.received_ns - stamp_ns
-        if self._command is not None:
-            passed_ns = command.received_ns - self._command.received_ns
-            shortest_ns = self._delay_ns + int(CLOCK_DRIFT * passed_ns)
-            # Later than a stream may be silent: not a hold-up, one of the clocks was set.
-            if delay_ns - shortest_ns < self._limits.timeout_s * 1e9:
-                delay_ns = min(delay_ns, shortest_ns)
-        self._delay_ns = delay_ns
-        self._base_ns = stamp_ns + delay_ns
 
     def tick(self, now_ns: int) -> Motion:
         """The reference to follow at `now_ns`."""
-        if self._command is not None:
-            silence_s = (now_ns - self._command.received_ns) / 1e9
-            if silence_s <= self._limits.timeout_s:
-                self.motion = self._extrapolate(self._command.record, now_ns)
-                return self.motion
+        command = self._stream.live(now_ns)
+        if command is not None:
+            self.motion = self._extrapolate(command, now_ns)
+            return self.motion
+        if self._stream.newest is not None:
             self._end_of_stream()
         if self.braking:
             self.motion = self._smoother.tick()
@@ -143,7 +124,7 @@ class ReferenceGuard:
         return self.motion
 
     def _end_of_stream(self) -> None:
-        self._command = None
+        self._stream.end()
         if float(np.abs(self.motion.twist).max()) < STILL:
             return
         self.silences += 1
@@ -151,9 +132,7 @@ class ReferenceGuard:
         self._smoother.brake_from(self.motion)
 
     def _extrapolate(self, record: PoseCommand, now_ns: int) -> Motion:
-        # As far as silence is tolerated: the stream is a function of time, so a late command meets
-        # the path its predecessors foretold.
-        ahead_s = min(max((now_ns - self._base_ns) / 1e9, 0.0), self._limits.timeout_s)
+        ahead_s = self._stream.ahead_s(now_ns)
         believed_s = min(ahead_s, ACCELERATE_S)
         twist = record.twist + record.acceleration * believed_s
         step = twist * ahead_s - record.acceleration * (0.5 * believed_s * believed_s)

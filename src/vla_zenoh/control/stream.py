@@ -1,0 +1,84 @@
+"""Whose commands a controller follows, which of them are new, and what time each is meant for."""
+
+from __future__ import annotations
+
+from typing import Generic, TypeVar
+
+from vla_zenoh.types import Header, Stamped
+
+CLOCK_DRIFT = 1e-3
+"""Share by which two clocks may drift apart; a real one does by a tenth of that."""
+ACCELERATE_S = 0.02
+"""For how long a command's acceleration is believed; its velocity is until the stream times out."""
+BRAKE_MARGIN = 2.0
+"""The robot's own stop may use this multiple of the stream's limits."""
+
+Command = TypeVar("Command")
+
+
+class CommandStream(Generic[Command]):
+    """The commands of one writer at a time.
+
+    Args:
+        timeout_s: silence after which the stream has ended.
+    """
+
+    def __init__(self, timeout_s: float) -> None:
+        self.newest: Stamped[Command] | None = None
+        self._timeout_s = timeout_s
+        self._source: str | None = None
+        self._last_seq = -1
+        self._base_ns = 0
+        self._delay_ns = 0
+
+    def objection(self, header: Header) -> str | None:
+        """Why a command with this header is not taken: ``foreign``, ``replayed``, or nothing."""
+        if self.newest is not None and header.source != self._source:
+            return "foreign"
+        if header.source == self._source and header.seq <= self._last_seq:
+            return "replayed"
+        return None
+
+    def take(self, command: Stamped[Command]) -> None:
+        """Follow `command`: it is put on our clock by its stamp, because arrival times jitter.
+
+        The difference of both clocks is the shortest delay seen: a command that was held up on its
+        way is not taken for one that is meant later.
+        """
+        stamp_ns = command.header.stamp_wall_ns
+        delay_ns = command.received_ns - stamp_ns
+        if self.newest is not None:
+            passed_ns = command.received_ns - self.newest.received_ns
+            shortest_ns = self._delay_ns + int(CLOCK_DRIFT * passed_ns)
+            # Later than a stream may be silent: not a hold-up, one of the clocks was set.
+            if delay_ns - shortest_ns < self._timeout_s * 1e9:
+                delay_ns = min(delay_ns, shortest_ns)
+        self._delay_ns = delay_ns
+        self._base_ns = stamp_ns + delay_ns
+        self.newest, self._source, self._last_seq = (
+            command,
+            command.header.source,
+            command.header.seq,
+        )
+
+    def live(self, now_ns: int) -> Command | None:
+        """The newest command, None where there is none or the stream has fallen silent."""
+        if self.newest is None or now_ns - self.newest.received_ns > self._timeout_s * 1e9:
+            return None
+        return self.newest.record
+
+    def ahead_s(self, now_ns: int) -> float:
+        """How far `now_ns` is past the time the newest command is meant for.
+
+        As far as silence is tolerated: the stream is a function of time, so a late command meets
+        the path its predecessors foretold.
+        """
+        return min(max((now_ns - self._base_ns) / 1e9, 0.0), self._timeout_s)
+
+    def end(self) -> None:
+        """Follow nobody; what was heard already is not new when it comes again."""
+        self.newest = None
+
+    def forget(self) -> None:
+        """Follow nobody, and know nobody."""
+        self.newest, self._source, self._last_seq = None, None, -1
