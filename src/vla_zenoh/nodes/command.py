@@ -20,6 +20,7 @@ from vla_zenoh.nodes.clock import FixedRate, make_this_thread_realtime
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.slots import Inbox, Latest
+from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.nodes.surroundings import Neighbours
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, Cause, GripperState, PoseState, Stamped
@@ -59,7 +60,9 @@ class CommandNode:
         self._pose_out = node.stream(keys.command_pose, Kind.CONTROL)
         self._gripper_out = node.stream(keys.command_gripper, Kind.ORDER)
         self._task_out = node.stream(keys.task, Kind.ORDER)
-        self._seen: dict[str, tuple[str, int]] = {}
+        self._speakers = {
+            kind: Speaker(profile.timing.state_timeout_s) for kind in (PoseState, GripperState)
+        }
         self._latency = {stage: Percentiles() for stage in STAGES}
         self._cost_us = Percentiles(2048)
         self._rate = RateMeter()
@@ -160,27 +163,7 @@ class CommandNode:
     def _state(self, kind: type[Any], slot: Latest) -> Stamped[Any] | None:
         """The newest state, if it is new and by the writer that speaks for the robot."""
         arrival = slot.take()
-        if arrival is None:
-            return None
-        stamped = self.node.read(kind, arrival)
-        if stamped is None:
-            return None
-        name, source, seq = kind.__name__, stamped.header.source, stamped.header.seq
-        known = self._seen.get(name)
-        silent_ns = self._silence_ns(name, stamped.received_ns)
-        if known is not None and silent_ns < self.node.profile.timing.state_timeout_s * 1e9:
-            if known[0] != source:
-                self.node.refuse("foreign", f"{name} by {source[:60]!r}, while {known[0]!r} speaks")
-                return None
-            if seq <= known[1]:
-                self.node.refuse("replayed", f"{name} {seq} came again or late")
-                return None
-        self._seen[name] = (source, seq)
-        return stamped
-
-    def _silence_ns(self, name: str, now_ns: int) -> int:
-        last = self.commander.pose if name == "PoseState" else self.commander.gripper_state
-        return now_ns - last.received_ns if last else 1 << 62
+        return None if arrival is None else self.node.read(kind, arrival, self._speakers[kind])
 
     def _check_clock(self) -> list[Setting]:
         if time.monotonic() - self._last_clock < CLOCK_PERIOD_S:

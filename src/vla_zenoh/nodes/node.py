@@ -19,6 +19,7 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.clock import Clock
 from vla_zenoh.nodes.session import QOS
 from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
+from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Event, Header, NodeStatus, Stamped
 
@@ -135,7 +136,8 @@ class Node:
     def refuse(self, reason: str, why: str) -> None:
         """Count a refusal by reason, and say why."""
         self.counters[f"refused.{reason}"] += 1
-        self.tell(Event("warning", "refusal", reason, why[:1000]))
+        readable = why[:1000].encode("utf-8", "replace").decode()
+        self.tell(Event("warning", "refusal", reason, readable))
 
     def report(
         self,
@@ -204,17 +206,38 @@ class Node:
         """Arrival time on this node's wall clock."""
         return self.clock.wall_ns() - (time.monotonic_ns() - arrival.mono_ns)
 
-    def read(self, kind: type[Record], arrival: Arrival) -> Stamped[Record] | None:
-        """Decode a stream sample; a refusal is counted and told, and None is returned."""
+    def read(
+        self, kind: type[Record], arrival: Arrival, speaker: Speaker | None = None
+    ) -> Stamped[Record] | None:
+        """Decode a stream sample; a refusal is counted and told, and None is returned.
+
+        Args:
+            kind: the record.
+            arrival: the sample.
+            speaker: of its key: only he is heard, and each of his records once.
+        """
         sample = arrival.sample
         try:
-            attachment = sample.attachment
-            header = header_codec.decode(attachment.to_bytes() if attachment is not None else None)
+            header = self.header(arrival)
+            if speaker is not None:  # before the payload: who shouts nonsense costs least
+                speaker.check(header, arrival.mono_ns)
             record = records.decode(kind, sample.payload.to_bytes())
         except CodecError as error:
             self.refuse(error.reason, f"{self.keys.short(str(sample.key_expr))}: {error}")
             return None
+        if speaker is not None:
+            speaker.heard(header, arrival.mono_ns)
         return Stamped(header, record, self.wall_of(arrival))
+
+    @staticmethod
+    def header(arrival: Arrival) -> Header:
+        """What the sample's writer says of it.
+
+        Raises:
+            CodecError: it has no header that can be read.
+        """
+        attachment = arrival.sample.attachment
+        return header_codec.decode(attachment.to_bytes() if attachment is not None else None)
 
     def read_text(self, decode: Callable[[bytes], Record], arrival: Arrival) -> Record | None:
         """Decode a plain setting likewise."""

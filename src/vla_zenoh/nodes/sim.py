@@ -18,8 +18,8 @@ import zenoh
 
 from vla_zenoh.codec import message, records, settings
 from vla_zenoh.control.impedance import ImpedanceGains, Reference
-from vla_zenoh.control.reference import GuardLimits, ReferenceGuard
-from vla_zenoh.control.smoothing import Motion, MotionLimits
+from vla_zenoh.control.reference import ReferenceGuard, guard_limits
+from vla_zenoh.control.smoothing import Motion
 from vla_zenoh.control.so3 import Pose
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind
@@ -30,14 +30,20 @@ from vla_zenoh.nodes.slots import Inbox
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.world import STEP_NS, World
-from vla_zenoh.types import GripperCommand, ObjectPoses, PoseCommand, SceneState
+from vla_zenoh.types import (
+    Event,
+    GripperCommand,
+    Header,
+    ObjectPoses,
+    PoseCommand,
+    SceneState,
+    Stamped,
+)
 
 CATCH_UP_NS = 50_000_000
 SCENE_HZ, OBJECTS_HZ, WATCH_HZ = 60.0, 10.0, 4.0
 MAX_LOCKSTEP_NS = 60_000_000_000
 SWITCH_INTERVAL_S = 1e-4
-GUARD_MARGIN = 2.0
-"""The robot's own stop may use this multiple of the profile's acceleration and jerk."""
 
 
 def build_world(profile: Profile) -> World:
@@ -64,24 +70,7 @@ def build_world(profile: Profile) -> World:
 
 def build_guard(profile: Profile, world: World) -> ReferenceGuard:
     """The robot side's guard of the pose stream, standing where the arm stands."""
-    translation, rotation = profile.limits.translation, profile.limits.rotation
-    limits = MotionLimits(
-        (
-            translation.velocity_m_s * GUARD_MARGIN,
-            translation.acceleration_m_s2 * GUARD_MARGIN,
-            translation.jerk_m_s3 * GUARD_MARGIN,
-        ),
-        (
-            rotation.velocity_rad_s * GUARD_MARGIN,
-            rotation.acceleration_rad_s2 * GUARD_MARGIN,
-            rotation.jerk_rad_s3 * GUARD_MARGIN,
-        ),
-    )
-    return ReferenceGuard(
-        Pose(*world.tcp()),
-        STEP_NS / 1e9,
-        GuardLimits(profile.timing.command_timeout_s, limits),
-    )
+    return ReferenceGuard(Pose(*world.tcp()), STEP_NS / 1e9, guard_limits(profile))
 
 
 class SimNode:
@@ -94,7 +83,10 @@ class SimNode:
         self.lockstep = lockstep
         keys = node.keys
         self._poses = node.listen(keys.command_pose, Inbox(64))
+        self._writer = ""
+        self._braking = False
         self._widths = node.listen(keys.command_gripper, Inbox(16))
+        self._last_width: Header | None = None
         self._resets = node.listen(keys.sim_reset, Inbox(4))
         self._joint = node.stream(keys.state_joint, Kind.STATE)
         self._pose = node.stream(keys.state_pose, Kind.STATE)
@@ -189,6 +181,8 @@ class SimNode:
         self._ticks += 1
         if not self._blown_up:
             self._reference = self._as_reference(self.guard.tick(now_ns))
+            if self.guard.braking != self._braking:
+                self._tell_braking()
             try:
                 self.world.tick(self._reference)
             except NodeError as error:
@@ -209,27 +203,62 @@ class SimNode:
     def _take_orders(self, now_ns: int) -> None:
         for arrival in self._poses.take_all():
             command = self.node.read(PoseCommand, arrival)
-            if command is None:
-                continue
-            reason = self.guard.offer(command, now_ns)
-            if reason is not None:
-                self.node.refuse(
-                    f"pose_{reason}", f"command/pose by {command.header.source[:60]!r}: {reason}"
-                )
+            if command is not None:
+                self._offer(command, now_ns)
         for arrival in self._widths.take_all():
             width = self.node.read(GripperCommand, arrival)
             if width is not None:
-                order = width.record
-                gripper = self.node.profile.robot.gripper
-                self.world.set_gripper(
-                    min(order.width_m, gripper.max_width_m),
-                    order.speed_m_s,
-                    max(order.force_n, 0.1),
-                )
+                self._take_width(width)
         for arrival in self._resets.take_all():
             seed = self.node.read_text(_seed_or_default, arrival)
             if seed is not None:
                 self._reset(seed.value)
+
+    def _offer(self, command: Stamped[PoseCommand], now_ns: int) -> None:
+        if self.lockstep:  # where nobody's clock but the world's counts
+            command = replace(command, received_ns=now_ns)
+        reason = self.guard.offer(command, now_ns)
+        if reason is None:
+            self._writer = command.header.source
+            return
+        self.node.refuse(
+            f"pose_{reason}", f"command/pose by {command.header.source[:60]!r}: {reason}"
+        )
+
+    def _take_width(self, width: Stamped[GripperCommand]) -> None:
+        header, last, order = width.header, self._last_width, width.record
+        if self.guard.following and header.source != self._writer:
+            self.node.refuse(
+                "foreign",
+                f"command/gripper by {header.source[:60]!r}, while {self._writer[:60]!r} moves the "
+                "arm",
+            )
+            return
+        if last is not None and header.source == last.source and header.seq <= last.seq:
+            self.node.refuse("replayed", f"command/gripper {header.seq} came again or late")
+            return
+        self._last_width = header
+        self.world.set_gripper(
+            min(order.width_m, self.node.profile.robot.gripper.max_width_m),
+            order.speed_m_s,
+            max(order.force_n, 0.1),
+        )
+
+    def _tell_braking(self) -> None:
+        self._braking = self.guard.braking
+        timeout_s = self.node.profile.timing.command_timeout_s
+        event = (
+            Event(
+                "warning",
+                "transition",
+                "following->braking",
+                f"no command/pose for {timeout_s:g} s while the arm moved: it brakes by itself",
+            )
+            if self._braking
+            else Event("info", "transition", "braking->standing", "nobody is followed")
+        )
+        self.node.tell(event)
+        self.node.report("braking" if self._braking else "running", detail=self._detail(), now=True)
 
     def _reset(self, seed: int | None) -> None:
         if self.guard.following and not self._blown_up:
