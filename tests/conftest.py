@@ -3,10 +3,31 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 
+import pytest
+from chain import Chain, running_chain
 from hypothesis import settings
 
 # Machines that run tests are slow now and then: time per example says nothing about the code.
 settings.register_profile("default", deadline=None)
 settings.register_profile("thorough", deadline=None, max_examples=2000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
+
+
+@pytest.fixture(scope="module")
+def shared_chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
+    """One robot for all tests of a file; take `chain` instead, which begins in order."""
+    with running_chain(tmp_path_factory.mktemp("chain")) as chain:
+        chain.activate_when_ready()
+        yield chain
+
+
+@pytest.fixture
+def chain(shared_chain: Chain) -> Chain:
+    """The file's robot: inactive, standing, nothing recorded, no event unread."""
+    shared_chain.settle()
+    shared_chain.recorder.forget()
+    shared_chain.client.take_events()
+    assert not shared_chain.failure, shared_chain.failure
+    return shared_chain

@@ -1,0 +1,216 @@
+"""Any node killed or hung while the arm moves: it brakes, comes back, and waits to be activated."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from chain import MOVING_M_S, Chain, Track
+
+BRAKE_S = 0.35
+"""A jerk-limited stop from 0.15 m/s takes 0.17 s, the rest is the arm's lag."""
+BUSY_S = 0.15
+"""What a busy machine may add to any of it."""
+OWN_BRAKE = 2.0
+"""The robot's side may brake by itself at this multiple of the profile's acceleration."""
+REFERENCE_TOLERANCE = 1.1
+MEASURED_TOLERANCE = 1.35
+"""The measured arm follows its reference with a spring: it may be this much harder."""
+RESTART_S = 12.0
+STEPS, STEP_M, WAY_TOLERANCE_M = 5, 0.01, 0.001
+JUMP_M = 0.002
+"""Between two references, 5 ms apart: 0.5 m/s would be 0.0025."""
+RUN_S = 0.5
+
+
+class Death(NamedTuple):
+    """A node, and what its death looks like from outside.
+
+    Args:
+        node: killed.
+        own_brake: the arm brakes without the command node.
+        why: in the command node's words.
+    """
+
+    node: str
+    own_brake: bool
+    why: str
+
+
+DEATHS = (
+    Death("worker-scripted", False, "node 'worker-scripted' is gone"),
+    Death("camera", False, "node 'camera' is gone"),
+    Death("command", True, "not activated yet"),
+)
+
+
+def acceleration_limit(chain: Chain, own_brake: bool) -> float:
+    return chain.profile.limits.translation.acceleration_m_s2 * (OWN_BRAKE if own_brake else 1.0)
+
+
+def assert_gentle(chain: Chain, track: Track, own_brake: bool) -> None:
+    limit = acceleration_limit(chain, own_brake)
+    assert track.hardest_reference_change() <= limit * REFERENCE_TOLERANCE
+    assert track.hardest_change() <= limit * MEASURED_TOLERANCE
+    assert track.largest_step_m() <= JUMP_M
+
+
+def kill_in_motion(chain: Chain, node: str) -> tuple[int, int]:
+    """Kill it; returns its process number and the time (ns)."""
+    chain.move()
+    time.sleep(RUN_S)
+    assert chain.moves()
+    chain.client.take_events()
+    pid = chain.pid(node)
+    at_ns = time.time_ns()
+    os.kill(pid, signal.SIGKILL)
+    return pid, at_ns
+
+
+def assert_restarted(chain: Chain, node: str, old_pid: int) -> None:
+    chain.until(
+        f"{node} runs again",
+        lambda: chain.host.supervisor.pids().get(node, old_pid) != old_pid,
+        RESTART_S,
+    )
+    chain.until(
+        f"{node} says so itsel",
+        lambda: (status := chain.client.status(node)) is not None and status.pid != old_pid,
+        RESTART_S,
+    )
+    assert any(name == node and "SIGKILL" in line for name, line in chain.told)
+
+
+def assert_waits_and_works_again(chain: Chain) -> None:
+    """Nothing moves before it is activated; then it does as told, from where it stands."""
+    chain.until(
+        "everything is there, only inactive",
+        lambda: chain.state() == "inactive" and chain.state("worker-scripted") == "inferring",
+        RESTART_S,
+    )
+    began_ns = time.time_ns()
+    time.sleep(0.5)
+    still = chain.recorder.track(began_ns)
+    assert len(still.stamp_ns) > 20
+    assert still.speed_m_s.max() < MOVING_M_S
+    assert chain.state() == "inactive"
+    assert chain.client.task is not None
+    assert not chain.client.task.active
+
+    chain.activate_when_ready()
+    direction, sign = ("up", 1) if chain.height_m() < 0.4 else ("down", -1)
+    way_m = chain.go(direction, STEPS)
+    assert way_m == pytest.approx(sign * STEPS * STEP_M, abs=WAY_TOLERANCE_M)
+    moved = chain.recorder.track(began_ns)
+    assert_gentle(chain, moved, own_brake=False)
+
+
+@pytest.mark.parametrize("death", DEATHS, ids=lambda death: death.node)
+def test_a_killed_node_brakes_the_arm_and_needs_a_new_activation(
+    chain: Chain, death: Death
+) -> None:
+    pid, killed_ns = kill_in_motion(chain, death.node)
+    assert_restarted(chain, death.node, pid)
+
+    track = chain.recorder.track()
+    before = track.between(killed_ns - 100_000_000, killed_ns)
+    assert before.speed_m_s.mean() > MOVING_M_S
+    stood_s = track.time_to_stand_s(killed_ns)
+    watchdog_s = chain.profile.timing.watchdog_s
+    print(f"{death.node}: {before.speed_m_s.mean():.3f} m/s to rest in {stood_s:.3f} s")
+    assert stood_s <= watchdog_s + BRAKE_S + BUSY_S
+    assert_gentle(chain, track, death.own_brake)
+    chain.until("it says why", lambda: chain.detail("why") == death.why)
+    if death.own_brake:
+        assert chain.events("following->braking")
+    else:
+        (event,) = chain.events("active->inactive")
+        assert event.why == death.why
+    assert_waits_and_works_again(chain)
+
+
+def test_a_killed_simulator_is_noticed_and_starts_again_at_home(chain: Chain) -> None:
+    pid, killed_ns = kill_in_motion(chain, "sim")
+    chain.until("it is noticed", lambda: chain.events("active->inactive"))
+    (event,) = chain.events("active->inactive")
+    assert event.why == "node 'sim' is gone"
+    assert_restarted(chain, "sim", pid)
+    # There is no arm to be measured: what would have been sent to one is.
+    commands = [(h, c) for h, c in chain.recorder.commands() if h.stamp_wall_ns > killed_ns]
+    moving = [h.stamp_wall_ns for h, c in commands if np.abs(c.twist).max() > 1e-3]
+    stood_s = (max(moving) - killed_ns) / 1e9
+    print(f"sim: the commanded pose stands after {stood_s:.3f} s")
+    assert stood_s <= chain.profile.timing.state_timeout_s + BRAKE_S + BUSY_S
+    chain.recorder.forget()
+    assert_waits_and_works_again(chain)
+
+
+def test_a_killed_router_stops_the_arm_and_all_find_each_other_again(chain: Chain) -> None:
+    pid, killed_ns = kill_in_motion(chain, "router")
+    at_kill = chain.recorder.track().between(0, killed_ns)
+    assert_restarted(chain, "router", pid)
+    nodes = ("sim", "camera", "command", "worker-scripted")
+    chain.until(
+        "all speak again",
+        lambda: all(age_s < 1.0 for n, (_, age_s, _) in chain.client.snapshot().items()),
+        RESTART_S,
+    )
+    assert chain.client.alive >= set(nodes)
+    # Nobody hears the arm while there is no router. Afterwards it stands, near where it was.
+    stands = chain.recorder.track(time.time_ns() - 300_000_000)
+    assert stands.speed_m_s.max() < MOVING_M_S
+    speed_m_s = float(at_kill.speed_m_s[-20:].mean())
+    went_m = float(np.linalg.norm(stands.position_m[-1] - at_kill.position_m[-1]))
+    timeout_s = chain.profile.timing.command_timeout_s
+    print(f"router: {speed_m_s:.3f} m/s, {went_m * 1e3:.1f} mm on")
+    assert went_m <= speed_m_s * (timeout_s + BRAKE_S + BUSY_S)
+    assert chain.counter("sim.stream_silences", "sim") >= 1
+    chain.until("it says why", lambda: "is gone" in str(chain.detail("why")))
+    chain.recorder.forget()
+    assert_waits_and_works_again(chain)
+
+
+# -- hung, not dead -------------------------------------------------------------------------------
+def hang_in_motion(chain: Chain, node: str, seconds: float) -> int:
+    chain.move()
+    time.sleep(RUN_S)
+    chain.client.take_events()
+    pid = chain.pid(node)
+    at_ns = time.time_ns()
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        time.sleep(seconds)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    return at_ns
+
+
+def test_a_hung_worker_lets_the_arm_hold_and_then_lose_it(chain: Chain) -> None:
+    lease_s = chain.profile.session.lease_ms / 1e3
+    at_ns = hang_in_motion(chain, "worker-scripted", 2.5 * lease_s)
+    timing = chain.profile.timing
+    track = chain.recorder.track()
+    stood_s = track.time_to_stand_s(at_ns)
+    patience_s = 1.0 / chain.profile.task.rate_hz + timing.watchdog_s
+    print(f"hung worker: to rest in {stood_s:.3f} s")
+    assert stood_s <= patience_s + BRAKE_S + BUSY_S
+    assert_gentle(chain, track, own_brake=False)
+    assert chain.events("active->holding")
+    (event,) = chain.events("holding->inactive")
+    assert event.why == "node 'worker-scripted' is gone"
+    assert_waits_and_works_again(chain)
+
+
+def test_a_hung_command_node_is_braked_by_the_robot_and_comes_back_inactive(chain: Chain) -> None:
+    at_ns = hang_in_motion(chain, "command", 2.0)
+    track = chain.recorder.track()
+    stood_s = track.time_to_stand_s(at_ns)
+    print(f"hung command node: to rest in {stood_s:.3f} s")
+    assert stood_s <= chain.profile.timing.command_timeout_s + BRAKE_S + BUSY_S
+    assert_gentle(chain, track, own_brake=True)
+    chain.until("it says why", lambda: "stood still" in str(chain.detail("why")))
+    assert_waits_and_works_again(chain)
