@@ -101,7 +101,6 @@ class CollisionModel:
             self._geometry.addCollisionPair(pin.CollisionPair(first, second))
         self._work: Any = self._geometry.createData()
         for request in self._work.distanceRequests:
-            request.enable_nearest_points = False
             # The last separating direction: the next configuration is a small step away.
             request.gjk_initial_guess = coal.GJKInitialGuess.CachedGuess
         self._results: list[Any] = list(self._work.distanceResults)
@@ -130,7 +129,9 @@ def _load(kinematics: Kinematics) -> Any:
             package_dirs=[str(folder) for folder in urdf.resolve().parents],
         )
     except (ValueError, RuntimeError) as error:
-        raise ResourceError(f"the collision shapes of {urdf.name} cannot be loaded: {error}") from error
+        raise ResourceError(
+            f"the collision shapes of {urdf.name} cannot be loaded: {error}"
+        ) from error
     if geometry.ngeoms == 0:
         raise ResourceError(f"{urdf.name} has no collision shapes; give it some, or do without")
     return geometry
@@ -149,9 +150,7 @@ def _one_hull_a_link(kinematics: Kinematics) -> Any:
         hull = coal.Convex.convexHull(points, True, "Qt")
         frame = full.getFrameId(link)
         parent = full.frames[frame].parentJoint
-        hulls.addGeometryObject(
-            pin.GeometryObject(link, parent, frame, pin.SE3.Identity(), hull)
-        )
+        hulls.addGeometryObject(pin.GeometryObject(link, parent, frame, pin.SE3.Identity(), hull))
     _, reduced = pin.buildReducedModel(
         full, hulls, kinematics.locked_joints, kinematics.locked_position
     )

@@ -148,7 +148,7 @@ class InverseKinematics:
                 error_m <= settings.position_tolerance_m
                 and error_rad <= settings.rotation_tolerance_rad
             )
-            # At a bound or out of reach the error shrinks by ever less: three such rounds are proof.
+            # At a bound or out of reach the error shrinks by ever less: three rounds are proof.
             stalls = stalls + 1 if squared > 0.8 * last and iteration > 2 else 0
             if solved or stalls == 3 or iteration == settings.max_iterations:
                 return Approach(joints, error_m, error_rad, solved, wanted, jacobian)

@@ -66,7 +66,9 @@ class Kinematics:
         self.upper_rad: FloatArray = np.array(self.model.upperPositionLimit)
         self.velocity_rad_s: FloatArray = np.array(self.model.upperVelocityLimit)
         for index, name in enumerate(self.arm_joints):
-            if not (self.lower_rad[index] < self.upper_rad[index] and self.velocity_rad_s[index] > 0):
+            if not (
+                self.lower_rad[index] < self.upper_rad[index] and self.velocity_rad_s[index] > 0
+            ):
                 raise ProfileError(
                     f"joint {name!r} of {urdf.name} has no room to move: its <limit> needs "
                     "lower < upper (rad) and velocity > 0 (rad/s)"
@@ -132,7 +134,9 @@ class Kinematics:
 
 def smallest_singular_value(jacobian: FloatArray) -> float:
     """How slow the TCP's slowest direction is (m and rad alike) per rad/s; 0 when singular."""
-    squared = jacobian @ jacobian.T if jacobian.shape[0] <= jacobian.shape[1] else jacobian.T @ jacobian
+    squared = (
+        jacobian @ jacobian.T if jacobian.shape[0] <= jacobian.shape[1] else jacobian.T @ jacobian
+    )
     return math.sqrt(max(float(np.linalg.eigvalsh(squared)[0]), 0.0))
 
 
@@ -171,7 +175,9 @@ def _locked(
         joint = model.joints[model.getJointId(name)]
         upper = float(model.upperPositionLimit[joint.idx_q])
         if joint.nq != 1 or not math.isfinite(upper):
-            raise ProfileError(f"finger joint {name!r} of {urdf.name} has no upper limit to open to")
+            raise ProfileError(
+                f"finger joint {name!r} of {urdf.name} has no upper limit to open to"
+            )
         position[joint.idx_q] = upper
     return position
 

@@ -28,6 +28,7 @@ from vla_zenoh.control.collision import TABLE, CollisionModel
 from vla_zenoh.control.ik import Approach, IkSettings, InverseKinematics, pose_error
 from vla_zenoh.control.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.located import LocatedHit
 from vla_zenoh.control.so3 import Pose, exp3, orthonormal
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types import FloatArray
@@ -72,21 +73,6 @@ class ReachLimits:
     velocity_m_s: float = 0.5
     velocity_rad_s: float = 1.5
     free_elbow: bool = False
-
-
-class ReachHit(LimitHit):
-    """A bound that acted, and where.
-
-    Attributes:
-        where: the joint, the pair of links, or the link over the table; empty for ``reach``.
-    """
-
-    where: str
-
-    def __new__(cls, name: str, value: float, limit: float, where: str = "") -> ReachHit:
-        hit = super().__new__(cls, name, value, limit)
-        hit.where = where
-        return hit
 
 
 class Margins(NamedTuple):
@@ -149,9 +135,14 @@ class Shadow:
         self.limits = limits = limits or ReachLimits()
         for name in ("singularity", "collision", "table"):
             suffix = "" if name == "singularity" else "_m"
-            slow, stop = getattr(limits, f"{name}_slow{suffix}"), getattr(limits, f"{name}_stop{suffix}")
+            slow, stop = (
+                getattr(limits, f"{name}_slow{suffix}"),
+                getattr(limits, f"{name}_stop{suffix}"),
+            )
             if slow < stop:
-                raise RecordError(f"{name}_slow ({slow:g}) must not be below {name}_stop ({stop:g})")
+                raise RecordError(
+                    f"{name}_slow ({slow:g}) must not be below {name}_stop ({stop:g})"
+                )
         settings = IkSettings(
             joint_margin_rad=limits.joint_margin_rad, max_iterations=SOLVER_ITERATIONS
         )
@@ -281,7 +272,7 @@ class Shadow:
         values[1:] = self.collisions.distances(joints_rad)
         return values - self._stop
 
-    def _try(self, start: _Stand, pose: Pose, dt_s: float) -> tuple[_Stand, list[ReachHit]]:
+    def _try(self, start: _Stand, pose: Pose, dt_s: float) -> tuple[_Stand, list[LocatedHit]]:
         """Where a step would lead, and what forbids it."""
         found = self._approach(pose, start.joints_rad)
         # Where the start has no solution itself, coming nearer to having one is the way out.
@@ -297,11 +288,11 @@ class Shadow:
             start.barriers - NOISE,
         )
         hits = [
-            ReachHit(
+            LocatedHit(
                 self._names[index],
                 float(end.barriers[index] + self._stop[index]),
                 float(floor[index] + self._stop[index]),
-                self._where(index),
+                self._where(int(index)),
             )
             for index in np.flatnonzero(end.barriers < floor)
         ]
@@ -313,7 +304,7 @@ class Shadow:
     def _approach(self, pose: Pose, start_rad: FloatArray) -> Approach:
         return self._solver.approach(pose, start_rad, bounded=self.limits.free_elbow)
 
-    def _out_of_range(self, start: _Stand, joints_rad: FloatArray) -> ReachHit | None:
+    def _out_of_range(self, start: _Stand, joints_rad: FloatArray) -> LocatedHit | None:
         lower, upper = self._solver.bounds(start.joints_rad)
         excess = np.maximum(lower - joints_rad, joints_rad - upper)
         joint = int(np.argmax(excess))
@@ -321,13 +312,13 @@ class Shadow:
             return None
         value = float(joints_rad[joint])
         bound = float(lower[joint] if value < lower[joint] else upper[joint])
-        return ReachHit("joint_limit", value, bound, self.kinematics.arm_joints[joint])
+        return LocatedHit("joint_limit", value, bound, self.kinematics.arm_joints[joint])
 
-    def _out_of_reach(self, found: Approach) -> ReachHit:
+    def _out_of_reach(self, found: Approach) -> LocatedHit:
         tolerance = self._solver.settings.position_tolerance_m
-        return ReachHit("reach", found.error_m + found.error_rad, tolerance)
+        return LocatedHit("reach", found.error_m + found.error_rad, tolerance)
 
-    def _too_fast(self, start: _Stand, end: _Stand, dt_s: float) -> list[ReachHit]:
+    def _too_fast(self, start: _Stand, end: _Stand, dt_s: float) -> list[LocatedHit]:
         error = pose_error(end.pose, start.pose)
         time_s = max(
             dt_s,
@@ -340,7 +331,7 @@ class Shadow:
         if speed[joint] <= limit:
             return []
         name = self.kinematics.arm_joints[joint]
-        return [ReachHit("joint_velocity", float(speed[joint]), limit, name)]
+        return [LocatedHit("joint_velocity", float(speed[joint]), limit, name)]
 
     def _where(self, index: int) -> str:
         if index == 0:

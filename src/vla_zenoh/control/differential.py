@@ -1,0 +1,256 @@
+"""Joint positions that follow a stream of TCP poses, for arms that take joints.
+
+Each tick takes one damped Newton step to the pose and turns it into joint velocities that the
+joints can have. With ``e`` the error from joints to target, ``v`` the target's twist and J# the
+inverse damped near a singularity::
+
+    feed      = J# v
+    back      = J# e / dt - feed      bounded to what can be stopped within J# e - feed dt
+    qd_wanted = (feed + back) + (1 - J# J) kp (q_posture - q)
+
+    J#        = J^T (J J^T + W)^-1,   W = wmax (1 - (s / s0)^2)^2 1 where s < s0, else 0
+
+`feed` makes a smooth stream exact; the bound on `back` makes a far target one that is reached
+without overshoot. All joints are slowed by one factor to the velocity limits, the change of
+velocity is shortened to the acceleration limits, and no joint gets faster towards the end of its
+range than it can brake; a joint held back so is taken out and the others carry on without it.
+Towards a singularity all joints are slowed so that its singular value s falls no faster than
+``ka (s - s_stop)``: an arm that has slipped through one would come back in another branch.
+
+Damping: Nakamura, Hanafusa, "Inverse kinematic solutions with singularity robustness", J. Dyn.
+Sys. Meas. Control 108, 1986.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vla_zenoh.control.ik import pose_error
+from vla_zenoh.control.kinematics import Kinematics, smallest_singular_value
+from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.located import LocatedHit
+from vla_zenoh.control.so3 import Pose
+from vla_zenoh.errors import RecordError
+from vla_zenoh.types import FloatArray
+
+_IDENTITY_6 = np.eye(6)
+WATCHED = 4.0
+"""Times `damped_below` under which it is looked where the singular value goes."""
+BACK_SHARE = 0.7
+"""Part of the acceleration planned with on the way to a far target, whose path is curved."""
+ROUNDING_RAD_S = 1e-9
+PEEK_RAD = 1e-3
+"""How far the joints are moved to see that."""
+
+
+@dataclass(frozen=True, slots=True)
+class FollowSettings:
+    """How the joints follow.
+
+    Args:
+        acceleration_rad_s2: of every joint, one number or one per joint.
+        velocity_share: part of the URDF's joint velocities that is used.
+        joint_margin_rad: kept from both ends of every joint's range.
+        posture_1_s: rate at which a redundant arm goes to its posture.
+        posture_rad_s: and its greatest speed.
+        damped_below: singular value s0 below which the inverse is damped.
+        damping: wmax, of a singular arm.
+        singularity_stop: singular value s_stop the arm does not go below by itself.
+        singularity_1_s: ka, how fast it may come near.
+    """
+
+    acceleration_rad_s2: float | tuple[float, ...] = 10.0
+    velocity_share: float = 1.0
+    joint_margin_rad: float = 0.05
+    posture_1_s: float = 1.0
+    posture_rad_s: float = 0.2
+    damped_below: float = 0.03
+    damping: float = 4e-4
+    singularity_stop: float = 0.015
+    singularity_1_s: float = 5.0
+
+
+class JointMotion(NamedTuple):
+    """Where the joints are to be: (n,) rad and (n,) rad/s."""
+
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+
+
+class JointFollower:
+    """See the module.
+
+    Args:
+        kinematics: of the arm.
+        posture_rad: (n,) where a redundant arm prefers to be.
+        settings: see `FollowSettings`.
+
+    Raises:
+        RecordError: settings that do not fit the arm.
+    """
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        posture_rad: ArrayLike,
+        settings: FollowSettings | None = None,
+    ) -> None:
+        self.kinematics = kinematics
+        self.settings = settings = settings or FollowSettings()
+        self.posture_rad = np.array(posture_rad, dtype=np.float64)
+        self.acceleration_rad_s2 = np.array(settings.acceleration_rad_s2, dtype=np.float64)
+        if self.acceleration_rad_s2.ndim == 0:
+            self.acceleration_rad_s2 = np.full(kinematics.size, float(self.acceleration_rad_s2))
+        for name in ("posture_rad", "acceleration_rad_s2"):
+            values = getattr(self, name)
+            if values.shape != (kinematics.size,) or not np.isfinite(values).all():
+                raise RecordError(
+                    f"{name} must be {kinematics.size} finite numbers, got shape {values.shape}"
+                )
+        if not (self.acceleration_rad_s2 > 0).all() or not 0 < settings.velocity_share <= 1:
+            raise RecordError("acceleration_rad_s2 must be positive, velocity_share in (0, 1]")
+        self.velocity_rad_s = settings.velocity_share * kinematics.velocity_rad_s
+        self.lower_rad = kinematics.lower_rad + settings.joint_margin_rad
+        self.upper_rad = kinematics.upper_rad - settings.joint_margin_rad
+
+    def step(
+        self, now: JointMotion, target: Pose, twist: FloatArray, dt_s: float
+    ) -> tuple[JointMotion, list[LimitHit]]:
+        """The joints one tick later.
+
+        Args:
+            now: what the last call returned; at first the measured joints at rest.
+            target: pose the TCP is to have then.
+            twist: (6,) velocity it is to have then, m/s and rad/s in base axes.
+            dt_s: of the tick.
+
+        Returns:
+            joints within their ranges, velocities and accelerations, whatever the target; and
+            what kept them from it: ``joint_velocity``, ``joint_limit``, ``singularity``.
+        """
+        joints, velocity = now
+        here, jacobian = self.kinematics.pose_and_jacobian(joints)
+        error = pose_error(target, here)
+        singular_value = smallest_singular_value(jacobian)
+        hits: list[LimitHit] = []
+        if singular_value < self.settings.damped_below:
+            hits.append(LocatedHit("singularity", singular_value, self.settings.damped_below))
+        low, high = self._allowed(joints, velocity, dt_s)
+        held = np.zeros(len(joints), dtype=bool)
+        onto = np.zeros(len(joints))
+        while True:
+            wanted = self._wanted(joints, jacobian, error, twist, singular_value, held, onto, dt_s)
+            wanted *= self._share_near_singularity(joints, wanted, singular_value)
+            reached, ratio = self._reachable(wanted, velocity, dt_s)
+            excess = np.where(held, 0.0, np.maximum(reached - high, low - reached))
+            joint = int(np.argmax(excess))
+            if excess[joint] <= ROUNDING_RAD_S or held.sum() >= len(joints) - 1:
+                break
+            held[joint] = True
+            onto[joint] = min(max(reached[joint], low[joint]), high[joint])
+            bound = self.upper_rad if reached[joint] > high[joint] else self.lower_rad
+            place, name = float(joints[joint]), self.kinematics.arm_joints[joint]
+            hits.append(LocatedHit("joint_limit", place, float(bound[joint]), name))
+        if ratio > 1.0 + 1e-9:
+            joint = int(np.argmax(np.abs(wanted) / self.velocity_rad_s))
+            asked, limit = abs(float(wanted[joint])), float(self.velocity_rad_s[joint])
+            name = self.kinematics.arm_joints[joint]
+            hits.append(LocatedHit("joint_velocity", asked, limit, name))
+        reached = np.clip(reached, low, high)
+        return JointMotion(joints + reached * dt_s, reached), hits
+
+    def brake(self, now: JointMotion, dt_s: float) -> JointMotion:
+        """The joints one tick later when they are to stop as soon as they can."""
+        most = self.acceleration_rad_s2 * dt_s
+        velocity = now.velocity_rad_s - np.clip(now.velocity_rad_s, -most, most)
+        return JointMotion(now.position_rad + velocity * dt_s, velocity)
+
+    def _wanted(
+        self,
+        joints: FloatArray,
+        jacobian: FloatArray,
+        error: FloatArray,
+        twist: FloatArray,
+        singular_value: float,
+        held: FloatArray,
+        onto: FloatArray,
+        dt_s: float,
+    ) -> FloatArray:
+        settings = self.settings
+        posture = settings.posture_1_s * (self.posture_rad - joints)
+        fastest = float(np.abs(posture).max())
+        if fastest > settings.posture_rad_s:
+            posture *= settings.posture_rad_s / fastest
+        free = jacobian
+        if held.any():
+            posture = np.where(held, 0.0, posture)
+            free = np.where(held, 0.0, jacobian)
+            singular_value = smallest_singular_value(free)
+        taken = jacobian @ onto
+        damping = 1e-12
+        if singular_value < settings.damped_below:
+            share = 1.0 - (singular_value / settings.damped_below) ** 2
+            damping += settings.damping * share * share
+        right = np.stack([error / dt_s - taken, twist - taken, free @ posture], axis=1)
+        solved = free.T @ np.linalg.solve(free @ free.T + damping * _IDENTITY_6, right)
+        whole, feed = solved[:, 0], solved[:, 1]
+        back = whole - feed
+        most = _stoppable(np.abs(back) * dt_s, BACK_SHARE * self.acceleration_rad_s2, dt_s)
+        excess = float(np.max(np.abs(back) / np.maximum(most, 1e-12)))
+        if excess > 1.0:
+            back = back / excess
+        return np.where(held, onto, feed + back + posture - solved[:, 2])
+
+    def _share_near_singularity(
+        self, joints: FloatArray, wanted: FloatArray, singular_value: float
+    ) -> float:
+        """Part of the velocities `wanted` at which a singularity comes near slowly enough."""
+        settings = self.settings
+        fastest = float(np.abs(wanted).max())
+        if singular_value > WATCHED * settings.damped_below or fastest == 0.0:
+            return 1.0
+        ahead = joints + wanted * (PEEK_RAD / fastest)
+        after = smallest_singular_value(self.kinematics.jacobian(ahead))
+        # At the speed it can really have, or the rate would be that of a wish.
+        share = 1.0 / max(1.0, float(np.max(np.abs(wanted) / self.velocity_rad_s)))
+        fall_1_s = (singular_value - after) / PEEK_RAD * fastest * share
+        allowed = settings.singularity_1_s * max(singular_value - settings.singularity_stop, 0.0)
+        return share * allowed / fall_1_s if fall_1_s > allowed else 1.0
+
+    def _reachable(
+        self, wanted: FloatArray, velocity: FloatArray, dt_s: float
+    ) -> tuple[FloatArray, float]:
+        """`wanted` slowed to the velocity limits, then as near to it as one tick can get."""
+        ratio = float(np.max(np.abs(wanted) / self.velocity_rad_s))
+        if ratio > 1.0:
+            wanted = wanted / ratio
+        change = wanted - velocity
+        excess = float(np.max(np.abs(change) / (self.acceleration_rad_s2 * dt_s)))
+        return (velocity + change / excess if excess > 1.0 else wanted), ratio
+
+    def _allowed(
+        self, joints: FloatArray, velocity: FloatArray, dt_s: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest velocities (n,) from which every joint can stop within its range."""
+        most = self.acceleration_rad_s2 * dt_s
+        up = _stoppable(np.maximum(self.upper_rad - joints, 0.0), self.acceleration_rad_s2, dt_s)
+        down = _stoppable(np.maximum(joints - self.lower_rad, 0.0), self.acceleration_rad_s2, dt_s)
+        # Where the two disagree (put outside its range, or found too fast) acceleration wins.
+        high = np.maximum(np.minimum(up, self.velocity_rad_s), velocity - most)
+        low = np.minimum(np.maximum(-down, -self.velocity_rad_s), velocity + most)
+        return np.maximum(low, velocity - most), np.minimum(high, velocity + most)
+
+
+def _stoppable(distance: FloatArray, acceleration: FloatArray, dt_s: float) -> FloatArray:
+    """Greatest velocity from which joints that change it once a tick stop within `distance`.
+
+    After ``v dt`` come ``(v - a dt) dt``, ``(v - 2 a dt) dt``, ...: with k whole ticks of braking
+    ``distance = (k + 1) v dt - k (k + 1) / 2 a dt^2``.
+    """
+    unit = acceleration * (dt_s * dt_s)
+    ticks = np.floor(np.sqrt(0.25 + 2.0 * distance / unit) - 0.5)
+    return (distance / (ticks + 1.0) + 0.5 * ticks * unit) / dt_s
