@@ -37,6 +37,10 @@ DECAY = 0.5
 """Part of the way to a stop that one step may take once it is nearer than `slow`."""
 HALVINGS = 4
 REFINEMENTS = 4
+SMALLEST_FRACTION = 1 / 128
+"""Less than this of a step is nothing."""
+GUESS_SHORT = 0.95
+"""A linear guess of the feasible part is taken a little shorter: most barriers bend downwards."""
 SOLVER_ITERATIONS = 12
 """Steps are short and the start is near: who has not arrived by then will not."""
 SAME_POSE = 1e-9
@@ -232,25 +236,37 @@ class Shadow:
         if not hits:
             self._here = end
             return asked, []
-        turn = pose_error(asked, before)
+        step = pose_error(asked, before)
         best, low, high = start, 0.0, 1.0
-        for halving in range(1, HALVINGS + 1):
-            fraction = 0.5**halving
-            end, found = self._try(start, _part(before, turn, fraction), dt_s)
+        fraction = self._guess(start, end, hits)
+        for _ in range(HALVINGS):
+            if fraction < SMALLEST_FRACTION:
+                break
+            end, found = self._try(start, _part(before, step, fraction), dt_s)
             if not found:
                 best, low = end, fraction
                 break
-            high, hits = fraction, found
+            high, hits, fraction = fraction, found, fraction / 2
         if low > 0.0:
             for _ in range(REFINEMENTS):
                 fraction = 0.5 * (low + high)
-                end, found = self._try(start, _part(before, turn, fraction), dt_s)
+                end, found = self._try(start, _part(before, step, fraction), dt_s)
                 if found:
                     high, hits = fraction, found
                 else:
                     best, low = end, fraction
         self._here = best
         return (best.pose if low > 0.0 else before), list(hits)
+
+    def _guess(self, start: _Stand, end: _Stand, hits: Sequence[LocatedHit]) -> float:
+        """Where to begin to look for the feasible part, from how the whole step failed."""
+        if end is start or start.error > 0 or start.barriers.min() <= 0:
+            return 0.5
+        if hits[0].name == "joint_velocity":
+            return GUESS_SHORT * hits[0].limit / hits[0].value
+        room = start.barriers - self._floor(start)
+        fall = np.maximum(start.barriers - end.barriers, 1e-12)
+        return GUESS_SHORT * min(1.0, float((room / fall).min()))
 
     # -- one place ----------------------------------------------------------------------------
     def _stand_at(self, pose: Pose, start_rad: FloatArray | None) -> _Stand:
@@ -282,11 +298,7 @@ class Shadow:
         if outside is not None:
             return start, [outside]
         end = self._stand(pose, found)
-        floor = np.where(
-            start.barriers > 0,
-            np.minimum(self._slow - self._stop, (1 - DECAY) * start.barriers),
-            start.barriers - NOISE,
-        )
+        floor = self._floor(start)
         hits = [
             LocatedHit(
                 self._names[index],
@@ -300,6 +312,17 @@ class Shadow:
         if not hits and not leaving:
             hits = self._too_fast(start, end, dt_s)
         return end, hits
+
+    def _floor(self, start: _Stand) -> FloatArray:
+        """What the barriers may come down to in one step from there."""
+        floor = np.where(
+            start.barriers > 0,
+            np.minimum(self._slow - self._stop, (1 - DECAY) * start.barriers),
+            start.barriers - NOISE,
+        )
+        if start.error > 0:  # an arm that points to what it cannot reach is singular
+            floor[0] = -np.inf
+        return floor
 
     def _approach(self, pose: Pose, start_rad: FloatArray) -> Approach:
         return self._solver.approach(pose, start_rad, bounded=self.limits.free_elbow)
