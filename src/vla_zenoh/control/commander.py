@@ -490,6 +490,8 @@ class Commander:
         return "" if self.dry_run else self._blocked()
 
     def _blocked(self) -> str:
+        if not self._streaming:
+            return ""
         limits = self.profile.limits
         for apart, limit, excused, back_off, unit in (
             (self.tracking_m, limits.tracking_m, self._excused[0], BACK_OFF_M, "m"),

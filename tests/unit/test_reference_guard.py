@@ -1,0 +1,250 @@
+"""The robot's side of the pose stream: what it follows, refuses, and does in silence."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vla_zenoh.control.reference import GuardLimits, ReferenceGuard, guard_limits
+from vla_zenoh.control.smoothing import MotionLimits, Smoother, motion_limits
+from vla_zenoh.control.so3 import Pose, angle_between, exp3, norm3, quat_from_rotation
+from vla_zenoh.profile import load_profile
+from vla_zenoh.types import Header, PoseCommand, Stamped
+
+MS = 1_000_000
+TICK_S, STREAM_S = 0.001, 0.004
+BRAKE = MotionLimits((1.0, 4.0, 40.0), (3.0, 12.0, 120.0))
+LIMITS = GuardLimits(0.1, BRAKE)
+START = Pose(np.array([0.43, 0.0, 0.3]), exp3(np.array([3.0, 0.1, 0.0])))
+SOURCE = "command-1"
+PATH_ATOL_M = 5e-5  # what clocks may drift apart while a command is held up
+FOLLOWED_M, FOLLOWED_RAD = 1e-4, 1e-3
+RTOL = 1e-6
+
+
+class Line:
+    """Commands along x at a constant speed, stamped on the clock of their writer."""
+
+    def __init__(self, speed: float, ahead_ns: int = 0) -> None:
+        self.speed, self.ahead_ns, self.seq = speed, ahead_ns, 0
+
+    def x(self, t_ns: int) -> float:
+        return float(START.position_m[0]) + self.speed * t_ns / 1e9
+
+    def at(self, t_ns: int, arrives_ns: int | None = None, **how: Any) -> Stamped[PoseCommand]:
+        self.seq += 1
+        header = Header(10**15 + t_ns + self.ahead_ns, self.seq, SOURCE)
+        return command(
+            self.x(t_ns), self.speed, header, t_ns if arrives_ns is None else arrives_ns, **how
+        )
+
+
+def command(
+    x: float,
+    speed: float,
+    header: Header,
+    arrives_ns: int,
+    *,
+    spin: float = 0.0,
+    acceleration: float = 0.0,
+) -> Stamped[PoseCommand]:
+    quat = quat_from_rotation(START.rotation)
+    position_m = np.array([x, 0.0, 0.3])
+    twist = np.array([speed, 0, 0, spin, 0, 0])
+    change = np.array([acceleration, 0, 0, 0, 0, 0])
+    record = PoseCommand(position_m, quat, twist, change, position_m, quat, "active")
+    return Stamped(header, record, 10**15 + arrives_ns)
+
+
+def guard() -> ReferenceGuard:
+    return ReferenceGuard(START, TICK_S, LIMITS)
+
+
+def now(t_ns: int) -> int:
+    return 10**15 + t_ns
+
+
+def test_it_stands_until_somebody_commands() -> None:
+    side = guard()
+    for t in range(100):
+        motion = side.tick(now(t * MS))
+    np.testing.assert_array_equal(motion.pose.position_m, START.position_m)
+    assert not side.following
+
+
+@pytest.mark.parametrize("ahead_ns", [0, 10**12, -5 * 10**11])
+def test_between_two_commands_it_goes_on_along_the_path_whatever_clock_they_are_stamped_by(
+    ahead_ns: int,
+) -> None:
+    side, line = guard(), Line(0.3, ahead_ns)
+    for t in range(500):
+        if t % 4 == 0:
+            assert side.offer(line.at(t * MS), now(t * MS)) is None
+        x = float(side.tick(now(t * MS)).pose.position_m[0])
+        assert x == pytest.approx(line.x(t * MS), abs=1e-9)
+
+
+@pytest.mark.parametrize("held_up_ms", [5, 30, 80])
+def test_a_command_that_was_held_up_on_its_way_does_not_pull_it_back(held_up_ms: int) -> None:
+    side, line, before = guard(), Line(0.4), 0.0
+    for t in range(600):
+        if t == 200 + held_up_ms:  # all that were held up arrive at once
+            for late in range(200, t, 4):
+                side.offer(line.at(late * MS, arrives_ns=t * MS), now(t * MS))
+        if t % 4 == 0 and not 200 <= t < 200 + held_up_ms:
+            side.offer(line.at(t * MS), now(t * MS))
+        x = float(side.tick(now(t * MS)).pose.position_m[0])
+        assert x == pytest.approx(line.x(t * MS), abs=PATH_ATOL_M)
+        assert x > before
+        before = x
+
+
+def test_one_stamp_from_the_future_does_not_spoil_the_clock() -> None:
+    side, line = guard(), Line(0.3)
+    for t in range(0, 400, 4):
+        given = line.at(t * MS)
+        if t == 200:
+            header = Header(given.header.stamp_wall_ns + 5 * 10**9, given.header.seq, SOURCE)
+            given = Stamped(header, given.record, given.received_ns)
+        side.offer(given, now(t * MS))
+        for ms in range(t, t + 4):
+            x = float(side.tick(now(ms * MS)).pose.position_m[0])
+            assert x == pytest.approx(line.x(ms * MS), abs=1e-6)
+
+
+def test_a_real_stream_is_followed_closely() -> None:
+    side, leader = (
+        guard(),
+        Smoother(START, STREAM_S, motion_limits(load_profile("panda_sim").limits)),
+    )
+    turned = exp3(np.array([0.0, 0.3, 0.2])) @ START.rotation
+    leader.target(Pose(START.position_m + [0.1, 0.05, -0.1], turned))
+    for k in range(400):
+        sent = leader.tick()
+        quat = quat_from_rotation(sent.pose.rotation)
+        record = PoseCommand(
+            sent.pose.position_m, quat, sent.twist, sent.acceleration, START.position_m, quat, ""
+        )
+        at_ns = now(k * 4 * MS)
+        assert side.offer(Stamped(Header(at_ns, k, SOURCE), record, at_ns), at_ns) is None
+        for ms in range(4):
+            motion = side.tick(at_ns + ms * MS)
+            assert norm3(motion.pose.position_m - sent.pose.position_m) < ms * 6e-4 + FOLLOWED_M
+        assert angle_between(motion.pose.rotation, sent.pose.rotation) < 3 * 1.6e-3 + FOLLOWED_RAD
+
+
+def test_a_second_writer_is_foreign_while_the_first_one_speaks() -> None:
+    side, line = guard(), Line(0.0)
+    side.offer(line.at(0), now(0))
+    other = command(0.43, 0.0, Header(now(4 * MS), 1, "command-2"), 4 * MS)
+    assert side.offer(other, now(4 * MS)) == "foreign"
+    for t in range(120):
+        side.tick(now(t * MS))
+    assert not side.following
+    assert side.offer(other, now(120 * MS)) is None
+
+
+def test_a_command_that_comes_again_or_late_is_replayed() -> None:
+    side, line = guard(), Line(0.0)
+    first, second = line.at(0), line.at(4 * MS)
+    assert side.offer(second, now(4 * MS)) is None
+    assert side.offer(first, now(4 * MS)) == "replayed"
+    assert side.offer(second, now(8 * MS)) == "replayed"
+
+
+@pytest.mark.parametrize(("x", "reason"), [(0.449, None), (0.451, "jump"), (0.4, "jump")])
+def test_a_jump_is_refused(x: float, reason: str | None) -> None:
+    assert guard().offer(command(x, 0.0, Header(now(0), 1, SOURCE), 0), now(0)) == reason
+
+
+def test_a_turn_that_jumps_is_refused() -> None:
+    side = guard()
+    quat = quat_from_rotation(exp3(np.array([0.0, 0.0, 0.11])) @ START.rotation)
+    at_m = START.position_m
+    record = PoseCommand(at_m, quat, np.zeros(6), np.zeros(6), at_m, quat, "active")
+    assert side.offer(Stamped(Header(now(0), 1, SOURCE), record, now(0)), now(0)) == "jump"
+
+
+@pytest.mark.parametrize(
+    "how", [{"speed": 2.1}, {"spin": 6.1}, {"acceleration": 8.1}], ids=lambda how: next(iter(how))
+)
+def test_a_command_faster_than_any_stream_of_ours_is_refused(how: dict[str, float]) -> None:
+    speed = how.pop("speed", 0.0)
+    given = command(0.43, speed, Header(now(0), 1, SOURCE), 0, **how)
+    assert guard().offer(given, now(0)) == "too_fast"
+
+
+def test_silence_in_motion_is_a_brake_within_the_limits() -> None:
+    side, line = guard(), Line(0.5)
+    for t in range(200):
+        if t % 4 == 0:
+            side.offer(line.at(t * MS), now(t * MS))
+        before = side.tick(now(t * MS))
+    end_ns = 196 * MS
+    braking = []
+    for t in range(200, 1500):
+        motion = side.tick(now(t * MS))
+        jerk = (motion.acceleration - before.acceleration) / TICK_S
+        assert np.abs(jerk[:3]).max() <= BRAKE.translation[2] * (1 + RTOL)
+        assert np.abs(motion.acceleration[:3]).max() <= BRAKE.translation[1] * (1 + RTOL)
+        step_m = motion.pose.position_m[0] - before.pose.position_m[0]
+        assert -1e-12 <= step_m <= 0.5 * TICK_S * (1 + RTOL)
+        if side.braking:
+            braking.append(t * MS - end_ns)
+        before = motion
+    assert braking[0] == pytest.approx(LIMITS.timeout_s * 1e9, abs=2 * MS)
+    assert side.silences == 1
+    assert not side.braking
+    np.testing.assert_array_equal(before.twist, np.zeros(6))
+
+
+def test_while_it_brakes_by_itself_it_takes_no_commands_and_afterwards_it_does() -> None:
+    side, line = guard(), Line(0.5)
+    for t in range(100):
+        if t % 4 == 0:
+            side.offer(line.at(t * MS), now(t * MS))
+        side.tick(now(t * MS))
+    t = 100
+    while not side.braking:
+        side.tick(now(t * MS))
+        t += 1
+    assert side.offer(line.at(t * MS), now(t * MS)) == "braking"
+    while side.braking:
+        side.tick(now(t * MS))
+        t += 1
+    x = float(side.motion.pose.position_m[0])
+    assert (
+        side.offer(command(x, 0.0, Header(now(t * MS), 1000, SOURCE), t * MS), now(t * MS)) is None
+    )
+
+
+def test_a_stream_that_ends_at_rest_has_ended_on_purpose() -> None:
+    side, line = guard(), Line(0.0)
+    for t in range(300):
+        if t == 0:
+            side.offer(line.at(0), now(0))
+        motion = side.tick(now(t * MS))
+    assert side.silences == 0
+    assert not side.following
+    np.testing.assert_array_equal(motion.pose.position_m, START.position_m)
+
+
+def test_restart_follows_nobody_from_another_place() -> None:
+    side, line = guard(), Line(0.4)
+    side.offer(line.at(0), now(0))
+    there = Pose(np.array([0.5, 0.2, 0.2]), START.rotation)
+    side.restart(there)
+    motion = side.tick(now(MS))
+    assert not side.following
+    np.testing.assert_array_equal(motion.pose.position_m, there.position_m)
+    np.testing.assert_array_equal(motion.twist, np.zeros(6))
+
+
+def test_the_robots_own_stop_may_be_twice_as_hard_as_the_stream() -> None:
+    profile = load_profile("panda_sim")
+    limits = guard_limits(profile)
+    assert limits.timeout_s == profile.timing.command_timeout_s
+    assert limits.brake.translation == (1.0, 4.0, 40.0)
+    assert limits.brake.rotation == (3.0, 12.0, 120.0)
