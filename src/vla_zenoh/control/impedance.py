@@ -183,6 +183,19 @@ class ImpedanceController:
         if posture_rad is not None:
             self._posture_rad = np.array(posture_rad, float)
 
+    def take_over(self, torque_nm: FloatArray, state: ArmState) -> None:
+        """Begin where another law held the arm at rest with `torque_nm` (n,), in that posture.
+
+        What that torque carried at the TCP beyond the model (friction, payload) goes into the
+        integral, so that the first torque of this law equals the last of the other there.
+        """
+        compliance = np.linalg.solve(state.inertia, state.jacobian.T)
+        mobility, axes = np.linalg.eigh(state.jacobian @ compliance)
+        task_inertia = (axes / np.maximum(mobility, MIN_MOBILITY)) @ axes.T
+        wrench = task_inertia @ (compliance.T @ (torque_nm - state.bias_nm))
+        self._integral = np.minimum(np.maximum(wrench, -self._integral_limit), self._integral_limit)
+        self._posture_rad = state.position_rad.copy()
+
     def torque(self, reference: Reference, state: ArmState) -> ImpedanceOutput:
         """One control period: joint torques that pull the TCP to `reference`."""
         jacobian, transposed = state.jacobian, state.jacobian.T
