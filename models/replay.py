@@ -16,6 +16,7 @@ Run it with ``vla-zenoh worker replay --set file=runs/.../chunks.npz``.
 from __future__ import annotations
 
 import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -34,10 +35,10 @@ class Replay:
     def __init__(self, file: str) -> None:
         path = Path(file).expanduser()
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with path.open("rb") as opened, np.load(opened, allow_pickle=False) as data:
                 spec = ModelSpec.from_dict(json.loads(str(data["spec"])))
-                steps, length = np.array(data["steps"], np.float32), np.array(data["length"])
-        except (OSError, KeyError, ValueError) as error:
+                steps, length = np.array(data["steps"], np.float32), data["length"].astype(int)
+        except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
             raise SpecError(f"{path} is not a chunk file: {error}") from error
         if steps.ndim != 3 or length.shape != steps.shape[:1]:
             raise SpecError(f"{path}: steps {steps.shape} and length {length.shape} do not fit")

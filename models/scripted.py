@@ -68,35 +68,42 @@ class Scripted:
 
     def reset(self) -> None:
         """Begin to count anew."""
-        self._begun = 0  # steps before the last chunk
-        self._last_stamp_ns = -1
-        self._last_length = 0
+        self._plan = [(0.0, 0.0)]  # steps and way (m or rad) at the end of every step given last
+        self._observed_ns = -1
 
     def infer(self, observation: Observation) -> ActionSteps:
         """The next chunk of the motion the prompt names."""
         asked = parse_hard(observation.prompt)
         if self._delay_s:
             time.sleep(self._delay_s * (1 + self._jitter * self._random.uniform(-1, 1)))
-        done_steps = self._done_steps(observation.stamp_wall_ns)
-        horizon = self.spec.action.horizon
-        left = horizon if asked.steps is None else max(asked.steps - done_steps, 0)
-        steps = np.zeros((horizon, self.spec.action.dimension), np.float32)
-        length = min(left, horizon)
-        if asked.motion is not None:
-            for index in range(length):
-                steps[index, asked.motion.axis] = asked.step(done_steps + index)
+        plan = [self._reached(observation.stamp_wall_ns)]
+        begun, _ = plan[0]
+        last = begun + self.spec.action.horizon if asked.steps is None else float(asked.steps)
+        while asked.motion is not None and len(plan) <= self.spec.action.horizon:
+            if plan[-1][0] >= last:
+                break
+            steps = min(begun + len(plan), last)
+            plan.append((steps, asked.offset(steps)))
+        given = np.zeros((max(len(plan) - 1, 1), self.spec.action.dimension), np.float32)
+        if asked.motion is not None and len(plan) > 1:
+            given[:, asked.motion.axis] = np.diff([way for _, way in plan])
         # Before the arm is given to us nothing is counted: nobody carries it out.
         if observation.task.active:
-            self._begun, self._last_length = done_steps, length
-            self._last_stamp_ns = observation.stamp_wall_ns
+            self._plan, self._observed_ns = plan, observation.stamp_wall_ns
         # The last step of a longer chunk has not begun when the chunk is sent.
-        done = asked.motion is None or (asked.steps is not None and left <= min(horizon, 1))
-        return ActionSteps(steps[: max(length, 1)], done)
+        done = asked.motion is None or (asked.steps is not None and last - begun <= 1.0)
+        return ActionSteps(given, done)
 
-    def _done_steps(self, stamp_ns: int) -> int:
-        """Steps that were in force when this observation was taken: the next one stands on them."""
-        if self._last_stamp_ns < 0:
-            return self._begun
-        dt_ns = int(self.spec.action.dt_s * 1e9)
-        begun = (stamp_ns - self._last_stamp_ns) // dt_ns + 1
-        return self._begun + min(begun, self._last_length)
+    def _reached(self, stamp_ns: int) -> tuple[float, float]:
+        """Steps and way that were asked for until this observation: the next chunk begins there.
+
+        As the command node counts: by time, and the first step at least.
+        """
+        passed = (stamp_ns - self._observed_ns) / int(self.spec.action.dt_s * 1e9)
+        passed = min(max(passed, 1.0), len(self._plan) - 1.0)
+        index = int(passed)
+        if index + 1 >= len(self._plan):
+            return self._plan[-1]
+        (steps, way), (next_steps, next_way) = self._plan[index : index + 2]
+        share = passed - index
+        return steps + share * (next_steps - steps), way + share * (next_way - way)

@@ -66,7 +66,7 @@ class HardPrompt(NamedTuple):
     steps: int | None
     within: float | None = None
 
-    def offset(self, steps: int) -> float:
+    def offset(self, steps: float) -> float:
         """Where the asked axis is after `steps` of them, in m or rad from the start."""
         if self.motion is None:
             return 0.0
@@ -76,7 +76,7 @@ class HardPrompt(NamedTuple):
         """What step `index` (from 0) asks for, in m or rad."""
         return self.offset(index + 1) - self.offset(index)
 
-    def _folded(self, steps: int) -> int:
+    def _folded(self, steps: float) -> float:
         if self.motion is None or self.within is None:
             return steps
         leg = max(1, int(self.within / abs(self.motion.step) + 1e-9))

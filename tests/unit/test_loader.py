@@ -1,0 +1,176 @@
+"""Finding a model file, reading its PEP 723 header, making its class; what is said of bad ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from vla_zenoh.errors import ResourceError, WorkerError
+from vla_zenoh.loader import find_model, make_policy
+
+HEADER = """\
+# /// script
+# requires-python = ">=3.11"
+# dependencies = [
+#   "numpy>=1.26",
+#   "no-such-distribution==1.0",
+# ]
+# ///
+"""
+MODEL = """\
+from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec
+
+class Still:
+    def __init__(self, size: str = "1"):
+        self.size = float(size)
+        self.spec = ModelSpec(name="still", action=ActionSpec(horizon=1, dt_s=0.1))
+
+    def infer(self, observation):
+        return ActionSteps([[0.0] * 7])
+"""
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    def write(text: str, name: str = "mine.py") -> str:
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(text.encode())
+        return str(path)
+
+    return write
+
+
+def test_a_header_says_what_the_model_needs(write) -> None:
+    model = find_model(write(HEADER + MODEL))
+    assert model.name == "mine"
+    assert model.requires_python == ">=3.11"
+    assert model.dependencies == ("numpy>=1.26", "no-such-distribution==1.0")
+    assert model.missing() == ["no-such-distribution==1.0"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["\ufeff" + HEADER + MODEL, (HEADER + MODEL).replace("\n", "\r\n")]
+    + ['"""Doc first."""\n' + HEADER + MODEL, HEADER.replace("# ///\n", "#\n# ///\n") + MODEL],
+    ids=["byte order mark", "Windows line ends", "after a docstring", "an empty comment line"],
+)
+def test_a_header_is_found_in_files_of_many_editors(write, text: str) -> None:
+    assert len(find_model(write(text)).dependencies) == 2
+
+
+def test_a_file_without_a_header_needs_nothing(write) -> None:
+    model = find_model(write("# /// pyproject\n# dependencies = 3\n# ///\n" + MODEL))
+    assert model.dependencies == ()
+    assert model.requires_python is None
+    assert model.missing() == []
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("# /// script\n# dependencies = [\n# ///\n", "script header is not valid TOML"),
+        ('# /// script\n# dependencies = "numpy"\n# ///\n', "must be a list of texts"),
+        ("# /// script\n# dependencies = [3]\n# ///\n", "must be a list of texts"),
+        ("# /// script\n# requires-python = 3.11\n# ///\n", "requires-python .* must be a text"),
+        (HEADER + "\n" + HEADER, "has 2 script headers; PEP 723 allows one"),
+    ],
+)
+def test_a_header_that_cannot_be_read_is_refused(write, text: str, match: str) -> None:
+    with pytest.raises(WorkerError, match=match):
+        find_model(write(text))
+
+
+def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    path.write_bytes(b"\xff\xfe\x00bad")
+    with pytest.raises(WorkerError, match="cannot be read"):
+        find_model(str(path))
+
+
+def test_a_folder_is_a_model_when_it_holds_a_model_file(write, tmp_path: Path) -> None:
+    write(MODEL, "big/model.py")
+    model = find_model(str(tmp_path / "big"))
+    assert model.name == "big"
+    assert make_policy(model).spec.name == "still"
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ResourceError, match=r"a folder without a model\.py"):
+        find_model(str(tmp_path / "empty"))
+
+
+def test_an_unknown_name_lists_what_there_is() -> None:
+    with pytest.raises(ResourceError, match="did you mean 'scripted'"):
+        find_model("scriptd")
+
+
+def test_options_reach_the_constructor_as_text(write) -> None:
+    policy = make_policy(find_model(write(MODEL)), {"size": "2.5"})
+    assert policy.size == 2.5  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"colour": "red"}, r"unexpected keyword .* \(options it takes: size\)"),
+        ({"size": "big"}, "could not convert"),
+    ],
+)
+def test_bad_options_are_refused_with_those_there_are(
+    write, options: dict[str, str], match: str
+) -> None:
+    with pytest.raises(WorkerError, match=match):
+        make_policy(find_model(write(MODEL)), options)
+
+
+TWO = MODEL + MODEL.replace("Still", "Other").replace('"still"', '"other"')
+
+
+def test_two_classes_need_a_name(write) -> None:
+    with pytest.raises(WorkerError, match=r"found: Still, Other; .* MODEL = ClassName"):
+        make_policy(find_model(write(TWO)))
+    assert make_policy(find_model(write(TWO + "MODEL = Other\n"))).spec.name == "other"
+
+
+def test_an_imported_class_is_not_taken_for_the_files_own(write) -> None:
+    text = "from vla_zenoh.policy import Policy\n" + MODEL
+    assert make_policy(find_model(write(text))).spec.name == "still"
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("x = 1\n", "wanted one class with a method infer, found: none"),
+        ("def broken(:\n", "cannot be imported: SyntaxError"),
+        ("import no_such_module_at_all\n", "cannot be imported: ModuleNotFoundError"),
+        ("import sys\nsys.exit(3)\n", "cannot be imported: SystemExit: 3"),
+        ("1 / 0\n", "cannot be imported: ZeroDivisionError"),
+        ("class A:\n    def infer(self, o): ...\n", "needs a property `spec`"),
+        ("class A:\n    spec = 3\n    def infer(self, o): ...\n", "needs a property `spec`"),
+        (
+            "class A:\n    def infer(self, o): ...\n    spec = property(lambda self: 1 / 0)\n",
+            "the spec of A cannot be read: ZeroDivisionError",
+        ),
+        (MODEL + "MODEL = 3\n", "MODEL must be a class, it is a int"),
+        (MODEL + "MODEL = dict\n", "dict needs a property `spec`"),
+        (MODEL.replace("horizon=1", "horizon=0"), "Still cannot be made: .*horizon"),
+    ],
+)
+def test_a_broken_model_file_is_named_with_its_fault(write, text: str, match: str) -> None:
+    with pytest.raises(WorkerError, match=f"(?s){match}"):
+        make_policy(find_model(write(text)))
+
+
+def test_a_file_that_is_not_python_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("a: 1\n")
+    with pytest.raises(WorkerError, match="is not a Python file"):
+        make_policy(find_model(str(tmp_path / "mine.yaml")))
+
+
+def test_a_model_may_hold_dataclasses(write) -> None:
+    # They look their module up by name while they are made.
+    text = (
+        "from __future__ import annotations\nfrom dataclasses import dataclass\n\n"
+        "@dataclass(slots=True)\nclass Note:\n    text: str = ''\n\n" + MODEL
+    )
+    assert make_policy(find_model(write(text))).spec.name == "still"
