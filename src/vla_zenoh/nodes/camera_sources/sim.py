@@ -10,7 +10,12 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from vla_zenoh.errors import MissingExtraError, NodeError, RecordError, VlaZenohError
+from vla_zenoh.nodes.camera_sources.coarseness import Coarseness
 from vla_zenoh.nodes.camera_sources.outlet import OK, Outlet
 from vla_zenoh.nodes.camera_sources.source import STALL_S
 from vla_zenoh.nodes.slots import Arrival, Latest
@@ -20,6 +25,7 @@ from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.types import SceneState, Stamped
 
+RAYCAST = "raycast"
 WAKE_S = 0.1
 IDLE_PERIOD_S = 1.0
 """With nobody listening one picture in this time is drawn, to know that it can be."""
@@ -48,6 +54,9 @@ class SimCameras:
         self._profile, self._views, self._slot = profile, tuple(views), slot
         self._read, self._refuse = read, refuse
         self._drawn_ns = {outlet.name: 0 for _, outlet in self._views}
+        self._coarseness = {
+            outlet.name: Coarseness(outlet.profile.rate_hz) for _, outlet in self._views
+        }
         self._heard_ns = time.monotonic_ns()
         self.renderer = "not ready yet"
 
@@ -146,13 +155,27 @@ class SimCameras:
             in_time = outlet.in_time(stamp_ns)
             proof_due = mono_ns - self._drawn_ns[outlet.name] > IDLE_PERIOD_S * 1e9
             if in_time if outlet.wanted else proof_due:
-                rgb = renderer.render(camera, outlet.profile.width, outlet.profile.height)
-                if rgb.shape != (outlet.profile.height, outlet.profile.width, 3):
-                    raise NodeError(f"the renderer drew a picture of shape {rgb.shape}")
+                rgb = self._draw(renderer, camera, outlet)
                 outlet.put_rgb(rgb, mono_ns, stamp_ns)
                 self._drawn_ns[outlet.name] = mono_ns
                 outlet.change(OK)
             outlet.seen(mono_ns)
+
+    def _draw(self, renderer: Renderer, camera: str, outlet: Outlet) -> NDArray[np.uint8]:
+        """One picture in full size; coarser inside where ray casting would be too slow."""
+        width, height = outlet.profile.width, outlet.profile.height
+        coarseness = self._coarseness[outlet.name]
+        began = time.perf_counter()
+        step = coarseness.step
+        rgb = renderer.render(camera, -(-width // step), -(-height // step))
+        if step > 1:
+            rgb = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR))
+        if rgb.shape != (height, width, 3):
+            raise NodeError(f"the renderer drew a picture of shape {rgb.shape}")
+        if renderer.backend.name == RAYCAST:
+            coarseness.took(time.perf_counter() - began)
+            outlet.backend = RAYCAST if coarseness.step == 1 else f"{RAYCAST} 1/{coarseness.step}"
+        return rgb
 
     def _lose_all(self, why: str) -> None:
         for _, outlet in self._views:
