@@ -15,11 +15,12 @@ from vla_zenoh import keys as key_names
 from vla_zenoh.codec import records, settings
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.so3 import quat_from_rotation
+from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.clock import FixedRate, make_this_thread_realtime
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
 from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.slots import Inbox, Latest
+from vla_zenoh.nodes.slots import Arrival, Inbox, Latest, Mailbox
 from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.nodes.surroundings import Neighbours
 from vla_zenoh.profile import Profile
@@ -49,13 +50,13 @@ class CommandNode:
         self._chunks = node.listen(keys.all_deltas, Inbox(64))
         self._pose_slot = node.listen(keys.state_pose, Latest())
         self._gripper_slot = node.listen(keys.state_gripper, Latest())
-        self._settings: list[tuple[str, Inbox, Callable[[bytes], Any]]] = [
-            ("stop", node.listen(keys.stop, Inbox(8)), lambda _: None),
-            ("reset", node.listen(keys.reset, Inbox(8)), lambda _: None),
-            ("prompt", node.listen(keys.prompt, Inbox(16)), settings.decode_text),
-            ("worker", node.listen(keys.worker, Inbox(16)), settings.decode_name),
-            ("rate", node.listen(keys.rate, Inbox(16)), settings.decode_rate),
-            ("active", node.listen(keys.active, Inbox(16)), settings.decode_bool),
+        self._settings: list[tuple[str, Mailbox, Callable[[bytes], Any]]] = [
+            ("stop", node.listen(keys.stop, Mailbox(8)), lambda _: None),
+            ("reset", node.listen(keys.reset, Mailbox(8)), lambda _: None),
+            ("prompt", node.listen(keys.prompt, Mailbox(16)), settings.decode_text),
+            ("worker", node.listen(keys.worker, Mailbox(16)), settings.decode_name),
+            ("rate", node.listen(keys.rate, Mailbox(16)), settings.decode_rate),
+            ("active", node.listen(keys.active, Mailbox(16)), settings.decode_bool),
         ]
         self._pose_out = node.stream(keys.command_pose, Kind.CONTROL)
         self._gripper_out = node.stream(keys.command_gripper, Kind.ORDER)
@@ -142,23 +143,36 @@ class CommandNode:
                 value = self.node.read_text(decode, arrival)
                 if value is not None:
                     put.append(Setting(name, value))
-        chunks: list[Stamped[ActionChunk]] = []
-        for arrival in self._chunks.take_all():
-            chunk = self.node.read(ActionChunk, arrival)
-            if chunk is None:
-                continue
-            if key_names.last(str(arrival.sample.key_expr)) != chunk.record.worker:
-                self.node.refuse("foreign", "a chunk on another worker's delta key")
-                continue
-            chunks.append(chunk)
+        around = self._neighbours.look(now_ns)
+        chunks = [self._chunk(arrival) for arrival in self._chunks.take_all()]
         clock = self._check_clock()
         return Inputs(
             [*put, *clock],
-            chunks,
+            [chunk for chunk in chunks if chunk is not None],
             self._state(PoseState, self._pose_slot),
             self._state(GripperState, self._gripper_slot),
-            self._neighbours.look(now_ns),
+            around,
         )
+
+    def _chunk(self, arrival: Arrival) -> Stamped[ActionChunk] | None:
+        """A chunk by the worker whose key it came on, None for any other."""
+        worker = key_names.last(str(arrival.sample.key_expr))
+        owner = self._neighbours.owner(worker)
+        try:
+            source = self.node.header(arrival).source
+        except CodecError as error:
+            self.node.refuse(error.reason, f"delta/{worker}: {error}")
+            return None
+        if owner is not None and source != owner:  # before its payload is looked at: it may be many
+            self.node.refuse(
+                "foreign", f"delta/{worker} by {source[:60]!r}, the worker is {owner[:60]!r}"
+            )
+            return None
+        chunk = self.node.read(ActionChunk, arrival)
+        if chunk is not None and chunk.record.worker != worker:
+            self.node.refuse("foreign", "a chunk on another worker's delta key")
+            return None
+        return chunk
 
     def _state(self, kind: type[Any], slot: Latest) -> Stamped[Any] | None:
         """The newest state, if it is new and by the writer that speaks for the robot."""

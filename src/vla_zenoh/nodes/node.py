@@ -8,6 +8,7 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import zenoh
@@ -18,7 +19,7 @@ from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.clock import Clock
 from vla_zenoh.nodes.session import QOS
-from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
+from vla_zenoh.nodes.slots import Arrival, Inbox, Latest, Mailbox
 from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Event, Header, NodeStatus, Stamped
@@ -29,7 +30,7 @@ EVENT_PERIOD_S = 0.25
 """The same kind of event is written at most this often; what came between is counted in `count`."""
 
 Record = TypeVar("Record")
-Slot = TypeVar("Slot", Latest, Inbox)
+Slot = TypeVar("Slot", Latest, Inbox, Mailbox)
 
 
 class Stream:
@@ -112,32 +113,29 @@ class Node:
 
     def tell(self, event: Event) -> None:
         """Write an event; a flood of the same is thinned out and counted."""
-        kind = (event.kind, event.what)
-        now = time.monotonic()
-        if len(self._last_event) > 512:
-            self._last_event.clear()
-        if event.kind != "transition" and now - self._last_event.get(kind, -1e9) < EVENT_PERIOD_S:
-            self._held_events[kind] += 1
-            return
-        self._last_event[kind] = now
-        held = self._held_events.pop(kind, 0)
-        if held:
-            event = Event(
-                event.level,
-                event.kind,
-                event.what,
-                event.why,
-                event.value,
-                event.limit,
-                held + 1,
-            )
-        self._events.put(event)
+        if event.kind == "transition" or self._due(event.kind, event.what):
+            self._write(event)
 
     def refuse(self, reason: str, why: str) -> None:
         """Count a refusal by reason, and say why."""
         self.counters[f"refused.{reason}"] += 1
-        readable = why[:1000].encode("utf-8", "replace").decode()
-        self.tell(Event("warning", "refusal", reason, readable))
+        if self._due("refusal", reason):
+            self._write(Event("warning", "refusal", reason, why[:1000]))
+
+    def _due(self, kind: str, what: str) -> bool:
+        """Whether an event of this kind may be written now; if not, it is counted."""
+        if len(self._last_event) > 512:
+            self._last_event.clear()
+        if time.monotonic() - self._last_event.get((kind, what), -1e9) >= EVENT_PERIOD_S:
+            return True
+        self._held_events[kind, what] += 1
+        return False
+
+    def _write(self, event: Event) -> None:
+        kind = (event.kind, event.what)
+        self._last_event[kind] = time.monotonic()
+        held = self._held_events.pop(kind, 0)
+        self._events.put(replace(event, count=event.count + held) if held else event)
 
     def report(
         self,
@@ -177,6 +175,11 @@ class Node:
     # -- reading ------------------------------------------------------------------------------
     def listen(self, key: str, slot: Slot) -> Slot:
         """Let samples on `key` fall into `slot`."""
+        if isinstance(slot, Mailbox):
+            subscriber = self.session.declare_subscriber(key, slot.channel())
+            slot.take_from(subscriber.try_recv)
+            self._declared.append(subscriber)
+            return slot
         handler = zenoh.handlers.Callback(slot, indirect=False)
         self._declared.append(self.session.declare_subscriber(key, handler))
         return slot

@@ -9,11 +9,13 @@ from vla_zenoh import keys as key_names
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.control.preflight import Surroundings
 from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.slots import Inbox
+from vla_zenoh.nodes.slots import Arrival, Mailbox
 from vla_zenoh.policy import ModelSpec
-from vla_zenoh.types import NodeStatus
+from vla_zenoh.types import NodeStatus, Stamped
 
 MAX_WORKERS = 32
+STATUSES_A_TICK, SPECS_A_TICK = 8, 4
+"""What is more was not sent by any node of ours: each says something twice a second."""
 
 
 class Neighbours:
@@ -26,10 +28,11 @@ class Neighbours:
         self._changed = True
         self._specs: dict[str, ModelSpec] = {}
         self._spec_sources: dict[str, str] = {}
+        self._voices: dict[str, str] = {}
         self._complaints: dict[str, str] = {}
         self._cameras: dict[str, tuple[str, float, int]] = {}
-        self._statuses = node.listen(node.keys.all_status, Inbox(64))
-        self._new_specs = node.listen(node.keys.all_specs, Inbox(32))
+        self._statuses = node.listen(node.keys.all_status, Mailbox(STATUSES_A_TICK))
+        self._new_specs = node.listen(node.keys.all_specs, Mailbox(SPECS_A_TICK))
         node.on_alive(self._on_alive)
         self._robot_node = node.profile.robot.driver
 
@@ -37,6 +40,8 @@ class Neighbours:
         with self._lock:
             (self._alive.add if alive else self._alive.discard)(name)
             self._changed = True
+            if not alive:
+                self._voices.pop(name, None)
             if not alive and name.startswith("worker-"):
                 worker = name.removeprefix("worker-")
                 self._specs.pop(worker, None)
@@ -47,7 +52,7 @@ class Neighbours:
         """The surroundings now, or None when nothing changed."""
         for arrival in self._statuses.take_all():
             stamped = self._node.read(NodeStatus, arrival)
-            if stamped is not None:
+            if stamped is not None and self._speaks_for_itself(stamped, arrival):
                 self._take_status(stamped.record, now_ns)
         for arrival in self._new_specs.take_all():
             stamped = self._node.read(ModelSpec, arrival)
@@ -70,6 +75,21 @@ class Neighbours:
                 },
                 {camera: node for camera, (node, _, _) in self._cameras.items()},
             )
+
+    def owner(self, worker: str) -> str | None:
+        """The source that speaks for a worker: who published its spec."""
+        with self._lock:
+            return self._spec_sources.get(worker)
+
+    def _speaks_for_itself(self, status: Stamped[NodeStatus], arrival: Arrival) -> bool:
+        """A node's status counts on its own key, while it is alive, by the first who wrote it."""
+        name, source = status.record.node, status.header.source
+        with self._lock:
+            ours = name == key_names.last(str(arrival.sample.key_expr)) and name in self._alive
+            if ours and self._voices.setdefault(name, source) == source:
+                return True
+        self._node.counters["refused.foreign_status"] += 1
+        return False
 
     def _take_spec(self, worker: str, spec: ModelSpec, source: str) -> None:
         with self._lock:
