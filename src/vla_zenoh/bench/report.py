@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 from vla_zenoh.bench.statistics import Slot, Summary, summarise
@@ -100,7 +101,7 @@ def main_table(result: Result) -> Table:
         table.add_section()
         if way.missing():
             table.add_row(way.title, *[""] * 6)
-            table.add_row(f"  not installed: {INSTALL}", *[""] * 6, style="yellow")
+            table.add_row(escape(f"  not installed: {INSTALL}"), *[""] * 6, style="yellow")
             continue
         if way.kind == "chain":
             table.add_row(way.title, *[""] * 6, style="bold")

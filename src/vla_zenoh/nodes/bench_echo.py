@@ -69,7 +69,7 @@ class EchoClient:
             NodeError: nobody does.
         """
         give_up = time.monotonic() + timeout_s
-        while not self._out.matching_status.matching:
+        while not self._out.matching_status.matching:  # pyright: ignore  # stub says bool
             if time.monotonic() > give_up:
                 raise NodeError("the echo of the benchmark does not answer")
             time.sleep(0.01)

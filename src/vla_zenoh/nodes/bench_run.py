@@ -31,7 +31,7 @@ PERIOD_S = (0.012, 0.020)
 """From one request to the next, evenly drawn: two ticks of 250 Hz wide, so that every phase of the
 tick is met equally often, and slower than the worker's highest rate."""
 WARM_UP = 20
-QUIET_S = 0.5
+QUIET_S = 1.0
 MAX_LOST = 10
 
 Ask = Callable[[NDArray[np.uint8]], Mapping[str, float]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -41,8 +42,10 @@ class Client:
     """The asking end."""
 
     def __init__(self, port: int) -> None:
-        self._socket = connect(
-            f"ws://{ADDRESS}:{port}", compression=None, max_size=None, proxy=None
+        self._up = ExitStack()
+        url = f"ws://{ADDRESS}:{port}"
+        self._socket = self._up.enter_context(
+            connect(url, compression=None, max_size=None, proxy=None)
         )
         self._socket.recv()
 
@@ -54,4 +57,4 @@ class Client:
 
     def close(self) -> None:
         """Say goodbye."""
-        self._socket.close()
+        self._up.close()
