@@ -47,7 +47,7 @@ class IkSettings:
     position_tolerance_m: float = 1e-6
     rotation_tolerance_rad: float = 1e-6
     joint_margin_rad: float = 0.05
-    posture_gain: float = 0.05
+    posture_gain: float = 0.1
     max_posture_step_rad: float = 0.01
     damping_bias: float = 1e-9
     max_iterations: int = 40
@@ -119,7 +119,9 @@ class InverseKinematics:
     def solve(self, pose: Pose, start_rad: FloatArray) -> FloatArray | None:
         """Joints (n,) that put the TCP there, near `start_rad`; None where there are none.
 
-        A start outside the bounds is taken as it is: no joint goes further out than it was.
+        A start outside the bounds is taken as it is: no joint goes further out than it was. The
+        search is local: a pose that needs several joints on the very ends of their ranges, or the
+        arm in another branch than at the start, may be missed.
         """
         found = self.approach(pose, start_rad)
         return found.joints_rad if found.solved else None
@@ -157,7 +159,7 @@ class InverseKinematics:
             farthest = float(np.abs(drift).max())
             if farthest > settings.max_posture_step_rad:
                 drift *= settings.max_posture_step_rad / farthest
-            pull = pull / 2 if iteration < 2 else 0.0  # the pose has the last word
+            pull = 0.0  # the pose has the last word
             step = self._step(error, jacobian, drift, 0.5 * squared + settings.damping_bias)
             largest = float(np.abs(step).max())
             if largest > settings.max_joint_step_rad:
