@@ -210,6 +210,16 @@ class Recorder:
         """(header, command) of what arrived since `since_ns`."""
         return self._read(self._commands, PoseCommand, since_ns, self.only["command"])
 
+    def hardest_command(self, since_ns: int = 0) -> float:
+        """Largest change of the commanded velocity within 20 ms, as m/s^2."""
+        found = sorted(self.commands(since_ns), key=lambda pair: pair[0].stamp_wall_ns)
+        hardest = 0.0
+        for source in {header.source for header, _ in found}:
+            own = [(h.stamp_wall_ns, c.twist[:3]) for h, c in found if h.source == source]
+            stamps = np.array([stamp for stamp, _ in own], np.int64)
+            hardest = max(hardest, _steepest(stamps, np.array([v for _, v in own]), 0.02))
+        return hardest
+
     def newest_state(self) -> PoseState | None:
         """The newest measured pose by the simulator."""
         for payload, attachment, _ in reversed(self._states):

@@ -9,17 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from chain import MOVING_M_S, Chain, Track
+from chain import MOVING_M_S, Chain
 
 BRAKE_S = 0.35
 """A jerk-limited stop from 0.15 m/s takes 0.17 s, the rest is the arm's lag."""
 BUSY_S = 0.15
 """What a busy machine may add to any of it."""
-OWN_BRAKE = 2.0
-"""The robot's side may brake by itself at this multiple of the profile's acceleration."""
-REFERENCE_TOLERANCE = 1.1
-MEASURED_TOLERANCE = 1.35
-"""The measured arm follows its reference with a spring: it may be this much harder."""
+COMMAND_TOLERANCE = 1.1
+"""What is commanded keeps to the profile, sampled as it is."""
+ARM_TOLERANCE = 2.7
+"""The robot's side may brake by itself at twice that, commands come late on a busy machine, and the
+measured arm follows with a spring. A step in velocity would be ten times as much."""
 RESTART_S = 12.0
 STEPS, STEP_M, WAY_TOLERANCE_M = 5, 0.01, 0.001
 JUMP_M = 0.002
@@ -48,14 +48,12 @@ DEATHS = (
 )
 
 
-def acceleration_limit(chain: Chain, own_brake: bool) -> float:
-    return chain.profile.limits.translation.acceleration_m_s2 * (OWN_BRAKE if own_brake else 1.0)
-
-
-def assert_gentle(chain: Chain, track: Track, own_brake: bool) -> None:
-    limit = acceleration_limit(chain, own_brake)
-    assert track.hardest_reference_change() <= limit * REFERENCE_TOLERANCE
-    assert track.hardest_change() <= limit * MEASURED_TOLERANCE
+def assert_gentle(chain: Chain, since_ns: int = 0) -> None:
+    """Neither what was commanded nor the arm itself changed its velocity in a step."""
+    limit = chain.profile.limits.translation.acceleration_m_s2
+    track = chain.recorder.track(since_ns)
+    assert chain.recorder.hardest_command(since_ns) <= limit * COMMAND_TOLERANCE
+    assert track.hardest_change() <= limit * ARM_TOLERANCE
     assert track.largest_step_m() <= JUMP_M
 
 
@@ -105,8 +103,7 @@ def assert_waits_and_works_again(chain: Chain) -> None:
     direction, sign = ("up", 1) if chain.height_m() < 0.4 else ("down", -1)
     way_m = chain.go(direction, STEPS)
     assert way_m == pytest.approx(sign * STEPS * STEP_M, abs=WAY_TOLERANCE_M)
-    moved = chain.recorder.track(began_ns)
-    assert_gentle(chain, moved, own_brake=False)
+    assert_gentle(chain, began_ns)
 
 
 @pytest.mark.parametrize("death", DEATHS, ids=lambda death: death.node)
@@ -123,7 +120,7 @@ def test_a_killed_node_brakes_the_arm_and_needs_a_new_activation(
     watchdog_s = chain.profile.timing.watchdog_s
     print(f"{death.node}: {before.speed_m_s.mean():.3f} m/s to rest in {stood_s:.3f} s")
     assert stood_s <= watchdog_s + BRAKE_S + BUSY_S
-    assert_gentle(chain, track, death.own_brake)
+    assert_gentle(chain)
     chain.until("it says why", lambda: chain.detail("why") == death.why)
     if death.own_brake:
         assert chain.events("following->braking")
@@ -198,7 +195,7 @@ def test_a_hung_worker_lets_the_arm_hold_and_then_lose_it(chain: Chain) -> None:
     patience_s = 1.0 / chain.profile.task.rate_hz + timing.watchdog_s
     print(f"hung worker: to rest in {stood_s:.3f} s")
     assert stood_s <= patience_s + BRAKE_S + BUSY_S
-    assert_gentle(chain, track, own_brake=False)
+    assert_gentle(chain)
     assert chain.events("active->holding")
     (event,) = chain.events("holding->inactive")
     assert event.why == "node 'worker-scripted' is gone"
@@ -211,6 +208,6 @@ def test_a_hung_command_node_is_braked_by_the_robot_and_comes_back_inactive(chai
     stood_s = track.time_to_stand_s(at_ns)
     print(f"hung command node: to rest in {stood_s:.3f} s")
     assert stood_s <= chain.profile.timing.command_timeout_s + BRAKE_S + BUSY_S
-    assert_gentle(chain, track, own_brake=True)
+    assert_gentle(chain)
     chain.until("it says why", lambda: "stood still" in str(chain.detail("why")))
     assert_waits_and_works_again(chain)
