@@ -38,7 +38,8 @@ class SimulatedArm:
         self.actuators = [int(model.actuator(PREFIX + name).id) for name in robot.arm_joints]
         self.effort_limit_nm = model.actuator_ctrlrange[self.actuators, 1].copy()
 
-        self.position_rad = data.qpos[first_q : first_q + len(joints)]
+        self._qpos = slice(first_q, first_q + len(joints))
+        self.position_rad = data.qpos[self._qpos]
         self.velocity_rad_s = data.qvel[self._dofs]
         self.effort_nm = data.qfrc_actuator[self._dofs]
         self._bias_nm = data.qfrc_bias[self._dofs]
@@ -50,6 +51,7 @@ class SimulatedArm:
         self._own_geom = model.body_rootid[model.geom_bodyid] == root
         self._linear, self._angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
         self._inertia = np.zeros((model.nv, model.nv))
+        self._elsewhere = mujoco.MjData(model)
 
     def state(self) -> ArmState:
         """What the impedance law needs; views where MuJoCo has them, so use it at once."""
@@ -64,6 +66,13 @@ class SimulatedArm:
             inertia=self._inertia[self._dofs, self._dofs],
             bias_nm=self._bias_nm,
         )
+
+    def tcp_at(self, position_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where the TCP is with the joints at `position_rad` (n,): m (3,) and rotation (3, 3)."""
+        data = self._elsewhere
+        data.qpos[self._qpos] = position_rad
+        mujoco.mj_kinematics(self._model, data)
+        return data.site_xpos[self._tcp].copy(), data.site_xmat[self._tcp].reshape(3, 3).copy()
 
     def jacobian(self) -> FloatArray:
         """(6, n) of the TCP, linear rows first, base axes."""

@@ -1,4 +1,4 @@
-"""The simulated world: robot, impedance controller, gripper and objects, one millisecond a tick."""
+"""The simulated world: robot, its controllers, gripper and objects, one millisecond a tick."""
 
 from __future__ import annotations
 
@@ -8,7 +8,19 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vla_zenoh.control.impedance import ImpedanceController, ImpedanceGains, Reference
+from vla_zenoh.control.impedance import (
+    ArmState,
+    ImpedanceController,
+    ImpedanceGains,
+    ImpedanceOutput,
+    Reference,
+)
+from vla_zenoh.control.joint_impedance import (
+    JointGains,
+    JointImpedanceController,
+    JointImpedanceOutput,
+    JointReference,
+)
 from vla_zenoh.errors import NodeError, ResourceError
 from vla_zenoh.simulation.arm import SimulatedArm
 from vla_zenoh.simulation.gripper import GripperServo
@@ -25,7 +37,10 @@ MAX_GRIPPER_FORCE_N = 70.0
 
 
 class World:
-    """A scene with a robot under Cartesian impedance control.
+    """A scene with a robot under impedance control, of its TCP (`tick`) or joints (`tick_joint`).
+
+    Either may follow the other while the arm stands: the next law takes over what the last one
+    carried. Who changes between them in motion gets a jolt.
 
     Deterministic to the bit: the same seed, references and gripper commands give the same state.
     All poses are those of the TCP in the robot's base frame, which is the world frame.
@@ -34,7 +49,8 @@ class World:
         scene: name of a folder of ``sim/``, or a path.
         robot: the robot in it.
         home_rad: (n,) arm joints after a reset; also the posture the nullspace prefers.
-        gains: of the impedance controller.
+        gains: of the Cartesian impedance controller.
+        joint_gains: of the joint impedance controller; None: the stiff ones.
         joint_friction_nm: dry friction in every arm joint, unknown to the controller.
         seed: see `reset`.
 
@@ -50,6 +66,7 @@ class World:
         *,
         home_rad: ArrayLike,
         gains: ImpedanceGains,
+        joint_gains: JointGains | None = None,
         joint_friction_nm: float = 0.0,
         seed: int | None = None,
     ) -> None:
@@ -67,6 +84,13 @@ class World:
             posture_rad=self._home_rad,
             period_s=STEP_S,
         )
+        self._joint_controller = JointImpedanceController(
+            joint_gains or JointGains.stiff(),
+            effort_nm=self._arm.effort_limit_nm,
+            period_s=STEP_S,
+        )
+        self._in_charge: ImpedanceController | JointImpedanceController | None = None
+        self._held_rad: FloatArray | None = None
         fingers = [self.model.joint(PREFIX + name) for name in robot.finger_joints]
         self._finger_q = [int(joint.qposadr[0]) for joint in fingers]
         self._finger_dofs = [int(joint.dofadr[0]) for joint in fingers]
@@ -97,7 +121,8 @@ class World:
                 self._put(name, (place.x_m, place.y_m, height), turn)
         self._gripper.reset(self._gripper.max_width_m)
         self._bound_gripper_force()
-        self._controller.reset()
+        self._controller.reset(self._home_rad)
+        self._forget_controllers()
         self._ticks = 0
         self.saturated = 0
         mujoco.mj_forward(model, data)
@@ -109,19 +134,25 @@ class World:
         Raises:
             NodeError: the simulation blew up; `reset` makes it usable again.
         """
-        model, data = self.model, self._data
-        mujoco.mj_step1(model, data)
-        output = self._controller.torque(reference, self._arm.state())
-        if not math.isfinite(output.torque_nm.sum()):
-            raise NodeError(f"the impedance controller got a bad reference: {reference}")
-        self.saturated += output.saturated
-        data.ctrl[self._arm.actuators] = output.torque_nm
-        data.ctrl[self._gripper_actuator] = self._gripper.step(*self._opening())
-        mujoco.mj_step2(model, data)
-        self._ticks += 1
-        self._fresh = False
-        if data.warning.number.any():
-            self._raise_blown_up()
+        mujoco.mj_step1(self.model, self._data)
+        state = self._put_in_charge(self._controller)
+        self._held_rad = None
+        self._apply(self._controller.torque(reference, state), reference)
+
+    def tick_joint(self, reference: JointReference) -> None:
+        """Likewise towards joint positions.
+
+        Raises:
+            NodeError: the simulation blew up; `reset` makes it usable again.
+        """
+        mujoco.mj_step1(self.model, self._data)
+        state = self._put_in_charge(self._joint_controller)
+        self._held_rad = reference.position_rad
+        self._apply(self._joint_controller.torque(reference, state), reference)
+
+    def hold_joint_reference(self) -> JointReference:
+        """The reference that keeps the joints where they are now."""
+        return JointReference.at_rest(self._arm.position_rad)
 
     def hold_reference(self) -> Reference:
         """The reference that keeps the TCP where it is now."""
@@ -151,10 +182,18 @@ class World:
         return self._arm.contact_wrench()
 
     def joint_state(self) -> JointState:
-        """Arm joints; the effort is what the motors apply."""
+        """Arm joints; the effort is what the motors apply.
+
+        The reference is that of `tick_joint`; under Cartesian control, which has none for joints,
+        it is where they are.
+        """
         arm = self._arm
         return JointState(
-            self.robot.arm_joints, arm.position_rad, arm.velocity_rad_s, arm.effort_nm
+            self.robot.arm_joints,
+            arm.position_rad,
+            arm.velocity_rad_s,
+            arm.effort_nm,
+            arm.position_rad if self._held_rad is None else self._held_rad,
         )
 
     def tcp(self) -> tuple[FloatArray, FloatArray]:
@@ -162,16 +201,20 @@ class World:
         self._refresh()
         return self._arm.tcp_position_m.copy(), self._arm.tcp_rotation.copy()
 
-    def pose_state(self, reference: Reference) -> PoseState:
+    def pose_state(self, reference: Reference | JointReference) -> PoseState:
         """Measured TCP pose, twist and wrench beside the reference held now."""
         position, rotation = self.tcp()
+        if isinstance(reference, JointReference):
+            held_m, held_rotation = self._arm.tcp_at(reference.position_rad)
+        else:
+            held_m, held_rotation = reference.position_m, reference.rotation
         return PoseState(
             position_m=position,
             quat_xyzw=_quat_xyzw(rotation),
             twist=self._arm.jacobian() @ self._arm.velocity_rad_s,
             wrench=self.wrench,
-            reference_position_m=reference.position_m,
-            reference_quat_xyzw=_quat_xyzw(reference.rotation),
+            reference_position_m=held_m,
+            reference_quat_xyzw=_quat_xyzw(held_rotation),
         )
 
     def gripper_state(self) -> GripperState:
@@ -218,12 +261,43 @@ class World:
         write_pose_vector(self.model, self._data, vector)
         self._data.qvel[:] = 0.0
         self._controller.reset()
+        self._forget_controllers()
         self._gripper.reset(self._opening()[0])
         self._bound_gripper_force()
         mujoco.mj_forward(self.model, self._data)
         self._fresh = True
 
     # -- inside --------------------------------------------------------------------------------
+
+    def _put_in_charge(self, law: ImpedanceController | JointImpedanceController) -> ArmState:
+        state = self._arm.state()
+        if self._in_charge is not law:
+            if self._in_charge is not None:
+                law.take_over(self._data.ctrl[self._arm.actuators], state)
+            self._in_charge = law
+        return state
+
+    def _forget_controllers(self) -> None:
+        self._joint_controller.reset()
+        self._in_charge = None
+        self._held_rad = None
+
+    def _apply(
+        self,
+        output: ImpedanceOutput | JointImpedanceOutput,
+        reference: Reference | JointReference,
+    ) -> None:
+        data = self._data
+        if not math.isfinite(output.torque_nm.sum()):
+            raise NodeError(f"the impedance controller got a bad reference: {reference}")
+        self.saturated += output.saturated
+        data.ctrl[self._arm.actuators] = output.torque_nm
+        data.ctrl[self._gripper_actuator] = self._gripper.step(*self._opening())
+        mujoco.mj_step2(self.model, data)
+        self._ticks += 1
+        self._fresh = False
+        if data.warning.number.any():
+            self._raise_blown_up()
 
     def _refresh(self) -> None:
         """Bring positions up to the last step; contacts and forces stay those of that step."""
