@@ -1,4 +1,7 @@
-"""The simulated robot on the bus: takes poses and widths, gives state, at 1 kHz inside.
+"""The simulated robot on the bus: takes poses, joints and widths, gives state, at 1 kHz inside.
+
+Poses and joint positions are both accepted; the stream that is followed owns the arm, the other may
+begin when it has ended and the arm stands.
 
 Real time by default: the world is stepped against the wall clock, and time lost to a busy computer
 is caught up (at most `CATCH_UP_NS`), then given up and counted. In lockstep mode time stands still
@@ -11,15 +14,19 @@ import gc
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import zenoh
 
 from vla_zenoh.codec import message, records, settings
-from vla_zenoh.control.impedance import ImpedanceGains, Reference
+from vla_zenoh.control.arm_guard import ArmGuard, Measured
+from vla_zenoh.control.impedance import ImpedanceGains
+from vla_zenoh.control.joint_impedance import JointGains, JointReference
+from vla_zenoh.control.joint_reference import JointGuard, joint_guard_limits
 from vla_zenoh.control.reference import ReferenceGuard, guard_limits
-from vla_zenoh.control.smoothing import Motion
 from vla_zenoh.control.so3 import Pose
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind
@@ -34,6 +41,7 @@ from vla_zenoh.types import (
     Event,
     GripperCommand,
     Header,
+    JointCommand,
     ObjectPoses,
     PoseCommand,
     SceneState,
@@ -44,6 +52,8 @@ CATCH_UP_NS = 50_000_000
 SCENE_HZ, OBJECTS_HZ, WATCH_HZ = 60.0, 10.0, 4.0
 MAX_LOCKSTEP_NS = 60_000_000_000
 SWITCH_INTERVAL_S = 1e-4
+
+Command = TypeVar("Command", PoseCommand, JointCommand)
 
 
 def build_world(profile: Profile) -> World:
@@ -57,20 +67,37 @@ def build_world(profile: Profile) -> World:
         arm_joints=profile.robot.arm_joints,
         tcp_link=profile.robot.tcp_frame,
     )
-    gains = {"stiff": ImpedanceGains.stiff, "compliant": ImpedanceGains.compliant}
+    stiff = profile.sim.gains == "stiff"
     return World(
         profile.sim.scene,
         robot,
         home_rad=profile.robot.home_rad,
-        gains=gains[profile.sim.gains](),
+        gains=ImpedanceGains.stiff() if stiff else ImpedanceGains.compliant(),
+        joint_gains=JointGains.stiff() if stiff else JointGains.compliant(),
         joint_friction_nm=profile.sim.joint_friction_nm,
         seed=profile.sim.seed,
     )
 
 
-def build_guard(profile: Profile, world: World) -> ReferenceGuard:
-    """The robot side's guard of the pose stream, standing where the arm stands."""
-    return ReferenceGuard(Pose(*world.tcp()), STEP_NS / 1e9, guard_limits(profile))
+def build_guard(profile: Profile, world: World) -> ArmGuard:
+    """The robot side's guard of both command streams, standing where the arm stands."""
+
+    def measure() -> Measured:
+        state = world.joint_state()
+        return Measured(Pose(*world.tcp()), state.position_rad, state.velocity_rad_s)
+
+    here = measure()
+    return ArmGuard(
+        ReferenceGuard(here.pose, STEP_NS / 1e9, guard_limits(profile)),
+        JointGuard(
+            profile.robot.arm_joints,
+            here.position_rad,
+            STEP_NS / 1e9,
+            joint_guard_limits(profile, *world.joint_range_rad),
+        ),
+        measure,
+        profile.robot.command,
+    )
 
 
 class SimNode:
@@ -83,6 +110,7 @@ class SimNode:
         self.lockstep = lockstep
         keys = node.keys
         self._poses = node.listen(keys.command_pose, Inbox(64))
+        self._joints = node.listen(keys.command_joint, Inbox(64))
         self._writer = ""
         self._braking = False
         self._widths = node.listen(keys.command_gripper, Inbox(16))
@@ -93,7 +121,7 @@ class SimNode:
         self._gripper = node.stream(keys.state_gripper, Kind.STATE)
         self._scene = node.stream(keys.sim_scene, Kind.STATE)
         self._objects = node.stream(keys.sim_objects, Kind.NEWS)
-        self._reference = self._as_reference(self.guard.motion)
+        self._reference = self.guard.reference
         self._base_ns = 0
         self._ticks = 0
         self._rate = RateMeter()
@@ -180,11 +208,14 @@ class SimNode:
         self._take_orders(now_ns)
         self._ticks += 1
         if not self._blown_up:
-            self._reference = self._as_reference(self.guard.tick(now_ns))
+            self._reference = self.guard.tick(now_ns)
             if self.guard.braking != self._braking:
                 self._tell_braking()
             try:
-                self.world.tick(self._reference)
+                if isinstance(self._reference, JointReference):
+                    self.world.tick_joint(self._reference)
+                else:
+                    self.world.tick(self._reference)
             except NodeError as error:
                 self._blown_up = str(error)
                 self.node.refuse("simulation_fault", str(error))
@@ -202,9 +233,13 @@ class SimNode:
 
     def _take_orders(self, now_ns: int) -> None:
         for arrival in self._poses.take_all():
-            command = self.node.read(PoseCommand, arrival)
-            if command is not None:
-                self._offer(command, now_ns)
+            pose = self.node.read(PoseCommand, arrival)
+            if pose is not None:
+                self._offer(pose, self.guard.offer_pose, "pose", now_ns)
+        for arrival in self._joints.take_all():
+            joints = self.node.read(JointCommand, arrival)
+            if joints is not None:
+                self._offer(joints, self.guard.offer_joint, "joint", now_ns)
         for arrival in self._widths.take_all():
             width = self.node.read(GripperCommand, arrival)
             if width is not None:
@@ -214,15 +249,21 @@ class SimNode:
             if seed is not None:
                 self._reset(seed.value)
 
-    def _offer(self, command: Stamped[PoseCommand], now_ns: int) -> None:
+    def _offer(
+        self,
+        command: Stamped[Command],
+        take: Callable[[Stamped[Command], int], str | None],
+        mode: str,
+        now_ns: int,
+    ) -> None:
         if self.lockstep:  # where nobody's clock but the world's counts
             command = replace(command, received_ns=now_ns)
-        reason = self.guard.offer(command, now_ns)
+        reason = take(command, now_ns)
         if reason is None:
             self._writer = command.header.source
             return
         self.node.refuse(
-            f"pose_{reason}", f"command/pose by {command.header.source[:60]!r}: {reason}"
+            f"{mode}_{reason}", f"command/{mode} by {command.header.source[:60]!r}: {reason}"
         )
 
     def _take_width(self, width: Stamped[GripperCommand]) -> None:
@@ -246,13 +287,13 @@ class SimNode:
 
     def _tell_braking(self) -> None:
         self._braking = self.guard.braking
-        timeout_s = self.node.profile.timing.command_timeout_s
+        silent = f"command/{self.guard.mode} for {self.node.profile.timing.command_timeout_s:g} s"
         event = (
             Event(
                 "warning",
                 "transition",
                 "following->braking",
-                f"no command/pose for {timeout_s:g} s while the arm moved: it brakes by itself",
+                f"no {silent} while the arm moved: it brakes by itself",
             )
             if self._braking
             else Event("info", "transition", "braking->standing", "nobody is followed")
@@ -266,16 +307,10 @@ class SimNode:
             self.node.refuse("reset_refused", why)
             return
         self.world.reset(self.node.profile.sim.seed if seed is None else seed)
-        self.guard.restart(Pose(*self.world.tcp()))
+        self.guard.restart()
         self._blown_up = ""
         self.node.counters["sim.resets"] += 1
         self.node.report("running", detail=self._detail(), now=True)
-
-    @staticmethod
-    def _as_reference(motion: Motion) -> Reference:
-        return Reference(
-            motion.pose.position_m, motion.pose.rotation, motion.twist, motion.acceleration
-        )
 
     # -- what is published --------------------------------------------------------------------
     def _publish_state(self, now_ns: int) -> None:
@@ -321,6 +356,7 @@ class SimNode:
         return {
             "scene": self.node.profile.sim.scene,
             "following": self.guard.following,
+            "command": self.guard.mode,
             "realtime": self._realtime,
             "lockstep": self.lockstep,
             "fault": self._blown_up,

@@ -171,6 +171,11 @@ class World:
     # -- what a robot reports ------------------------------------------------------------------
 
     @property
+    def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest position of every arm joint, (n,) each."""
+        return self._arm.lower_rad.copy(), self._arm.upper_rad.copy()
+
+    @property
     def time_ns(self) -> int:
         """Simulated time since the last reset."""
         return self._ticks * STEP_NS

@@ -1,0 +1,140 @@
+"""One arm, two streams: poses of the TCP or joint positions. Whoever is followed owns the arm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from vla_zenoh.control.impedance import Reference
+from vla_zenoh.control.joint_impedance import JointReference
+from vla_zenoh.control.joint_reference import JointGuard
+from vla_zenoh.control.reference import ReferenceGuard
+from vla_zenoh.control.so3 import Pose
+from vla_zenoh.types import FloatArray, JointCommand, PoseCommand, Stamped
+
+STANDING_RAD_S = 0.02
+"""An arm of which no joint is faster stands: its law may be exchanged."""
+
+Mode = Literal["pose", "joint"]
+
+
+class Measured(NamedTuple):
+    """Where the arm is.
+
+    Args:
+        pose: of the TCP.
+        position_rad: (n,).
+        velocity_rad_s: (n,).
+    """
+
+    pose: Pose
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+
+
+class ArmGuard:
+    """Follows one stream; the other may begin when nobody is followed and the arm stands.
+
+    It begins where the arm was measured, not where the last reference was: the change itself moves
+    nothing.
+
+    Args:
+        poses: guard of the pose stream.
+        joints: guard of the joint stream.
+        measure: where the arm is now.
+        mode: which of them holds the arm at first.
+    """
+
+    def __init__(
+        self,
+        poses: ReferenceGuard,
+        joints: JointGuard,
+        measure: Callable[[], Measured],
+        mode: Mode = "pose",
+    ) -> None:
+        self._poses, self._joints = poses, joints
+        self._measure = measure
+        self.mode: Mode = mode
+
+    @property
+    def _in_charge(self) -> ReferenceGuard | JointGuard:
+        return self._poses if self.mode == "pose" else self._joints
+
+    @property
+    def following(self) -> bool:
+        """A command stream is being followed."""
+        return self._in_charge.following
+
+    @property
+    def braking(self) -> bool:
+        """The stream fell silent in motion."""
+        return self._in_charge.braking
+
+    @property
+    def silences(self) -> int:
+        """How often a stream fell silent in motion."""
+        return self._poses.silences + self._joints.silences
+
+    @property
+    def reference(self) -> Reference | JointReference:
+        """What the arm holds now."""
+        if self.mode == "joint":
+            return self._joints.motion
+        motion = self._poses.motion
+        return Reference(
+            motion.pose.position_m, motion.pose.rotation, motion.twist, motion.acceleration
+        )
+
+    def offer_pose(self, command: Stamped[PoseCommand], now_ns: int) -> str | None:
+        """Take a pose, or say in one word why not.
+
+        Returns:
+            None, ``other_mode`` (joints are followed), ``moving`` (the arm does, so that its law
+            cannot be exchanged), or what `ReferenceGuard.offer` says.
+        """
+        if self.mode != "pose":
+            if self.following or self.braking:
+                return "other_mode"
+            measured = self._measure()
+            if _moves(measured):
+                return "moving"
+            self._poses.anchor(measured.pose)
+        reason = self._poses.offer(command, now_ns)
+        if reason is None:
+            self.mode = "pose"
+        return reason
+
+    def offer_joint(self, command: Stamped[JointCommand], now_ns: int) -> str | None:
+        """Take joint positions, or say in one word why not.
+
+        Returns:
+            None, ``other_mode`` (poses are followed), ``moving``, or what `JointGuard.offer` says.
+        """
+        if self.mode != "joint":
+            if self.following or self.braking:
+                return "other_mode"
+            measured = self._measure()
+            if _moves(measured):
+                return "moving"
+            self._joints.anchor(measured.position_rad)
+        reason = self._joints.offer(command, now_ns)
+        if reason is None:
+            self.mode = "joint"
+        return reason
+
+    def tick(self, now_ns: int) -> Reference | JointReference:
+        """What the arm has to hold at `now_ns`."""
+        self._in_charge.tick(now_ns)
+        return self.reference
+
+    def restart(self) -> None:
+        """The robot was put elsewhere; follow nobody and stand there."""
+        measured = self._measure()
+        self._poses.restart(measured.pose)
+        self._joints.restart(measured.position_rad)
+
+
+def _moves(measured: Measured) -> bool:
+    return float(np.abs(measured.velocity_rad_s).max()) > STANDING_RAD_S
