@@ -224,7 +224,6 @@ def forged(**fields: Any) -> bytes:
 def test_garbage_on_the_joint_key_is_refused_and_counted(
     robot: Robot, payload: bytes, reason: str
 ) -> None:
-    robot.nobody_is_followed()
     before, counted = robot.now_rad.copy(), robot.refused(reason)
     robot.put(robot.profile.keys.command_joint, payload)
     until(f"{reason} counted", lambda: robot.refused(reason) > counted)
@@ -238,7 +237,6 @@ def test_a_command_without_a_header_is_refused_and_counted(robot: Robot) -> None
 
 
 def test_a_jump_and_a_speed_no_joint_has_are_refused_and_counted(robot: Robot) -> None:
-    robot.nobody_is_followed()
     before = robot.now_rad.copy()
     jumps, fast = robot.refused("joint_jump"), robot.refused("joint_too_fast")
     robot.put_joints(before + 0.3)
