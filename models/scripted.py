@@ -19,6 +19,7 @@ Prompts, one step per request, as in the thesis this package grew from::
 
 from __future__ import annotations
 
+import math
 import random
 import time
 
@@ -68,42 +69,46 @@ class Scripted:
 
     def reset(self) -> None:
         """Begin to count anew."""
-        self._plan = [(0.0, 0.0)]  # steps and way (m or rad) at the end of every step given last
-        self._observed_ns = -1
+        self._last_stamp_ns = -1
+        self._last: list[tuple[float, float]] = [(0.0, 0.0)]
 
     def infer(self, observation: Observation) -> ActionSteps:
         """The next chunk of the motion the prompt names."""
         asked = parse_hard(observation.prompt)
         if self._delay_s:
             time.sleep(self._delay_s * (1 + self._jitter * self._random.uniform(-1, 1)))
-        plan = [self._reached(observation.stamp_wall_ns)]
-        begun, _ = plan[0]
-        last = begun + self.spec.action.horizon if asked.steps is None else float(asked.steps)
-        while asked.motion is not None and len(plan) <= self.spec.action.horizon:
-            if plan[-1][0] >= last:
-                break
-            steps = min(begun + len(plan), last)
-            plan.append((steps, asked.offset(steps)))
-        given = np.zeros((max(len(plan) - 1, 1), self.spec.action.dimension), np.float32)
-        if asked.motion is not None and len(plan) > 1:
-            given[:, asked.motion.axis] = np.diff([way for _, way in plan])
+        begun, place = self._asked_by(observation.stamp_wall_ns)
+        horizon, limit = self.spec.action.horizon, asked.steps or math.inf
+        ends = [min(begun + index, limit) for index in range(1, horizon + 1)]
+        # No step twice: the chunk ends with the one that completes the count.
+        ends = [end for index, end in enumerate(ends) if index == 0 or end > ends[index - 1]]
+        steps = np.zeros((len(ends), self.spec.action.dimension), np.float32)
+        reached: list[tuple[float, float]] = []
+        for row, end in enumerate(ends):
+            before, place = place, asked.offset(end)
+            reached.append((end, place))
+            if asked.motion is not None:
+                steps[row, asked.motion.axis] = place - before
         # Before the arm is given to us nothing is counted: nobody carries it out.
         if observation.task.active:
-            self._plan, self._observed_ns = plan, observation.stamp_wall_ns
-        # The last step of a longer chunk has not begun when the chunk is sent.
-        done = asked.motion is None or (asked.steps is not None and last - begun <= 1.0)
-        return ActionSteps(given, done)
+            self._last_stamp_ns, self._last = observation.stamp_wall_ns, reached
+        # The later steps of a chunk have not begun when it is sent.
+        done = asked.motion is None or (len(ends) == 1 and ends[0] >= limit)
+        return ActionSteps(steps, done)
 
-    def _reached(self, stamp_ns: int) -> tuple[float, float]:
-        """Steps and way that were asked for until this observation: the next chunk begins there.
+    def _asked_by(self, stamp_ns: int) -> tuple[float, float]:
+        """Steps, and the way, asked for when this observation was taken: the next stands on them.
 
-        As the command node counts: by time, and the first step at least.
+        The command node reckons alike: the first step at once, a later one along its duration.
         """
-        passed = (stamp_ns - self._observed_ns) / int(self.spec.action.dt_s * 1e9)
-        passed = min(max(passed, 1.0), len(self._plan) - 1.0)
-        index = int(passed)
-        if index + 1 >= len(self._plan):
-            return self._plan[-1]
-        (steps, way), (next_steps, next_way) = self._plan[index : index + 2]
-        share = passed - index
-        return steps + share * (next_steps - steps), way + share * (next_way - way)
+        if self._last_stamp_ns < 0:
+            return 0.0, 0.0
+        dt_ns = int(self.spec.action.dt_s * 1e9)
+        done, part_ns = divmod(stamp_ns - self._last_stamp_ns, dt_ns)
+        if done < 1:
+            return self._last[0]
+        if done >= len(self._last):
+            return self._last[-1]
+        (steps, place), (later_steps, later_place) = self._last[done - 1], self._last[done]
+        share = part_ns / dt_ns
+        return steps + share * (later_steps - steps), place + share * (later_place - place)

@@ -23,6 +23,7 @@ from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.impedance import Reference
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.control.preflight import Surroundings
+from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.reference import ReferenceGuard, guard_limits
 from vla_zenoh.control.so3 import Pose
 from vla_zenoh.observe import History, NotYet, assemble
@@ -105,7 +106,8 @@ class Lockstep:
         policy: the model; its ``load`` is called here if it has one.
         delays: see `Delays`.
         picture: what a camera sees, by name; None: small gray pictures.
-        dry_run: see `Commander`.
+        reach: see `Commander`.
+        dry_run: likewise.
         seed: of the jitter.
     """
 
@@ -117,13 +119,14 @@ class Lockstep:
         *,
         delays: Delays | None = None,
         picture: Callable[[str], Image] | None = None,
+        reach: Shadow | None = None,
         dry_run: bool = False,
         seed: int = 0,
     ) -> None:
         self.profile, self.world = profile, world
         self.delays = delays or Delays()
         self.now_ns = START_NS
-        self.commander = Commander(profile, dry_run=dry_run)
+        self.commander = Commander(profile, reach=reach, dry_run=dry_run)
         self.guard = ReferenceGuard(Pose(*world.tcp()), TICK_NS / 1e9, guard_limits(profile))
         self.alive = {SIM, CAMERA, COMMAND, worker_node(profile.task.worker)}
         self.trace = Trace()
@@ -218,8 +221,8 @@ class Lockstep:
         held = Reference(reference.pose.position_m, reference.pose.rotation, *reference[1:])
         self._send(SIM, self.world.pose_state(held), self._take_pose_state)
         self._send(SIM, self.world.gripper_state(), self._take_gripper_state)
-        if "joint" in self.worker.spec.observation.state:
-            self._send(SIM, self.world.joint_state(), self.worker.take_state)
+        if self.commander.reach is not None or "joint" in self.worker.spec.observation.state:
+            self._send(SIM, self.world.joint_state(), self._take_joint_state)
 
     def _publish_pictures(self) -> None:
         self._seq[CAMERA] += 1
@@ -256,6 +259,10 @@ class Lockstep:
 
     def _take_pose_state(self, state: Stamped[PoseState]) -> None:
         self._inbox.pose = state
+        self.worker.take_state(state)
+
+    def _take_joint_state(self, state: Stamped[JointState]) -> None:
+        self._inbox.joint = state
         self.worker.take_state(state)
 
     def _take_gripper_state(self, state: Stamped[GripperState]) -> None:

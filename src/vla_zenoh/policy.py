@@ -11,6 +11,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -163,7 +164,7 @@ class ModelSpec(_Spec):
         """Plain types, ready for the wire."""
         return self.model_dump(mode="json")
 
-    @property
+    @cached_property
     def hash(self) -> str:
         """16 hex digits that differ when any declared meaning differs."""
         canonical = json.dumps(self.to_dict(), sort_keys=True, separators=(",", ":"))

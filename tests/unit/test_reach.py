@@ -14,7 +14,6 @@ from panda_arm import HOME_RAD, moved, panda, tool_down_at
 from vla_zenoh.control.collision import TABLE, CollisionModel
 from vla_zenoh.control.kinematics import smallest_singular_value
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.located import LocatedHit
 from vla_zenoh.control.reach import ReachLimits, Shadow
 from vla_zenoh.control.so3 import Pose, angle_between, log3
 from vla_zenoh.errors import RecordError
@@ -68,9 +67,9 @@ class Walk(NamedTuple):
         return {hit.name for hits in self.hits for hit in hits}
 
     @property
-    def last(self) -> LocatedHit:
+    def last(self) -> LimitHit:
         hit = self.hits[-1][0]
-        assert isinstance(hit, LocatedHit)
+        assert isinstance(hit, LimitHit)
         return hit
 
 
@@ -354,7 +353,7 @@ def test_a_step_in_too_little_time_is_shortened_to_what_the_joints_can_do() -> N
     assert hits == []
     fast, hits = near.bound(before, asked, dt_s=0.016, start_rad=joints)
     assert [hit.name for hit in hits] == ["joint_velocity"]
-    assert isinstance(hits[0], LocatedHit)
+    assert isinstance(hits[0], LimitHit)
     assert hits[0].where == "panda_joint4"
     assert hits[0].limit == 2.175
     gone_m = np.linalg.norm(fast.position_m - before.position_m)

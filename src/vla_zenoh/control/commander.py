@@ -23,6 +23,7 @@ from vla_zenoh.control.preflight import (
     Surroundings,
     reasons_not_to_activate,
 )
+from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.smoothing import Motion, Smoother, motion_limits
 from vla_zenoh.control.so3 import (
     Pose,
@@ -32,7 +33,7 @@ from vla_zenoh.control.so3 import (
     rotation_from_quat,
 )
 from vla_zenoh.control.states import OBEYING, State, Trigger, after
-from vla_zenoh.errors import RecordError
+from vla_zenoh.errors import RecordError, VlaZenohError
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     MAX_TEXT,
@@ -41,6 +42,7 @@ from vla_zenoh.types import (
     Event,
     GripperCommand,
     GripperState,
+    JointState,
     PoseCommand,
     PoseState,
     Stamped,
@@ -49,6 +51,11 @@ from vla_zenoh.types import (
 
 FIRST_CHUNK_PATIENCE_S = 1.0
 """After activation a new observation, an inference and a chunk have to happen first."""
+BOUND_AHEAD = 8
+"""Steps of a chunk that are checked against the arm at once; the rest when they come due."""
+JOINT_PATIENCE_S = 0.1
+SAME_TCP_M, SAME_TCP_RAD = 0.005, 0.02
+"""Kinematics and the robot's own word on its TCP may differ by this much."""
 LINGER_NS = 500_000_000
 """The stream goes on for this long after the arm stands, so that its last pose is not lost."""
 SAME_WIDTH_M = 0.005
@@ -74,6 +81,7 @@ class Inputs:
         pose: newest TCP pose, or None when none came since.
         gripper: likewise.
         around: the nodes around; None: unchanged.
+        joint: newest joints, looked at when the arm is activated.
     """
 
     settings: Sequence[Setting] = ()
@@ -81,6 +89,7 @@ class Inputs:
     pose: Stamped[PoseState] | None = None
     gripper: Stamped[GripperState] | None = None
     around: Surroundings | None = None
+    joint: Stamped[JointState] | None = None
 
 
 @dataclass(slots=True)
@@ -109,16 +118,21 @@ class Commander:
 
     Args:
         profile: limits, timing and first settings.
+        reach: the arm's kinematic shadow; None: only the workspace box bounds a goal.
         dry_run: compute everything, stream nothing.
     """
 
-    def __init__(self, profile: Profile, *, dry_run: bool = False) -> None:
+    def __init__(
+        self, profile: Profile, *, reach: Shadow | None = None, dry_run: bool = False
+    ) -> None:
         self.profile = profile
+        self.reach = reach
         self.dry_run = dry_run
         self.state = State.INACTIVE
         self.why = "not activated yet"
         self.task = Task(0, False, profile.task.prompt, profile.task.worker, profile.task.rate_hz)
         self.pose: Stamped[PoseState] | None = None
+        self.joint: Stamped[JointState] | None = None
         self.gripper_state: Stamped[GripperState] | None = None
         self.gripper = GripperArbiter(profile.robot.gripper)
         self.lease: Lease | None = None
@@ -191,6 +205,8 @@ class Commander:
             self._around = inputs.around
         if inputs.pose is not None:
             self.pose = inputs.pose
+        if inputs.joint is not None:
+            self.joint = inputs.joint
         if inputs.gripper is not None:
             self.gripper_state = inputs.gripper
             faults, mode = inputs.gripper.record.faults, inputs.gripper.record.mode
@@ -278,10 +294,34 @@ class Commander:
             now_ns,
             self.task.rate_hz,
         )
+        reasons += self._why_joints_do_not_fit(now_ns)
         if reasons or chunk is None:
             return None, reasons
         spec = self._around.specs[worker]
         return Lease(spec, chunk.header.source, now_ns, chunk.header.seq), []
+
+    def _why_joints_do_not_fit(self, now_ns: int) -> list[str]:
+        """Whether the kinematics know this robot: joints heard, and their TCP where it is said."""
+        if self.reach is None or self.pose is None:
+            return []
+        if self.joint is None:
+            return ["the joints are not known: nothing was heard on state/joint"]
+        age_s = (now_ns - self.joint.received_ns) / 1e9
+        if age_s > self.profile.timing.state_timeout_s + JOINT_PATIENCE_S:
+            return [f"the joint state is {age_s:.2f} s old"]
+        measured = Pose(self.pose.record.position_m, rotation_from_quat(self.pose.record.quat_xyzw))
+        kinematics = self.reach.kinematics
+        try:
+            joints_rad = kinematics.joints_of(self.joint.record)
+        except VlaZenohError as error:
+            return [str(error)]
+        apart_m, apart_rad = _distance(kinematics.forward(joints_rad), measured)
+        if apart_m > SAME_TCP_M or apart_rad > SAME_TCP_RAD:
+            return [
+                f"the joints put the TCP {apart_m * 1e3:.1f} mm and {apart_rad:.3f} rad from where "
+                "the robot says it is: robot.description or robot.tcp_frame is another robot's"
+            ]
+        return []
 
     def _refuse_setting(self, what: str, reasons: list[str]) -> None:
         self.why = f"{what} refused: {'; '.join(reasons)}"
@@ -291,6 +331,8 @@ class Commander:
 
     def _anchor(self, measured: PoseState, gripper: GripperState, now_ns: int) -> None:
         """Begin where the robot's own controller stands, so that nothing jumps."""
+        if self.reach is not None and self.joint is not None:
+            self.reach.reset(self.reach.kinematics.joints_of(self.joint.record))
         actual = Pose(measured.position_m, rotation_from_quat(measured.quat_xyzw))
         start = actual
         if measured.reference_position_m is not None and measured.reference_quat_xyzw is not None:
@@ -376,6 +418,7 @@ class Commander:
         assert self.lease is not None and self._timeline is not None
         action, record = self.lease.spec.action, chunk.record
         before = self._timeline.at(record.observation_stamp_ns)
+        refusing = self.profile.limits.out_of_bounds == "refuse"
         goals: list[Goal] = []
         hits: list[bounds.LimitHit] = []
         for step in record.steps:
@@ -394,15 +437,19 @@ class Commander:
                         hit.value,
                         hit.limit,
                     )
-            if acted and self.profile.limits.out_of_bounds == "refuse":
+            joints_rad = None
+            if self.reach is not None and (len(goals) < BOUND_AHEAD or refusing):
+                pose, cut = self.reach.bound(before.pose, pose, action.dt_s, before.joints_rad)
+                acted = [*acted, *cut]
+                joints_rad = self.reach.joints_rad
+            if acted and refusing:
                 return Refusal(
                     acted[0].name, "out of bounds, and the profile says refuse", *acted[0][1:3]
                 )
             hits += acted
-            before = Goal(pose, before.width_m if width_m is None else width_m)
+            before = Goal(pose, before.width_m if width_m is None else width_m, joints_rad)
             goals.append(before)
-        for hit in hits[:1]:
-            self._tell("warning", "limit", hit.name, "shortened", hit.value, hit.limit)
+        self._tell_shortened(hits)
         cause = Cause(
             record.worker,
             chunk.header.seq,
@@ -419,6 +466,7 @@ class Commander:
             max(int(action.dt_s * 1e9), 1),
             goals,
             cause,
+            len(goals) if self.reach is None or refusing else min(len(goals), BOUND_AHEAD),
         )
         self._timeline.add(plan, now_ns)
         self._deadline_ns = max(plan.end_ns, now_ns) + self._patience_ns(0.0)
@@ -563,16 +611,41 @@ class Commander:
         plan = timeline.plan
         index = plan.index_at(now_ns)
         goal = plan.goals[index]
+        if self.reach is not None and plan.cause is not None and index >= plan.bounded:
+            self._bound_until(plan, timeline, index)
+            goal = plan.goals[index]
         if goal is not self._target:
             pose, hits = bounds.leash(self.profile.limits, goal.pose, smoother.motion.pose)
             if hits:
-                goal = Goal(pose, goal.width_m)
+                goal = Goal(pose, goal.width_m)  # between two goals that were bounded
                 timeline.shift_rest(index, goal, self.profile.limits)
                 self._tell("warning", "limit", hits[0].name, "leash", hits[0].value, hits[0].limit)
             smoother.target(goal.pose)
             self._target = goal
             self.gripper.want(goal.width_m)
         return plan.cause
+
+    def _bound_until(self, plan: Plan, timeline: GoalTimeline, index: int) -> None:
+        """Bound the goals that a long chunk left for when they come due."""
+        assert self.reach is not None
+        for due in range(plan.bounded, index + 1):
+            before, asked = plan.goals[due - 1], plan.goals[due]
+            pose, cut = self.reach.bound(
+                before.pose, asked.pose, plan.dt_ns / 1e9, before.joints_rad
+            )
+            goal = Goal(pose, asked.width_m, self.reach.joints_rad)
+            if cut:
+                timeline.shift_rest(due, goal, self.profile.limits)
+                self._tell_shortened(cut)
+            else:
+                plan.goals[due] = goal
+        plan.bounded = index + 1
+
+    def _tell_shortened(self, hits: Sequence[bounds.LimitHit]) -> None:
+        """The last bound that acted on a chunk: what stands in the way now."""
+        for hit in hits[-1:]:
+            where = f" at {hit.where}" if hit.where else ""
+            self._tell("warning", "limit", hit.name, f"shortened{where}", hit.value, hit.limit)
 
     def _brake(self, smoother: Smoother, timeline: GoalTimeline, now_ns: int) -> None:
         """Stop, and let the goal be where the arm stops, so that nothing pulls it further."""

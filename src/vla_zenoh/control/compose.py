@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.so3 import Pose, between, orthonormal
 from vla_zenoh.profile import Limits
-from vla_zenoh.types import Cause
+from vla_zenoh.types import Cause, FloatArray
 
 HISTORY_NS = 15_000_000_000
 """Observations are refused long before they are this old."""
@@ -33,10 +33,17 @@ HISTORY_NS = 15_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A TCP pose and a gripper width (m) to go to."""
+    """A TCP pose and a gripper width (m) to go to.
+
+    Args:
+        pose: of the TCP.
+        width_m: of the gripper.
+        joints_rad: (n,) a joint solution of the pose, where one was looked for.
+    """
 
     pose: Pose
     width_m: float
+    joints_rad: FloatArray | None = None
 
 
 @dataclass(slots=True)
@@ -49,6 +56,7 @@ class Plan:
         dt_ns: length of a step's window.
         goals: one per step.
         cause: the chunk it came from, None for a hold.
+        bounded: so many of the goals are known to be within what the arm can do.
     """
 
     effective_ns: int
@@ -56,6 +64,7 @@ class Plan:
     dt_ns: int
     goals: list[Goal]
     cause: Cause | None = None
+    bounded: int = 0
 
     def index_at(self, t_ns: int) -> int:
         """Index of the step in force at `t_ns`."""

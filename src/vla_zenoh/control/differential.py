@@ -32,7 +32,6 @@ from numpy.typing import ArrayLike
 from vla_zenoh.control.ik import pose_error
 from vla_zenoh.control.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.located import LocatedHit
 from vla_zenoh.control.so3 import Pose
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types import FloatArray
@@ -138,7 +137,7 @@ class JointFollower:
         singular_value = smallest_singular_value(jacobian)
         hits: list[LimitHit] = []
         if singular_value < self.settings.damped_below:
-            hits.append(LocatedHit("singularity", singular_value, self.settings.damped_below))
+            hits.append(LimitHit("singularity", singular_value, self.settings.damped_below))
         low, high = self._allowed(joints, velocity, dt_s)
         held = np.zeros(len(joints), dtype=bool)
         onto = np.zeros(len(joints))
@@ -154,12 +153,12 @@ class JointFollower:
             onto[joint] = min(max(reached[joint], low[joint]), high[joint])
             bound = self.upper_rad if reached[joint] > high[joint] else self.lower_rad
             place, name = float(joints[joint]), self.kinematics.arm_joints[joint]
-            hits.append(LocatedHit("joint_limit", place, float(bound[joint]), name))
+            hits.append(LimitHit("joint_limit", place, float(bound[joint]), where=name))
         if ratio > 1.0 + 1e-9:
             joint = int(np.argmax(np.abs(wanted) / self.velocity_rad_s))
             asked, limit = abs(float(wanted[joint])), float(self.velocity_rad_s[joint])
             name = self.kinematics.arm_joints[joint]
-            hits.append(LocatedHit("joint_velocity", asked, limit, name))
+            hits.append(LimitHit("joint_velocity", asked, limit, where=name))
         reached = np.clip(reached, low, high)
         return JointMotion(joints + reached * dt_s, reached), hits
 

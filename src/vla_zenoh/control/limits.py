@@ -19,16 +19,20 @@ class LimitHit(NamedTuple):
     """A bound that acted.
 
     Args:
-        name: ``step_m``, ``step_rad``, ``workspace``, ``lead_m``, ``lead_rad``.
+        name: ``step_m``, ``step_rad``, ``workspace``, ``lead_m``, ``lead_rad``; from the arm's
+            kinematics ``reach``, ``joint_limit``, ``joint_velocity``, ``singularity``,
+            ``self_collision``, ``table_distance``.
         value: what was asked for.
         limit: what is allowed.
         fatal: too far off to be shortened.
+        where: the joint, the two links, or the link over the table; empty for the whole arm.
     """
 
     name: str
     value: float
     limit: float
     fatal: bool = False
+    where: str = ""
 
 
 def bound_step(limits: Limits, before: Pose, asked: Pose) -> tuple[Pose, list[LimitHit]]:

@@ -28,7 +28,6 @@ from vla_zenoh.control.collision import TABLE, CollisionModel
 from vla_zenoh.control.ik import Approach, IkSettings, InverseKinematics, pose_error
 from vla_zenoh.control.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.located import LocatedHit
 from vla_zenoh.control.so3 import Pose, exp3, orthonormal
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types import FloatArray
@@ -258,7 +257,7 @@ class Shadow:
         self._here = best
         return (best.pose if low > 0.0 else before), list(hits)
 
-    def _guess(self, start: _Stand, end: _Stand, hits: Sequence[LocatedHit]) -> float:
+    def _guess(self, start: _Stand, end: _Stand, hits: Sequence[LimitHit]) -> float:
         """Where to begin to look for the feasible part, from how the whole step failed."""
         if end is start or start.error > 0 or start.barriers.min() <= 0:
             return 0.5
@@ -288,7 +287,7 @@ class Shadow:
         values[1:] = self.collisions.distances(joints_rad)
         return values - self._stop
 
-    def _try(self, start: _Stand, pose: Pose, dt_s: float) -> tuple[_Stand, list[LocatedHit]]:
+    def _try(self, start: _Stand, pose: Pose, dt_s: float) -> tuple[_Stand, list[LimitHit]]:
         """Where a step would lead, and what forbids it."""
         found = self._approach(pose, start.joints_rad)
         # Where the start has no solution itself, coming nearer to having one is the way out.
@@ -300,11 +299,11 @@ class Shadow:
         end = self._stand(pose, found)
         floor = self._floor(start)
         hits = [
-            LocatedHit(
+            LimitHit(
                 self._names[index],
                 float(end.barriers[index] + self._stop[index]),
                 float(floor[index] + self._stop[index]),
-                self._where(int(index)),
+                where=self._where(int(index)),
             )
             for index in np.flatnonzero(end.barriers < floor)
         ]
@@ -327,7 +326,7 @@ class Shadow:
     def _approach(self, pose: Pose, start_rad: FloatArray) -> Approach:
         return self._solver.approach(pose, start_rad, bounded=self.limits.free_elbow)
 
-    def _out_of_range(self, start: _Stand, joints_rad: FloatArray) -> LocatedHit | None:
+    def _out_of_range(self, start: _Stand, joints_rad: FloatArray) -> LimitHit | None:
         lower, upper = self._solver.bounds(start.joints_rad)
         excess = np.maximum(lower - joints_rad, joints_rad - upper)
         joint = int(np.argmax(excess))
@@ -335,13 +334,13 @@ class Shadow:
             return None
         value = float(joints_rad[joint])
         bound = float(lower[joint] if value < lower[joint] else upper[joint])
-        return LocatedHit("joint_limit", value, bound, self.kinematics.arm_joints[joint])
+        return LimitHit("joint_limit", value, bound, where=self.kinematics.arm_joints[joint])
 
-    def _out_of_reach(self, found: Approach) -> LocatedHit:
+    def _out_of_reach(self, found: Approach) -> LimitHit:
         tolerance = self._solver.settings.position_tolerance_m
-        return LocatedHit("reach", found.error_m + found.error_rad, tolerance)
+        return LimitHit("reach", found.error_m + found.error_rad, tolerance)
 
-    def _too_fast(self, start: _Stand, end: _Stand, dt_s: float) -> list[LocatedHit]:
+    def _too_fast(self, start: _Stand, end: _Stand, dt_s: float) -> list[LimitHit]:
         error = pose_error(end.pose, start.pose)
         time_s = max(
             dt_s,
@@ -354,7 +353,7 @@ class Shadow:
         if speed[joint] <= limit:
             return []
         name = self.kinematics.arm_joints[joint]
-        return [LocatedHit("joint_velocity", float(speed[joint]), limit, name)]
+        return [LimitHit("joint_velocity", float(speed[joint]), limit, where=name)]
 
     def _where(self, index: int) -> str:
         if index == 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import sys
 import threading
 import time
@@ -13,6 +14,7 @@ import zenoh
 
 from vla_zenoh import keys as key_names
 from vla_zenoh.codec import records, settings
+from vla_zenoh.control.arm import make_shadow
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.so3 import quat_from_rotation
 from vla_zenoh.errors import CodecError
@@ -24,7 +26,14 @@ from vla_zenoh.nodes.slots import Arrival, Inbox, Latest, Mailbox
 from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.nodes.surroundings import Neighbours
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, Cause, GripperState, PoseState, Stamped
+from vla_zenoh.types import (
+    ActionChunk,
+    Cause,
+    GripperState,
+    JointState,
+    PoseState,
+    Stamped,
+)
 
 TASK_PERIOD_S = 0.2
 CLOCK_PERIOD_S = 0.1
@@ -44,12 +53,13 @@ class CommandNode:
 
     def __init__(self, profile: Profile, session: zenoh.Session, *, dry_run: bool = False) -> None:
         node = self.node = Node("command", profile, session)
-        self.commander = Commander(profile, dry_run=dry_run)
+        self.commander = Commander(profile, reach=make_shadow(profile), dry_run=dry_run)
         keys = node.keys
         self._neighbours = Neighbours(node)
         self._chunks = node.listen(keys.all_deltas, Inbox(64))
         self._pose_slot = node.listen(keys.state_pose, Latest())
         self._gripper_slot = node.listen(keys.state_gripper, Latest())
+        self._joint_slot = node.listen(keys.state_joint, Latest())
         self._settings: list[tuple[str, Mailbox, Callable[[bytes], Any]]] = [
             ("stop", node.listen(keys.stop, Mailbox(8)), lambda _: None),
             ("reset", node.listen(keys.reset, Mailbox(8)), lambda _: None),
@@ -62,7 +72,8 @@ class CommandNode:
         self._gripper_out = node.stream(keys.command_gripper, Kind.ORDER)
         self._task_out = node.stream(keys.task, Kind.ORDER)
         self._speakers = {
-            kind: Speaker(profile.timing.state_timeout_s) for kind in (PoseState, GripperState)
+            kind: Speaker(profile.timing.state_timeout_s)
+            for kind in (PoseState, JointState, GripperState)
         }
         self._latency = {stage: Percentiles() for stage in STAGES}
         self._cost_us = Percentiles(2048)
@@ -147,11 +158,12 @@ class CommandNode:
         chunks = [self._chunk(arrival) for arrival in self._chunks.take_all()]
         clock = self._check_clock()
         return Inputs(
-            [*put, *clock],
-            [chunk for chunk in chunks if chunk is not None],
-            self._state(PoseState, self._pose_slot),
-            self._state(GripperState, self._gripper_slot),
-            around,
+            settings=[*put, *clock],
+            chunks=[chunk for chunk in chunks if chunk is not None],
+            pose=self._state(PoseState, self._pose_slot),
+            joint=self._joints(put),
+            gripper=self._state(GripperState, self._gripper_slot),
+            around=around,
         )
 
     def _chunk(self, arrival: Arrival) -> Stamped[ActionChunk] | None:
@@ -178,6 +190,12 @@ class CommandNode:
         """The newest state, if it is new and by the writer that speaks for the robot."""
         arrival = slot.take()
         return None if arrival is None else self.node.read(kind, arrival, self._speakers[kind])
+
+    def _joints(self, put: list[Setting]) -> Stamped[JointState] | None:
+        """Joints are looked at when the arm is given to somebody; decoding them costs."""
+        if not any(setting.name in ("active", "worker") for setting in put):
+            return None
+        return self._state(JointState, self._joint_slot)
 
     def _check_clock(self) -> list[Setting]:
         if time.monotonic() - self._last_clock < CLOCK_PERIOD_S:
@@ -256,6 +274,7 @@ class CommandNode:
                 "realtime": self._realtime,
                 "dry_run": mind.dry_run,
                 **self._goal(),
+                **self._margins(),
             },
             ages_s=ages_s,
             rates_hz={"loop": self._rate.rate_hz},
@@ -271,4 +290,18 @@ class CommandNode:
             "goal_m": [round(float(value), 6) for value in goal.pose.position_m],
             "goal_quat_xyzw": [round(float(v), 6) for v in quat_from_rotation(goal.pose.rotation)],
             "goal_width_m": round(goal.width_m, 5),
+        }
+
+    def _margins(self) -> dict[str, Any]:
+        """Room the arm has at its goal."""
+        reach = self.commander.reach
+        if reach is None or self.commander.goal is None:
+            return {}
+        room = reach.margins
+        return {
+            "joint_margin_rad": round(room.joint_rad, 4),
+            "joint_margin_of": room.joint,
+            "singular_value": round(room.singular_value, 4),
+            "self_distance_m": round(room.self_m, 4) if math.isfinite(room.self_m) else None,
+            "table_distance_m": round(room.table_m, 4) if math.isfinite(room.table_m) else None,
         }

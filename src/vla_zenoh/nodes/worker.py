@@ -44,6 +44,7 @@ LOOK_PERIOD_S = 0.25
 AFTER_A_FAILURE_S = 0.5
 FRESH_PATIENCE_S = 0.05
 MAX_COMPLAINT = 500
+NAP_S, NAPS = 0.004, 5
 FRESH_TOLERANCE_S = 0.005
 STATE_KINDS: dict[str, type[Any]] = {
     "joint": JointState,
@@ -151,7 +152,11 @@ class WorkerNode:
         """Sleep until the slowest input brings something, or a little while."""
         if self._image_slots:
             slot = next(iter(self._image_slots.values()))
-            slot.wait(0.02)
+            for _ in range(NAPS):
+                if slot.wait(NAP_S):
+                    return
+                # States that are decoded while nothing else is to do need no time afterwards.
+                self._listen_to_states()
         else:
             stop.wait(0.002 if self._task is not None else 0.02)
 
@@ -168,6 +173,9 @@ class WorkerNode:
             if arrival is not None and image is not None:
                 self._images[camera] = image
                 self._pictures_s[camera] = arrival.mono_ns / 1e9
+        self._listen_to_states()
+
+    def _listen_to_states(self) -> None:
         for part, inbox in self._state_slots.items():
             for arrival in inbox.take_all():
                 state = self.node.read(STATE_KINDS[part], arrival, self._speakers[part])

@@ -150,6 +150,55 @@ class RotationLimits(Section):
     jerk_rad_s3: float = Field(default=60.0, gt=0, le=12500)
 
 
+class ReachLimits(Section):
+    """What the arm's kinematics allow a goal to be; see `vla_zenoh.control.reach`.
+
+    Args:
+        joint_margin_rad: kept from both ends of every joint's range.
+        singularity_slow: smallest singular value of the Jacobian below which steps get shorter.
+        singularity_stop: it gets no smaller than this.
+        collision_slow_m: distance of the arm to itself below which steps get shorter.
+        collision_stop_m: it comes no nearer; also the arm, without its hand, to the table.
+        table_z_m: height of the table in the base frame; null: there is none.
+        table_slow_m: likewise for hand and fingers, which have work to do there.
+        table_stop_m: they come no nearer.
+    """
+
+    joint_margin_rad: float = Field(default=0.05, ge=0, le=0.5)
+    singularity_slow: float = Field(default=0.025, ge=0, le=0.5)
+    singularity_stop: float = Field(default=0.015, ge=0, le=0.5)
+    collision_slow_m: float = Field(default=0.05, ge=0, le=0.3)
+    collision_stop_m: float = Field(default=0.02, ge=0, le=0.3)
+    table_z_m: float | None = Field(default=0.0, ge=-2, le=2)
+    table_slow_m: float = Field(default=0.002, ge=0, le=0.3)
+    table_stop_m: float = Field(default=0.001, ge=0, le=0.3)
+
+    @model_validator(mode="after")
+    def _a_stop_lies_behind_its_slow(self) -> ReachLimits:
+        refuse(
+            [
+                ((stop,), f"is {at:g}, which must not be above {slow} ({before:g})")
+                for slow, before, stop, at in (
+                    (
+                        "singularity_slow",
+                        self.singularity_slow,
+                        "singularity_stop",
+                        self.singularity_stop,
+                    ),
+                    (
+                        "collision_slow_m",
+                        self.collision_slow_m,
+                        "collision_stop_m",
+                        self.collision_stop_m,
+                    ),
+                    ("table_slow_m", self.table_slow_m, "table_stop_m", self.table_stop_m),
+                )
+                if at > before
+            ]
+        )
+        return self
+
+
 class Limits(Section):
     """Bounds of every motion; upper bounds are Franka's published ones for the Panda.
 
@@ -158,6 +207,7 @@ class Limits(Section):
         translation: of the smoothed motion.
         rotation: likewise.
         joint: of a motion commanded by joint positions.
+        reach: what joints, singularities, the arm itself and the table allow.
         step_m: largest translation of one model step.
         step_rad: largest rotation of one model step.
         out_of_bounds: ``clamp`` shortens to the bound and tells, ``refuse`` drops the whole chunk.
@@ -171,6 +221,7 @@ class Limits(Section):
     translation: TranslationLimits = TranslationLimits()
     rotation: RotationLimits = RotationLimits()
     joint: JointLimits = JointLimits()
+    reach: ReachLimits = ReachLimits()
     step_m: float = Field(default=0.05, gt=0, le=0.2)
     step_rad: float = Field(default=0.2, gt=0, le=0.8)
     out_of_bounds: Literal["clamp", "refuse"] = "clamp"

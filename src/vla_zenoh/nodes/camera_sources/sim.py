@@ -169,7 +169,8 @@ class SimCameras:
         step = coarseness.step
         rgb = renderer.render(camera, -(-width // step), -(-height // step))
         if step > 1:
-            rgb = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR))
+            scaled = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
+            rgb = np.asarray(scaled, np.uint8)
         if rgb.shape != (height, width, 3):
             raise NodeError(f"the renderer drew a picture of shape {rgb.shape}")
         if renderer.backend.name == RAYCAST:
