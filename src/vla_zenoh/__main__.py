@@ -1,6 +1,10 @@
 """``python -m vla_zenoh``: the same as ``vla-zenoh``."""
 
-from vla_zenoh.cli.main import app_entry
+from vla_zenoh.nodes.orphan import die_with_parent
 
 if __name__ == "__main__":
+    die_with_parent()  # before what a node imports, which takes its time
+
+    from vla_zenoh.cli.main import app_entry
+
     app_entry()

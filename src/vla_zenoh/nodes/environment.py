@@ -16,6 +16,7 @@ from pathlib import Path
 from vla_zenoh import __version__
 from vla_zenoh.errors import WorkerError
 from vla_zenoh.loader import ModelFile
+from vla_zenoh.nodes.orphan import die_with_parent
 
 INSIDE_VARIABLE = "VLA_ZENOH_WORKER_ENVIRONMENT"
 
@@ -30,6 +31,7 @@ def run_in_own_environment(model: ModelFile, python: str | None) -> None:
     Raises:
         WorkerError: another environment is needed and cannot be made.
     """
+    die_with_parent()  # before the model itself is made, which may take long or hang
     missing = model.missing()
     if INSIDE_VARIABLE in os.environ:
         if missing:

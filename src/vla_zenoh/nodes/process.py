@@ -1,9 +1,7 @@
-"""What a node's process does around it: signals, the session, and not outliving its parent."""
+"""What a node's process does around it: signals and the session."""
 
 from __future__ import annotations
 
-import ctypes
-import ctypes.util
 import os
 import signal
 import threading
@@ -11,12 +9,11 @@ from collections.abc import Callable
 
 import zenoh
 
+from vla_zenoh.errors import SessionError
+from vla_zenoh.nodes.orphan import PARENT_VARIABLE, die_with_parent
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile
 
-PARENT_VARIABLE = "VLA_ZENOH_PARENT"
-"""Process number of the supervisor; a child whose supervisor is gone ends itself."""
-PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 ROUTER_PATIENCE_S = 10.0
 
 
@@ -26,28 +23,6 @@ def stop_on_signals() -> threading.Event:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     return stop
-
-
-def die_with_parent() -> None:
-    """Where a supervisor started us: end in an orderly way when it dies, however it dies."""
-    parent = os.environ.get(PARENT_VARIABLE)
-    if parent is None:
-        return
-    library = ctypes.util.find_library("c")
-    if library is not None:
-        ctypes.CDLL(library, use_errno=True).prctl(PARENT_DEATH_SIGNAL, signal.SIGTERM, 0, 0, 0)
-    if not _exists(int(parent)):  # it died before we asked
-        os.kill(os.getpid(), signal.SIGTERM)
-
-
-def _exists(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 def run_node(
@@ -71,5 +46,11 @@ def run_node(
     die_with_parent()
     if wait_s is None:
         wait_s = ROUTER_PATIENCE_S if PARENT_VARIABLE in os.environ else 0.0
-    with open_session(profile.session, wait_s=wait_s) as session:
+    try:
+        session = open_session(profile.session, wait_s=wait_s, stop=stop)
+    except SessionError:
+        if stop.is_set():
+            return
+        raise
+    with session:
         run(session, stop)

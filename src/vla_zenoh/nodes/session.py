@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from typing import Any
 
@@ -73,6 +74,7 @@ def open_session(
     mode: str | None = None,
     connect: tuple[str, ...] | None = None,
     wait_s: float = 0.0,
+    stop: threading.Event | None = None,
 ) -> zenoh.Session:
     """A session as the profile says.
 
@@ -81,18 +83,19 @@ def open_session(
         mode: overrides the profile's, for the router.
         connect: overrides the profile's endpoints.
         wait_s: keep trying for this long.
+        stop: give up at once when it is set.
 
     Raises:
         SessionError: nobody answers there, or the address is taken; says what to do.
     """
     settings = config(profile, mode=mode, connect=connect)
     give_up = time.monotonic() + wait_s
+    stop = stop or threading.Event()
     while True:
         try:
             return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
         except zenoh.ZError as error:
-            if time.monotonic() < give_up:
-                time.sleep(RETRY_S)
+            if time.monotonic() < give_up and not stop.wait(RETRY_S):
                 continue
             raise _explain(settings, error) from error
 

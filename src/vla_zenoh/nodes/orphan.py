@@ -1,0 +1,61 @@
+"""Not outliving the supervisor. Imports next to nothing: a node does this before all else."""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+PARENT_VARIABLE = "VLA_ZENOH_PARENT"
+"""Process number of the supervisor; a child whose supervisor is gone ends itself."""
+PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
+WATCH = "watch over the supervisor"
+LOOK_PERIOD_S = 0.25
+LAST_WORDS_S = 1.5
+
+
+def die_with_parent() -> None:
+    """Where a supervisor started us: end in an orderly way when it dies, however it dies.
+
+    Linux tells a child at once. A process between us (uv, for a model with an environment of its
+    own) swallows that, and elsewhere there is no such thing: so we look as well, and what does not
+    end within `LAST_WORDS_S` of it, because it hangs in a library, is ended.
+    """
+    parent = os.environ.get(PARENT_VARIABLE)
+    if parent is None:
+        return
+    library = ctypes.util.find_library("c")
+    if library is not None and sys.platform == "linux":
+        ctypes.CDLL(library, use_errno=True).prctl(PARENT_DEATH_SIGNAL, signal.SIGTERM, 0, 0, 0)
+    if not is_running(int(parent)):  # it died before we asked
+        os.kill(os.getpid(), signal.SIGTERM)
+    if not any(thread.name == WATCH for thread in threading.enumerate()):
+        threading.Thread(target=_watch, args=(int(parent),), name=WATCH, daemon=True).start()
+
+
+def _watch(parent: int) -> None:
+    while is_running(parent):
+        time.sleep(LOOK_PERIOD_S)
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(LAST_WORDS_S)
+    os._exit(1)
+
+
+def is_running(pid: int) -> bool:
+    """Whether there is such a process, and it is not a dead one that nobody has waited for."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return not Path("/proc/self").exists()  # without /proc, what can be signalled runs
+    return stat.rpartition(") ")[2][:1] not in ("Z", "X")
