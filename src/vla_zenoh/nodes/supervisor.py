@@ -9,17 +9,19 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
-from vla_zenoh.nodes.process import PARENT_VARIABLE
+from vla_zenoh.nodes.orphan import PARENT_VARIABLE
 
 BACKOFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
-STABLE_S = 10.0
-"""A node that ran this long starts with the shortest backoff again."""
+STABLE_S = 60.0
+"""A node that ran this long starts with the shortest backoff again. Longer than one takes to start
+and find, on a busy machine, that it cannot."""
 GIVE_UP_AFTER = 6
 """Deaths in a row, each before `STABLE_S`."""
-TERM_PATIENCE_S = 1.6
-STOP_ORDER = ("worker", "camera", "command", "sim", "router")
+STOP_ORDER = ((("worker", "camera", "command"), 0.8), (("sim",), 0.4), (("router",), 0.1))
+"""What is ended one after the other, and how long before the deadline the next one has its turn."""
 POLL_S = 0.05
 
 
@@ -98,12 +100,9 @@ class Supervisor:
         Args:
             deadline_s: on the monotonic clock; what still runs then is killed.
         """
-        for kind in STOP_ORDER[:-1]:
-            self._signal(kind, signal.SIGTERM)
-        last = max(time.monotonic(), min(deadline_s - 0.4, time.monotonic() + TERM_PATIENCE_S))
-        self._await([c for c in self.children if c.command.kind != "router"], last)
-        self._signal("router", signal.SIGTERM)
-        self._await(self.children, min(deadline_s, last + 0.4))
+        for kinds, left_s in STOP_ORDER:
+            self._signal(kinds, signal.SIGTERM)
+            self._await(kinds, deadline_s - left_s)
         self.kill()
         for child in self.children:
             for thread in child.threads:
@@ -112,8 +111,8 @@ class Supervisor:
     def kill(self) -> None:
         """End whatever still runs, at once."""
         for child in self.children:
-            if child.process is not None and child.process.poll() is None:
-                child.process.kill()
+            if child.process is not None:
+                _kill_group(child.process)
                 child.process.wait()
 
     def pids(self) -> dict[str, int]:
@@ -157,19 +156,34 @@ class Supervisor:
         stable = now - child.started_s > STABLE_S
         child.deaths_in_a_row = 1 if stable else child.deaths_in_a_row + 1
         wait_s = BACKOFF_S[min(child.deaths_in_a_row, len(BACKOFF_S)) - 1]
+        if child.process is not None:
+            _kill_group(child.process)
         child.process, child.start_again_s = None, now + wait_s
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
         self._tell(child.command.name, f"{how}; starting again in {wait_s:g} s")
 
-    def _signal(self, kind: str, number: signal.Signals) -> None:
-        for child in self.children:
-            running = child.process is not None and child.process.poll() is None
-            if child.command.kind == kind and running and child.process is not None:
-                child.process.send_signal(number)
+    def _signal(self, kinds: Sequence[str], number: signal.Signals) -> None:
+        for process in self._running(kinds):
+            # All of its group: between us and the node there may be a process that made its
+            # environment.
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, number)
 
-    @staticmethod
-    def _await(children: Sequence[Child], deadline_s: float) -> None:
-        while time.monotonic() < deadline_s:
-            if all(c.process is None or c.process.poll() is not None for c in children):
-                return
+    def _running(self, kinds: Sequence[str]) -> list[subprocess.Popen[str]]:
+        return [
+            child.process
+            for child in self.children
+            if child.command.kind in kinds
+            and child.process is not None
+            and child.process.poll() is None
+        ]
+
+    def _await(self, kinds: Sequence[str], deadline_s: float) -> None:
+        while self._running(kinds) and time.monotonic() < deadline_s:
             time.sleep(POLL_S)
+
+
+def _kill_group(process: subprocess.Popen[str]) -> None:
+    """End the process and all that it started. Its group has its number (`start_new_session`)."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)

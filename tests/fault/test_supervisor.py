@@ -1,0 +1,265 @@
+"""``vla-zenoh up`` as a process: how it ends, what it leaves behind, when it gives up."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_rig import until
+from chain import MOVING_M_S, READY_PATIENCE_S, Recorder, write_profile
+
+from vla_zenoh.errors import SessionError
+from vla_zenoh.nodes.client import Client
+from vla_zenoh.nodes.orphan import PARENT_VARIABLE
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.nodes.supervisor import GIVE_UP_AFTER, NodeCommand, Supervisor
+from vla_zenoh.profile import load_profile
+
+END_S = 3.0
+BUSY_S = 1.0
+"""What a busy machine may add to it."""
+STILL_TWIST = 1e-3
+GIVE_UP_S = 90.0
+"""Nine seconds of waiting between six starts of an interpreter."""
+NODES = {"router", "sim", "camera", "command", "worker-scripted"}
+
+
+class Up:
+    """A running ``vla-zenoh up`` and what it wrote."""
+
+    def __init__(self, *arguments: str) -> None:
+        environment = {**os.environ, "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb"}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "vla_zenoh", "up", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=environment,
+            start_new_session=True,
+        )
+        self.lines: list[str] = []
+        self.thread = threading.Thread(target=self._read)
+        self.thread.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.append(line.rstrip())
+
+    @property
+    def text(self) -> str:
+        return "\n".join(self.lines)
+
+    def end(self, number: int, timeout_s: float = 15.0) -> float:
+        """Send it a signal; returns how long it took to end (s)."""
+        began = time.monotonic()
+        self.process.send_signal(number)
+        self.process.wait(timeout_s)
+        return time.monotonic() - began
+
+    def children(self) -> dict[int, str]:
+        """Process number -> command line of all that it, or what it started, has started."""
+        marked = f"{PARENT_VARIABLE}={self.process.pid}".encode()
+        found: dict[int, str] = {}
+        for folder in Path("/proc").iterdir():
+            try:
+                if not folder.name.isdigit():
+                    continue
+                if marked not in (folder / "environ").read_bytes().split(b"\0"):
+                    continue
+                if (folder / "stat").read_text().rpartition(") ")[2].startswith("Z"):
+                    continue
+                found[int(folder.name)] = (folder / "cmdline").read_bytes().decode()
+            except OSError:  # it has just ended
+                continue
+        return found
+
+
+@contextmanager
+def up(*arguments: str) -> Iterator[Up]:
+    running = Up(*arguments)
+    try:
+        yield running
+    finally:
+        if running.process.poll() is None:
+            running.process.kill()
+            running.process.wait()
+        for pid in running.children():
+            os.kill(pid, signal.SIGKILL)
+        running.thread.join(5.0)
+        assert running.process.stdout is not None
+        running.process.stdout.close()
+
+
+@contextmanager
+def client_of(path: Path) -> Iterator[tuple[Client, Recorder]]:
+    profile = load_profile(str(path))
+    with open_session(profile.session, wait_s=READY_PATIENCE_S) as session:
+        yield Client(profile, session).follow(), Recorder(session, profile.keys)
+
+
+def get_moving(client: Client, recorder: Recorder) -> None:
+    def activated() -> bool:
+        try:
+            return client.activate().active
+        except SessionError:
+            return False
+
+    until("an active arm", activated, READY_PATIENCE_S)
+    client.set_prompt("HARD: go up")
+
+    def moves() -> bool:
+        state = recorder.newest_state()
+        return state is not None and bool(np.linalg.norm(state.twist[:3]) > MOVING_M_S)
+
+    until("a moving arm", moves)
+    time.sleep(0.3)
+
+
+def ends(running: Up, but: frozenset[int] = frozenset()) -> None:
+    """All nodes have ended within the time, but those of `but`."""
+    give_up = time.monotonic() + END_S + BUSY_S
+    while set(running.children()) - but:
+        if time.monotonic() > give_up:
+            left = "\n".join(running.children().values()).replace("\0", " ")
+            raise AssertionError(f"still there:\n{left}\n{running.text}")
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+def test_a_signal_brakes_the_arm_first_and_then_ends_everything(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    path = write_profile(tmp_path)
+    with up(str(path)) as running, client_of(path) as (client, recorder):
+        get_moving(client, recorder)
+        assert len(running.children()) == len(NODES)
+        took_s = running.end(number)
+        assert running.process.returncode == 0, running.text
+        print(f"{number.name}: ended in {took_s:.2f} s")
+        assert took_s < END_S + BUSY_S
+        assert running.children() == {}
+        _, last = max(recorder.commands(), key=lambda pair: pair[0].seq)
+        assert np.abs(last.twist).max() < STILL_TWIST
+        state = recorder.newest_state()
+        assert state is not None
+        assert np.linalg.norm(state.twist[:3]) < MOVING_M_S
+        running.thread.join(5.0)
+        assert "braking the arm" in running.text
+        assert "all nodes have ended" in running.text
+
+
+def test_nothing_outlives_a_killed_supervisor(tmp_path: Path) -> None:
+    path = write_profile(tmp_path)
+    with up(str(path)) as running, client_of(path) as (client, recorder):
+        get_moving(client, recorder)
+        hung = next(pid for pid, line in running.children().items() if "\0worker\0" in line)
+        # Dead before it is told: it must not need to be told.
+        os.kill(hung, signal.SIGSTOP)
+        running.process.kill()
+        killed = time.monotonic()
+        ends(running, but=frozenset({hung}))
+        print(f"killed supervisor: all ended in {time.monotonic() - killed:.2f} s")
+        os.kill(hung, signal.SIGCONT)
+        ends(running)
+
+
+def test_a_killed_supervisor_that_nobody_has_buried_yet_counts_as_gone(tmp_path: Path) -> None:
+    """Killed while its nodes still start up: they find a dead parent, and end."""
+    path = write_profile(tmp_path)
+    with up(str(path)) as running:
+        until("nodes", lambda: len(running.children()) >= len(NODES), READY_PATIENCE_S)
+        os.kill(running.process.pid, signal.SIGKILL)  # and no wait(): it stays a zombie
+        ends(running)
+
+
+def test_a_node_that_dies_at_every_start_is_given_up(tmp_path: Path) -> None:
+    path = write_profile(tmp_path, more="workers: [missing_model]\n")
+    text = path.read_text().replace("worker: scripted", "worker: missing_model")
+    path.write_text(text)
+    with up(str(path)) as running:
+        began = time.monotonic()
+        running.process.wait(GIVE_UP_S)
+        running.thread.join(5.0)
+        print(f"given up after {time.monotonic() - began:.1f} s")
+        assert running.process.returncode == 1
+        assert running.children() == {}
+        assert f"died {GIVE_UP_AFTER} times in a row; giving up" in running.text
+        assert "error: worker-missing_model dies again and again" in running.text
+        assert "missing_model" in running.text
+
+
+def test_a_router_that_runs_already_is_used_and_left_running(tmp_path: Path) -> None:
+    path = write_profile(tmp_path)
+    profile = load_profile(str(path))
+    with (
+        open_session(profile.session, mode="router"),
+        up(str(path)) as running,
+        client_of(path) as (client, _),
+    ):
+        until("a sim", lambda: "sim" in client.alive, READY_PATIENCE_S)
+        until("the others", lambda: len(running.children()) == len(NODES) - 1)
+        assert "one answers already; using it" in running.text
+        took_s = running.end(signal.SIGINT)
+        assert took_s < END_S + BUSY_S
+        assert running.children() == {}
+        open_session(profile.session).close()
+
+
+MODEL = """
+import subprocess, sys
+
+INNER = '''
+import signal, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print("inner", flush=True)
+time.sleep(60)
+'''
+
+class Model:
+    def __init__(self):
+        subprocess.run([sys.executable, "-c", INNER])
+
+    def infer(self, observation):
+        pass
+"""
+
+
+def test_what_a_node_has_started_ends_with_it(tmp_path: Path) -> None:
+    """A model's own environment is made by a process between the supervisor and the node."""
+    model = tmp_path / "slow_to_make.py"
+    model.write_text(MODEL)
+    lines: list[str] = []
+    supervisor = Supervisor(
+        [NodeCommand("worker-slow", "worker", ("worker", str(model)))],
+        log=lambda _, line: lines.append(line),
+        tell=lambda *_: None,
+    )
+    supervisor.start()
+    until("a process that the model has started", lambda: "inner" in lines)
+    (group,) = supervisor.pids().values()
+    assert os.getpgid(group) == group
+    supervisor.stop(time.monotonic() + END_S)
+
+    until("nothing is left of it", lambda: not group_runs(group), BUSY_S)
+
+
+def group_runs(group: int) -> bool:
+    """Whether any process of that group is more than a zombie."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, its_group = stat.read_text().rpartition(") ")[2].split()[:3]
+        except OSError:
+            continue
+        if int(its_group) == group and state not in "ZX":
+            return True
+    return False
