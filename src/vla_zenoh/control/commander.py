@@ -17,6 +17,7 @@ from vla_zenoh.control.acceptance import Lease, Refusal, refuse
 from vla_zenoh.control.actions import step_pose, step_width
 from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
 from vla_zenoh.control.gripper import GripperArbiter
+from vla_zenoh.control.joint_stage import JointStage
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.control.preflight import (
     CLOCK_TOLERANCE_S,
@@ -33,15 +34,17 @@ from vla_zenoh.control.so3 import (
     rotation_from_quat,
 )
 from vla_zenoh.control.states import OBEYING, State, Trigger, after
-from vla_zenoh.errors import RecordError, VlaZenohError
+from vla_zenoh.errors import ProfileError, RecordError, VlaZenohError
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     MAX_TEXT,
     ActionChunk,
     Cause,
     Event,
+    FloatArray,
     GripperCommand,
     GripperState,
+    JointCommand,
     JointState,
     PoseCommand,
     PoseState,
@@ -97,7 +100,8 @@ class Outputs:
     """What to publish.
 
     Args:
-        pose: None while nothing is streamed.
+        pose: None while nothing is streamed, or where joints are commanded.
+        joint: None while nothing is streamed, or where poses are commanded.
         gripper: None unless a new width is to be sent.
         task_changed: `Commander.task` differs from the last tick's.
         events: what happened.
@@ -106,6 +110,7 @@ class Outputs:
     """
 
     pose: PoseCommand | None = None
+    joint: JointCommand | None = None
     gripper: GripperCommand | None = None
     task_changed: bool = False
     events: list[Event] = field(default_factory=list)
@@ -118,7 +123,8 @@ class Commander:
 
     Args:
         profile: limits, timing and first settings.
-        reach: the arm's kinematic shadow; None: only the workspace box bounds a goal.
+        reach: the arm's kinematic shadow; None: only the workspace box bounds a goal, and joints
+            cannot be commanded.
         dry_run: compute everything, stream nothing.
     """
 
@@ -127,6 +133,11 @@ class Commander:
     ) -> None:
         self.profile = profile
         self.reach = reach
+        self._joints: JointStage | None = None
+        if profile.robot.command == "joint":
+            if reach is None:
+                raise ProfileError("robot.command is joint, which needs the robot's kinematics")
+            self._joints = JointStage(profile, reach.kinematics)
         self.dry_run = dry_run
         self.state = State.INACTIVE
         self.why = "not activated yet"
@@ -186,8 +197,9 @@ class Commander:
 
     @property
     def at_rest(self) -> bool:
-        """The commanded pose stands still."""
-        return self._smoother is None or self._smoother.at_rest
+        """What is commanded stands still."""
+        still = self._joints is None or self._joints.at_rest
+        return self._smoother is None or (self._smoother.at_rest and still)
 
     @property
     def streaming(self) -> bool:
@@ -349,6 +361,8 @@ class Commander:
             )
         elif not self._streaming:
             self._smoother.reset(start)
+        if self._joints is not None and not self._streaming:
+            self._joints.restart(self._held_joints())
         width_m = self._width_to_keep(gripper)
         self.gripper.restart(width_m)
         # A blocked arm's controller is led back to where the arm is. Otherwise a brake under way
@@ -361,6 +375,14 @@ class Commander:
             self._timeline.restart(goal, now_ns)
         self._target = None if blocked else goal
         self._deadline_ns = now_ns + self._patience_ns(FIRST_CHUNK_PATIENCE_S)
+
+    def _held_joints(self) -> FloatArray:
+        """Joints the robot's controller holds, or where they are."""
+        assert self.reach is not None and self.joint is not None
+        state, kinematics = self.joint.record, self.reach.kinematics
+        if state.reference_rad is not None:
+            return kinematics.ordered(state.names, state.reference_rad)
+        return kinematics.joints_of(state)
 
     def _width_to_keep(self, gripper: GripperState) -> float:
         """The width last sent while the gripper obeys it, because a grip ends with another."""
@@ -592,17 +614,21 @@ class Commander:
             cause = self._follow(self._smoother, self._timeline, now_ns)
         else:
             self._brake(self._smoother, self._timeline, now_ns)
-        if not self._must_stream(self._smoother, now_ns):
+        if not self._must_stream(now_ns):
             self._streaming = False
             return
         self._streaming = True
         failures = self._smoother.failures
-        motion = self._smoother.tick()
-        for _ in range(ticks - 1):
+        motion = self._smoother.motion
+        for _ in range(ticks):
             motion = self._smoother.tick()
+            if self._joints is not None:
+                self._joints.tick(motion)
         if self._smoother.failures > failures:
             self._change(Trigger.FAULT, "no trajectory could be computed; braked")
-        if not self.dry_run:
+        if not self.dry_run and self._joints is not None:
+            self._out.joint = self._joints.command(self.state.value, cause)
+        elif not self.dry_run:
             self._out.pose = self._command(motion, cause)
         if self.state is State.ACTIVE and not self.dry_run:
             self._out.gripper = self.gripper.step(now_ns, self.gripper_state)
@@ -654,8 +680,8 @@ class Commander:
         if timeline.plan.cause is not None and smoother.at_rest:
             timeline.hold(Goal(smoother.motion.pose, timeline.at(now_ns).width_m), now_ns)
 
-    def _must_stream(self, smoother: Smoother, now_ns: int) -> bool:
-        if self.state in OBEYING or not smoother.at_rest:
+    def _must_stream(self, now_ns: int) -> bool:
+        if self.state in OBEYING or not self.at_rest:
             self._rest_since_ns = None
             return self.state in OBEYING or self._streaming
         if self._rest_since_ns is None:

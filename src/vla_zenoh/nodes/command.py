@@ -69,6 +69,7 @@ class CommandNode:
             ("active", node.listen(keys.active, Mailbox(16)), settings.decode_bool),
         ]
         self._pose_out = node.stream(keys.command_pose, Kind.CONTROL)
+        self._joint_out = node.stream(keys.command_joint, Kind.CONTROL)
         self._gripper_out = node.stream(keys.command_gripper, Kind.ORDER)
         self._task_out = node.stream(keys.task, Kind.ORDER)
         self._speakers = {
@@ -211,6 +212,8 @@ class CommandNode:
     def _publish(self, out: Outputs, now_ns: int) -> None:
         if out.pose is not None:
             self._pose_out.put(out.pose, stamp_wall_ns=now_ns)
+        if out.joint is not None:
+            self._joint_out.put(out.joint, stamp_wall_ns=now_ns)
         if out.gripper is not None:
             self._gripper_out.put(out.gripper)
         for refusal in out.refusals:

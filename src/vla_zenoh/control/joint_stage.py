@@ -1,0 +1,66 @@
+"""Joint commands out of the smoothed pose stream, for arms that take joint positions."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vla_zenoh.control.differential import FollowSettings, JointFollower, JointMotion
+from vla_zenoh.control.kinematics import Kinematics
+from vla_zenoh.control.smoothing import Motion
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import Cause, FloatArray, JointCommand
+
+REST_RAD_S = 1e-5
+
+
+class JointStage:
+    """Joints that follow the pose stream by differential inverse kinematics.
+
+    Args:
+        profile: joint limits, home as posture, rate.
+        kinematics: of the arm.
+    """
+
+    def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
+        robot, limits = profile.robot, profile.limits
+        size = len(robot.arm_joints)
+        # The follower's joints are in chain order, the profile's in its own.
+        acceleration = kinematics.ordered(
+            robot.arm_joints, limits.joint.of("acceleration_rad_s2", size)
+        )
+        velocity = kinematics.ordered(robot.arm_joints, limits.joint.of("velocity_rad_s", size))
+        share = float(np.min(velocity / kinematics.velocity_rad_s))
+        self._follower = JointFollower(
+            kinematics,
+            kinematics.ordered(robot.arm_joints, robot.home_rad),
+            FollowSettings(
+                acceleration_rad_s2=tuple(float(value) for value in acceleration),
+                velocity_share=min(share, 1.0),
+                joint_margin_rad=limits.reach.joint_margin_rad,
+                singularity_stop=limits.reach.singularity_stop,
+            ),
+        )
+        self._dt_s = 1.0 / profile.timing.command_hz
+        self._names = kinematics.arm_joints
+        self.restart(self._follower.posture_rad)
+
+    def restart(self, joints_rad: FloatArray) -> None:
+        """Stand at these joints (chain order); only for an arm that is not streamed to."""
+        still = np.zeros(len(joints_rad))
+        self._now = JointMotion(np.array(joints_rad, dtype=np.float64), still)
+        self._acceleration = still
+
+    def tick(self, motion: Motion) -> None:
+        """Follow for one tick."""
+        before = self._now.velocity_rad_s
+        self._now, _ = self._follower.step(self._now, motion.pose, motion.twist, self._dt_s)
+        self._acceleration = (self._now.velocity_rad_s - before) / self._dt_s
+
+    @property
+    def at_rest(self) -> bool:
+        """No joint moves."""
+        return float(np.abs(self._now.velocity_rad_s).max()) < REST_RAD_S
+
+    def command(self, state: str, cause: Cause | None) -> JointCommand:
+        """Where the joints have to be now."""
+        return JointCommand(self._names, *self._now, self._acceleration, state=state, cause=cause)
