@@ -139,6 +139,30 @@ def test_a_chunk_whose_observation_does_not_show_the_last_chunk_replaces_it() ->
     np.testing.assert_allclose(rig.moved_m(), [0, 0, STEP_M], atol=AT_GOAL_M)
 
 
+def test_a_chunk_counts_from_its_publication_however_long_it_was_on_its_way() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.run(0.2)
+    rig.send([UP], observed_ago_s=0.15, published_ago_s=0.1)
+    rig.run(0.02)
+    rig.send([UP], observed_ago_s=0.08)  # later than the first one's publication: on top of it
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, 2 * STEP_M], atol=AT_GOAL_M)
+
+
+def test_a_chunk_published_before_it_was_observed_counts_from_its_observation() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.run(0.2)
+    rig.send([UP], observed_ago_s=0.15)
+    rig.run(0.1)
+    rig.send([UP], observed_ago_s=0.05, published_ago_s=10.0)
+    rig.run(0.02)
+    rig.send([UP], observed_ago_s=0.01)
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, 3 * STEP_M], atol=AT_GOAL_M)
+
+
 def test_steps_whose_time_has_passed_are_skipped_and_no_way_is_lost() -> None:
     rig = Rig()
     rig.activate()
