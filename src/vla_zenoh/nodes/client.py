@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -37,6 +38,8 @@ class Client:
         self.alive: set[str] = set()
         self.events: deque[tuple[str, Header, Event]] = deque(maxlen=4096)
         self.task: Task | None = None
+        self._task_heard_s = -1e9
+        self._refusals: deque[tuple[float, Event]] = deque(maxlen=256)
         self._subscriptions: list[Any] = []
 
     def follow(self) -> Client:
@@ -79,11 +82,14 @@ class Client:
         if found is not None:
             with self._lock:
                 self.events.append((last(str(sample.key_expr)), *found))
+                if found[1].kind == "refusal":
+                    self._refusals.append((time.monotonic(), found[1]))
 
     def _on_task(self, sample: zenoh.Sample) -> None:
         found = self._decode(Task, sample)
         if found is not None:
-            self.task = found[1]
+            with self._lock:
+                self.task, self._task_heard_s = found[1], time.monotonic()
 
     def _on_alive(self, sample: zenoh.Sample) -> None:
         name = last(str(sample.key_expr))
@@ -92,6 +98,8 @@ class Client:
                 self.alive.add(name)
             else:
                 self.alive.discard(name)
+                if name == "command":  # nobody keeps the task any more
+                    self.task = None
 
     # -- reading ------------------------------------------------------------------------------
     def status(self, node: str) -> NodeStatus | None:
@@ -136,21 +144,26 @@ class Client:
         Raises:
             SessionError: it did not; says why where it said so.
         """
-        self.put(self.keys.prompt, prompt)
         wanted = prompt.strip()
-        return self._settled(lambda: self.task and self.task.prompt == wanted, "prompt", timeout_s)
+        return self._set(
+            self.keys.prompt, prompt, lambda task: task.prompt == wanted, "prompt", timeout_s
+        )
 
     def set_rate(self, rate_hz: float, timeout_s: float = 2.0) -> Task:
         """Likewise for the rate."""
-        self.put(self.keys.rate, f"{rate_hz:g}")
-        return self._settled(
-            lambda: self.task and abs(self.task.rate_hz - rate_hz) < 1e-6, "rate", timeout_s
+        return self._set(
+            self.keys.rate,
+            f"{rate_hz:g}",
+            lambda task: math.isclose(task.rate_hz, rate_hz, rel_tol=1e-5),
+            "rate",
+            timeout_s,
         )
 
     def set_worker(self, worker: str, timeout_s: float = 2.0) -> Task:
         """Likewise for the worker."""
-        self.put(self.keys.worker, worker)
-        return self._settled(lambda: self.task and self.task.worker == worker, "worker", timeout_s)
+        return self._set(
+            self.keys.worker, worker, lambda task: task.worker == worker, "worker", timeout_s
+        )
 
     def activate(self, timeout_s: float = 3.0) -> Task:
         """Activate and wait until the arm obeys.
@@ -158,41 +171,56 @@ class Client:
         Raises:
             SessionError: it was refused, with every reason.
         """
-        self.take_events()
-        self.put(self.keys.active, "true")
-        return self._settled(lambda: self.task and self.task.active, "activate", timeout_s)
+        return self._set(self.keys.active, "true", lambda task: task.active, "activate", timeout_s)
 
     def deactivate(self, timeout_s: float = 3.0) -> bool:
         """Deactivate; True when the arm stands within `timeout_s`."""
+        began_s = time.monotonic()
         self.put(self.keys.active, "false")
-        return bool(self.wait_for(self._stands, timeout_s))
+        return bool(self.wait_for(lambda: self._stands(began_s), timeout_s))
 
-    def _stands(self) -> bool:
-        status = self.status("command")
+    def _stands(self, since_s: float) -> bool:
+        """By a status that is younger than the order: an older one says nothing about it."""
+        with self._lock:
+            status, heard_s = self.statuses.get("command", (None, 0.0))
         return (
             status is not None
+            and heard_s > since_s
             and status.state not in ("active", "holding")
             and status.detail.get("at_rest") is True
         )
 
-    def _settled(self, condition: Callable[[], Any], what: str, timeout_s: float) -> Task:
-        reasons: list[str] = []
-
-        def look() -> bool:
-            for _, _, event in self.take_events():
-                if event.kind == "refusal" and event.what == f"{what}_refused":
-                    reasons.append(event.why)
-            return bool(reasons) or bool(condition())
-
-        self.wait_for(look, timeout_s)
-        if reasons:
+    def _set(
+        self, key: str, text: str, taken: Callable[[Task], bool], what: str, timeout_s: float
+    ) -> Task:
+        """Put a setting, and wait for a task that says so or a refusal, both younger than it."""
+        began_s = time.monotonic()
+        self.put(key, text)
+        self.wait_for(
+            lambda: self._refused(what, began_s) or self._taken(taken, began_s), timeout_s
+        )
+        if self._refused(what, began_s):
             time.sleep(0.1)  # the other reasons come right behind the first
-            look()
-            raise SessionError(f"{what} refused:\n  - " + "\n  - ".join(dict.fromkeys(reasons)))
-        if not condition() or self.task is None:
-            if "command" not in self.alive:
-                raise SessionError(f"{what}: no command node of robot {self.keys.robot!r} is alive")
-            status = self.status("command")
-            why = f"; it says: {status.detail.get('why', '')}" if status else ""
-            raise SessionError(f"{what}: the command node did not take it in {timeout_s:g} s{why}")
-        return self.task
+            reasons = dict.fromkeys(self._refused(what, began_s))
+            raise SessionError(f"{what} refused:\n  - " + "\n  - ".join(reasons))
+        task = self._taken(taken, began_s)
+        if task is not None:
+            return task
+        if "command" not in self.alive:
+            raise SessionError(f"{what}: no command node of robot {self.keys.robot!r} is alive")
+        status = self.status("command")
+        why = f"; it says: {status.detail.get('why', '')}" if status else ""
+        raise SessionError(f"{what}: the command node did not take it in {timeout_s:g} s{why}")
+
+    def _taken(self, taken: Callable[[Task], bool], since_s: float) -> Task | None:
+        with self._lock:
+            task, heard_s = self.task, self._task_heard_s
+        return task if task is not None and heard_s > since_s and taken(task) else None
+
+    def _refused(self, what: str, since_s: float) -> list[str]:
+        with self._lock:
+            return [
+                event.why
+                for heard_s, event in self._refusals
+                if heard_s > since_s and event.what == f"{what}_refused"
+            ]

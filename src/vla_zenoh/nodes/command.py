@@ -81,6 +81,7 @@ class CommandNode:
         self._rate = RateMeter()
         self._last_task = self._last_clock = 0.0
         self._realtime = False
+        self._was_at_rest = True
         self._answer_settings()
 
     def _answer_settings(self) -> None:
@@ -146,15 +147,7 @@ class CommandNode:
 
     # -- in -----------------------------------------------------------------------------------
     def _gather(self, now_ns: int) -> Inputs:
-        put: list[Setting] = []
-        for name, inbox, decode in self._settings:
-            for arrival in inbox.take_all():
-                if name in ("stop", "reset"):
-                    put.append(Setting(name))
-                    continue
-                value = self.node.read_text(decode, arrival)
-                if value is not None:
-                    put.append(Setting(name, value))
+        put = self._settings_put()
         around = self._neighbours.look(now_ns)
         chunks = [self._chunk(arrival) for arrival in self._chunks.take_all()]
         clock = self._check_clock()
@@ -166,6 +159,33 @@ class CommandNode:
             gripper=self._state(GripperState, self._gripper_slot),
             around=around,
         )
+
+    def _settings_put(self) -> list[Setting]:
+        """What was put since the last tick, in the order in which the router saw it.
+
+        Each setting has a mailbox of its own, so that a flood of one does not push out another.
+        Between peers without a router nobody stamps samples: each key's own order is kept then.
+        """
+        arrivals = [
+            (name, decode, arrival)
+            for name, inbox, decode in self._settings
+            for arrival in inbox.take_all()
+        ]
+        stamps = [
+            stamp.get_time() for *_, arrival in arrivals if (stamp := arrival.sample.timestamp)
+        ]
+        if len(stamps) == len(arrivals):
+            order = sorted(range(len(arrivals)), key=stamps.__getitem__)
+            arrivals = [arrivals[index] for index in order]
+        put: list[Setting] = []
+        for name, decode, arrival in arrivals:
+            if name in ("stop", "reset"):
+                put.append(Setting(name))
+                continue
+            value = self.node.read_text(decode, arrival)
+            if value is not None:
+                put.append(Setting(name, value))
+        return put
 
     def _chunk(self, arrival: Arrival) -> Stamped[ActionChunk] | None:
         """A chunk by the worker whose key it came on, None for any other."""
@@ -244,6 +264,8 @@ class CommandNode:
         mind = self.commander
         # An event is news of a change, so status says the same at once.
         now = any(event.kind == "transition" for event in out.events) or out.task_changed
+        now = now or mind.at_rest != self._was_at_rest
+        self._was_at_rest = mind.at_rest
         if not now and not self.node.report_due(mind.state.value):
             return
         task = mind.task

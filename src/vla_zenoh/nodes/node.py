@@ -89,8 +89,8 @@ class Node:
         self.counters: Counter[str] = Counter()
         self.started_wall_ns = time.time_ns()
         self._declared: list[Any] = []
-        self._last_event: dict[tuple[str, str], float] = {}
-        self._held_events: Counter[tuple[str, str]] = Counter()
+        self._last_event: dict[tuple[str, str, str], float] = {}
+        self._held_events: Counter[tuple[str, str, str]] = Counter()
         self._last_status = 0.0
         self._last_state = ""
         self._refuse_a_second_one()
@@ -116,23 +116,30 @@ class Node:
         if event.kind == "transition" or self._due(event.kind, event.what):
             self._write(event)
 
-    def refuse(self, reason: str, why: str) -> None:
-        """Count a refusal by reason, and say why."""
-        self.counters[f"refused.{reason}"] += 1
-        if self._due("refusal", reason):
-            self._write(Event("warning", "refusal", reason, why[:1000]))
+    def refuse(self, reason: str, why: str, about: str = "") -> None:
+        """Count a refusal by reason, and say why.
 
-    def _due(self, kind: str, what: str) -> bool:
+        Args:
+            reason: short stable name.
+            why: a sentence.
+            about: what is refused; a flood of refusals of one thing does not silence another's.
+        """
+        self.counters[f"refused.{reason}"] += 1
+        if self._due("refusal", reason, about):
+            self._write(Event("warning", "refusal", reason, why[:1000]), about)
+
+    def _due(self, kind: str, what: str, about: str = "") -> bool:
         """Whether an event of this kind may be written now; if not, it is counted."""
         if len(self._last_event) > 512:
             self._last_event.clear()
-        if time.monotonic() - self._last_event.get((kind, what), -1e9) >= EVENT_PERIOD_S:
+            self._held_events.clear()
+        if time.monotonic() - self._last_event.get((kind, what, about), -1e9) >= EVENT_PERIOD_S:
             return True
-        self._held_events[kind, what] += 1
+        self._held_events[kind, what, about] += 1
         return False
 
-    def _write(self, event: Event) -> None:
-        kind = (event.kind, event.what)
+    def _write(self, event: Event, about: str = "") -> None:
+        kind = (event.kind, event.what, about)
         self._last_event[kind] = time.monotonic()
         held = self._held_events.pop(kind, 0)
         self._events.put(replace(event, count=event.count + held) if held else event)
@@ -226,7 +233,8 @@ class Node:
                 speaker.check(header, arrival.mono_ns)
             record = records.decode(kind, sample.payload.to_bytes())
         except CodecError as error:
-            self.refuse(error.reason, f"{self.keys.short(str(sample.key_expr))}: {error}")
+            key = self.keys.short(str(sample.key_expr))
+            self.refuse(error.reason, f"{key}: {error}", key)
             return None
         if speaker is not None:
             speaker.heard(header, arrival.mono_ns)
@@ -248,7 +256,7 @@ class Node:
             return decode(arrival.sample.payload.to_bytes())
         except CodecError as error:
             key = self.keys.short(str(arrival.sample.key_expr))
-            self.refuse(error.reason, f"{key}: {error}")
+            self.refuse(error.reason, f"{key}: {error}", key)
             return None
 
     def close(self) -> None:
