@@ -150,7 +150,7 @@ def _summary(
     profile: Profile, rate_hz: float, result: DemoResult, recorder: Recorder
 ) -> dict[str, Any]:
     outcomes = [outcome.to_dict() for outcome in result.outcomes]
-    commands = recorder.recording.commands
+    commands = recorder.recording.commands or recorder.recording.joint_commands
     refusals: dict[str, int] = {}
     for status in result.statuses.values():
         for name, count in status.counters.items():
@@ -167,7 +167,7 @@ def _summary(
         "rotation_drift_rad": max((o["rotation_drift_rad"] for o in outcomes), default=None),
         "latency_ms": latencies(first_commands(recorder)),
         "rates_hz": {
-            "pose_command": _rate(commands),
+            "command": _rate(commands),
             "state": _rate(recorder.recording.poses),
             "chunks": result.statuses[f"worker-{profile.task.worker}"].rates_hz.get("chunks", 0.0)
             if f"worker-{profile.task.worker}" in result.statuses

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vla_zenoh.control.so3 import log3, rotation_from_quat
 from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import Cause, FloatArray
+from vla_zenoh.types import Cause, FloatArray, PoseState
 
 MAX_POINTS = 4000
 AXES = (("x", "tab:red"), ("y", "tab:green"), ("z", "tab:blue"))
@@ -46,8 +46,10 @@ def plot_run(
     except ImportError as error:
         raise MissingExtraError("matplotlib", "sim") from error
     poses, commands = _thin(poses), _thin(commands)
-    if not poses or not commands:
+    if not poses:
         return
+    if not commands:  # an arm that takes joints: what its controller holds is the command
+        commands = [_Held(entry.heard_ns, _held(entry.record)) for entry in poses]
     zero_ns = poses[0].heard_ns
     figure = plt.figure(figsize=(13, 9), layout="constrained")
     grid = figure.add_gridspec(3, 3)
@@ -89,6 +91,17 @@ def plot_run(
     figure.suptitle(f"vla-zenoh run, profile {profile.name}")
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+class _Held(NamedTuple):
+    heard_ns: int
+    record: Any
+
+
+def _held(state: PoseState) -> PoseState:
+    if state.reference_position_m is None or state.reference_quat_xyzw is None:
+        return state
+    return PoseState(state.reference_position_m, state.reference_quat_xyzw, state.twist)
 
 
 def _thin(entries: Sequence[Any]) -> Sequence[Any]:

@@ -204,15 +204,16 @@ class DemoRun:
 
     def _at_rest(self) -> bool:
         heard = self._recorder.recording
-        command = heard.commands[-1].record if heard.commands else None
-        gripper = heard.grippers[-1].record if heard.grippers else None
-        return bool(
-            command is not None
-            and float(np.abs(command.twist).max()) < 1e-5
-            and float(np.linalg.norm(command.goal_position_m - command.position_m)) < 1e-5
-            and gripper is not None
-            and not gripper.moving
-        )
+        if not heard.grippers or heard.grippers[-1].record.moving:
+            return False
+        if heard.joint_commands:
+            joints = heard.joint_commands[-1].record
+            return self._at_rest_measured() and float(np.abs(joints.velocity_rad_s).max()) < 1e-5
+        if not heard.commands:
+            return False
+        command = heard.commands[-1].record
+        ahead_m = float(np.linalg.norm(command.goal_position_m - command.position_m))
+        return float(np.abs(command.twist).max()) < 1e-5 and ahead_m < 1e-5
 
     def _standing(self) -> Standing:
         """Mean measured pose of the next moments."""
@@ -266,7 +267,8 @@ def first_commands(recorder: Recorder) -> list[tuple[Cause, int]]:
     """For each chunk the first pose command that carries it out, and when it was heard."""
     out: list[tuple[Cause, int]] = []
     last: tuple[str, int] | None = None
-    for entry in recorder.recording.commands:
+    heard = recorder.recording
+    for entry in heard.commands or heard.joint_commands:
         cause = entry.record.cause
         if cause is not None and (cause.worker, cause.chunk_seq) != last:
             last = (cause.worker, cause.chunk_seq)

@@ -18,6 +18,7 @@ from vla_zenoh.types import (
     ActionChunk,
     GripperState,
     Header,
+    JointCommand,
     JointState,
     PoseCommand,
     PoseState,
@@ -43,6 +44,7 @@ class Recording:
     joints: list[Heard] = field(default_factory=list)
     grippers: list[Heard] = field(default_factory=list)
     commands: list[Heard] = field(default_factory=list)
+    joint_commands: list[Heard] = field(default_factory=list)
     chunks: list[Heard] = field(default_factory=list)
     frames: list[tuple[int, bytes]] = field(default_factory=list)
     marks: list[tuple[int, str]] = field(default_factory=list)
@@ -86,6 +88,7 @@ class Recorder:
             "joints": keys.state_joint,
             "grippers": keys.state_gripper,
             "commands": keys.command_pose,
+            "joint_commands": keys.command_joint,
             "chunks": keys.delta(worker),
         }
         self._subscribers = [
@@ -126,6 +129,7 @@ class Recorder:
             "joints": JointState,
             "grippers": GripperState,
             "commands": PoseCommand,
+            "joint_commands": JointCommand,
             "chunks": ActionChunk,
         }
         while not self._closed or self._queue:
