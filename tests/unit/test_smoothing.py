@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.smoothing import Motion, MotionLimits, Smoother
@@ -18,7 +18,7 @@ START = Pose(np.array([0.43, 0.0, 0.3]), exp3(np.array([3.0, 0.2, -0.4])))
 
 LIMIT_RTOL = 1e-6
 STILL = 1e-6  # m/s and rad/s
-AT_TARGET_M, AT_TARGET_RAD = 1e-9, 1e-7
+AT_TARGET_M, AT_TARGET_RAD = 1e-8, 1e-7
 # Errors of the trapezium rule over one tick of a motion whose jerk is bounded.
 STEP_ATOL_M, STEP_ATOL_RAD = 2e-7, 1e-6
 SPEED_ATOL = np.array([2e-4] * 3 + [1e-3] * 3)
@@ -69,6 +69,7 @@ def test_limits_hold_and_the_pose_is_the_integral_of_the_twist_whatever_is_order
 
 
 @settings(max_examples=40)
+@example([(3, (np.array([0.0, 0.0, 0.15]), np.array([0.0, 0.0, 0.6])))], (np.zeros(3), np.zeros(3)))
 @given(orders, targets)
 def test_it_ends_exactly_on_its_last_target(
     given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | None]],

@@ -31,6 +31,8 @@ from vla_zenoh.types import FloatArray
 AXES = 6
 REST_VELOCITY = 1e-6
 """m/s and rad/s: slower counts as standing."""
+REST_OFFSET = 1e-6
+"""m and rad: nearer to the target counts as there. Ruckig may end some 1e-9 beside it."""
 
 ROTATION_BOX = 0.55
 """Share of a rotation limit given to each axis, so that the norm over three axes (sqrt 3 of it) and
@@ -195,7 +197,7 @@ class Smoother:
         if self.braking:
             return float(np.abs(self.motion.acceleration).max()) < 1e-3
         ahead = np.array(self._input.target_position) - np.array(self._input.current_position)
-        return float(np.abs(ahead).max()) < 1e-9
+        return float(np.abs(ahead).max()) < REST_OFFSET
 
     def _anchor_here(self) -> None:
         rotvec = np.array(self._input.current_position[3:])
