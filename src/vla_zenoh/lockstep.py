@@ -3,6 +3,10 @@
 The same `Commander`, `ReferenceGuard` and `assemble` as in the nodes, and every record goes through
 the codec as on the wire; only sessions, threads and waiting are left out. A run is reproducible to
 the bit and as fast as the computer: for tests, for making data, for measuring what latency does.
+
+Faults are put in from outside: `Lockstep.tamper` stands on the wire and may drop, delay, repeat or
+change every message; `Lockstep.set_clock` sets the wall clock of one node; `Lockstep.alive` names
+the nodes that others believe alive.
 """
 
 from __future__ import annotations
@@ -10,8 +14,8 @@ from __future__ import annotations
 import heapq
 import random
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +30,7 @@ from vla_zenoh.control.preflight import Surroundings
 from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.reference import ReferenceGuard, guard_limits
 from vla_zenoh.control.so3 import Pose
+from vla_zenoh.errors import CodecError
 from vla_zenoh.observe import History, NotYet, assemble
 from vla_zenoh.policy import ActionSteps, Policy, check_steps
 from vla_zenoh.profile import Profile
@@ -78,6 +83,27 @@ class Delays:
     wire_s: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One record on the wire.
+
+    Args:
+        kind: class of the record.
+        header: what its writer says of it.
+        payload: the record as bytes.
+        arrival_ns: virtual time at which it arrives.
+    """
+
+    kind: type[Any]
+    header: Header
+    payload: bytes
+    arrival_ns: int
+
+
+Tamper = Callable[[Message], Iterable[Message]]
+"""What arrives in place of a message: nothing, itself, several, others."""
+
+
 @dataclass(slots=True)
 class Trace:
     """What was commanded and where the TCP was, one entry per command tick.
@@ -109,6 +135,7 @@ class Lockstep:
         reach: see `Commander`.
         dry_run: likewise.
         seed: of the jitter.
+        others: more workers, by name; they run in the shadow until one is chosen.
     """
 
     def __init__(
@@ -122,18 +149,25 @@ class Lockstep:
         reach: Shadow | None = None,
         dry_run: bool = False,
         seed: int = 0,
+        others: Mapping[str, Policy] | None = None,
     ) -> None:
         self.profile, self.world = profile, world
         self.delays = delays or Delays()
         self.now_ns = START_NS
         self.commander = Commander(profile, reach=reach, dry_run=dry_run)
         self.guard = ReferenceGuard(Pose(*world.tcp()), TICK_NS / 1e9, guard_limits(profile))
-        self.alive = {SIM, CAMERA, COMMAND, worker_node(profile.task.worker)}
+        self.tamper: Tamper | None = None
         self.trace = Trace()
         self.events: list[Event] = []
         self.refused: Counter[str] = Counter()
         self.guard_refused: Counter[str] = Counter()
-        self.worker = _Worker(profile, policy, self.delays, random.Random(seed))
+        policies = {profile.task.worker: policy, **(others or {})}
+        self.workers = {
+            name: _Worker(profile, name, each, self.delays, random.Random(seed + index))
+            for index, (name, each) in enumerate(policies.items())
+        }
+        self.alive = {SIM, CAMERA, COMMAND, *(w.source for w in self.workers.values())}
+        self._clock_ns: Counter[str] = Counter()
         self._picture = picture or _gray
         self._arrivals: list[tuple[int, int, Callable[[], None]]] = []
         self._sent = 0
@@ -160,6 +194,21 @@ class Lockstep:
             self._tick()
         return condition()
 
+    def set_clock(self, node: str, offset_s: float) -> None:
+        """Set the wall clock of `node` (its stamps are its source) to this much past the others'.
+
+        The command node answers a step of its own clock as `vla_zenoh.nodes.command` does.
+        """
+        offset_ns = round(offset_s * 1e9)
+        step_s = (offset_ns - self._clock_ns[node]) / 1e9
+        self._clock_ns[node] = offset_ns
+        if node == COMMAND and abs(step_s) > self.profile.timing.max_clock_step_s:
+            self.put("lose", f"the wall clock was set by {step_s:+.3f} s")
+
+    def wall_ns(self, node: str) -> int:
+        """The wall clock of `node`."""
+        return self.now_ns + self._clock_ns[node]
+
     # -- one millisecond ----------------------------------------------------------------------
     def _tick(self) -> None:
         self.now_ns += TICK_NS
@@ -170,15 +219,17 @@ class Lockstep:
             self._next_picture_ns += round(1e9 / self.delays.camera_hz)
             self._publish_pictures()
         self._receive()
-        chunk = self.worker.turn(self.now_ns)
-        if chunk is not None:
-            # Published when the inference is over, and stamped with that time.
-            self._send(self.worker.source, chunk, self._take_chunk, chunk.inference_end_ns)
+        for worker in self.workers.values():
+            chunk = worker.turn(self.now_ns, self.wall_ns(worker.source))
+            if chunk is not None:
+                # Published when the inference is over, and stamped with that time.
+                end_ns = chunk.inference_end_ns - self._clock_ns[worker.source]
+                self._send(worker.source, chunk, self._take_chunk, end_ns)
         self._receive()
         if self.now_ns >= self._next_command_ns:
             self._next_command_ns += round(1e9 / self.profile.timing.command_hz)
             self._command()
-        reference = self.guard.tick(self.now_ns)
+        reference = self.guard.tick(self.wall_ns(SIM))
         self.world.tick(
             Reference(reference.pose.position_m, reference.pose.rotation, *reference[1:])
         )
@@ -191,13 +242,13 @@ class Lockstep:
         self._inbox.around = Surroundings(
             alive=frozenset(self.alive),
             robot_node=SIM,
-            specs={self.worker.name: self.worker.spec},
-            spec_sources={self.worker.name: self.worker.source},
+            specs={name: worker.spec for name, worker in self.workers.items()},
+            spec_sources={name: worker.source for name, worker in self.workers.items()},
             camera_ages_s=dict.fromkeys(self.profile.cameras, 0.0),
             camera_nodes=dict.fromkeys(self.profile.cameras, CAMERA),
         )
         inputs, self._inbox = self._inbox, Inputs([], [])
-        out = self.commander.step(inputs, self.now_ns)
+        out = self.commander.step(inputs, self.wall_ns(COMMAND))
         self._publish(out)
         position_m, rotation = self.world.tcp()
         self.trace.time_ns.append(self.now_ns)
@@ -213,24 +264,29 @@ class Lockstep:
             self._send(COMMAND, out.pose, self._take_pose_command)
         if out.gripper is not None:
             self._send(COMMAND, out.gripper, self._take_gripper_command)
-        if out.task_changed or self.worker.task is None:
-            self._send(COMMAND, self.commander.task, self.worker.take_task)
+        if out.task_changed or any(worker.task is None for worker in self.workers.values()):
+            self._send(COMMAND, self.commander.task, self._take_task)
 
     def _publish_states(self) -> None:
         reference = self.guard.motion
         held = Reference(reference.pose.position_m, reference.pose.rotation, *reference[1:])
         self._send(SIM, self.world.pose_state(held), self._take_pose_state)
-        self._send(SIM, self.world.gripper_state(), self._take_gripper_state)
-        if self.commander.reach is not None or "joint" in self.worker.spec.observation.state:
+        gripper = self.world.gripper_state()
+        if self.guard.braking:
+            gripper = replace(gripper, mode="braking")
+        self._send(SIM, gripper, self._take_gripper_state)
+        wanted = {part for w in self.workers.values() for part in w.spec.observation.state}
+        if self.commander.reach is not None or "joint" in wanted:
             self._send(SIM, self.world.joint_state(), self._take_joint_state)
 
     def _publish_pictures(self) -> None:
         self._seq[CAMERA] += 1
-        for camera in self.worker.spec.observation.cameras:
-            header = Header(self.now_ns, self._seq[CAMERA], CAMERA)
-            arrival_ns = self.now_ns + round(self.delays.camera_s * 1e9)
-            picture = Stamped(header, self._picture(camera.camera), arrival_ns)
-            self._deliver(arrival_ns, partial(self.worker.take_picture, camera.camera, picture))
+        header = Header(self.wall_ns(CAMERA), self._seq[CAMERA], CAMERA)
+        arrival_ns = self.now_ns + round(self.delays.camera_s * 1e9)
+        seen = {c.camera for w in self.workers.values() for c in w.spec.observation.cameras}
+        for camera in sorted(seen):
+            picture = Stamped(header, self._picture(camera), arrival_ns)
+            self._deliver(arrival_ns, partial(self._take_picture, camera, picture))
 
     # -- the wire -----------------------------------------------------------------------------
     def _send(
@@ -238,42 +294,67 @@ class Lockstep:
         source: str,
         record: Any,
         take: Callable[[Stamped[Any]], None],
-        stamp_ns: int | None = None,
+        sent_ns: int | None = None,
     ) -> None:
-        stamp_ns = self.now_ns if stamp_ns is None else stamp_ns
+        """Put a record on the wire; `take` gets it with the virtual time of its arrival."""
+        sent_ns = self.now_ns if sent_ns is None else sent_ns
         self._seq[f"{source} {type(record).__name__}"] += 1
         seq = self._seq[f"{source} {type(record).__name__}"]
-        attachment = header_codec.encode(Header(stamp_ns, seq, source))
-        payload, kind = records.encode(record), type(record)
-        arrival_ns = stamp_ns + round(self.delays.wire_s * 1e9)
+        message = Message(
+            type(record),
+            Header(sent_ns + self._clock_ns[source], seq, source),
+            records.encode(record),
+            sent_ns + round(self.delays.wire_s * 1e9),
+        )
+        for arriving in [message] if self.tamper is None else self.tamper(message):
+            self._deliver(arriving.arrival_ns, partial(self._arrive, arriving, take))
 
-        def arrive() -> None:
-            header = header_codec.decode(attachment)
-            take(Stamped(header, records.decode(kind, payload), arrival_ns))
+    def _arrive(self, message: Message, take: Callable[[Stamped[Any]], None]) -> None:
+        try:
+            header = header_codec.decode(header_codec.encode(message.header))
+            record = records.decode(message.kind, message.payload)
+        except CodecError as error:
+            self.refused[error.reason] += 1
+            return
+        take(Stamped(header, record, message.arrival_ns))
 
-        self._deliver(arrival_ns, arrive)
+    def _at(self, node: str, arrived: Stamped[Any]) -> Stamped[Any]:
+        """As `node` dates it."""
+        return replace(arrived, received_ns=arrived.received_ns + self._clock_ns[node])
 
     def _deliver(self, arrival_ns: int, arrive: Callable[[], None]) -> None:
         self._sent += 1
         heapq.heappush(self._arrivals, (arrival_ns, self._sent, arrive))
 
     def _take_pose_state(self, state: Stamped[PoseState]) -> None:
-        self._inbox.pose = state
-        self.worker.take_state(state)
+        self._inbox.pose = self._at(COMMAND, state)
+        self._take_state(state)
 
     def _take_joint_state(self, state: Stamped[JointState]) -> None:
-        self._inbox.joint = state
-        self.worker.take_state(state)
+        self._inbox.joint = self._at(COMMAND, state)
+        self._take_state(state)
 
     def _take_gripper_state(self, state: Stamped[GripperState]) -> None:
-        self._inbox.gripper = state
-        self.worker.take_state(state)
+        self._inbox.gripper = self._at(COMMAND, state)
+        self._take_state(state)
+
+    def _take_state(self, state: Stamped[Any]) -> None:
+        for worker in self.workers.values():
+            worker.take_state(self._at(worker.source, state))
+
+    def _take_picture(self, camera: str, picture: Stamped[Image]) -> None:
+        for worker in self.workers.values():
+            worker.take_picture(camera, self._at(worker.source, picture))
+
+    def _take_task(self, task: Stamped[Task]) -> None:
+        for worker in self.workers.values():
+            worker.take_task(self._at(worker.source, task))
 
     def _take_chunk(self, chunk: Stamped[ActionChunk]) -> None:
-        self._inbox.chunks = [*self._inbox.chunks, chunk]
+        self._inbox.chunks = [*self._inbox.chunks, self._at(COMMAND, chunk)]
 
     def _take_pose_command(self, command: Stamped[PoseCommand]) -> None:
-        refusal = self.guard.offer(command, self.now_ns)
+        refusal = self.guard.offer(self._at(SIM, command), self.wall_ns(SIM))
         if refusal is not None:
             self.guard_refused[refusal] += 1
 
@@ -286,10 +367,10 @@ class _Worker:
     """A worker on the virtual clock: one inference at a time, at the task's rate."""
 
     def __init__(
-        self, profile: Profile, policy: Policy, delays: Delays, jitter: random.Random
+        self, profile: Profile, name: str, policy: Policy, delays: Delays, jitter: random.Random
     ) -> None:
-        self.name = profile.task.worker
-        self.source = worker_node(self.name)
+        self.name = name
+        self.source = worker_node(name)
         self.policy, self.spec = policy, policy.spec
         self.task: Task | None = None
         self._patience_ns = int(profile.timing.max_observation_age_s * 1e9)
@@ -320,9 +401,14 @@ class _Worker:
         """The newest picture of a camera."""
         self._images[camera] = picture
 
-    def turn(self, now_ns: int) -> ActionChunk | None:
-        """Begin an inference if it is time and there is something to see."""
-        if self.task is None or now_ns < max(self._due_ns, self._not_before_ns):
+    def turn(self, now_ns: int, wall_ns: int) -> ActionChunk | None:
+        """Begin an inference if it is time and there is something to see.
+
+        Args:
+            now_ns: virtual time.
+            wall_ns: this worker's wall clock, in which a chunk is dated.
+        """
+        if self.task is None or now_ns < self._due_ns or wall_ns < self._not_before_ns:
             return None
         observation = assemble(
             self.spec,
@@ -330,7 +416,7 @@ class _Worker:
             self._images,
             self._states,
             not_before_ns=self._not_before_ns,
-            now_ns=now_ns,
+            now_ns=wall_ns,
         )
         if isinstance(observation, NotYet):
             return None
@@ -338,9 +424,11 @@ class _Worker:
         answer = result if isinstance(result, ActionSteps) else ActionSteps(result)
         steps = check_steps(self.spec.action, answer.steps)
         share = 1.0 + self._delays.jitter * self._jitter.uniform(-1.0, 1.0)
-        end_ns = now_ns + round(self._delays.inference_s * share * 1e9)
-        self._due_ns = max(self._due_ns + round(1e9 / observation.rate_hz), now_ns)
-        self._not_before_ns = end_ns
+        duration_ns = round(self._delays.inference_s * share * 1e9)
+        # One inference at a time, and a period that was missed is not made up for.
+        period_ns = round(1e9 / observation.rate_hz)
+        self._due_ns = max(self._due_ns + period_ns, now_ns + duration_ns)
+        self._not_before_ns = wall_ns + duration_ns
         return ActionChunk(
             worker=self.name,
             spec_hash=self.spec.hash,
@@ -351,9 +439,9 @@ class _Worker:
             + int(len(steps) * self.spec.action.dt_s * 1e9)
             + self._patience_ns,
             steps=steps,
-            observed_ns=now_ns,
-            inference_start_ns=now_ns,
-            inference_end_ns=end_ns,
+            observed_ns=wall_ns,
+            inference_start_ns=wall_ns,
+            inference_end_ns=wall_ns + duration_ns,
             done=answer.done,
         )
 
