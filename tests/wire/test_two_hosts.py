@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from camera_rig import until
+from camera_rig import free_endpoint, until
 from chain import READY_PATIENCE_S, Recorder, write_profile
 
 from vla_zenoh.errors import SessionError
@@ -20,6 +20,12 @@ from vla_zenoh.profile import load_profile
 
 STEPS, STEP_M, TOLERANCE_M = 5, 0.01, 0.001
 END_S = 5.0
+HOSTS = """\
+hosts:
+  robot: {{nodes: [router, sim, camera, command]}}
+  gpu: {{nodes: [worker], connect: ["{endpoint}"]}}
+"""
+"""As shipped, at a free port."""
 
 
 @contextmanager
@@ -37,7 +43,13 @@ def up(path: Path, host: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def test_models_on_another_host_get_jpeg_and_move_the_arm(tmp_path: Path) -> None:
-    path = write_profile(tmp_path, extends="panda_sim_two_hosts")
+    endpoint = free_endpoint()
+    path = write_profile(
+        tmp_path,
+        extends="panda_sim_two_hosts",
+        endpoint=endpoint,
+        more=HOSTS.format(endpoint=endpoint),
+    )
     profile = load_profile(str(path))
     with (
         up(path, "robot") as robot,
