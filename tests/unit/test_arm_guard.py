@@ -72,7 +72,7 @@ def test_it_holds_the_arm_by_what_the_profile_says_until_somebody_commands(
 
 def test_while_poses_are_followed_joints_are_refused_and_change_nothing() -> None:
     side = Side()
-    assert side.pose(0.005, 0.1) is None
+    assert side.pose(0.001, 0.1) is None
     before = side.tick()
     assert side.joint() == "other_mode"
     assert side.guard.mode == "pose"

@@ -156,15 +156,26 @@ def test_a_command_that_comes_again_or_late_is_replayed() -> None:
 
 @pytest.mark.parametrize(("x", "reason"), [(0.449, None), (0.451, "jump"), (0.4, "jump")])
 def test_a_jump_is_refused(x: float, reason: str | None) -> None:
+    side = guard()
+    assert side.offer(command(0.43, 0.0, Header(now(0), 1, SOURCE), 0), now(0)) is None
+    assert side.offer(command(x, 0.0, Header(now(0), 2, SOURCE), 0), now(0)) == reason
+
+
+@pytest.mark.parametrize(("x", "reason"), [(0.4315, None), (0.4325, "jump")])
+def test_a_stream_begins_where_the_reference_is(x: float, reason: str | None) -> None:
     assert guard().offer(command(x, 0.0, Header(now(0), 1, SOURCE), 0), now(0)) == reason
 
 
-def test_a_turn_that_jumps_is_refused() -> None:
-    side = guard()
-    quat = quat_from_rotation(exp3(np.array([0.0, 0.0, 0.11])) @ START.rotation)
-    at_m = START.position_m
-    record = PoseCommand(at_m, quat, np.zeros(6), np.zeros(6), at_m, quat, "active")
-    assert side.offer(Stamped(Header(now(0), 1, SOURCE), record, now(0)), now(0)) == "jump"
+@pytest.mark.parametrize(("turn_rad", "followed"), [(0.009, False), (0.09, True)])
+def test_a_turn_that_jumps_is_refused(turn_rad: float, followed: bool) -> None:
+    for by_rad, reason in ((turn_rad, None), (turn_rad * 1.2, "jump")):
+        side = guard()
+        if followed:
+            assert side.offer(command(0.43, 0.0, Header(now(0), 1, SOURCE), 0), now(0)) is None
+        quat = quat_from_rotation(exp3(np.array([0.0, 0.0, by_rad])) @ START.rotation)
+        at_m = START.position_m
+        record = PoseCommand(at_m, quat, np.zeros(6), np.zeros(6), at_m, quat, "active")
+        assert side.offer(Stamped(Header(now(0), 2, SOURCE), record, now(0)), now(0)) == reason
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,9 @@ class GuardLimits(NamedTuple):
         timeout_s: silence after which it brakes.
         jump_m: a command may differ from the reference in force by this much.
         jump_rad: likewise.
+        begin_m: the first command of a stream may differ by this much. A stream begins where the
+            reference is; one that goes on after the robot has braked by itself would jerk it.
+        begin_rad: likewise.
         brake: velocity, acceleration and jerk of its own stop.
     """
 
@@ -43,6 +46,8 @@ class GuardLimits(NamedTuple):
     brake: MotionLimits
     jump_m: float = 0.02
     jump_rad: float = 0.1
+    begin_m: float = 0.002
+    begin_rad: float = 0.01
 
 
 class ReferenceGuard:
@@ -94,10 +99,15 @@ class ReferenceGuard:
         if self.braking:
             return "braking"
         rotation = rotation_from_quat(record.quat_xyzw)
-        here = self.motion.pose
+        here, limits = self.motion.pose, self._limits
+        jump_m, jump_rad = (
+            (limits.jump_m, limits.jump_rad)
+            if self.following
+            else (limits.begin_m, limits.begin_rad)
+        )
         if (
-            norm3(record.position_m - here.position_m) > self._limits.jump_m
-            or angle_between(here.rotation, rotation) > self._limits.jump_rad
+            norm3(record.position_m - here.position_m) > jump_m
+            or angle_between(here.rotation, rotation) > jump_rad
         ):
             return "jump"
         for values, order in ((record.twist, 0), (record.acceleration, 1)):
