@@ -20,7 +20,8 @@ from command_rig import (
     quat_of,
 )
 
-from vla_zenoh.control.commander import LINGER_NS, Inputs, Setting
+from vla_zenoh.control.commander import Inputs, Setting
+from vla_zenoh.control.mover import LINGER_NS
 from vla_zenoh.control.so3 import norm3
 from vla_zenoh.types import GripperState, PoseState
 

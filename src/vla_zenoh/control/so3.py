@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, PoseState
 
 
 class Pose(NamedTuple):
@@ -64,6 +64,23 @@ def norm3(vector: FloatArray) -> float:
 def angle_between(a: FloatArray, b: FloatArray) -> float:
     """Geodesic distance of two rotation matrices in rad."""
     return norm3(log3(b @ a.T))
+
+
+def distance(a: Pose, b: Pose) -> tuple[float, float]:
+    """How far two poses are apart: m and rad."""
+    return norm3(a.position_m - b.position_m), angle_between(a.rotation, b.rotation)
+
+
+def pose_of(measured: PoseState) -> Pose:
+    """The pose a robot tells."""
+    return Pose(measured.position_m, rotation_from_quat(measured.quat_xyzw))
+
+
+def held_pose(measured: PoseState) -> Pose:
+    """Where the robot's controller holds the arm, where the robot tells it; else where it is."""
+    if measured.reference_position_m is None or measured.reference_quat_xyzw is None:
+        return pose_of(measured)
+    return Pose(measured.reference_position_m, rotation_from_quat(measured.reference_quat_xyzw))
 
 
 def between(start: Pose, end: Pose, share: float) -> Pose:

@@ -1,0 +1,218 @@
+"""From goals on a time axis to commands: leash, smoothing, joints, braking, and when to stream."""
+
+from __future__ import annotations
+
+from vla_zenoh.control.compose import Goal, GoalTimeline
+from vla_zenoh.control.composer import Composer
+from vla_zenoh.control.gripper import GripperArbiter
+from vla_zenoh.control.joint_stage import JointStage
+from vla_zenoh.control.limits import leash
+from vla_zenoh.control.ports import Outputs
+from vla_zenoh.control.reach import Shadow
+from vla_zenoh.control.smoothing import Motion, Smoother, motion_limits
+from vla_zenoh.control.so3 import Pose, held_pose, pose_of, quat_from_rotation
+from vla_zenoh.control.states import OBEYING, State
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import (
+    Cause,
+    FloatArray,
+    GripperState,
+    JointState,
+    PoseCommand,
+    PoseState,
+    Stamped,
+)
+
+LINGER_NS = 500_000_000
+"""The stream goes on for this long after the arm stands, so that its last pose is not lost."""
+SAME_WIDTH_M = 0.005
+"""A gripper this near to the width last sent has reached it."""
+
+
+class Mover:
+    """See the module.
+
+    Args:
+        profile: limits, rate, and whether poses or joints are commanded.
+        reach: see `Commander`.
+        composer: bounds the goals that come due.
+
+    Raises:
+        ProfileError: joints are to be commanded and there are no kinematics.
+    """
+
+    def __init__(self, profile: Profile, reach: Shadow | None, composer: Composer) -> None:
+        self._limits = profile.limits
+        self._dt_s = 1.0 / profile.timing.command_hz
+        self._max_width_m = profile.robot.gripper.max_width_m
+        self._reach, self._composer = reach, composer
+        self._joints: JointStage | None = None
+        if profile.robot.command == "joint":
+            if reach is None:
+                raise ProfileError("robot.command is joint, which needs the robot's kinematics")
+            self._joints = JointStage(profile, reach.kinematics)
+        self.gripper = GripperArbiter(profile.robot.gripper)
+        self.timeline: GoalTimeline | None = None
+        self.goal: Goal | None = None
+        self.streaming = False
+        self._smoother: Smoother | None = None
+        self._cause: Cause | None = None
+        self._rest_since_ns: int | None = None
+
+    # -- where it is --------------------------------------------------------------------------
+    @property
+    def at_rest(self) -> bool:
+        """What is commanded stands still."""
+        still = self._joints is None or self._joints.at_rest
+        return self._smoother is None or (self._smoother.at_rest and still)
+
+    @property
+    def commanded(self) -> Pose | None:
+        """The pose last streamed, None while nothing is."""
+        return self._smoother.motion.pose if self._smoother and self.streaming else None
+
+    @property
+    def failures(self) -> int:
+        """Times Ruckig found no way and the arm was braked instead."""
+        return self._smoother.failures if self._smoother else 0
+
+    # -- beginning ----------------------------------------------------------------------------
+    def anchor(
+        self,
+        measured: PoseState,
+        gripper: GripperState,
+        joint: JointState | None,
+        now_ns: int,
+        *,
+        blocked: bool,
+    ) -> None:
+        """Begin where the robot's own controller stands, so that nothing jumps.
+
+        Args:
+            measured: TCP pose, with the controller's reference where the robot tells it.
+            gripper: what it holds, it keeps.
+            joint: newest joints.
+            now_ns: time of this tick.
+            blocked: the arm is far from its controller's reference.
+        """
+        if self._reach is not None and joint is not None:
+            self._reach.reset(self._reach.kinematics.joints_of(joint))
+        actual, start = pose_of(measured), held_pose(measured)
+        if self._smoother is None:
+            self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits))
+        elif not self.streaming:
+            self._smoother.reset(start)
+        if self._joints is not None and joint is not None and not self.streaming:
+            self._joints.restart(self._held_joints(joint))
+        width_m = self._width_to_keep(gripper)
+        self.gripper.restart(width_m)
+        # A blocked arm's controller is led back to where the arm is. Otherwise a brake under way
+        # goes on to its end, and the goal is where it ends.
+        goal = Goal(actual if blocked else self._smoother.resting_pose(), width_m)
+        if self.timeline is None:
+            self.timeline = GoalTimeline(goal, now_ns)
+        else:
+            self.timeline.restart(goal, now_ns)
+        self.goal = None if blocked else goal
+
+    def _held_joints(self, joint: JointState) -> FloatArray:
+        """Joints the robot's controller holds, or where they are."""
+        assert self._reach is not None
+        kinematics = self._reach.kinematics
+        if joint.reference_rad is not None:
+            return kinematics.ordered(joint.names, joint.reference_rad)
+        return kinematics.joints_of(joint)
+
+    def _width_to_keep(self, gripper: GripperState) -> float:
+        """The width last sent while the gripper obeys it, because a grip ends with another."""
+        sent_m = self.gripper.sent_m
+        if sent_m is not None and (
+            abs(sent_m - gripper.width_m) < SAME_WIDTH_M
+            or (gripper.holding and sent_m < gripper.width_m)
+        ):
+            return sent_m
+        return min(max(gripper.width_m, 0.0), self._max_width_m)
+
+    # -- one tick -----------------------------------------------------------------------------
+    def advance(self, state: State, now_ns: int, ticks: int, out: Outputs) -> bool:
+        """Move on by `ticks` periods: after the goal in force where active, else braking.
+
+        Returns:
+            whether a trajectory could be computed; where not, the arm brakes.
+        """
+        if self._smoother is None or self.timeline is None:
+            return True
+        self._cause = None
+        if state is State.ACTIVE:
+            self._cause = self._follow(self._smoother, self.timeline, now_ns, out)
+        else:
+            self._brake(self._smoother, self.timeline, now_ns)
+        self.streaming = self._must_stream(state, now_ns)
+        if not self.streaming:
+            return True
+        failures = self._smoother.failures
+        for _ in range(ticks):
+            motion = self._smoother.tick()
+            if self._joints is not None:
+                self._joints.tick(motion)
+        return self._smoother.failures == failures
+
+    def command(
+        self, state: State, now_ns: int, gripper: Stamped[GripperState] | None, out: Outputs
+    ) -> None:
+        """Say where robot and gripper have to be now, while streaming."""
+        if not self.streaming or self._smoother is None:
+            return
+        if self._joints is not None:
+            out.joint = self._joints.command(state.value, self._cause)
+        else:
+            out.pose = self._pose_command(self._smoother.motion, state)
+        if state is State.ACTIVE:
+            out.gripper = self.gripper.step(now_ns, gripper)
+
+    def _follow(
+        self, smoother: Smoother, timeline: GoalTimeline, now_ns: int, out: Outputs
+    ) -> Cause | None:
+        plan = timeline.plan
+        index = plan.index_at(now_ns)
+        self._composer.bound_until(plan, timeline, index, out)
+        goal = plan.goals[index]
+        if goal is not self.goal:
+            pose, hits = leash(self._limits, goal.pose, smoother.motion.pose)
+            if hits:
+                goal = Goal(pose, goal.width_m)  # between two goals that were bounded
+                timeline.shift_rest(index, goal, self._limits)
+                out.tell("warning", "limit", hits[0].name, "leash", hits[0].value, hits[0].limit)
+            smoother.target(goal.pose)
+            self.goal = goal
+            self.gripper.want(goal.width_m)
+        return plan.cause
+
+    def _brake(self, smoother: Smoother, timeline: GoalTimeline, now_ns: int) -> None:
+        """Stop, and let the goal be where the arm stops, so that nothing pulls it further."""
+        smoother.brake()
+        self.goal = None
+        if timeline.plan.cause is not None and smoother.at_rest:
+            timeline.hold(Goal(smoother.motion.pose, timeline.at(now_ns).width_m), now_ns)
+
+    def _must_stream(self, state: State, now_ns: int) -> bool:
+        if state in OBEYING or not self.at_rest:
+            self._rest_since_ns = None
+            return state in OBEYING or self.streaming
+        if self._rest_since_ns is None:
+            self._rest_since_ns = now_ns
+        return self.streaming and now_ns - self._rest_since_ns < LINGER_NS
+
+    def _pose_command(self, motion: Motion, state: State) -> PoseCommand:
+        goal = self.goal.pose if self.goal else motion.pose
+        return PoseCommand(
+            motion.pose.position_m,
+            quat_from_rotation(motion.pose.rotation),
+            motion.twist,
+            motion.acceleration,
+            goal.position_m,
+            quat_from_rotation(goal.rotation),
+            state.value,
+            self._cause,
+        )
