@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from typing import NoReturn
 
@@ -39,6 +38,8 @@ EXTRA_OF = {
     "av": "sim",
 }
 """Modules of the extras, for whoever starts a node whose extra is not installed."""
+NODES = frozenset({"up", "router", "sim", "camera", "worker", "command"})
+"""Commands whose output is a log: that of Zenoh belongs to it."""
 RUN, DRIVE, LOOK = "Run", "Drive the robot", "Look"
 
 app = typer.Typer(
@@ -59,11 +60,13 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _main(
+    context: typer.Context,
     version: bool = typer.Option(
         False, "--version", callback=_version, is_eager=True, help="Print the version."
     ),
 ) -> None:
-    zenoh.init_log_from_env_or(os.environ.get("RUST_LOG", "error"))
+    # Zenoh logs to stdout, where the others write what a script reads.
+    zenoh.init_log_from_env_or("error" if context.invoked_subcommand in NODES else "off")
 
 
 for panel, name, function in (
