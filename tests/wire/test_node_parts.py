@@ -1,0 +1,126 @@
+"""Who is heard on a key, mailboxes, and a wall clock that is set."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import pytest
+from camera_rig import await_match, free_endpoint, until
+
+from vla_zenoh.errors import CodecError
+from vla_zenoh.nodes.clock import ADOPT_S, Clock
+from vla_zenoh.nodes.orphan import is_running
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.nodes.slots import Mailbox
+from vla_zenoh.nodes.speaker import Speaker
+from vla_zenoh.profile import SessionProfile
+from vla_zenoh.types import Header
+
+SILENCE_NS = 500_000_000
+STEP_TOLERANCE_S = 0.002
+
+
+def refused(speaker: Speaker, header: Header, mono_ns: int) -> str | None:
+    try:
+        speaker.check(header, mono_ns)
+    except CodecError as error:
+        return error.reason
+    return None
+
+
+@pytest.fixture
+def spoken() -> Speaker:
+    """Number 7 of ``robot#1`` was heard at time 0."""
+    speaker = Speaker(SILENCE_NS / 1e9)
+    speaker.check(Header(0, 7, "robot#1"), 0)
+    speaker.heard(Header(0, 7, "robot#1"), 0)
+    return speaker
+
+
+@pytest.mark.parametrize(
+    ("source", "seq", "at_ns", "reason"),
+    [
+        ("robot#1", 8, 1, None),
+        ("robot#1", 7, 1, "replayed"),
+        ("robot#1", 6, 1, "replayed"),
+        ("robot#2", 8, 1, "foreign"),
+        ("robot#2", 0, SILENCE_NS - 1, "foreign"),
+        ("robot#2", 0, SILENCE_NS, None),
+    ],
+)
+def test_one_source_is_heard_until_it_falls_silent(
+    spoken: Speaker, source: str, seq: int, at_ns: int, reason: str | None
+) -> None:
+    assert refused(spoken, Header(0, seq, source), at_ns) == reason
+
+
+def test_what_was_refused_does_not_keep_the_speaker_alive(spoken: Speaker) -> None:
+    stranger = Header(0, 0, "robot#2")
+    assert refused(spoken, stranger, SILENCE_NS - 1) == "foreign"
+    assert refused(spoken, stranger, SILENCE_NS) is None
+
+
+def test_a_record_that_was_not_taken_does_not_use_up_its_number(spoken: Speaker) -> None:
+    nonsense = Header(0, 8, "robot#1")
+    assert refused(spoken, nonsense, 1) is None  # its payload turns out to be none
+    assert refused(spoken, nonsense, 2) is None
+
+
+def test_a_mailbox_keeps_the_newest_in_order_and_no_more_than_it_holds() -> None:
+    endpoint = free_endpoint()
+    profile = SessionProfile(listen=(endpoint,), connect=(endpoint,))
+    with (
+        open_session(profile, mode="router"),
+        open_session(profile) as reader,
+        open_session(profile) as writer,
+    ):
+        box = Mailbox(3)
+        subscriber = reader.declare_subscriber("test/box", box.channel())
+        box.take_from(subscriber.try_recv)
+        await_match(writer, "test/box")
+        last = reader.declare_subscriber("test/end", Mailbox(1).channel())
+        await_match(writer, "test/end")
+        for number in range(10):
+            writer.put("test/box", str(number))
+        writer.put("test/end", "")
+        until("the end", last.try_recv)
+        taken = [arrival.sample.payload.to_string() for arrival in box.take_all()]
+        assert taken == ["7", "8", "9"]
+        assert box.take_all() == []
+
+
+@pytest.mark.parametrize("step_s", [-1.0, -0.1, 0.1, 3600.0])
+def test_a_wall_clock_that_is_set_is_noticed_once_and_followed(
+    monkeypatch: pytest.MonkeyPatch, step_s: float
+) -> None:
+    clock = Clock()
+    true: Callable[[], int] = time.time_ns
+    before_ns = clock.wall_ns()
+    monkeypatch.setattr(time, "time_ns", lambda: true() + int(step_s * 1e9))
+    assert clock.wall_ns() - before_ns < 1e9, "it does not jump by itself"
+    assert clock.follow() == pytest.approx(step_s, abs=STEP_TOLERANCE_S)
+    assert clock.follow() == 0.0
+    assert (clock.wall_ns() - true()) / 1e9 == pytest.approx(step_s, abs=STEP_TOLERANCE_S)
+
+
+def test_a_slewing_clock_is_followed_silently(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    true: Callable[[], int] = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: true() + int(0.5 * ADOPT_S * 1e9))
+    assert clock.follow() == 0.0
+    assert clock.wall_ns() - true() > 0.4 * ADOPT_S * 1e9
+
+
+def test_a_dead_process_is_not_running_even_before_it_is_buried() -> None:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    pid = process.pid
+    try:
+        until("it has died", lambda: not is_running(pid))
+    finally:
+        process.wait()
+    assert not is_running(pid)
+    assert is_running(os.getpid())
