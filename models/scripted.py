@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 import random
 import time
+from itertools import pairwise
 
 import numpy as np
 
@@ -34,6 +35,9 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
 )
+
+ROUNDING = 1e-6
+"""Less than this of a step is none."""
 
 
 class Scripted:
@@ -81,7 +85,7 @@ class Scripted:
         horizon, limit = self.spec.action.horizon, asked.steps or math.inf
         ends = [min(begun + index, limit) for index in range(1, horizon + 1)]
         # No step twice: the chunk ends with the one that completes the count.
-        ends = [end for index, end in enumerate(ends) if index == 0 or end > ends[index - 1]]
+        ends = [ends[0], *(b for a, b in pairwise(ends) if b > a + ROUNDING)]
         steps = np.zeros((len(ends), self.spec.action.dimension), np.float32)
         reached: list[tuple[float, float]] = []
         for row, end in enumerate(ends):
@@ -92,9 +96,7 @@ class Scripted:
         # Before the arm is given to us nothing is counted: nobody carries it out.
         if observation.task.active:
             self._last_stamp_ns, self._last = observation.stamp_wall_ns, reached
-        # The later steps of a chunk have not begun when it is sent.
-        done = asked.motion is None or (len(ends) == 1 and ends[0] >= limit)
-        return ActionSteps(steps, done)
+        return ActionSteps(steps, asked.motion is None or ends[-1] >= limit - ROUNDING)
 
     def _asked_by(self, stamp_ns: int) -> tuple[float, float]:
         """Steps, and the way, asked for when this observation was taken: the next stands on them.

@@ -192,7 +192,7 @@ class ActionSteps(NamedTuple):
 
     Args:
         steps: (H, D), H at most the declared horizon; anything numpy can read.
-        done: the task is finished as far as the model can tell.
+        done: the task is finished with these steps, as far as the model can tell.
     """
 
     steps: ArrayLike

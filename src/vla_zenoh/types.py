@@ -356,7 +356,7 @@ class ActionChunk:
         observed_ns: wall time at which the worker took the observation.
         inference_start_ns: wall time.
         inference_end_ns: wall time.
-        done: the policy says its task is finished.
+        done: the policy says its task is finished when these steps are.
     """
 
     worker: str

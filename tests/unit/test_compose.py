@@ -147,7 +147,7 @@ def test_a_shortened_goal_takes_the_later_ones_along() -> None:
     timeline = GoalTimeline(at(0.3), 0)
     timeline.add(Plan(0, 0, DT_NS, rising(at(0.3), 4)), 0)
     turned = at(0.315, yaw_rad=0.3)
-    timeline.shift_rest(1, turned, Limits())
+    timeline.plan.shift_rest(1, turned, Limits())
     assert [round(height(goal), 6) for goal in timeline.plan.goals] == [0.31, 0.315, 0.325, 0.335]
     assert angle_between(timeline.plan.goals[3].pose.rotation, turned.pose.rotation) < ATOL_RAD
 
@@ -165,6 +165,6 @@ def test_goals_that_a_leash_takes_along_stay_in_the_workspace(
     timeline.add(Plan(0, 0, DT_NS, goals), 0)
     index = data.draw(st.integers(0, len(ways) - 1))
     cut = Goal(Pose(goals[index].pose.position_m - [0.2, 0.2, 0.2], np.eye(3)), 0.08)
-    timeline.shift_rest(index, cut, limits)
+    timeline.plan.shift_rest(index, cut, limits)
     for goal in timeline.plan.goals[index + 1 :]:
         assert into_workspace(limits, goal.pose.position_m)[1] == 0.0

@@ -10,6 +10,7 @@ Here are states and settings. `composer` makes plans of chunks, `mover` makes co
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from vla_zenoh.control.acceptance import Lease, Refusal, refuse
@@ -32,6 +33,9 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped, Task
 
 __all__ = ["Commander", "Inputs", "Outputs", "Setting"]
+
+WHOLE_STEP = 1e-6
+"""Parts of steps that sum up to all but this are a step."""
 
 
 class Commander:
@@ -93,6 +97,8 @@ class Commander:
         self._look_around(now_ns)
         if not self._mover.advance(self.state, now_ns, ticks, self._out):
             self._change(Trigger.FAULT, "no trajectory could be computed; braked")
+        if self.state is State.ACTIVE:
+            self._count_steps(now_ns)
         if not self.dry_run:
             self._mover.command(self.state, now_ns, self.gripper_state, self._out)
         if self.state is not state_before and self.task.active != (self.state in OBEYING):
@@ -288,9 +294,6 @@ class Commander:
         self._shadow[worker] = chunk
         self.lease.last_observation_ns = chunk.record.observation_stamp_ns
         self.accepted_chunks += 1
-        if not self.policy_done:  # what comes after that only keeps the arm where it is
-            self.accepted_steps += len(chunk.record.steps)
-        self.policy_done = chunk.record.done
         self._change(Trigger.FRESH, "fresh chunk")
 
     def _carry_out(self, chunk: Stamped[ActionChunk], lease: Lease, now_ns: int) -> Refusal | None:
@@ -306,6 +309,16 @@ class Commander:
         self._watch.expect_next(max(plan.end_ns, now_ns), self.task.rate_hz)
         self._out.accepted = plan.cause
         return None
+
+    def _count_steps(self, now_ns: int) -> None:
+        """Steps that have come in force, and whether they were the last ones."""
+        assert self._mover.timeline is not None
+        plan = self._mover.timeline.plan
+        if plan.episode != self.task.episode:
+            return
+        steps = math.floor(plan.steps_in_force(now_ns) + WHOLE_STEP)
+        self.accepted_steps = max(self.accepted_steps, steps)
+        self.policy_done = plan.done and plan.index_at(now_ns) == len(plan.goals) - 1
 
     # -- watching -----------------------------------------------------------------------------
     def _look_around(self, now_ns: int) -> None:

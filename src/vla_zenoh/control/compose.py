@@ -14,12 +14,18 @@ taken earlier does not, so the next delta replaces it. Nothing is counted twice 
 whatever the latency. Steps whose time has passed when a chunk arrives are skipped, never replayed:
 waypoints are sums, so skipping them loses no way.
 
+In overlapping plans the goal that is followed may be a blend of several, see
+`vla_zenoh.control.aggregate`; ``G`` is that of the newest one in every mode.
+
 A chunk that is replaced half-way counts for the time it had, and for its first step at least: the
 speed a model asks for is the speed it gets however often it is asked, and a single step is a step.
+Steps are counted in the same way: a plan begins with as many as its ``W_0`` stands for.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from vla_zenoh.control.limits import into_workspace
@@ -57,6 +63,11 @@ class Plan:
         goals: one per step.
         cause: the chunk it came from, None for a hold.
         bounded: so many of the goals are known to be within what the arm can do.
+        episode: the chunk's.
+        begun: steps of the episode that had been asked for when its observation was taken.
+        most: steps of the episode that there are at all, as far as the policy has said.
+        done: the policy says that these steps are the last.
+        arrival_ns: when the chunk arrived.
     """
 
     effective_ns: int
@@ -65,6 +76,11 @@ class Plan:
     goals: list[Goal]
     cause: Cause | None = None
     bounded: int = 0
+    episode: int = 0
+    begun: float = 0.0
+    most: float = math.inf
+    done: bool = False
+    arrival_ns: int = 0
 
     def index_at(self, t_ns: int) -> int:
         """Index of the step in force at `t_ns`."""
@@ -83,10 +99,34 @@ class Plan:
             last.width_m + share * (coming.width_m - last.width_m),
         )
 
+    def steps_asked_until(self, t_ns: int) -> float:
+        """Steps of the episode that have been asked for until `t_ns`, parts of one included."""
+        had = (t_ns - self.start_ns) / self.dt_ns
+        return min(self.begun + min(max(had, 1.0), len(self.goals)), self.most)
+
+    def steps_in_force(self, t_ns: int) -> float:
+        """Likewise those that have come in force, the present one as a whole."""
+        return min(self.begun + self.index_at(t_ns) + 1, self.most)
+
     @property
     def end_ns(self) -> int:
         """End of the last step's window."""
         return self.start_ns + len(self.goals) * self.dt_ns
+
+    def shift(self, index: int, way_m: FloatArray, turn: FloatArray, limits: Limits) -> None:
+        """Move the goals from `index` on; what leaves the workspace stays at its border."""
+        for later in range(index, len(self.goals)):
+            goal = self.goals[later]
+            inside, _ = into_workspace(limits, goal.pose.position_m + way_m)
+            turned = orthonormal(goal.pose.rotation @ turn)
+            self.goals[later] = Goal(Pose(inside, turned), goal.width_m)
+
+    def shift_rest(self, index: int, goal: Goal, limits: Limits) -> None:
+        """Replace goal `index`, moving the later ones along with it."""
+        old = self.goals[index].pose
+        way_m = goal.pose.position_m - old.position_m
+        self.shift(index + 1, way_m, old.rotation.T @ goal.pose.rotation, limits)
+        self.goals[index] = goal
 
 
 class GoalTimeline:
@@ -98,7 +138,12 @@ class GoalTimeline:
 
     def hold(self, goal: Goal, now_ns: int) -> None:
         """From now on the goal is to stand at `goal`."""
-        self.add(Plan(now_ns, now_ns, 1_000_000_000, [goal]), now_ns)
+        hold = Plan(now_ns, now_ns, 1_000_000_000, [goal])
+        if self._plans:
+            last = self.plan
+            hold.episode, hold.done = last.episode, last.done
+            hold.begun = hold.most = last.steps_asked_until(now_ns)
+        self.add(hold, now_ns)
 
     def restart(self, goal: Goal, now_ns: int) -> None:
         """Forget everything and stand at `goal`."""
@@ -109,6 +154,7 @@ class GoalTimeline:
         """Put `plan` in force, not before what is there already and not after now."""
         earliest = self._plans[-1].effective_ns if self._plans else plan.effective_ns
         plan.effective_ns = max(earliest, min(plan.effective_ns, now_ns))
+        plan.arrival_ns = now_ns
         self._plans.append(plan)
         while len(self._plans) > 1 and self._plans[1].effective_ns < now_ns - HISTORY_NS:
             del self._plans[0]
@@ -118,29 +164,22 @@ class GoalTimeline:
         """The newest plan."""
         return self._plans[-1]
 
-    def at(self, t_ns: int) -> Goal:
-        """G(t): what the plan that was in force at `t_ns` had asked for by then."""
-        chosen = self._plans[0]
+    def kin(self) -> Iterator[Plan]:
+        """The newest plan, then older ones of the same episode back to a hold, which is none."""
+        newest = self.plan
+        yield newest
+        for plan in reversed(self._plans[:-1]):
+            if newest.cause is None or plan.cause is None or plan.episode != newest.episode:
+                return
+            yield plan
+
+    def in_force(self, t_ns: int) -> Plan:
+        """The newest plan that was in force at `t_ns`."""
         for plan in reversed(self._plans):
             if plan.effective_ns <= t_ns:
-                chosen = plan
-                break
-        return chosen.asked_until(t_ns)
+                return plan
+        return self._plans[0]
 
-    def shift_rest(self, index: int, goal: Goal, limits: Limits) -> None:
-        """Replace the newest plan's goal `index`, moving the later ones along with it.
-
-        A leash that shortened the goal in force has to be known to every later composition, or
-        the cut way would come back. What is moved out of the workspace stays at its border.
-        """
-        plan = self.plan
-        old = plan.goals[index].pose
-        way_m = goal.pose.position_m - old.position_m
-        turn = old.rotation.T @ goal.pose.rotation
-        for later in range(index + 1, len(plan.goals)):
-            pose = plan.goals[later].pose
-            inside, _ = into_workspace(limits, pose.position_m + way_m)
-            plan.goals[later] = Goal(
-                Pose(inside, orthonormal(pose.rotation @ turn)), plan.goals[later].width_m
-            )
-        plan.goals[index] = goal
+    def at(self, t_ns: int) -> Goal:
+        """G(t): what the plan that was in force at `t_ns` had asked for by then."""
+        return self.in_force(t_ns).asked_until(t_ns)

@@ -36,7 +36,8 @@ class Composer:
     ) -> Plan | Refusal:
         """The plan of `chunk` on top of what was asked for when its observation was taken."""
         record = chunk.record
-        before = timeline.at(record.observation_stamp_ns)
+        standing_on = timeline.in_force(record.observation_stamp_ns)
+        before = standing_on.asked_until(record.observation_stamp_ns)
         goals: list[Goal] = []
         hits: list[LimitHit] = []
         for step in record.steps:
@@ -68,17 +69,24 @@ class Composer:
             before = Goal(pose, before.width_m if width_m is None else width_m, joints_rad)
             goals.append(before)
         out.shortened(hits)
-        return Plan(
+        plan = Plan(
             max(chunk.header.stamp_wall_ns, record.observation_stamp_ns),
             record.observation_stamp_ns,
             max(int(action.dt_s * 1e9), 1),
             goals,
             _cause(chunk),
             len(goals) if self._reach is None or self._refusing else min(len(goals), BOUND_AHEAD),
+            record.episode,
+            done=record.done,
         )
+        if standing_on.episode == record.episode:
+            plan.begun = standing_on.steps_asked_until(record.observation_stamp_ns)
+            if record.done and standing_on.done:  # it only says the last of its steps again
+                plan.most = min(standing_on.begun + len(standing_on.goals), standing_on.most)
+        return plan
 
-    def bound_until(self, plan: Plan, timeline: GoalTimeline, index: int, out: Outputs) -> None:
-        """Bound those goals of the newest plan up to `index` that were left for when they are due.
+    def bound_until(self, plan: Plan, index: int, out: Outputs) -> None:
+        """Bound those goals of `plan` up to `index` that were left for when they are due.
 
         What is cut off is known to every later goal.
         """
@@ -91,7 +99,7 @@ class Composer:
             )
             goal = Goal(pose, asked.width_m, self._reach.joints_rad)
             if cut:
-                timeline.shift_rest(due, goal, self._limits)
+                plan.shift_rest(due, goal, self._limits)
                 out.shortened(cut)
             else:
                 plan.goals[due] = goal

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from vla_zenoh.control.compose import Goal, GoalTimeline
+from collections.abc import Sequence
+
+from vla_zenoh.control.aggregate import Aggregator
+from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
 from vla_zenoh.control.composer import Composer
 from vla_zenoh.control.gripper import GripperArbiter
 from vla_zenoh.control.joint_stage import JointStage
@@ -47,6 +50,7 @@ class Mover:
         self._dt_s = 1.0 / profile.timing.command_hz
         self._max_width_m = profile.robot.gripper.max_width_m
         self._reach, self._composer = reach, composer
+        self._aggregator = Aggregator(profile.composition)
         self._joints: JointStage | None = None
         if profile.robot.command == "joint":
             if reach is None:
@@ -174,20 +178,34 @@ class Mover:
     def _follow(
         self, smoother: Smoother, timeline: GoalTimeline, now_ns: int, out: Outputs
     ) -> Cause | None:
-        plan = timeline.plan
-        index = plan.index_at(now_ns)
-        self._composer.bound_until(plan, timeline, index, out)
-        goal = plan.goals[index]
+        plans = self._aggregator.plans(timeline, now_ns)
+        for plan in plans:
+            self._composer.bound_until(plan, plan.index_at(now_ns), out)
+        goal = self._aggregator.goal(plans, now_ns)
         if goal is not self.goal:
             pose, hits = leash(self._limits, goal.pose, smoother.motion.pose)
             if hits:
-                goal = Goal(pose, goal.width_m)  # between two goals that were bounded
-                timeline.shift_rest(index, goal, self._limits)
+                goal = self._shorten(plans, goal, pose, now_ns)
                 out.tell("warning", "limit", hits[0].name, "leash", hits[0].value, hits[0].limit)
             smoother.target(goal.pose)
             self.goal = goal
             self.gripper.want(goal.width_m)
-        return plan.cause
+        return timeline.plan.cause
+
+    def _shorten(self, plans: Sequence[Plan], goal: Goal, pose: Pose, now_ns: int) -> Goal:
+        """Move all that is ahead by what the leash cut off, or the cut way would come back.
+
+        What is moved lies between goals that were bounded.
+        """
+        cut = Goal(pose, goal.width_m)
+        if len(plans) == 1:
+            plans[0].shift_rest(plans[0].index_at(now_ns), cut, self._limits)
+            return cut
+        way_m = pose.position_m - goal.pose.position_m
+        turn = goal.pose.rotation.T @ pose.rotation
+        for plan in plans:
+            plan.shift(plan.index_at(now_ns), way_m, turn, self._limits)
+        return cut
 
     def _brake(self, smoother: Smoother, timeline: GoalTimeline, now_ns: int) -> None:
         """Stop, and let the goal be where the arm stops, so that nothing pulls it further."""

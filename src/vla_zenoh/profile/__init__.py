@@ -5,6 +5,7 @@ from vla_zenoh.profile.joint_limits import JointLimits
 from vla_zenoh.profile.load import load_profile, override, profile_file, profile_names, to_yaml
 from vla_zenoh.profile.schema import (
     CameraProfile,
+    Composition,
     GripperProfile,
     HostProfile,
     Limits,
@@ -16,6 +17,7 @@ from vla_zenoh.profile.session import SessionProfile
 
 __all__ = [
     "CameraProfile",
+    "Composition",
     "GripperProfile",
     "HostProfile",
     "JointLimits",

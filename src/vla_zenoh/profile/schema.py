@@ -282,6 +282,23 @@ class Timing(Section):
         return self
 
 
+class Composition(Section):
+    """What is followed where chunks overlap; see `vla_zenoh.control.aggregate`.
+
+    Args:
+        mode: ``replace``: the newest chunk alone; ``blend``: it takes over from the one before
+            within a window; ``ensemble``: the weighted mean of all that still run.
+        blend_s: the window of ``blend``.
+        ensemble_decay: m of ``ensemble``: chunk i, 0 the oldest, has the weight exp(-m i).
+        ensemble_plans: the newest so many chunks have a say at most.
+    """
+
+    mode: Literal["replace", "blend", "ensemble"] = "replace"
+    blend_s: float = Field(default=0.2, gt=0, le=2)
+    ensemble_decay: float = Field(default=0.01, ge=0, le=10)
+    ensemble_plans: int = Field(default=16, ge=2, le=64)
+
+
 class CameraProfile(Section):
     """A camera.
 
@@ -354,6 +371,7 @@ class Profile(Section):
     robot: RobotProfile
     limits: Limits = Limits()
     timing: Timing = Timing()
+    composition: Composition = Composition()
     cameras: dict[Name, CameraProfile] = Field(default_factory=dict)
     sim: SimProfile = SimProfile()
     workers: Names = ("scripted",)
