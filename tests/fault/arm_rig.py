@@ -1,0 +1,247 @@
+"""The closed loop on a virtual clock, for faults in motion: what is done to it, how it moved.
+
+All figures are of MuJoCo's own TCP, sampled at every command tick.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.codec import message
+from vla_zenoh.control.arm import make_shadow
+from vla_zenoh.control.reach import Shadow
+from vla_zenoh.control.stream import BRAKE_MARGIN
+from vla_zenoh.lockstep import Lockstep, Message, Tamper
+from vla_zenoh.nodes.sim import build_world
+from vla_zenoh.policy import (
+    ActionSpec,
+    ActionSteps,
+    CameraSpec,
+    ModelSpec,
+    Observation,
+    ObservationSpec,
+)
+from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.simulation.world import World
+from vla_zenoh.types import ActionChunk, FloatArray, PoseCommand
+
+RATE_HZ = 10.0
+STEP_M = 0.02
+SPEED_M_S = RATE_HZ * STEP_M
+UP, HOLD = f"0 0 {STEP_M}", "0 0 0"
+LIMIT_RTOL = 1e-6
+ARM_FACTOR = 1.15
+"""The measured arm may be this much faster, or accelerate more, than it is commanded to."""
+STILL_M_S = 2e-3
+TICK_S = 1 / 250
+
+
+class Asked:
+    """A model that is told its step: ``0 0 0.02`` is two centimetres up at every request.
+
+    A fourth number is a delta of the gripper's width.
+
+    Args:
+        name: of the worker.
+        horizon: steps of a chunk, each of the same size.
+    """
+
+    def __init__(self, name: str = "scripted", horizon: int = 1) -> None:
+        self.spec = ModelSpec(
+            name=name,
+            observation=ObservationSpec(
+                cameras=(CameraSpec(camera="front"),), state=("pose", "gripper"), prompt=True
+            ),
+            action=ActionSpec(horizon=horizon, dt_s=0.1, gripper="delta_m"),
+        )
+        self.horizon = horizon
+
+    def infer(self, observation: Observation) -> ActionSteps:
+        step = np.zeros((self.horizon, 7))
+        if observation.task.active and re.fullmatch(r"[-+. \d]+", observation.prompt):
+            numbers = [float(number) for number in observation.prompt.split()]
+            step[:, :3] = numbers[:3]
+            step[:, 6] = numbers[3] if len(numbers) > 3 else 0.0
+        return ActionSteps(step)
+
+
+@cache
+def shipped() -> Profile:
+    return load_profile("panda_sim")
+
+
+@cache
+def _world() -> World:
+    return build_world(shipped())
+
+
+@cache
+def _shadow() -> Shadow:
+    return make_shadow(shipped())
+
+
+def begin(
+    prompt: str = HOLD,
+    rate_hz: float = RATE_HZ,
+    *,
+    others: dict[str, Asked] | None = None,
+    bounded: bool = False,
+) -> Lockstep:
+    """An active loop at home; the arm begins to move as `prompt` says.
+
+    All loops share one world: a new one ends the one before.
+
+    Args:
+        prompt: see `Asked`.
+        rate_hz: of the chunks.
+        others: more workers.
+        bounded: by the arm's kinematics; where only steps and faults matter it just takes time.
+    """
+    world = _world()
+    world.reset()
+    reach = _shadow() if bounded else None
+    loop = Lockstep(shipped(), world, Asked(), reach=reach, others=others)
+    loop.put("rate", rate_hz)
+    loop.put("prompt", prompt)
+    loop.run(1.1)  # the first request was due at the rate of the profile
+    activate(loop)
+    return loop
+
+
+def moving(seconds: float = 1.0, prompt: str = UP, rate_hz: float = RATE_HZ) -> Lockstep:
+    """A loop whose arm is in full motion."""
+    loop = begin(prompt, rate_hz)
+    loop.run(seconds)
+    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
+    return loop
+
+
+def activate(loop: Lockstep) -> None:
+    """Activate, and see that it worked."""
+    loop.put("active", True)
+    loop.run(0.01)
+    assert loop.commander.state.value == "active", loop.commander.why
+
+
+def mark(loop: Lockstep) -> int:
+    """Index of now in the trace."""
+    return len(loop.trace.time_ns)
+
+
+# -- what the arm did -----------------------------------------------------------------------------
+def path_m(loop: Lockstep) -> FloatArray:
+    """(n, 3) measured TCP."""
+    return np.array(loop.trace.position_m)
+
+
+def speed_m_s(loop: Lockstep) -> FloatArray:
+    """(n - 1,) of the measured TCP."""
+    return np.linalg.norm(np.diff(path_m(loop), axis=0), axis=1) / TICK_S
+
+
+def stop_time_s(loop: Lockstep, since: int) -> float:
+    """When the measured TCP moved for the last time, after `since`."""
+    fast = np.flatnonzero(speed_m_s(loop)[since:] > STILL_M_S)
+    return 0.0 if not len(fast) else float((fast[-1] + 1) * TICK_S)
+
+
+def way_m(loop: Lockstep, since: int) -> float:
+    """How far the measured TCP got from where it was at `since`, at most."""
+    path = path_m(loop)
+    return float(np.linalg.norm(path[since:] - path[since - 1], axis=1).max())
+
+
+def check_motion(loop: Lockstep, *, own_brake: bool = False, contact: bool = False) -> None:
+    """Every command and the measured arm kept the profile's limits from beginning to end.
+
+    Args:
+        own_brake: the robot braked by itself, which may be harder.
+        contact: it touched something, which accelerates it as it likes.
+    """
+    _check_commands(loop)
+    limits, margin = loop.profile.limits.translation, BRAKE_MARGIN if own_brake else 1.0
+    path = path_m(loop)
+    assert np.isfinite(path).all()
+    velocity = np.diff(path, axis=0) / TICK_S
+    assert np.abs(velocity).max() <= limits.velocity_m_s * ARM_FACTOR
+    if not contact:
+        acceleration = np.diff(velocity, axis=0) / TICK_S
+        assert np.abs(acceleration).max() <= limits.acceleration_m_s2 * ARM_FACTOR * margin
+
+
+def _check_commands(loop: Lockstep) -> None:
+    limits = loop.profile.limits
+    bounds = [
+        (low, high)
+        for low, high in zip(
+            limits.translation.model_dump().values(),
+            limits.rotation.model_dump().values(),
+            strict=True,
+        )
+    ]
+    for run in _streams(loop.trace.commands):
+        twist = np.array([command.twist for command in run])
+        acceleration = np.array([command.acceleration for command in run])
+        position_m = np.array([command.position_m for command in run])
+        jerk = np.diff(acceleration, axis=0) / TICK_S
+        for values, (translation, rotation) in zip(
+            (twist, acceleration, jerk), bounds, strict=True
+        ):
+            assert np.abs(values[:, :3]).max(initial=0.0) <= translation * (1 + LIMIT_RTOL)
+            turning = np.linalg.norm(values[:, 3:], axis=1)
+            assert turning.max(initial=0.0) <= rotation * (1 + LIMIT_RTOL)
+        # Nothing jumps: position is what the velocity made of it.
+        explained = (twist[:-1, :3] + twist[1:, :3]) * (TICK_S / 2)
+        apart = np.abs(np.diff(position_m, axis=0) - explained)
+        assert apart.max(initial=0.0) <= bounds[2][0] * TICK_S**3
+        # A stream begins and ends with an arm that stands.
+        assert np.abs(twist[0]).max() <= bounds[2][1] * TICK_S**2
+
+
+def _streams(commands: list[PoseCommand | None]) -> Iterable[list[PoseCommand]]:
+    run: list[PoseCommand] = []
+    for command in [*commands, None]:
+        if command is not None:
+            run.append(command)
+        elif run:
+            yield run
+            run = []
+
+
+# -- what is done to messages ---------------------------------------------------------------------
+def delayed(by_s: float, *kinds: type) -> Tamper:
+    """Messages of these kinds arrive later."""
+
+    return lambda sent: [later(sent, by_s) if sent.kind in kinds else sent]
+
+
+def dropped(*kinds: type) -> Tamper:
+    """Messages of these kinds are lost."""
+    return lambda sent: [] if sent.kind in kinds else [sent]
+
+
+def with_fields(sent: Message, **fields: Any) -> Message:
+    """The same message with other fields in its payload."""
+    data = message.unpack(sent.payload)
+    return replace(sent, payload=message.pack({**data, **fields}))
+
+
+def changed(kind: type, **fields: Any) -> Tamper:
+    """Messages of this kind have other fields in their payload."""
+    return lambda sent: [with_fields(sent, **fields) if sent.kind is kind else sent]
+
+
+def chunks_only(change: Callable[[Message], Iterable[Message]]) -> Tamper:
+    """Only chunks are tampered with."""
+    return lambda sent: change(sent) if sent.kind is ActionChunk else [sent]
+
+
+def later(sent: Message, by_s: float) -> Message:
+    """The same message arrives later."""
+    return replace(sent, arrival_ns=sent.arrival_ns + round(by_s * 1e9))

@@ -1,0 +1,363 @@
+"""Messages that come late, early, twice, in disorder, in a heap, dated wrongly or broken.
+
+Rows of the fault table in docs/design.md; each looks at the arm itself in MuJoCo.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from arm_rig import (
+    HOLD,
+    LIMIT_RTOL,
+    RATE_HZ,
+    SPEED_M_S,
+    STEP_M,
+    STILL_M_S,
+    UP,
+    Asked,
+    activate,
+    begin,
+    changed,
+    check_motion,
+    chunks_only,
+    delayed,
+    later,
+    mark,
+    moving,
+    path_m,
+    speed_m_s,
+    stop_time_s,
+    way_m,
+    with_fields,
+)
+
+from vla_zenoh.codec import message, records
+from vla_zenoh.errors import CodecError
+from vla_zenoh.lockstep import CAMERA, COMMAND, SIM, Lockstep, Message
+from vla_zenoh.types import (
+    ActionChunk,
+    FloatArray,
+    GripperCommand,
+    GripperState,
+    JointState,
+    PoseCommand,
+    PoseState,
+    Task,
+)
+
+STARVED_STOP_S, STARVED_WAY_M = 0.30, 0.040
+"""From the last good chunk: a period, the watchdog (less the period begun) and the brake."""
+BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.020
+OWN_STOP_S, OWN_WAY_M = 0.15, 0.015
+LOST_STOP_S, LOST_WAY_M = 0.40, 0.060
+SILENT_STOP_S, SILENT_WAY_M = 0.25, 0.035
+"""The stream of commands times out, then the robot's own brake."""
+EXACT_M = 1e-3
+WORKER = "worker-scripted"
+
+
+def settled_height_m(loop: Lockstep) -> float:
+    """Where it stands when nothing more is asked."""
+    loop.put("prompt", HOLD)
+    loop.run(1.2)
+    assert speed_m_s(loop)[-1] < STILL_M_S
+    return float(path_m(loop)[-1, 2])
+
+
+def after(seconds: float, tamper: Any = None) -> FloatArray:
+    """The path of a second up and what follows, with `tamper` on the wire."""
+    loop = moving()
+    loop.tamper = tamper
+    loop.run(seconds)
+    check_motion(loop)
+    return path_m(loop)
+
+
+def test_late_chunks_cost_time_and_no_way() -> None:
+    loop = moving(0.6)
+    start_m, steps = path_m(loop)[0, 2], loop.commander.accepted_steps
+    assert steps >= 5
+    loop.tamper = delayed(0.2, ActionChunk)
+    loop.run(1.0)
+    steps = loop.commander.accepted_steps  # a new prompt counts anew
+    loop.tamper = None
+    assert settled_height_m(loop) - start_m == pytest.approx(STEP_M * steps, abs=EXACT_M)
+    check_motion(loop)
+
+
+def test_chunks_that_are_too_late_are_nothing_and_the_arm_stops() -> None:
+    loop = moving()
+    since = mark(loop)
+    loop.tamper = delayed(1.2, ActionChunk)
+    loop.run(2.5)
+    assert loop.refused["stale"] > 5
+    assert stop_time_s(loop, since) < STARVED_STOP_S
+    assert way_m(loop, since) < STARVED_WAY_M
+    check_motion(loop)
+
+
+def test_chunks_from_the_future_are_nothing_and_the_arm_stops() -> None:
+    def early(sent: Message) -> Iterable[Message]:
+        data = message.unpack(sent.payload)
+        ahead_ns = 200_000_000
+        stamps = {
+            name: data[name] + ahead_ns for name in ("observation_stamp_ns", "valid_until_ns")
+        }
+        header = replace(sent.header, stamp_wall_ns=sent.header.stamp_wall_ns + ahead_ns)
+        return [with_fields(replace(sent, header=header), **stamps)]
+
+    loop = moving()
+    since = mark(loop)
+    loop.tamper = chunks_only(early)
+    loop.run(1.0)
+    assert loop.refused["future"] > 5
+    assert stop_time_s(loop, since) < STARVED_STOP_S
+    assert way_m(loop, since) < STARVED_WAY_M
+    check_motion(loop)
+
+
+@pytest.mark.parametrize("kinds", [(ActionChunk,), (PoseCommand,), (PoseState, GripperState)])
+def test_duplicates_move_nothing(kinds: tuple[type, ...]) -> None:
+    undisturbed = after(1.0)
+    twice = after(1.0, lambda sent: [sent, sent] if sent.kind in kinds else [sent])
+    np.testing.assert_array_equal(twice, undisturbed)
+
+
+def test_duplicates_that_come_much_later_move_nothing() -> None:
+    undisturbed = after(1.0)
+    kinds = (ActionChunk, PoseCommand)
+    echo = after(1.0, lambda sent: [sent, later(sent, 0.15)] if sent.kind in kinds else [sent])
+    np.testing.assert_array_equal(echo, undisturbed)
+
+
+def test_a_chunk_that_is_overtaken_is_left_out_and_nothing_jumps() -> None:
+    loop = moving(0.6)
+    start_m = path_m(loop)[0, 2]
+    loop.tamper = chunks_only(
+        lambda sent: [later(sent, 0.25) if sent.header.seq % 4 == 0 else sent]
+    )
+    loop.run(1.2)
+    steps = loop.commander.accepted_steps
+    loop.tamper = None
+    assert loop.refused["replayed"] >= 2
+    # One that was left out had been seen by no later one: its way is missing, and no more.
+    assert settled_height_m(loop) - start_m == pytest.approx(STEP_M * steps, abs=EXACT_M)
+    check_motion(loop)
+
+
+def test_commands_in_disorder_do_not_shake_the_arm() -> None:
+    undisturbed = after(1.0)
+    mixed = after(
+        1.0,
+        lambda sent: [
+            later(sent, 0.006) if sent.kind is PoseCommand and sent.header.seq % 3 == 0 else sent
+        ],
+    )
+    assert np.abs(mixed - undisturbed).max() < EXACT_M
+
+
+def test_a_heap_of_chunks_after_a_pause_is_not_made_up_for() -> None:
+    loop = moving()
+    since = mark(loop)
+    free_ns = loop.now_ns + 1_500_000_000
+    loop.tamper = chunks_only(
+        lambda sent: [replace(sent, arrival_ns=max(sent.arrival_ns, free_ns))]
+    )
+    loop.run(1.45)
+    assert stop_time_s(loop, since) < STARVED_STOP_S
+    assert way_m(loop, since) < STARVED_WAY_M
+    waiting = mark(loop)
+    loop.run(0.35)
+    # Ten chunks lay there, fresh enough, made by a model that saw an arm that stood.
+    assert way_m(loop, waiting) < 0.35 * SPEED_M_S + STEP_M
+    assert speed_m_s(loop)[waiting:].max() < 1.5 * SPEED_M_S
+    loop.run(0.5)
+    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
+    check_motion(loop)
+
+
+@pytest.mark.parametrize("step_s", [2.0, -2.0])
+@pytest.mark.parametrize("node", [CAMERA, WORKER])
+def test_a_clock_of_camera_or_worker_that_jumps_stops_the_arm_until_it_is_right(
+    node: str, step_s: float
+) -> None:
+    loop = moving()
+    since = mark(loop)
+    loop.set_clock(node, step_s)
+    loop.run(1.0)
+    assert stop_time_s(loop, since) < STARVED_STOP_S
+    assert way_m(loop, since) < STARVED_WAY_M
+    loop.set_clock(node, 0.0)
+    loop.run(0.5)
+    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
+    check_motion(loop)
+
+
+@pytest.mark.parametrize("step_s", [2.0, -2.0])
+def test_a_clock_of_the_command_node_that_jumps_stops_the_arm(step_s: float) -> None:
+    loop = moving()
+    since = mark(loop)
+    loop.set_clock(COMMAND, step_s)
+    loop.run(1.0)
+    assert stop_time_s(loop, since) < BRAKE_STOP_S
+    assert way_m(loop, since) < BRAKE_WAY_M
+    loop.put("active", True)
+    loop.run(0.2)  # its clock differs from the others', so it is not given the arm
+    loop.set_clock(COMMAND, 0.0)
+    loop.run(0.2)
+    assert way_m(loop, since) < BRAKE_WAY_M
+    activate(loop)
+    loop.run(0.5)
+    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
+    check_motion(loop)
+
+
+@pytest.mark.parametrize(
+    ("step_s", "stop_s", "within_m"),
+    [(2.0, OWN_STOP_S, OWN_WAY_M), (-2.0, BRAKE_STOP_S, BRAKE_WAY_M)],
+)
+def test_a_clock_of_the_robot_that_jumps_stops_the_arm(
+    step_s: float, stop_s: float, within_m: float
+) -> None:
+    loop = moving()
+    since = mark(loop)
+    loop.set_clock(SIM, step_s)
+    loop.run(1.5)
+    assert stop_time_s(loop, since) < stop_s
+    assert way_m(loop, since) < within_m
+    loop.set_clock(SIM, 0.0)
+    loop.run(0.3)
+    assert way_m(loop, since) < within_m
+    activate(loop)
+    loop.run(0.5)
+    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
+    check_motion(loop, own_brake=step_s > 0)
+
+
+def test_a_second_worker_moves_nothing_while_the_first_has_the_arm() -> None:
+    def run(others: dict[str, Asked] | None) -> FloatArray:
+        loop = begin(UP, others=others)
+        loop.run(1.5)
+        check_motion(loop)
+        return path_m(loop)
+
+    alone = run(None)
+    np.testing.assert_array_equal(run({"other": Asked("other", horizon=8)}), alone)
+
+
+def test_a_second_process_under_the_name_of_the_worker_moves_nothing() -> None:
+    def forge(sent: Message) -> Iterable[Message]:
+        header = replace(sent.header, source="worker-scripted-2", seq=sent.header.seq + 100)
+        steps = -message.unpack(sent.payload)["steps"]
+        return [sent, replace(with_fields(sent, steps=steps), header=header)]
+
+    undisturbed = after(1.0)
+    np.testing.assert_array_equal(after(1.0, chunks_only(forge)), undisturbed)
+
+
+# -- NaN, infinity, quaternions -------------------------------------------------------------------
+BROKEN: list[tuple[type, str, float, float]] = [
+    (ActionChunk, "steps", STARVED_STOP_S, STARVED_WAY_M),
+    (PoseState, "position_m", LOST_STOP_S, LOST_WAY_M),
+    (PoseState, "quat_xyzw", LOST_STOP_S, LOST_WAY_M),
+    (GripperState, "width_m", LOST_STOP_S, LOST_WAY_M),
+    (PoseCommand, "position_m", SILENT_STOP_S, SILENT_WAY_M),
+    (PoseCommand, "quat_xyzw", SILENT_STOP_S, SILENT_WAY_M),
+    (PoseCommand, "acceleration", SILENT_STOP_S, SILENT_WAY_M),
+]
+
+
+def spoil(value: Any, by: float) -> Any:
+    """One number of it is not one."""
+    if isinstance(value, np.ndarray):
+        spoilt = value.copy()
+        spoilt.reshape(-1)[-1] = by
+        return spoilt
+    return by
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "stop_s", "within_m"),
+    BROKEN,
+    ids=[f"{kind.__name__}-{name}" for kind, name, *_ in BROKEN],
+)
+def test_numbers_that_are_none_stop_the_arm(
+    kind: type, name: str, stop_s: float, within_m: float
+) -> None:
+    bad = [np.nan, np.inf, -np.inf]
+
+    def tamper(sent: Message) -> Iterable[Message]:
+        if sent.kind is not kind:
+            return [sent]
+        value = message.unpack(sent.payload)[name]
+        return [with_fields(sent, **{name: spoil(value, bad[sent.header.seq % 3])})]
+
+    loop = moving()
+    since = mark(loop)
+    loop.tamper = tamper
+    loop.run(0.7)
+    assert loop.refused["invalid"] > 0
+    assert stop_time_s(loop, since) < stop_s
+    assert way_m(loop, since) < within_m
+    check_motion(loop, own_brake=kind is PoseCommand)
+
+
+@pytest.mark.parametrize("by", [np.nan, np.inf, -np.inf])
+def test_no_record_carries_a_number_that_is_none(by: float) -> None:
+    loop = begin(bounded=True)
+    sent: dict[type, Message] = {}
+
+    def keep(one: Message) -> Iterable[Message]:
+        sent[one.kind] = one
+        return [one]
+
+    loop.tamper = keep
+    loop.put("prompt", f"{HOLD} -0.03")
+    loop.run(0.3)
+    assert set(sent) == {
+        ActionChunk, GripperCommand, GripperState, JointState, PoseCommand, PoseState, Task,
+    }  # fmt: skip
+    tried = 0
+    for kind, one in sent.items():
+        data = message.unpack(one.payload)
+        for field in dataclasses.fields(kind):
+            value = data[field.name]
+            if isinstance(value, (float, np.ndarray)):
+                tried += 1
+                with pytest.raises(CodecError, match=r"invalid|NaN|number|finite|norm"):
+                    records.decode(kind, with_fields(one, **{field.name: spoil(value, by)}).payload)
+    assert tried >= 20
+    assert way_m(loop, 1) < EXACT_M
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "stop_s", "within_m"),
+    [
+        (PoseState, "quat_xyzw", LOST_STOP_S, LOST_WAY_M),
+        (PoseCommand, "quat_xyzw", SILENT_STOP_S, SILENT_WAY_M),
+    ],
+)
+@pytest.mark.parametrize("quat", [[0.0, 0.0, 0.0, 0.0], [0.9, 0.0, 0.0, 0.0]])
+def test_a_quaternion_that_is_no_rotation_stops_the_arm(
+    kind: type, name: str, stop_s: float, within_m: float, quat: list[float]
+) -> None:
+    loop = moving()
+    since = mark(loop)
+    loop.tamper = changed(kind, **{name: np.array(quat)})
+    loop.run(0.7)
+    assert stop_time_s(loop, since) < stop_s
+    assert way_m(loop, since) < within_m
+    check_motion(loop, own_brake=kind is PoseCommand)
+
+
+def test_the_undisturbed_arm_keeps_the_speed_that_is_asked_for() -> None:
+    loop = moving(1.5)
+    assert np.abs(np.diff(path_m(loop)[-25:, 2]) * 250 - SPEED_M_S).max() < 0.1 * SPEED_M_S
+    assert loop.commander.task.rate_hz == pytest.approx(RATE_HZ, rel=LIMIT_RTOL)
+    check_motion(loop)

@@ -1,0 +1,249 @@
+"""The robot's own faults in motion: state frozen, jumping or missing, blocked, off, out of reach.
+
+Rows of the fault table in docs/design.md; each looks at the arm itself in MuJoCo.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm_rig import (
+    SPEED_M_S,
+    STILL_M_S,
+    UP,
+    activate,
+    begin,
+    changed,
+    check_motion,
+    dropped,
+    mark,
+    moving,
+    path_m,
+    speed_m_s,
+    stop_time_s,
+    way_m,
+    with_fields,
+)
+
+from vla_zenoh.codec import message
+from vla_zenoh.control.so3 import Pose, norm3
+from vla_zenoh.lockstep import SIM, Lockstep, Message
+from vla_zenoh.types import GripperCommand, GripperState, JointState, PoseCommand, PoseState
+
+BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.020
+LOST_STOP_S, LOST_WAY_M = 0.40, 0.060
+FROZEN_STOP_S, FROZEN_WAY_M = 0.50, 0.085
+"""The command runs `tracking_m` ahead of a measured pose that stands still, then the brake."""
+SILENT_STOP_S, SILENT_WAY_M = 0.25, 0.035
+PUSH_N = 150.0
+"""At most, on what is in the way: stiffness times `tracking_m`, and what the brake adds."""
+PUSH_WAY_M = 0.005
+STANDS_M = 1e-3
+STATES = (PoseState, GripperState, JointState)
+
+
+def goes_on(loop: Lockstep) -> None:
+    """Activated again it moves from where it is, without a jump."""
+    activate(loop)
+    loop.run(0.6)
+    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
+
+
+def test_without_robot_state_the_arm_stops() -> None:
+    loop = moving()
+    since = mark(loop)
+    loop.tamper = dropped(*STATES)
+    loop.run(1.0)
+    assert stop_time_s(loop, since) < LOST_STOP_S
+    assert way_m(loop, since) < LOST_WAY_M
+    loop.tamper = None
+    loop.run(0.3)
+    assert way_m(loop, since) < LOST_WAY_M
+    goes_on(loop)
+    check_motion(loop)
+
+
+def test_a_state_that_is_said_again_and_again_stops_the_arm() -> None:
+    frozen: dict[type, Message] = {}
+
+    def freeze(sent: Message) -> Iterable[Message]:
+        if sent.kind not in STATES:
+            return [sent]
+        return [replace(frozen.setdefault(sent.kind, sent), arrival_ns=sent.arrival_ns)]
+
+    loop = moving()
+    since = mark(loop)
+    loop.tamper = freeze
+    loop.run(1.0)
+    assert stop_time_s(loop, since) < LOST_STOP_S
+    assert way_m(loop, since) < LOST_WAY_M
+    check_motion(loop)
+
+
+def test_a_sensor_that_is_stuck_stops_the_arm() -> None:
+    frozen: dict[type, Message] = {}
+
+    def freeze(sent: Message) -> Iterable[Message]:
+        if sent.kind is not PoseState:
+            return [sent]
+        return [replace(sent, payload=frozen.setdefault(sent.kind, sent).payload)]
+
+    loop = moving()
+    since = mark(loop)
+    loop.tamper = freeze
+    loop.run(1.0)
+    assert stop_time_s(loop, since) < FROZEN_STOP_S
+    assert way_m(loop, since) < FROZEN_WAY_M
+    check_motion(loop)
+
+
+def shifted(by_m: float) -> object:
+    """The measured position is said to be elsewhere, every other time."""
+
+    def tamper(sent: Message) -> Iterable[Message]:
+        if sent.kind is not PoseState or sent.header.seq % 2:
+            return [sent]
+        measured_m = message.unpack(sent.payload)["position_m"]
+        return [with_fields(sent, position_m=measured_m + np.array([by_m, by_m, 0.0]))]
+
+    return tamper
+
+
+def test_a_measured_pose_that_jumps_a_little_moves_nothing() -> None:
+    paths = []
+    for tamper in (None, shifted(0.02)):
+        loop = moving()
+        loop.tamper = tamper  # pyright: ignore[reportAttributeAccessIssue]
+        loop.run(1.0)
+        paths.append(path_m(loop))
+        check_motion(loop)
+    np.testing.assert_array_equal(paths[0], paths[1])
+
+
+def test_a_measured_pose_that_jumps_far_stops_the_arm() -> None:
+    loop = moving()
+    since = mark(loop)
+    loop.tamper = shifted(0.2)  # pyright: ignore[reportAttributeAccessIssue]
+    loop.run(1.0)
+    assert stop_time_s(loop, since) < BRAKE_STOP_S
+    assert way_m(loop, since) < BRAKE_WAY_M
+    check_motion(loop)
+
+
+def test_an_arm_that_is_blocked_pushes_no_harder_than_it_may_and_is_led_back() -> None:
+    loop = begin("0 0.01 0")
+    x_m, y_m, z_m = path_m(loop)[-1]
+    # A wall of the open box, which cannot be pushed away, beside hand and fingers.
+    loop.world.place("box", (x_m, y_m + 0.22, z_m - 0.02))
+    push_n: list[float] = []
+    for _ in range(300):
+        loop.run(0.01)
+        push_n.append(norm3(loop.world.wrench[:3]))
+    assert max(push_n) > 10.0  # it did touch
+    assert max(push_n) < PUSH_N
+    assert loop.commander.state.value == "inactive"
+    assert "does not follow" in loop.commander.why
+    blocked_m = path_m(loop)[-1]
+    assert speed_m_s(loop)[-125:].max() < STILL_M_S
+    loop.put("prompt", "0 -0.01 0")
+    activate(loop)
+    loop.run(1.0)
+    assert path_m(loop)[-1, 1] < blocked_m[1] - 0.02  # it comes away
+    assert push_n[-1] >= norm3(loop.world.wrench[:3])
+    check_motion(loop, contact=True)
+
+
+def test_an_arm_pressed_on_the_table_stops() -> None:
+    loop = begin("0 0 -0.02")
+    tilt = 0.02  # the table is higher than anybody knows
+    loop.world.place("box", (0.43 + 0.0685, 0.0, 0.05 + tilt))
+    loop.run(2.5)
+    rest_m = path_m(loop)[-1]
+    assert speed_m_s(loop)[-125:].max() < STILL_M_S
+    assert norm3(loop.world.wrench[:3]) < PUSH_N
+    assert rest_m[2] > 0.06
+    check_motion(loop, contact=True)
+
+
+@pytest.mark.parametrize("mode", ["user_stopped", "guiding"])
+def test_a_robot_that_is_switched_to_another_mode_stops_and_waits(mode: str) -> None:
+    loop = moving()
+    since = mark(loop)
+    loop.tamper = changed(GripperState, mode=mode)
+    loop.run(0.6)
+    assert stop_time_s(loop, since) < BRAKE_STOP_S
+    assert way_m(loop, since) < BRAKE_WAY_M
+    loop.put("active", True)
+    loop.run(0.3)
+    loop.tamper = None
+    loop.run(0.3)
+    assert way_m(loop, since) < BRAKE_WAY_M  # being ready again does not start it
+    goes_on(loop)
+    check_motion(loop)
+
+
+def test_a_robot_that_is_switched_off_and_on_moves_again_only_when_it_is_told() -> None:
+    loop = moving()
+    since = mark(loop)
+    loop.alive.discard(SIM)
+    loop.tamper = dropped(*STATES, PoseCommand, GripperCommand)
+    loop.run(0.8)
+    assert stop_time_s(loop, since) < SILENT_STOP_S
+    assert way_m(loop, since) < SILENT_WAY_M
+    loop.put("active", True)
+    loop.run(0.3)
+    loop.guard.restart(Pose(*loop.world.tcp()))
+    loop.alive.add(SIM)
+    loop.tamper = None
+    loop.run(0.5)
+    assert way_m(loop, since) < SILENT_WAY_M
+    goes_on(loop)
+    check_motion(loop, own_brake=True)
+
+
+def test_without_commands_the_robot_brakes_by_itself_and_nothing_jumps_afterwards() -> None:
+    loop = moving()
+    since = mark(loop)
+    loop.tamper = dropped(PoseCommand)
+    loop.run(0.3)
+    assert stop_time_s(loop, since) < SILENT_STOP_S
+    assert way_m(loop, since) < SILENT_WAY_M
+    loop.tamper = None
+    standing = mark(loop)
+    loop.run(0.1)  # the command node still streams where its own brake ended
+    assert way_m(loop, standing) < STANDS_M
+    goes_on(loop)
+    check_motion(loop, own_brake=True)
+
+
+def test_a_goal_out_of_reach_is_approached_and_no_further() -> None:
+    loop = begin("0.02 0 0.02", bounded=True)
+    loop.run(4.5)
+    commanded = loop.trace.commands[-1]
+    assert commanded is not None
+    assert speed_m_s(loop)[-50:].max() < STILL_M_S
+    assert norm3(path_m(loop)[-1] - commanded.position_m) < STANDS_M
+    assert path_m(loop)[-1, 0] < loop.profile.limits.workspace.x_m[1] + STANDS_M
+    assert loop.commander.state.value == "active"
+    assert any(event.kind == "limit" for event in loop.events)
+    loop.put("prompt", "-0.02 0 -0.02")
+    loop.run(1.0)
+    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S  # and back at once
+    check_motion(loop)
+
+
+def test_a_step_no_arm_can_make_is_not_begun() -> None:
+    loop = moving()
+    since = mark(loop)
+    loop.put("prompt", "0 0 5")
+    loop.run(1.0)
+    assert loop.refused["step_m"] > 0
+    assert stop_time_s(loop, since) < 0.35
+    assert speed_m_s(loop)[since:].max() < 1.15 * SPEED_M_S
+    loop.put("prompt", UP)
+    loop.run(0.5)
+    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
+    check_motion(loop)
