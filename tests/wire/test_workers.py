@@ -77,7 +77,8 @@ def test_a_shadow_is_not_obeyed_and_takes_over_in_motion(chain: Chain, tmp_path:
         limit = chain.profile.limits.translation.acceleration_m_s2
         assert chain.recorder.hardest_command() <= limit * COMMAND_TOLERANCE
         assert across.hardest_change() <= limit * ARM_TOLERANCE
-        assert chain.state() == "active"
+        chain.until("active", lambda: chain.state() == "active")
+        assert not chain.events("active->inactive")
 
         # Who is obeyed and dies brakes the arm, though another worker is there.
         chain.client.take_events()
