@@ -1,6 +1,6 @@
 """The whole loop in one thread on a virtual clock: robot, cameras, worker, command node.
 
-The same `Commander`, `ReferenceGuard` and `assemble` as in the nodes, and every record goes through
+The same `Commander`, `ArmGuard` and `assemble` as in the nodes, and every record goes through
 the codec as on the wire; only sessions, threads and waiting are left out. A run is reproducible to
 the bit and as fast as the computer: for tests, for making data, for measuring what latency does.
 
@@ -23,12 +23,12 @@ import numpy as np
 
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
+from vla_zenoh.control.arm_guard import Measured, make_arm_guard
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
-from vla_zenoh.control.impedance import Reference
+from vla_zenoh.control.joint_impedance import JointReference
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.control.preflight import Surroundings
 from vla_zenoh.control.reach import Shadow
-from vla_zenoh.control.reference import ReferenceGuard, guard_limits
 from vla_zenoh.control.so3 import Pose
 from vla_zenoh.errors import CodecError
 from vla_zenoh.observe import History, NotYet, assemble
@@ -42,6 +42,7 @@ from vla_zenoh.types import (
     GripperState,
     Header,
     Image,
+    JointCommand,
     JointState,
     PoseCommand,
     PoseState,
@@ -111,6 +112,7 @@ class Trace:
     Args:
         time_ns: (n,) virtual wall clock.
         commands: the pose commands; None where nothing was streamed.
+        joints: likewise the joint commands.
         position_m: measured TCP, (3,) each.
         rotation: measured TCP, (3, 3) each.
         width_m: measured opening.
@@ -118,6 +120,7 @@ class Trace:
 
     time_ns: list[int] = field(default_factory=list)
     commands: list[PoseCommand | None] = field(default_factory=list)
+    joints: list[JointCommand | None] = field(default_factory=list)
     position_m: list[FloatArray] = field(default_factory=list)
     rotation: list[FloatArray] = field(default_factory=list)
     width_m: list[float] = field(default_factory=list)
@@ -155,7 +158,7 @@ class Lockstep:
         self.delays = delays or Delays()
         self.now_ns = START_NS
         self.commander = Commander(profile, reach=reach, dry_run=dry_run)
-        self.guard = ReferenceGuard(Pose(*world.tcp()), TICK_NS / 1e9, guard_limits(profile))
+        self.guard = make_arm_guard(profile, self._measure, world.joint_range_rad, TICK_NS / 1e9)
         self.tamper: Tamper | None = None
         self.trace = Trace()
         self.events: list[Event] = []
@@ -230,9 +233,14 @@ class Lockstep:
             self._next_command_ns += round(1e9 / self.profile.timing.command_hz)
             self._command()
         reference = self.guard.tick(self.wall_ns(SIM))
-        self.world.tick(
-            Reference(reference.pose.position_m, reference.pose.rotation, *reference[1:])
-        )
+        if isinstance(reference, JointReference):
+            self.world.tick_joint(reference)
+        else:
+            self.world.tick(reference)
+
+    def _measure(self) -> Measured:
+        state = self.world.joint_state()
+        return Measured(Pose(*self.world.tcp()), state.position_rad, state.velocity_rad_s)
 
     def _receive(self) -> None:
         while self._arrivals and self._arrivals[0][0] <= self.now_ns:
@@ -253,6 +261,7 @@ class Lockstep:
         position_m, rotation = self.world.tcp()
         self.trace.time_ns.append(self.now_ns)
         self.trace.commands.append(out.pose)
+        self.trace.joints.append(out.joint)
         self.trace.position_m.append(position_m)
         self.trace.rotation.append(rotation)
         self.trace.width_m.append(self.world.gripper_state().width_m)
@@ -262,15 +271,16 @@ class Lockstep:
         self.refused.update(refusal.reason for refusal in out.refusals)
         if out.pose is not None:
             self._send(COMMAND, out.pose, self._take_pose_command)
+        if out.joint is not None:
+            self._send(COMMAND, out.joint, self._take_joint_command)
         if out.gripper is not None:
             self._send(COMMAND, out.gripper, self._take_gripper_command)
         if out.task_changed or any(worker.task is None for worker in self.workers.values()):
             self._send(COMMAND, self.commander.task, self._take_task)
 
     def _publish_states(self) -> None:
-        reference = self.guard.motion
-        held = Reference(reference.pose.position_m, reference.pose.rotation, *reference[1:])
-        self._send(SIM, self.world.pose_state(held), self._take_pose_state)
+        held = self.world.pose_state(self.guard.reference)
+        self._send(SIM, held, self._take_pose_state)
         gripper = self.world.gripper_state()
         if self.guard.braking:
             gripper = replace(gripper, mode="braking")
@@ -354,7 +364,12 @@ class Lockstep:
         self._inbox.chunks = [*self._inbox.chunks, self._at(COMMAND, chunk)]
 
     def _take_pose_command(self, command: Stamped[PoseCommand]) -> None:
-        refusal = self.guard.offer(self._at(SIM, command), self.wall_ns(SIM))
+        refusal = self.guard.offer_pose(self._at(SIM, command), self.wall_ns(SIM))
+        if refusal is not None:
+            self.guard_refused[refusal] += 1
+
+    def _take_joint_command(self, command: Stamped[JointCommand]) -> None:
+        refusal = self.guard.offer_joint(self._at(SIM, command), self.wall_ns(SIM))
         if refusal is not None:
             self.guard_refused[refusal] += 1
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from vla_zenoh.control.impedance import Reference
 from vla_zenoh.control.joint_impedance import JointReference
-from vla_zenoh.control.joint_reference import JointGuard
-from vla_zenoh.control.reference import ReferenceGuard
+from vla_zenoh.control.joint_reference import JointGuard, joint_guard_limits
+from vla_zenoh.control.reference import ReferenceGuard, guard_limits
 from vla_zenoh.control.so3 import Pose
+from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, JointCommand, PoseCommand, Stamped
 
 STANDING_RAD_S = 0.02
@@ -134,6 +135,34 @@ class ArmGuard:
         measured = self._measure()
         self._poses.restart(measured.pose)
         self._joints.restart(measured.position_rad)
+
+
+def make_arm_guard(
+    profile: Profile,
+    measure: Callable[[], Measured],
+    joint_range_rad: tuple[FloatArray, FloatArray],
+    dt_s: float,
+) -> ArmGuard:
+    """The guard of a profile's robot, standing where the arm stands.
+
+    Args:
+        profile: limits, timing, and which stream holds the arm at first.
+        measure: where the arm is now.
+        joint_range_rad: lower and upper ends of the joints, (n,) each.
+        dt_s: time between two ticks.
+    """
+    here = measure()
+    return ArmGuard(
+        ReferenceGuard(here.pose, dt_s, guard_limits(profile)),
+        JointGuard(
+            profile.robot.arm_joints,
+            here.position_rad,
+            dt_s,
+            joint_guard_limits(profile, *joint_range_rad),
+        ),
+        measure,
+        profile.robot.command,
+    )
 
 
 def _moves(measured: Measured) -> bool:

@@ -22,11 +22,9 @@ import numpy as np
 import zenoh
 
 from vla_zenoh.codec import message, records, settings
-from vla_zenoh.control.arm_guard import ArmGuard, Measured
+from vla_zenoh.control.arm_guard import ArmGuard, Measured, make_arm_guard
 from vla_zenoh.control.impedance import ImpedanceGains
 from vla_zenoh.control.joint_impedance import JointGains, JointReference
-from vla_zenoh.control.joint_reference import JointGuard, joint_guard_limits
-from vla_zenoh.control.reference import ReferenceGuard, guard_limits
 from vla_zenoh.control.so3 import Pose
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind
@@ -86,18 +84,7 @@ def build_guard(profile: Profile, world: World) -> ArmGuard:
         state = world.joint_state()
         return Measured(Pose(*world.tcp()), state.position_rad, state.velocity_rad_s)
 
-    here = measure()
-    return ArmGuard(
-        ReferenceGuard(here.pose, STEP_NS / 1e9, guard_limits(profile)),
-        JointGuard(
-            profile.robot.arm_joints,
-            here.position_rad,
-            STEP_NS / 1e9,
-            joint_guard_limits(profile, *world.joint_range_rad),
-        ),
-        measure,
-        profile.robot.command,
-    )
+    return make_arm_guard(profile, measure, world.joint_range_rad, STEP_NS / 1e9)
 
 
 class SimNode:
