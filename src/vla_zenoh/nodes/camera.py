@@ -14,8 +14,10 @@ from vla_zenoh.nodes.camera_sources.opencv import prepare
 from vla_zenoh.nodes.camera_sources.outlet import ENDED, OK, Outlet
 from vla_zenoh.nodes.camera_sources.rtsp import without_password
 from vla_zenoh.nodes.camera_sources.sim import SimCameras
+from vla_zenoh.nodes.camera_sources.source import STALL_S
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.slots import Arrival, Latest
+from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Event, SceneState, Stamped
 
@@ -48,6 +50,7 @@ class CameraNode:
         chosen = choose_cameras(profile, cameras)
         prepare()
         self.node = Node(name, profile, session)
+        self._scene_speaker = Speaker(STALL_S)
         self._voice = threading.Lock()  # a Node speaks for one thread at a time
         self._halt = threading.Event()
         self._outlets = {
@@ -105,7 +108,7 @@ class CameraNode:
 
     def _read_scene(self, arrival: Arrival) -> Stamped[SceneState] | None:
         with self._voice:
-            return self.node.read(SceneState, arrival)
+            return self.node.read(SceneState, arrival, self._scene_speaker)
 
     # -- status -------------------------------------------------------------------------------
     def _watch(self) -> None:
