@@ -67,6 +67,7 @@ class Commander:
         self.accepted_chunks = 0
         self.accepted_steps = 0
         self.policy_done = False
+        self._resumed_ns = 0
         self._around = Surroundings()
         self._shadow: dict[str, Stamped[ActionChunk]] = {}
         self._composer = Composer(profile, reach)
@@ -305,6 +306,11 @@ class Commander:
         plan = self._composer.compose(chunk, lease.spec.action, timeline, self._out)
         if isinstance(plan, Refusal):
             return plan
+        if self.state is State.HOLDING:
+            self._resumed_ns = now_ns
+        # Until then the arm stood, and what was seen of it stands on that: chunks that come in a
+        # heap after a pause replace each other.
+        plan.effective_ns = max(plan.effective_ns, self._resumed_ns)
         timeline.add(plan, now_ns)
         self._watch.expect_next(max(plan.end_ns, now_ns), self.task.rate_hz)
         self._out.accepted = plan.cause

@@ -105,7 +105,8 @@ class Mover:
         actual, start = pose_of(measured), held_pose(measured)
         if self._smoother is None:
             self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits))
-        elif not self.streaming:
+        elif not self.streaming or self._smoother.at_rest:
+            # Also at rest: a robot that braked by itself stands elsewhere than we command.
             self._smoother.reset(start)
         if self._joints is not None and joint is not None and not self.streaming:
             self._joints.restart(self._held_joints(joint))
