@@ -30,9 +30,10 @@ class JointStage:
         )
         velocity = kinematics.ordered(robot.arm_joints, limits.joint.of("velocity_rad_s", size))
         share = float(np.min(velocity / kinematics.velocity_rad_s))
+        self._posture_rad = kinematics.ordered(robot.arm_joints, robot.home_rad)
         self._follower = JointFollower(
             kinematics,
-            kinematics.ordered(robot.arm_joints, robot.home_rad),
+            self._posture_rad,
             FollowSettings(
                 acceleration_rad_s2=tuple(float(value) for value in acceleration),
                 velocity_share=min(share, 1.0),
@@ -50,8 +51,9 @@ class JointStage:
         self._now = JointMotion(np.array(joints_rad, dtype=np.float64), still)
         self._acceleration = still
 
-    def tick(self, motion: Motion) -> None:
-        """Follow for one tick."""
+    def tick(self, motion: Motion, *, braking: bool = False) -> None:
+        """Follow for one tick; an arm that brakes leaves its elbow where it is."""
+        self._follower.posture_rad = self._now.position_rad if braking else self._posture_rad
         before = self._now.velocity_rad_s
         self._now, _ = self._follower.step(self._now, motion.pose, motion.twist, self._dt_s)
         self._acceleration = (self._now.velocity_rad_s - before) / self._dt_s

@@ -160,7 +160,7 @@ class Mover:
         for _ in range(ticks):
             motion = self._smoother.tick()
             if self._joints is not None:
-                self._joints.tick(motion)
+                self._joints.tick(motion, braking=state is not State.ACTIVE)
         return self._smoother.failures == failures
 
     def command(
