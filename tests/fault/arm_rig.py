@@ -39,6 +39,8 @@ LIMIT_RTOL = 1e-6
 ARM_FACTOR = 1.15
 """The measured arm may be this much faster, or accelerate more, than it is commanded to."""
 STILL_M_S = 2e-3
+AT_REST = 1e-6
+WOBBLE_FACTOR = 2.0
 TICK_S = 1 / 250
 
 
@@ -157,15 +159,19 @@ def way_m(loop: Lockstep, since: int) -> float:
     return float(np.linalg.norm(path[since:] - path[since - 1], axis=1).max())
 
 
-def check_motion(loop: Lockstep, *, own_brake: bool = False, contact: bool = False) -> None:
+def check_motion(
+    loop: Lockstep, *, own_brake: bool = False, contact: bool = False, singular: bool = False
+) -> None:
     """Every command and the measured arm kept the profile's limits from beginning to end.
 
     Args:
         own_brake: the robot braked by itself, which may be harder.
         contact: it touched something, which accelerates it as it likes.
+        singular: it was stretched out, where it follows less exactly.
     """
     _check_commands(loop)
     limits, margin = loop.profile.limits.translation, BRAKE_MARGIN if own_brake else 1.0
+    margin *= WOBBLE_FACTOR if singular else 1.0
     path = path_m(loop)
     assert np.isfinite(path).all()
     velocity = np.diff(path, axis=0) / TICK_S
@@ -208,10 +214,23 @@ def _streams(commands: list[PoseCommand | None]) -> Iterable[list[PoseCommand]]:
     run: list[PoseCommand] = []
     for command in [*commands, None]:
         if command is not None:
+            if run and _anchored_anew(run[-1], command):
+                yield run
+                run = []
             run.append(command)
         elif run:
             yield run
             run = []
+
+
+def _anchored_anew(before: PoseCommand, now: PoseCommand) -> bool:
+    """Standing, and from another place: where the robot's own brake has put the arm."""
+    return (
+        float(np.abs(before.twist).max()) < AT_REST
+        and before.state != "active"
+        and now.state == "active"
+        and float(np.abs(now.position_m - before.position_m).max()) > 1e-5
+    )
 
 
 # -- what is done to messages ---------------------------------------------------------------------

@@ -29,7 +29,7 @@ from arm_rig import (
 )
 
 from vla_zenoh.codec import message
-from vla_zenoh.control.so3 import Pose, norm3
+from vla_zenoh.control.so3 import norm3
 from vla_zenoh.lockstep import SIM, Lockstep, Message
 from vla_zenoh.types import GripperCommand, GripperState, JointState, PoseCommand, PoseState
 
@@ -136,8 +136,8 @@ def test_a_measured_pose_that_jumps_far_stops_the_arm() -> None:
 def test_an_arm_that_is_blocked_pushes_no_harder_than_it_may_and_is_led_back() -> None:
     loop = begin("0 0.01 0")
     x_m, y_m, z_m = path_m(loop)[-1]
-    # A wall of the open box, which cannot be pushed away, beside hand and fingers.
-    loop.world.place("box", (x_m, y_m + 0.22, z_m - 0.02))
+    # A wall of the open box, which cannot be pushed away, beside the hand.
+    loop.world.place("box", (x_m, y_m + 0.25, z_m + 0.05))
     push_n: list[float] = []
     for _ in range(300):
         loop.run(0.01)
@@ -195,7 +195,7 @@ def test_a_robot_that_is_switched_off_and_on_moves_again_only_when_it_is_told() 
     assert way_m(loop, since) < SILENT_WAY_M
     loop.put("active", True)
     loop.run(0.3)
-    loop.guard.restart(Pose(*loop.world.tcp()))
+    loop.guard.restart()
     loop.alive.add(SIM)
     loop.tamper = None
     loop.run(0.5)
@@ -224,7 +224,7 @@ def test_a_goal_out_of_reach_is_approached_and_no_further() -> None:
     loop.run(4.5)
     commanded = loop.trace.commands[-1]
     assert commanded is not None
-    assert speed_m_s(loop)[-50:].max() < STILL_M_S
+    assert way_m(loop, mark(loop) - 250) < STANDS_M  # while it is told to go on
     assert norm3(path_m(loop)[-1] - commanded.position_m) < STANDS_M
     assert path_m(loop)[-1, 0] < loop.profile.limits.workspace.x_m[1] + STANDS_M
     assert loop.commander.state.value == "active"
@@ -232,7 +232,7 @@ def test_a_goal_out_of_reach_is_approached_and_no_further() -> None:
     loop.put("prompt", "-0.02 0 -0.02")
     loop.run(1.0)
     assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S  # and back at once
-    check_motion(loop)
+    check_motion(loop, singular=True)
 
 
 def test_a_step_no_arm_can_make_is_not_begun() -> None:
