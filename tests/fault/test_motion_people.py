@@ -34,7 +34,8 @@ from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand
 EXACT_M = 1e-3
 BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.020
 SLIP_M = 1e-3
-TOGGLES_S = 12.0
+TOGGLES_S = 20.0
+MOVES_M_S, TOGGLED_WAY_M = 0.02, 0.3
 GRIPPER_S = 6.0
 STALL_S = 1.0
 
@@ -109,7 +110,7 @@ def test_stop_in_motion_stops_the_arm_and_only_a_reset_frees_it() -> None:
     check_motion(loop)
 
 
-@pytest.mark.parametrize("wait_s", [0.02, 0.06, 0.12, 0.3])
+@pytest.mark.parametrize("wait_s", [0.02, 0.06, 0.12])
 def test_activated_while_it_still_moves_it_does_not_jump(wait_s: float) -> None:
     loop = moving()
     loop.put("active", False)
@@ -126,10 +127,12 @@ def test_activated_during_or_after_the_robots_own_brake_it_does_not_jump(wait_s:
     loop.tamper = dropped(PoseCommand)
     loop.run(wait_s)
     loop.tamper = None
-    loop.put("active", True)  # refused while the robot brakes
-    loop.run(1.0)
-    if loop.commander.state.value != "active":
-        activate(loop)
+    if loop.guard.braking:
+        loop.put("active", True)
+        loop.run(0.02)
+        assert loop.commander.state.value == "inactive"
+    loop.run(0.3)  # the command node still streams where its own brake ended
+    activate(loop)
     loop.run(0.8)
     assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
     check_motion(loop, own_brake=True)
@@ -153,17 +156,19 @@ def test_activated_away_from_where_its_controller_holds_it_the_arm_is_not_pulled
 
 
 def test_active_toggled_ten_times_a_second_stays_smooth() -> None:
-    loop = begin("0 0 0.01")
+    # Often, so that the arm is under way each time before it is told to stop again.
+    loop = begin(UP, rate_hz=30.0)
     for toggle in range(round(TOGGLES_S * 10)):
         if toggle % 50 == 0:  # there and back, for the workspace ends
-            loop.put("prompt", "0 0 0.01" if toggle % 100 == 0 else "0 0 -0.01")
+            loop.put("prompt", UP if toggle % 100 == 0 else f"0 0 -{STEP_M}")
         loop.put("active", toggle % 2 == 1)
         loop.run(0.1)
     since = mark(loop)
     loop.put("active", False)
     loop.run(1.0)
     assert stop_time_s(loop, since) < BRAKE_STOP_S
-    assert way_m(loop, 1) < 0.5
+    assert speed_m_s(loop).max() > MOVES_M_S
+    assert way_m(loop, 1) < TOGGLED_WAY_M
     check_motion(loop)
 
 
