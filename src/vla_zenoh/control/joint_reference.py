@@ -18,6 +18,7 @@ from ruckig import (
     Trajectory,
 )
 
+from vla_zenoh.control.correction import Correction
 from vla_zenoh.control.joint_impedance import JointReference
 from vla_zenoh.control.stream import ACCELERATE_S, BRAKE_MARGIN, CommandStream
 from vla_zenoh.profile import Profile
@@ -25,6 +26,9 @@ from vla_zenoh.types import FloatArray, JointCommand, Stamped
 
 STILL_RAD_S = 1e-4
 """A stream that ends slower than this has ended on purpose."""
+
+SMOOTHED_RAD = 0.002
+"""A command this far from what was foretold is not on its path: it was late, or one was lost."""
 
 
 class JointMotionLimits(NamedTuple):
@@ -74,6 +78,7 @@ class JointGuard:
         self._limits = limits
         self._dt_s = dt_s
         self._stream: CommandStream[JointReference] = CommandStream(limits.timeout_s)
+        self._correction = Correction(len(position_rad), dt_s)
         self._brake: Trajectory | None = None
         self._brake_s = 0.0
         self.silences = 0
@@ -87,6 +92,7 @@ class JointGuard:
     def anchor(self, position_rad: FloatArray) -> None:
         """Somebody else moved the robot; follow nobody and stand. Commands heard stay heard."""
         self._stream.end()
+        self._correction.clear()
         self._brake = None
         self.motion = JointReference.at_rest(position_rad)
 
@@ -127,7 +133,17 @@ class JointGuard:
             wanted.position_rad > np.maximum(limits.upper_rad, here)
         ).any():
             return "out_of_range"
+        followed = self._stream.live(now_ns)
+        ahead_s = self._stream.ahead_s(now_ns)
         self._stream.take(Stamped(command.header, wanted, command.received_ns))
+        if followed is None:
+            self._correction.clear()
+            return None
+        foretold = self._extrapolate(followed, ahead_s)
+        told = self._extrapolate(wanted, self._stream.ahead_s(now_ns))
+        apart = foretold.position_rad - told.position_rad
+        if float(np.abs(apart).max()) > SMOOTHED_RAD:
+            self._correction.add(apart, foretold.velocity_rad_s - told.velocity_rad_s)
         return None
 
     def _ordered(self, record: JointCommand) -> JointReference | None:
@@ -144,7 +160,8 @@ class JointGuard:
         """The reference to follow at `now_ns`."""
         command = self._stream.live(now_ns)
         if command is not None:
-            self.motion = self._extrapolate(command, self._stream.ahead_s(now_ns))
+            self._correction.tick()
+            self.motion = self._corrected(self._extrapolate(command, self._stream.ahead_s(now_ns)))
             return self.motion
         if self._stream.newest is not None:
             self._end_of_stream()
@@ -157,8 +174,19 @@ class JointGuard:
             self._brake = None
         return self.motion
 
+    def _corrected(self, motion: JointReference) -> JointReference:
+        rest = self._correction.now
+        if rest is None:
+            return motion
+        return JointReference(
+            motion.position_rad + rest.value,
+            motion.velocity_rad_s + rest.rate,
+            motion.acceleration_rad_s2 + rest.change,
+        )
+
     def _end_of_stream(self) -> None:
         self._stream.end()
+        self._correction.clear()
         if float(np.abs(self.motion.velocity_rad_s).max()) < STILL_RAD_S:
             return
         self.silences += 1

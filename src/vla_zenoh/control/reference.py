@@ -12,11 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vla_zenoh.control.correction import Correction
 from vla_zenoh.control.smoothing import Motion, MotionLimits, Smoother, motion_limits
 from vla_zenoh.control.so3 import (
     Pose,
     angle_between,
     exp3,
+    log3,
     norm3,
     orthonormal,
     rotation_from_quat,
@@ -27,6 +29,10 @@ from vla_zenoh.types import PoseCommand, Stamped
 
 STILL = 1e-4
 """m/s and rad/s: a stream that ends slower than this has ended on purpose."""
+
+
+SMOOTHED_M, SMOOTHED_RAD = 0.0005, 0.002
+"""A command this far from what was foretold is not on its path: it was late, or one was lost."""
 
 
 class GuardLimits(NamedTuple):
@@ -65,6 +71,7 @@ class ReferenceGuard:
         self._smoother = Smoother(pose, dt_s, limits.brake)
         self._brake_limits = limits.brake
         self._stream: CommandStream[PoseCommand] = CommandStream(limits.timeout_s)
+        self._correction = Correction(6, dt_s)
         self.braking = False
         self.silences = 0
         self.motion = self._smoother.motion
@@ -77,6 +84,7 @@ class ReferenceGuard:
     def anchor(self, pose: Pose) -> None:
         """Somebody else moved the robot; follow nobody and stand. Commands heard stay heard."""
         self._stream.end()
+        self._correction.clear()
         self.braking = False
         self._smoother.reset(pose)
         self.motion = self._smoother.motion
@@ -115,14 +123,28 @@ class ReferenceGuard:
                 return "too_fast"
             if float(np.linalg.norm(values[3:])) > 2 * self._brake_limits.rotation[order]:
                 return "too_fast"
+        followed = self._stream.live(now_ns)
+        foretold = None if followed is None else self._extrapolate(followed, now_ns)
         self._stream.take(command)
+        if foretold is None:
+            self._correction.clear()
+        else:
+            self._correct(foretold, self._extrapolate(record, now_ns))
         return None
+
+    def _correct(self, foretold: Motion, told: Motion) -> None:
+        """Where a command says something else than its predecessors, go over to it smoothly."""
+        apart = foretold.pose.position_m - told.pose.position_m
+        turned = log3(foretold.pose.rotation @ told.pose.rotation.T)
+        if norm3(apart) > SMOOTHED_M or norm3(turned) > SMOOTHED_RAD:
+            self._correction.add(np.concatenate([apart, turned]), foretold.twist - told.twist)
 
     def tick(self, now_ns: int) -> Motion:
         """The reference to follow at `now_ns`."""
         command = self._stream.live(now_ns)
         if command is not None:
-            self.motion = self._extrapolate(command, now_ns)
+            self._correction.tick()
+            self.motion = self._corrected(self._extrapolate(command, now_ns))
             return self.motion
         if self._stream.newest is not None:
             self._end_of_stream()
@@ -133,8 +155,22 @@ class ReferenceGuard:
         self.motion = Motion(self.motion.pose, np.zeros(6), np.zeros(6))
         return self.motion
 
+    def _corrected(self, motion: Motion) -> Motion:
+        rest = self._correction.now
+        if rest is None:
+            return motion
+        return Motion(
+            Pose(
+                motion.pose.position_m + rest.value[:3],
+                orthonormal(exp3(rest.value[3:]) @ motion.pose.rotation),
+            ),
+            motion.twist + rest.rate,
+            motion.acceleration + rest.change,
+        )
+
     def _end_of_stream(self) -> None:
         self._stream.end()
+        self._correction.clear()
         if float(np.abs(self.motion.twist).max()) < STILL:
             return
         self.silences += 1

@@ -6,37 +6,42 @@ import threading
 
 import numpy as np
 
+from vla_zenoh.control.arm import make_kinematics
+from vla_zenoh.control.so3 import quat_from_rotation
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.clock import FixedRate
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.process import ROUTER_PATIENCE_S
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import load_profile
-from vla_zenoh.types import GripperState, PoseState
-
-TOOL_DOWN_XYZW = (1.0, 0.0, 0.0, 0.0)
+from vla_zenoh.types import GripperState, JointState, PoseState
 
 
 def stand(profile_file: str, stop: threading.Event) -> None:
-    """Publish the state of an arm in the middle of its workspace, at the profile's rate.
+    """Publish the state of an arm that stands at home, at the profile's rate.
 
     Args:
         profile_file: whose robot it plays.
         stop: ends it.
     """
     profile = load_profile(profile_file)
-    box = profile.limits.workspace
-    middle_m = np.mean([box.x_m, box.y_m, box.z_m], axis=1)
-    pose = PoseState(middle_m, np.array(TOOL_DOWN_XYZW), np.zeros(6))
+    robot = profile.robot
+    kinematics = make_kinematics(profile)
+    home = kinematics.forward(kinematics.ordered(robot.arm_joints, robot.home_rad))
+    still = np.zeros(len(robot.arm_joints))
+    joints = JointState(robot.arm_joints, np.array(robot.home_rad), still, still)
+    pose = PoseState(home.position_m, quat_from_rotation(home.rotation), np.zeros(6))
     gripper = GripperState(profile.robot.gripper.max_width_m, moving=False, holding=False)
     with open_session(profile.session, wait_s=ROUTER_PATIENCE_S) as session:
         node = Node(profile.robot.driver, profile, session)
         poses = node.stream(node.keys.state_pose, Kind.STATE)
+        arms = node.stream(node.keys.state_joint, Kind.STATE)
         grippers = node.stream(node.keys.state_gripper, Kind.STATE)
         pace = FixedRate(profile.timing.state_hz)
         while not stop.is_set():
             pace.wait()
             header = poses.put(pose)
+            arms.put(joints, stamp_wall_ns=header.stamp_wall_ns, seq=header.seq)
             grippers.put(gripper, stamp_wall_ns=header.stamp_wall_ns, seq=header.seq)
             node.report("standing")
         node.close()
