@@ -7,7 +7,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check format bench build clean
+.PHONY: help setup demo test slow check format bench build clean
 
 help: ## Show this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 16
@@ -21,8 +21,11 @@ $(READY): pyproject.toml constraints.txt scripts/bootstrap.py
 demo: $(READY) ## Simulator, model and command node at work, no GPU needed
 	$(BIN)/vla-zenoh demo $(ARGS)
 
-test: $(READY) ## Run all tests
+test: $(READY) ## Run the tests
 	$(BIN)/python -m pytest $(ARGS)
+
+slow: $(READY) ## Run the tests that take long, too
+	$(BIN)/python -m pytest -m "slow or not slow" $(ARGS)
 
 check: $(READY) ## Lint, format and types, as CI does
 	$(BIN)/ruff check .

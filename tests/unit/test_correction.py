@@ -70,7 +70,7 @@ def test_a_stream_that_stood_still_for_a_moment_does_not_pull_the_reference_back
     limits = GuardLimits(0.1, MotionLimits((1.0, 4.0, 40.0), (3.0, 12.0, 120.0)))
     guard = ReferenceGuard(start, DT_S, limits)
     now_ns, sent, way_m, positions = 10**18, 0, 0.0, []
-    for tick in range(600):
+    for tick in range(1000):
         now_ns += TICK_NS
         # The writer stalls for 60 ms and then goes on where it was, not where it should be.
         if tick % 4 == 0 and not 300 <= tick < 360:
