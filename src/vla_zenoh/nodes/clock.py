@@ -24,6 +24,10 @@ class Clock:
         """Nanoseconds since the Unix epoch."""
         return time.monotonic_ns() + self._offset_ns
 
+    def wall_at(self, mono_ns: int) -> int:
+        """The same for a time of the monotonic clock."""
+        return mono_ns + self._offset_ns
+
     def follow(self) -> float:
         """Take over the system's wall clock; returns by how much it had been stepped (s), or 0."""
         offset_ns = time.time_ns() - time.monotonic_ns()
@@ -37,12 +41,12 @@ class Tick(NamedTuple):
 
     Args:
         periods: how many periods have passed since the last turn, at least 1.
-        behind_s: time since the multiple this turn stands for, less than a period.
+        nominal_ns: the multiple this turn stands for, on the monotonic clock.
         stall_s: how late this turn was woken in all.
     """
 
     periods: int
-    behind_s: float
+    nominal_ns: int
     stall_s: float
 
 
@@ -62,7 +66,7 @@ class FixedRate:
         late_ns = max(now_ns - self._next_ns, 0)
         periods = 1 + late_ns // self._period_ns
         self._next_ns += periods * self._period_ns
-        return Tick(int(periods), late_ns % self._period_ns / 1e9, late_ns / 1e9)
+        return Tick(int(periods), self._next_ns - self._period_ns, late_ns / 1e9)
 
 
 def make_this_thread_realtime() -> bool:

@@ -120,7 +120,7 @@ class CommandNode:
                 extra.append(Setting("active", False))
                 if not self.commander.streaming or time.monotonic() > give_up:
                     break
-            self._turn(extra, tick.periods, tick.behind_s)
+            self._turn(extra, tick.periods, tick.nominal_ns)
         self.node.report("stopped", now=True)
         self.node.close()
 
@@ -129,9 +129,9 @@ class CommandNode:
             return []
         return [Setting("lose", f"the command loop stood still for {stall_s:.3f} s")]
 
-    def _turn(self, extra: list[Setting], periods: int, behind_s: float) -> None:
+    def _turn(self, extra: list[Setting], periods: int, nominal_ns: int) -> None:
         began = time.perf_counter()
-        now_ns = self.node.clock.wall_ns() - int(behind_s * 1e9)
+        now_ns = self.node.clock.wall_at(nominal_ns)
         inputs = self._gather(now_ns)
         inputs.settings = [*inputs.settings, *extra]
         limit = max(1, int(self.node.profile.timing.command_timeout_s * self._hz))
