@@ -89,7 +89,9 @@ def make_row(
 ) -> dict[str, Any]:
     """One row of the result."""
     translation, rotation = profile.limits.translation, profile.limits.rotation
-    step_s = np.diff(stream.time_s)
+    # Commands are whole periods apart; what their stamps say beyond that is the clock being read.
+    period_s = 1.0 / profile.timing.command_hz
+    step_s = np.round(np.diff(stream.time_s) / period_s) * period_s
     inside = step_s > 0
     step_s = step_s[inside][:, None]
     jerk = np.diff(stream.acceleration, axis=0)[inside] / step_s

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 ADOPT_S = 0.005
 """A smaller difference to the system's wall clock is slewing, and is followed silently."""
+NOISE_S = 0.001
+"""A still smaller one is mostly the time between reading two clocks, and would make stamps jitter."""
 REALTIME_PRIORITY = 40
 TIMER_SLACK_OPTION = 29  # PR_SET_TIMERSLACK
 
@@ -32,6 +34,8 @@ class Clock:
         """Take over the system's wall clock; returns by how much it had been stepped (s), or 0."""
         offset_ns = time.time_ns() - time.monotonic_ns()
         step_s = (offset_ns - self._offset_ns) / 1e9
+        if abs(step_s) < NOISE_S:
+            return 0.0
         self._offset_ns = offset_ns
         return step_s if abs(step_s) > ADOPT_S else 0.0
 
