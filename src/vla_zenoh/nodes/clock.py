@@ -11,7 +11,7 @@ from typing import NamedTuple
 ADOPT_S = 0.005
 """A smaller difference to the system's wall clock is slewing, and is followed silently."""
 NOISE_S = 0.001
-"""A still smaller one is mostly the time between reading two clocks, and would make stamps jitter."""
+"""A still smaller one is mostly the time between reading two clocks: following it is jitter."""
 REALTIME_PRIORITY = 40
 TIMER_SLACK_OPTION = 29  # PR_SET_TIMERSLACK
 
