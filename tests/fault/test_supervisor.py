@@ -182,6 +182,7 @@ def test_a_killed_supervisor_that_nobody_has_buried_yet_counts_as_gone(tmp_path:
         ends(running)
 
 
+@pytest.mark.slow
 def test_a_node_that_dies_at_every_start_is_given_up(tmp_path: Path) -> None:
     path = write_profile(tmp_path, more="workers: [missing_model]\n")
     text = path.read_text().replace("worker: scripted", "worker: missing_model")

@@ -142,7 +142,10 @@ def check_translation(run: Run, axis: int, way_m: float, tolerance_m: float = RE
     assert norm3(np.append(off_axis_m, 0.0)) < max(OFF_AXIS_M, tolerance_m)
 
 
-@pytest.mark.parametrize(("rate_hz", "count"), [(1.0, 20), (5.0, 50), (10.0, 50)])
+@pytest.mark.parametrize(
+    ("rate_hz", "count"),
+    [pytest.param(1.0, 50, marks=pytest.mark.slow), (2.0, 10), (5.0, 50), (10.0, 50)],
+)
 def test_steps_up_add_up_to_their_whole_way_at_every_rate(rate_hz: float, count: int) -> None:
     run = carry_out(begin(rate_hz, make_world()), "go up", count)
     check_translation(run, 2, 0.01 * count)
