@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -12,6 +14,7 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
+from vla_zenoh.nodes.orphan import RUN_FOLDER_VARIABLE
 from vla_zenoh.nodes.process import run_node
 
 
@@ -26,4 +29,9 @@ def command(
     from vla_zenoh.nodes.command import CommandNode
 
     loaded = effective_profile(profile, connect)
-    run_node(loaded, lambda session, stop: CommandNode(loaded, session, dry_run=dry_run).run(stop))
+    folder = os.environ.get(RUN_FOLDER_VARIABLE)
+    latch = Path(folder) / "stopped" if folder else None
+    run_node(
+        loaded,
+        lambda session, stop: CommandNode(loaded, session, dry_run=dry_run, latch=latch).run(stop),
+    )

@@ -30,7 +30,15 @@ from vla_zenoh.control.states import OBEYING, State, Trigger, after
 from vla_zenoh.control.watch import Watch
 from vla_zenoh.errors import RecordError
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped, Task
+from vla_zenoh.types import (
+    MAX_TEXT,
+    ActionChunk,
+    GripperState,
+    JointState,
+    PoseState,
+    Stamped,
+    Task,
+)
 
 __all__ = ["Commander", "Inputs", "Outputs", "Setting"]
 
@@ -220,6 +228,7 @@ class Commander:
             self._refuse_setting("activate", reasons)
             return
         self.lease = lease
+        self._resumed_ns = 0
         measured, joint = self.pose.record, self.joint.record if self.joint else None
         blocked = self._watch.begin(held_pose(measured), pose_of(measured))
         self._mover.anchor(measured, self.gripper_state.record, joint, now_ns, blocked=blocked)
@@ -243,16 +252,26 @@ class Commander:
             reasons += reasons_joints_do_not_fit(
                 self.profile, self.reach.kinematics, self.joint, self.pose, now_ns
             )
+        if self.joint is not None and self.pose is not None:
+            writers = {self.joint.header.source, self.pose.header.source}
+            if len(writers) > 1:
+                reasons.append(f"joints and pose are by different writers: {', '.join(writers)}")
         if reasons or chunk is None:
             return None, reasons
         spec = self._around.specs[worker]
         return Lease(spec, chunk.header.source, now_ns, chunk.header.seq), []
 
     def _refuse_setting(self, what: str, reasons: list[str]) -> None:
-        self.why = f"{what} refused: {'; '.join(reasons)}"
+        # Why it stopped is not covered up by what was refused because of it.
+        if self.state not in (State.STOPPED, State.FAULT):
+            self.why = f"{what} refused: {'; '.join(reasons)}"[:MAX_TEXT]
         for reason in reasons:
             self._out.tell("warning", "refusal", f"{what}_refused", reason)
             self._out.refusals.append(Refusal(f"{what}_refused", reason))
+
+    def latch(self, why: str) -> None:
+        """Begin stopped: an emergency stop outlives the process that heard it."""
+        self.state, self.why = State.STOPPED, why[:MAX_TEXT]
 
     def _reset(self) -> None:
         faults = self.gripper_state.record.faults if self.gripper_state else ()

@@ -115,6 +115,8 @@ class Plan:
 
     def shift(self, index: int, way_m: FloatArray, turn: FloatArray, limits: Limits) -> None:
         """Move the goals from `index` on; what leaves the workspace stays at its border."""
+        # Elsewhere than checked: looked at again when they come due. Goal 0 has none before it.
+        self.bounded = min(self.bounded, max(index, 1))
         for later in range(index, len(self.goals)):
             goal = self.goals[later]
             inside, _ = into_workspace(limits, goal.pose.position_m + way_m)

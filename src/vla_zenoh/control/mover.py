@@ -103,12 +103,13 @@ class Mover:
         if self._reach is not None and joint is not None:
             self._reach.reset(self._reach.kinematics.joints_of(joint))
         actual, start = pose_of(measured), held_pose(measured)
+        standing = not self.streaming or self._smoother is None or self._smoother.at_rest
         if self._smoother is None:
             self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits))
-        elif not self.streaming or self._smoother.at_rest:
+        elif standing:
             # Also at rest: a robot that braked by itself stands elsewhere than we command.
             self._smoother.reset(start)
-        if self._joints is not None and joint is not None and not self.streaming:
+        if self._joints is not None and joint is not None and standing:
             self._joints.restart(self._held_joints(joint))
         width_m = self._width_to_keep(gripper)
         self.gripper.restart(width_m)

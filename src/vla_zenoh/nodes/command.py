@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -17,12 +18,13 @@ from vla_zenoh.codec import records, settings
 from vla_zenoh.control.arm import make_shadow
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.so3 import quat_from_rotation
+from vla_zenoh.control.states import State
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.clock import FixedRate, make_this_thread_realtime
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
 from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.slots import Arrival, Inbox, Latest, Mailbox
+from vla_zenoh.nodes.slots import Arrival, Inbox, Mailbox
 from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.nodes.surroundings import Neighbours
 from vla_zenoh.profile import Profile
@@ -35,6 +37,9 @@ from vla_zenoh.types import (
     Stamped,
 )
 
+STATES = 16
+"""States kept between two looks; room for the robot's own beside a stranger's."""
+MAX_WHY = 2000
 TASK_PERIOD_S = 0.2
 CLOCK_PERIOD_S = 0.1
 BRAKE_BEFORE_EXIT_S = 1.0
@@ -49,17 +54,29 @@ class CommandNode:
         profile: limits, timing, first settings.
         session: open session.
         dry_run: compute everything, publish no command.
+        latch: file that stands while an emergency stop or a fault is latched, so that a command
+            node that is started again is stopped as well.
     """
 
-    def __init__(self, profile: Profile, session: zenoh.Session, *, dry_run: bool = False) -> None:
+    def __init__(
+        self,
+        profile: Profile,
+        session: zenoh.Session,
+        *,
+        dry_run: bool = False,
+        latch: Path | None = None,
+    ) -> None:
         node = self.node = Node("command", profile, session)
         self.commander = Commander(profile, reach=make_shadow(profile), dry_run=dry_run)
+        self._latch = latch
+        if latch is not None and latch.exists():
+            self.commander.latch(f"stopped before this node was started: {latch.read_text()}")
         keys = node.keys
         self._neighbours = Neighbours(node)
         self._chunks = node.listen(keys.all_deltas, Inbox(64))
-        self._pose_slot = node.listen(keys.state_pose, Latest())
-        self._gripper_slot = node.listen(keys.state_gripper, Latest())
-        self._joint_slot = node.listen(keys.state_joint, Latest())
+        self._pose_slot = node.listen(keys.state_pose, Inbox(STATES))
+        self._gripper_slot = node.listen(keys.state_gripper, Inbox(STATES))
+        self._joint_slot = node.listen(keys.state_joint, Inbox(STATES))
         self._settings: list[tuple[str, Mailbox, Callable[[bytes], Any]]] = [
             ("stop", node.listen(keys.stop, Mailbox(8)), lambda _: None),
             ("reset", node.listen(keys.reset, Mailbox(8)), lambda _: None),
@@ -137,9 +154,19 @@ class CommandNode:
         limit = max(1, int(self.node.profile.timing.command_timeout_s * self._hz))
         out = self.commander.step(inputs, now_ns, min(periods, limit))
         self._publish(out, now_ns)
+        if any(event.kind == "transition" for event in out.events):
+            self._keep_latch()
         self._rate.tick()
         self._cost_us.add((time.perf_counter() - began) * 1e6)
         self._report(out)
+
+    def _keep_latch(self) -> None:
+        if self._latch is None:
+            return
+        if self.commander.state in (State.STOPPED, State.FAULT):
+            self._latch.write_text(self.commander.why)
+        else:
+            self._latch.unlink(missing_ok=True)
 
     @property
     def _hz(self) -> float:
@@ -207,10 +234,12 @@ class CommandNode:
             return None
         return chunk
 
-    def _state(self, kind: type[Any], slot: Latest) -> Stamped[Any] | None:
-        """The newest state, if it is new and by the writer that speaks for the robot."""
-        arrival = slot.take()
-        return None if arrival is None else self.node.read(kind, arrival, self._speakers[kind])
+    def _state(self, kind: type[Any], slot: Inbox) -> Stamped[Any] | None:
+        """The newest state by the writer that speaks for the robot, whoever else writes."""
+        newest: Stamped[Any] | None = None
+        for arrival in slot.take_all():
+            newest = self.node.read(kind, arrival, self._speakers[kind]) or newest
+        return newest
 
     def _joints(self, put: list[Setting]) -> Stamped[JointState] | None:
         """Joints are looked at when the arm is given to somebody; decoding them costs."""
@@ -283,7 +312,7 @@ class CommandNode:
         self.node.report(
             mind.state.value,
             detail={
-                "why": mind.why,
+                "why": mind.why[:MAX_WHY],
                 "prompt": task.prompt,
                 "worker": task.worker,
                 "rate_hz": task.rate_hz,

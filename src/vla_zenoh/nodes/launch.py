@@ -102,7 +102,10 @@ class Host:
         self.profile_file = Path(self._folder.name) / f"{profile.name}.yaml"
         self.profile_file.write_text(to_yaml(profile), "utf-8")
         self.supervisor = Supervisor(
-            node_commands(profile, self.host, self.profile_file, worker_options), log=log, tell=tell
+            node_commands(profile, self.host, self.profile_file, worker_options),
+            log=log,
+            tell=tell,
+            folder=Path(self._folder.name),
         )
         self._own_router = own_router
         self.session: zenoh.Session | None = None
@@ -151,7 +154,7 @@ class Host:
     def stop(self) -> None:
         """Brake the arm, then end every node; within `STOP_BUDGET_S` in all."""
         deadline_s = time.monotonic() + STOP_BUDGET_S
-        if self.client is not None and "command" in self.supervisor.pids():
+        if self.client is not None and "command" in self.client.alive:
             self._brake(self.client)
         if self.session is not None:
             self.session.close()

@@ -113,8 +113,10 @@ class Node:
 
     def tell(self, event: Event) -> None:
         """Write an event; a flood of the same is thinned out and counted."""
-        if event.kind == "transition" or self._due(event.kind, event.what):
-            self._write(event)
+        # A person is told every reason of a refused setting, not only the first.
+        about = event.why if event.what.endswith("_refused") else ""
+        if event.kind == "transition" or self._due(event.kind, event.what, about):
+            self._write(event, about)
 
     def refuse(self, reason: str, why: str, about: str = "") -> None:
         """Count a refusal by reason, and say why.

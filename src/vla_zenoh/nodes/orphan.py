@@ -13,6 +13,8 @@ from pathlib import Path
 
 PARENT_VARIABLE = "VLA_ZENOH_PARENT"
 """Process number of the supervisor; a child whose supervisor is gone ends itself."""
+RUN_FOLDER_VARIABLE = "VLA_ZENOH_RUN_FOLDER"
+"""Where a node may leave what it has to know when it is started again."""
 PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 WATCH = "watch over the supervisor"
 LOOK_PERIOD_S = 0.25

@@ -11,8 +11,9 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 
-from vla_zenoh.nodes.orphan import PARENT_VARIABLE
+from vla_zenoh.nodes.orphan import PARENT_VARIABLE, RUN_FOLDER_VARIABLE
 
 BACKOFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 STABLE_S = 60.0
@@ -60,6 +61,7 @@ class Supervisor:
         commands: in the order to start them.
         log: called with (node name, line) for every line a node writes.
         tell: called with (node name, sentence) for what the supervisor does.
+        folder: where nodes may leave what one that is started again has to know.
     """
 
     def __init__(
@@ -68,7 +70,9 @@ class Supervisor:
         *,
         log: Callable[[str, str], None],
         tell: Callable[[str, str], None],
+        folder: Path | None = None,
     ) -> None:
+        self._folder = folder
         self.children = [Child(command) for command in commands]
         self._log, self._tell = log, tell
         self.given_up: Child | None = None
@@ -127,6 +131,8 @@ class Supervisor:
         environment = dict(os.environ)
         environment[PARENT_VARIABLE] = str(os.getpid())
         environment["PYTHONUNBUFFERED"] = "1"
+        if self._folder is not None:
+            environment[RUN_FOLDER_VARIABLE] = str(self._folder)
         child.process = subprocess.Popen(
             [sys.executable, "-m", "vla_zenoh", *child.command.arguments],
             stdin=subprocess.DEVNULL,
@@ -159,7 +165,7 @@ class Supervisor:
         if child.process is not None:
             _kill_group(child.process)
         child.process, child.start_again_s = None, now + wait_s
-        how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+        how = f"killed by {_signal_name(-code)}" if code < 0 else f"ended with code {code}"
         self._tell(child.command.name, f"{how}; starting again in {wait_s:g} s")
 
     def _signal(self, kinds: Sequence[str], number: signal.Signals) -> None:
@@ -187,3 +193,10 @@ def _kill_group(process: subprocess.Popen[str]) -> None:
     """End the process and all that it started. Its group has its number (`start_new_session`)."""
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # a real-time signal has no name
+        return f"signal {number}"

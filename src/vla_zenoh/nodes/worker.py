@@ -191,7 +191,10 @@ class WorkerNode:
         self._not_before_ns = task.header.stamp_wall_ns
         reset = getattr(self.policy, "reset", None)
         if callable(reset):
-            reset()
+            try:
+                reset()
+            except Exception as error:
+                self._failed("reset_failed", f"{type(error).__name__}: {error}")
 
     def _read_image(self, camera: str, arrival: Arrival) -> Stamped[Image] | None:
         sample = arrival.sample
@@ -251,7 +254,7 @@ class WorkerNode:
         try:
             result = self.policy.infer(observation)
             answer = result if isinstance(result, ActionSteps) else ActionSteps(result)
-            steps = check_steps(self.spec.action, answer.steps)
+            steps, done = check_steps(self.spec.action, answer.steps), bool(answer.done)
         except SpecError as error:
             return self._failed("contract", str(error))
         except Exception as error:
@@ -272,7 +275,7 @@ class WorkerNode:
                 observed_ns=observed_ns,
                 inference_start_ns=start_ns,
                 inference_end_ns=end_ns,
-                done=bool(answer.done),
+                done=done,
             )
         )
         self._not_before_ns = header.stamp_wall_ns
