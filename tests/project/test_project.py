@@ -80,7 +80,7 @@ def test_what_pip_was_told_is_said_to_uv(bootstrap: ModuleType, tmp_path: Path) 
     environ = {
         "HOME": str(tmp_path),
         "PIP_CONFIG_FILE": str(tmp_path / "none"),
-        "PIP_INDEX_URL": "https://index.example/simple",
+        "PIP_INDEX_URL": "https://packages.example/simple",
         "PIP_EXTRA_INDEX_URL": "https://one.example/simple https://two.example/simple",
         "PIP_FIND_LINKS": f"{wheels} {tmp_path / 'absent'} https://wheels.example",
         "PIP_CERT": "/etc/lab.pem",
@@ -88,7 +88,7 @@ def test_what_pip_was_told_is_said_to_uv(bootstrap: ModuleType, tmp_path: Path) 
         "PIP_DEFAULT_TIMEOUT": "90",
     }
     told = bootstrap.uv_environment(environ)
-    assert told["UV_DEFAULT_INDEX"] == "https://index.example/simple"
+    assert told["UV_DEFAULT_INDEX"] == "https://packages.example/simple"
     assert told["UV_INDEX"] == "https://one.example/simple https://two.example/simple"
     assert told["UV_FIND_LINKS"] == f"{wheels},https://wheels.example"
     assert told["SSL_CERT_FILE"] == "/etc/lab.pem"
