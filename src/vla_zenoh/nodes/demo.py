@@ -14,7 +14,7 @@ from vla_zenoh.control.names import worker_node
 from vla_zenoh.control.so3 import Pose, exp3, log3, rotation_from_quat
 from vla_zenoh.demo.analysis import Outcome, Standing, judge
 from vla_zenoh.demo.segments import Segment
-from vla_zenoh.errors import NodeError
+from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.recording import Recorder
 from vla_zenoh.types import Cause, NodeStatus
@@ -122,7 +122,7 @@ class DemoRun:
             try:
                 self._client.activate()
                 return
-            except Exception:
+            except SessionError:
                 if time.monotonic() > give_up:
                     raise
                 self._pause(0.3)
