@@ -11,7 +11,8 @@
     ├── MissingExtraError  an optional dependency is not installed
     ├── SessionError       no Zenoh session could be had
     ├── WorkerError        a model worker cannot be loaded or broke its contract
-    └── NodeError          a node cannot start or go on (a second command node, a dead device)
+    ├── NodeError          a node cannot start or go on (a second command node, a dead device)
+    └── SecurityError      a certificate or key cannot be made or used
 
 A message says what is wrong, what is allowed and what to do. Errors of libraries are turned into
 these at the edge, with ``from``.
@@ -45,7 +46,15 @@ class ProfileError(VlaZenohError, ValueError):
 
 
 class SpecError(VlaZenohError, ValueError):
-    """A model's spec is wrong, or does not fit the profile."""
+    """A model's spec is wrong, or does not fit the profile, or an answer does not fit the spec.
+
+    Attributes:
+        reason: short stable name of what does not fit, for example ``horizon``.
+    """
+
+    def __init__(self, message: str, reason: str = "contract") -> None:
+        super().__init__(message)
+        self.reason = reason
 
 
 class ResourceError(VlaZenohError, FileNotFoundError):
@@ -80,3 +89,7 @@ class WorkerError(VlaZenohError):
 
 class NodeError(VlaZenohError):
     """A node cannot start or go on."""
+
+
+class SecurityError(VlaZenohError):
+    """A certificate or key cannot be made or used."""

@@ -193,10 +193,16 @@ class ActionSteps(NamedTuple):
     Args:
         steps: (H, D), H at most the declared horizon; anything numpy can read.
         done: the task is finished with these steps, as far as the model can tell.
+        raw: what stood before `steps`, for people: tokens, normalised actions, whatever the model
+            has, as text and numbers. Shown by ``vla-zenoh seen``, used by nobody.
+        pictures: camera -> (H, W, 3) RGB uint8 as it went into the network, where the model itself
+            changes what it is given (a crop).
     """
 
     steps: ArrayLike
     done: bool = False
+    raw: Mapping[str, Any] | None = None
+    pictures: Mapping[str, NDArray[np.uint8]] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,7 +241,8 @@ class Policy(Protocol):
     """A model. Only `spec` and `infer` are needed; ``load()`` and ``reset()`` are called if there.
 
     ``load()`` runs once before the first inference: heavy imports and weights belong there.
-    ``reset()`` runs at the start of every episode.
+    ``reset()`` runs at the start of every episode. ``normalisation_keys``, where a model has it,
+    names the statistics its weights came with: `ActionSpec.normalisation` must be one of them.
     """
 
     @property
@@ -248,24 +255,29 @@ def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
     """`steps` as finite float32 (H, D) of the declared shape.
 
     Raises:
-        SpecError: says what is wrong and what was declared.
+        SpecError: says what is wrong and what was declared; its reason is ``dtype``, ``shape``,
+            ``horizon`` or ``not_finite``.
     """
     try:
         given = np.asarray(steps)
     except (TypeError, ValueError, OverflowError) as error:
-        raise SpecError(f"steps are not numbers: {error}") from error
+        raise SpecError(f"steps are not numbers: {error}", "dtype") from error
     if given.dtype.kind not in "iuf":
-        raise SpecError(f"steps are not numbers but {given.dtype}")
+        raise SpecError(f"steps are not numbers but {given.dtype}", "dtype")
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, seen below
         array = np.array(given, dtype=np.float32, order="C")
     if array.ndim == 1 and array.shape[0] == spec.dimension:
         array = array[None]
     if array.ndim != 2 or array.shape[1] != spec.dimension:
-        raise SpecError(f"steps have shape {array.shape}, the spec says (H, {spec.dimension})")
+        raise SpecError(
+            f"steps have shape {array.shape}, the spec says (H, {spec.dimension})", "shape"
+        )
     if not 1 <= array.shape[0] <= spec.horizon:
-        raise SpecError(f"a chunk of {array.shape[0]} steps, the spec says 1 to {spec.horizon}")
+        raise SpecError(
+            f"a chunk of {array.shape[0]} steps, the spec says 1 to {spec.horizon}", "horizon"
+        )
     if not np.isfinite(array).all():
-        raise SpecError("steps hold NaN or infinity")
+        raise SpecError("steps hold NaN or infinity", "not_finite")
     return array
 
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.control.limits import REFUSE_FACTOR, bound_step, into_workspace, leash
+from vla_zenoh.control.limits import bound_step, into_workspace, leash
 from vla_zenoh.control.so3 import Pose, angle_between, exp3, log3, norm3
-from vla_zenoh.profile import Limits
+from vla_zenoh.profile import REFUSE_FACTOR, Limits
 
 LIMITS = Limits()
 RTOL = 1e-5  # steps travel as float32

@@ -5,12 +5,12 @@ from __future__ import annotations
 from vla_zenoh.control.acceptance import Refusal
 from vla_zenoh.control.actions import step_pose, step_width
 from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
-from vla_zenoh.control.limits import REFUSE_FACTOR, LimitHit, bound_step
+from vla_zenoh.control.limits import LimitHit, bound_step
 from vla_zenoh.control.ports import Outputs
 from vla_zenoh.control.reach import Shadow
 from vla_zenoh.errors import RecordError
 from vla_zenoh.policy import ActionSpec
-from vla_zenoh.profile import Profile
+from vla_zenoh.profile import REFUSE_FACTOR, Profile
 from vla_zenoh.types import ActionChunk, Cause, FloatArray, Stamped
 
 BOUND_AHEAD = 8

@@ -8,11 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.so3 import Pose, exp3, log3, norm3, orthonormal
-from vla_zenoh.profile import Limits
+from vla_zenoh.profile import REFUSE_FACTOR, Limits
 from vla_zenoh.types import FloatArray
-
-REFUSE_FACTOR = 4.0
-"""A step this many times over its limit is a mistake (a wrong unit), not a motion: refused."""
 
 
 class LimitHit(NamedTuple):

@@ -4,6 +4,8 @@ from vla_zenoh.profile.advice import advice
 from vla_zenoh.profile.joint_limits import JointLimits
 from vla_zenoh.profile.load import load_profile, override, profile_file, profile_names, to_yaml
 from vla_zenoh.profile.schema import (
+    REACH_M,
+    REFUSE_FACTOR,
     CameraProfile,
     Composition,
     GripperProfile,
@@ -16,6 +18,8 @@ from vla_zenoh.profile.schema import (
 from vla_zenoh.profile.session import SessionProfile
 
 __all__ = [
+    "REACH_M",
+    "REFUSE_FACTOR",
     "CameraProfile",
     "Composition",
     "GripperProfile",

@@ -34,6 +34,8 @@ NODE_KINDS: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worke
 CAMERA_SOURCES = ("sim:CAMERA", "v4l2:DEVICE", "rtsp://...", "file:PATH", "ros2:TOPIC")
 REACH_M = 3.0
 """No arm that fits a table reaches further: a workspace beyond it is in other units."""
+REFUSE_FACTOR = 4.0
+"""A step this many times over its limit is a mistake (a wrong unit), not a motion: refused."""
 MIN_PERIODS = 3
 """A silence shorter than this many periods happens on a healthy link."""
 
