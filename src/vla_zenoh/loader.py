@@ -11,6 +11,7 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from vla_zenoh import resources
@@ -92,6 +93,39 @@ def _read_header(path: Path) -> Mapping[str, Any]:
         raise WorkerError(f"{path}: its script header is not valid TOML: {error}") from error
 
 
+def module_name(name: str) -> str:
+    """What the module of the model called `name` is imported as."""
+    return "vla_zenoh_model_" + re.sub(r"\W", "_", name)
+
+
+def import_model(model: ModelFile) -> ModuleType:
+    """Import the file, without making its model.
+
+    A model that is a folder is imported as a package, so that its `model.py` can have files beside
+    it: models/NAME/part.py is ``vla_zenoh_model_NAME.part``.
+
+    Raises:
+        WorkerError: it does not import.
+    """
+    name = module_name(model.name)
+    beside = [str(model.path.parent)] if model.path.name == ENTRY_FILE else None
+    found = importlib.util.spec_from_file_location(
+        name, model.path, submodule_search_locations=beside
+    )
+    if found is None or found.loader is None:
+        raise WorkerError(f"{model.path} is not a Python file")
+    module = importlib.util.module_from_spec(found)
+    sys.modules[name] = module
+    try:
+        found.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        del sys.modules[name]
+        raise WorkerError(
+            f"{model.path} cannot be imported: {type(error).__name__}: {error}"
+        ) from error
+    return module
+
+
 def make_policy(model: ModelFile, options: Mapping[str, str] | None = None) -> Policy:
     """Import the file and make its model, without loading weights.
 
@@ -101,18 +135,7 @@ def make_policy(model: ModelFile, options: Mapping[str, str] | None = None) -> P
     Raises:
         WorkerError: the file does not import, has no such class, or refuses the options.
     """
-    found = importlib.util.spec_from_file_location(f"vla_zenoh_model_{model.name}", model.path)
-    if found is None or found.loader is None:
-        raise WorkerError(f"{model.path} is not a Python file")
-    module = importlib.util.module_from_spec(found)
-    sys.modules[found.name] = module
-    try:
-        found.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        del sys.modules[found.name]
-        raise WorkerError(
-            f"{model.path} cannot be imported: {type(error).__name__}: {error}"
-        ) from error
+    module = import_model(model)
     maker = getattr(module, "MODEL", None) or _only_model(module, model.path)
     if not callable(maker):
         raise WorkerError(f"{model.path}: MODEL must be a class, it is a {type(maker).__name__}")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from vla_zenoh.errors import ResourceError, WorkerError
-from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.loader import find_model, import_model, make_policy
 
 HEADER = """\
 # /// script
@@ -174,3 +174,17 @@ def test_a_model_may_hold_dataclasses(write) -> None:
         "@dataclass(slots=True)\nclass Note:\n    text: str = ''\n\n" + MODEL
     )
     assert make_policy(find_model(write(text))).spec.name == "still"
+
+
+def test_a_folder_may_have_files_beside_its_model(tmp_path: Path) -> None:
+    folder = tmp_path / "with-parts"
+    folder.mkdir()
+    (folder / "part.py").write_text("ANSWER = 41\n")
+    (folder / "model.py").write_text(
+        "class Model:\n"
+        "    def infer(self, observation):\n"
+        "        from vla_zenoh_model_with_parts.part import ANSWER\n"
+        "        return ANSWER + 1\n"
+    )
+    module = import_model(find_model(str(folder)))
+    assert module.Model().infer(None) == 42
