@@ -11,6 +11,7 @@
     ├── MissingExtraError  an optional dependency is not installed
     ├── SessionError       no Zenoh session could be had
     ├── WorkerError        a model worker cannot be loaded or broke its contract
+    ├── PeerError          a policy server gave no answer that can be used
     ├── NodeError          a node cannot start or go on (a second command node, a dead device)
     └── SecurityError      a certificate or key cannot be made or used
 
@@ -85,6 +86,22 @@ class SessionError(VlaZenohError, ConnectionError):
 
 class WorkerError(VlaZenohError):
     """A model worker cannot be loaded, or broke its contract."""
+
+
+class RecordingError(VlaZenohError):
+    """A recorded run cannot be written or read."""
+
+
+class PeerError(VlaZenohError):
+    """A policy server gave no answer that can be used.
+
+    Attributes:
+        reason: short stable name used as a counter in status, for example ``peer_timeout``.
+    """
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
 
 
 class NodeError(VlaZenohError):
