@@ -16,7 +16,7 @@ import zenoh
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
 from vla_zenoh.control.names import worker_node
-from vla_zenoh.errors import CodecError, SpecError
+from vla_zenoh.errors import CodecError, PeerError, SpecError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
 from vla_zenoh.nodes.node import Node
@@ -257,6 +257,8 @@ class WorkerNode:
             steps, done = check_steps(self.spec.action, answer.steps), bool(answer.done)
         except SpecError as error:
             return self._failed("contract", str(error))
+        except PeerError as error:  # no chunk now, and the model says why
+            return self._failed(error.reason, str(error))
         except Exception as error:
             return self._failed("inference_failed", f"{type(error).__name__}: {error}")
         end_ns = self.node.clock.wall_ns()
