@@ -7,11 +7,14 @@ all of it can be carried out. A prompt begins where the one named as preparation
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from vla_zenoh.control.so3 import Pose, log3, norm3
 from vla_zenoh.demo.analysis import Outcome
 from vla_zenoh.demo.segments import Segment, make_segment
 from vla_zenoh.profile import Profile
@@ -20,6 +23,8 @@ from vla_zenoh.types import FloatArray
 STEPS = 50
 RATES_HZ = (1.0, 2.0, 5.0, 10.0)
 PREPARATION_HZ = 10.0
+WAY_HZ = 20.0
+"""A path's length is taken between measured poses at this rate: what trembles faster is no way."""
 TOLERANCE_M, TOLERANCE_RAD = 0.001, 0.002
 OFF_AXIS_MM, OFF_AXIS_RAD = 1.0, 0.002
 VELOCITY_STEP_SLACK = 1.02
@@ -64,6 +69,30 @@ PROTOCOL: tuple[Trial, ...] = (
 
 
 @dataclass(frozen=True, slots=True)
+class Conditions:
+    """How the prompts are carried out.
+
+    Args:
+        rate_hz: requests a second.
+        horizon: steps in one chunk.
+        delay_ms: time an inference takes.
+        jitter: share by which that varies, either way.
+    """
+
+    rate_hz: float
+    horizon: int = 1
+    delay_ms: float = 0.0
+    jitter: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        chunk = f", chunks of {self.horizon}" if self.horizon > 1 else ""
+        delay = f", {self.delay_ms:g} ms +-{self.jitter:.0%}" if self.delay_ms else ""
+        return f"{self.rate_hz:g} Hz{chunk}{delay}"
+
+
+@dataclass(frozen=True, slots=True)
 class Stream:
     """The commanded motion of a trial.
 
@@ -71,6 +100,9 @@ class Stream:
         time_s: (n,) stamps.
         twist: (n, 6).
         acceleration: (n, 6).
+        chunk_seq: (n,) the chunk each command carries out; -1: none.
+        path_m: way of the measured TCP, in translation.
+        path_rad: likewise in rotation.
         tracking_m: largest distance between measured and reference pose.
         e2e_ms: camera stamp to pose command, one per chunk.
         outbound_ms: camera stamp to chunk received, one per chunk.
@@ -79,13 +111,21 @@ class Stream:
     time_s: FloatArray
     twist: FloatArray
     acceleration: FloatArray
+    chunk_seq: NDArray[np.int64]
+    path_m: float
+    path_rad: float
     tracking_m: float
     e2e_ms: Sequence[float]
     outbound_ms: Sequence[float]
 
 
+def failed_row(trial: Trial, conditions: Conditions, why: str) -> dict[str, Any]:
+    """The row of a prompt that was not carried out to its end; it has no figures."""
+    return {"prompt": trial.name, **asdict(conditions), "faults": [why], "ok": False}
+
+
 def make_row(
-    trial: Trial, rate_hz: float, profile: Profile, outcome: Outcome, stream: Stream
+    trial: Trial, conditions: Conditions, profile: Profile, outcome: Outcome, stream: Stream
 ) -> dict[str, Any]:
     """One row of the result."""
     translation, rotation = profile.limits.translation, profile.limits.rotation
@@ -95,10 +135,14 @@ def make_row(
     inside = step_s > 0
     step_s = step_s[inside][:, None]
     jerk = np.diff(stream.acceleration, axis=0)[inside] / step_s
+    at_seam = (np.diff(stream.chunk_seq) != 0)[inside]
     change = np.diff(stream.twist, axis=0)[inside] / step_s
+    motion = outcome.segment.motion
+    axis = motion.axis if motion else 0
+    asked_path = abs(motion.step) * outcome.segment.steps if motion else 0.0
     row: dict[str, Any] = {
         "prompt": trial.name,
-        "rate_hz": rate_hz,
+        **asdict(conditions),
         "steps": outcome.segment.steps,
         "steps_done": outcome.steps_done,
         "within": outcome.segment.within,
@@ -106,6 +150,10 @@ def make_row(
         "asked_rad": outcome.asked_rad,
         "reached_m": outcome.reached_m,
         "reached_rad": outcome.reached_rad,
+        "asked_path_m": asked_path if axis < 3 else 0.0,
+        "asked_path_rad": asked_path if 3 <= axis < 6 else 0.0,
+        "path_m": stream.path_m,
+        "path_rad": stream.path_rad,
         "off_axis_mm": outcome.drift_mm,
         "off_axis_rad": outcome.drift_rad,
         "asked_width_m": outcome.asked_width_m,
@@ -113,16 +161,20 @@ def make_row(
         "e2e_ms_p50": _percentile(stream.e2e_ms, 50),
         "e2e_ms_p95": _percentile(stream.e2e_ms, 95),
         "e2e_ms_mean": _mean(stream.e2e_ms),
+        "outbound_ms_p50": _percentile(stream.outbound_ms, 50),
         "outbound_ms_mean": _mean(stream.outbound_ms),
         "outbound_ms_p95": _percentile(stream.outbound_ms, 95),
         "tracking_mm": stream.tracking_m * 1e3,
         "peak_velocity_m_s": _peak(stream.twist[:, :3]),
         "peak_velocity_rad_s": _peak_norm(stream.twist[:, 3:]),
-        "peak_jerk_over_limit": max(
-            _peak(jerk[:, :3]) / translation.jerk_m_s3,
-            _peak_norm(jerk[:, 3:]) / rotation.jerk_rad_s3,
-        ),
-        "peak_acceleration_over_limit": max(
+        "peak_acceleration_m_s2": _peak(stream.acceleration[:, :3]),
+        "peak_acceleration_rad_s2": _peak_norm(stream.acceleration[:, 3:]),
+        "peak_jerk_over_limit": _jerk_over_limit(jerk, profile),
+        # What a chunk's seam does to the acceleration, beside what happens anywhere else.
+        "seams": int(at_seam.sum()),
+        "seam_jerk_over_limit": _jerk_over_limit(jerk[at_seam], profile),
+        "elsewhere_jerk_over_limit": _jerk_over_limit(jerk[~at_seam], profile),
+        "peak_velocity_step_over_limit": max(
             _peak(change[:, :3]) / translation.acceleration_m_s2,
             _peak_norm(change[:, 3:]) / rotation.acceleration_rad_s2,
         ),
@@ -143,7 +195,7 @@ def faults_of(row: dict[str, Any], outcome: Outcome) -> list[str]:
         ("jerk", row["peak_jerk_over_limit"], 1.001, "times its limit"),
         (
             "velocity step",
-            row["peak_acceleration_over_limit"],
+            row["peak_velocity_step_over_limit"],
             VELOCITY_STEP_SLACK,
             "times what acceleration allows",
         ),
@@ -151,9 +203,29 @@ def faults_of(row: dict[str, Any], outcome: Outcome) -> list[str]:
     out = [
         f"{name} {value:.4g} {unit}" for name, value, limit, unit in checks if not value <= limit
     ]
-    if outcome.steps_done != outcome.segment.steps:
+    # Steps of chunks that overlap are asked for more than once and carried out once.
+    wanted = outcome.segment.steps
+    if outcome.steps_done < wanted or (row["horizon"] == 1 and outcome.steps_done > wanted):
         out.append(f"{outcome.steps_done} of {outcome.segment.steps} steps")
     return out
+
+
+def way_of(poses: Sequence[Pose]) -> tuple[float, float]:
+    """Length of the way through `poses`: metres, and radians of the angles between them."""
+    pairs = list(pairwise(poses))
+    return (
+        sum(norm3(b.position_m - a.position_m) for a, b in pairs),
+        sum(norm3(log3(b.rotation @ a.rotation.T)) for a, b in pairs),
+    )
+
+
+def _jerk_over_limit(jerk: FloatArray, profile: Profile) -> float:
+    """Largest of (n, 6) jerks, as a share of what the profile allows."""
+    limits = profile.limits
+    return max(
+        _peak(jerk[:, :3]) / limits.translation.jerk_m_s3,
+        _peak_norm(jerk[:, 3:]) / limits.rotation.jerk_rad_s3,
+    )
 
 
 def _percentile(values: Sequence[float], share: float) -> float | None:

@@ -1,4 +1,4 @@
-"""Runs the motion protocol: through the real chain in real time, or in lockstep."""
+"""Runs the motion protocol through the real chain in real time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.bench.motion import PREPARATION_HZ, Stream, Trial, make_row
+from vla_zenoh.bench.motion import (
+    PREPARATION_HZ,
+    WAY_HZ,
+    Conditions,
+    Stream,
+    Trial,
+    failed_row,
+    make_row,
+    way_of,
+)
+from vla_zenoh.control.so3 import pose_of
 from vla_zenoh.demo.segments import make_segment
 from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes.demo import DemoRun, first_commands
@@ -23,21 +33,21 @@ HOME_TOLERANCE_M = 0.002
 def run_in_real_time(
     host: Host,
     trials: Sequence[Trial],
-    rates_hz: Sequence[float],
+    conditions: Sequence[Conditions],
     stop: threading.Event,
-    progress: Callable[[Trial, float, int], None],
+    progress: Callable[[Trial, Conditions, int], None],
 ) -> Iterator[tuple[dict[str, Any], Recording]]:
     """One row after the other, with what was recorded for it.
 
     Args:
         host: up, with a simulator.
         trials: prompts.
-        rates_hz: each prompt at each of these.
+        conditions: each prompt under each of these; only the rate may differ, the worker is up.
         stop: set by Ctrl-C.
-        progress: called with trial, rate and steps carried out.
+        progress: called with trial, conditions and steps carried out.
 
     Raises:
-        NodeError: the chain does not come up or the arm is not obeyed to the end.
+        NodeError: the chain does not come up.
         Interrupted: Ctrl-C.
     """
     assert host.session is not None and host.client is not None
@@ -47,7 +57,7 @@ def run_in_real_time(
         if not host.supervisor.watch():
             raise NodeError("a node dies again and again; look into nodes.log")
 
-    for rate_hz in rates_hz:
+    for each in conditions:
         for trial in trials:
             recorder = Recorder(host.session, profile.keys, profile.task.worker, camera=None)
             run = DemoRun(
@@ -55,22 +65,29 @@ def run_in_real_time(
                 recorder,
                 stop,
                 watch,
-                lambda _, done, trial=trial, rate_hz=rate_hz: progress(trial, rate_hz, done),
+                lambda _, done, trial=trial, each=each: progress(trial, each, done),
             )
             run.wait_until_ready()
             _go_home(host, recorder)
             run.activate(PREPARATION_HZ)
-            if trial.preparation:
-                prepared = run.carry_out(0, make_segment(trial.preparation, 1), PREPARATION_HZ)
-                if prepared.faults():
-                    raise NodeError(f"{trial.preparation}: {'; '.join(prepared.faults())}")
-            host.client.set_rate(rate_hz)
-            since_ns = time.time_ns()
-            outcome = run.carry_out(0, trial.segment, rate_hz)
-            host.client.deactivate()
+            try:
+                if trial.preparation:
+                    prepared = run.carry_out(0, make_segment(trial.preparation, 1), PREPARATION_HZ)
+                    if prepared.faults():
+                        raise NodeError(f"{trial.preparation}: {'; '.join(prepared.faults())}")
+                host.client.set_rate(each.rate_hz)
+                since_ns = time.time_ns()
+                outcome = run.carry_out(0, trial.segment, each.rate_hz)
+            except NodeError as error:
+                # The arm stands, as it should; the other prompts can still be measured.
+                yield failed_row(trial, each, str(error)), recorder.close()
+                continue
+            finally:
+                host.client.deactivate()
             recording = recorder.close()
-            stream = stream_of(recording, first_commands(recorder), since_ns)
-            yield make_row(trial, rate_hz, profile, outcome, stream), recording
+            first = first_commands(recorder)
+            stream = stream_of(recording, first, since_ns, profile.timing.state_hz)
+            yield make_row(trial, each, profile, outcome, stream), recording
 
 
 def _go_home(host: Host, recorder: Recorder) -> None:
@@ -90,9 +107,12 @@ def _resets(host: Host) -> int:
     return int(status.counters.get("sim.resets", 0)) if status else 0
 
 
-def stream_of(recording: Recording, first: Sequence[tuple[Any, int]], since_ns: int) -> Stream:
+def stream_of(
+    recording: Recording, first: Sequence[tuple[Any, int]], since_ns: int, state_hz: float
+) -> Stream:
     """The commanded motion since `since_ns`, as arrays."""
     commands = [entry for entry in recording.commands if entry.header.stamp_wall_ns >= since_ns]
+    causes = [entry.record.cause for entry in commands]
     poses = [entry.record for entry in recording.poses if entry.header.stamp_wall_ns >= since_ns]
     tracking_m = max(
         (
@@ -107,6 +127,8 @@ def stream_of(recording: Recording, first: Sequence[tuple[Any, int]], since_ns: 
         np.array([entry.header.stamp_wall_ns - since_ns for entry in commands]) / 1e9,
         np.array([entry.record.twist for entry in commands]).reshape(-1, 6),
         np.array([entry.record.acceleration for entry in commands]).reshape(-1, 6),
+        np.array([cause.chunk_seq if cause else -1 for cause in causes]),
+        *way_of([pose_of(pose) for pose in poses[:: round(state_hz / WAY_HZ)]]),
         tracking_m,
         [(heard - cause.observation_stamp_ns) / 1e6 for cause, heard in mine],
         [(cause.received_ns - cause.observation_stamp_ns) / 1e6 for cause, _ in mine],
