@@ -7,10 +7,10 @@ BIN := .venv/bin
 READY := .venv/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow check format bench build clean
+.PHONY: help setup demo test slow test-ros2 check format bench build ros2-bridge clean
 
 help: ## Show this list
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 16
+	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
 
 setup: $(READY) ## Make ./.venv with everything in it
 
@@ -27,6 +27,9 @@ test: $(READY) ## Run the tests
 slow: $(READY) ## Run the tests that take long, too
 	$(BIN)/python -m pytest -m "slow or not slow" $(ARGS)
 
+test-ros2: $(READY) ros2-bridge ## Run the tests with a real ROS 2 bridge and a DDS robot
+	$(BIN)/python -m pytest -m ros2 $(ARGS)
+
 check: $(READY) ## Lint, format and types, as CI does
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -41,6 +44,9 @@ bench: $(READY) ## Measure camera to command on this machine
 
 build: $(READY) ## Build wheel and sdist into dist/ and try each in an empty environment
 	$(BIN)/python scripts/check_wheel.py $(ARGS)
+
+ros2-bridge: ## Build a zenoh-bridge-ros2dds for the tests, once, unless PATH has one
+	@$(PYTHON) scripts/ros2_bridge.py
 
 clean: ## Remove everything these targets made
 	rm -rf .venv .tools dist .pytest_cache .ruff_cache .hypothesis
