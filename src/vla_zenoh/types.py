@@ -619,14 +619,18 @@ class SceneState:
     Args:
         scene: name of the scene.
         qpos: (nq,), the simulator's own order and units, then what it can place by hand.
+        seed: of the last reset, which says how the scene looks where its look is varied; or None.
     """
 
     scene: str
     qpos: FloatArray
+    seed: int | None = None
 
     def __post_init__(self) -> None:
         text("scene", self.scene, 512)
         _set(self, "qpos", vector("qpos", self.qpos, None))
+        if self.seed is not None:
+            _set(self, "seed", integer("seed", self.seed))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

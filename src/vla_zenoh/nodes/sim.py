@@ -74,6 +74,7 @@ def build_world(profile: Profile) -> World:
         joint_gains=JointGains.stiff() if stiff else JointGains.compliant(),
         joint_friction_nm=profile.sim.joint_friction_nm,
         seed=profile.sim.seed,
+        vary=profile.sim.vary,
     )
 
 
@@ -211,7 +212,8 @@ class SimNode:
             self._publish_state(now_ns)
         if self._ticks % self._every["scene"] == 0 and self._scene_wanted:
             self._scene.put(
-                SceneState(self.node.profile.sim.scene, self.world.qpos()), stamp_wall_ns=now_ns
+                SceneState(self.node.profile.sim.scene, self.world.qpos(), self.world.seed),
+                stamp_wall_ns=now_ns,
             )
         if self._ticks % self._every["objects"] == 0 and self._objects_wanted:
             self._publish_objects(now_ns)

@@ -29,8 +29,9 @@ from vla_zenoh.profile.section import (
 )
 from vla_zenoh.profile.session import Endpoints, SessionProfile
 
-NodeKind = Literal["router", "sim", "camera", "command", "worker"]
-NODE_KINDS: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")
+NodeKind = Literal["router", "sim", "ros2", "camera", "command", "worker"]
+NODE_KINDS: tuple[NodeKind, ...] = ("router", "sim", "ros2", "camera", "command", "worker")
+SIMULATED: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")
 CAMERA_SOURCES = ("sim:CAMERA", "v4l2:DEVICE", "rtsp://...", "file:PATH", "ros2:TOPIC")
 REACH_M = 3.0
 """No arm that fits a table reaches further: a workspace beyond it is in other units."""
@@ -330,6 +331,7 @@ class SimProfile(Section):
         gains: preset of the impedance controller.
         joint_friction_nm: Coulomb friction in every arm joint.
         seed: of the first placement of the objects.
+        vary: what else a seed changes, beside places; the scene has to have it.
         renderer: ``auto`` takes OpenGL where it works, else ray casting.
     """
 
@@ -337,6 +339,11 @@ class SimProfile(Section):
     gains: Literal["stiff", "compliant"] = "stiff"
     joint_friction_nm: float = Field(default=0.0, ge=0, le=10)
     seed: int = Field(default=0, ge=0)
+    vary: Annotated[
+        tuple[Literal["lights", "table", "camera", "distractors"], ...],
+        Field(strict=False),
+        Distinct,
+    ] = ()
     renderer: Literal["auto", "egl", "osmesa", "raycast"] = "auto"
 
 
@@ -354,12 +361,17 @@ class HostProfile(Section):
     Args:
         nodes: kinds of nodes.
         connect: where the router is seen from there; None: as session.connect says.
+        listen: where the router of this host listens; None: as session.listen says.
+        link: routers of other hosts that this one connects to. With two routers in ``connect`` a
+            host goes on with the second one when the first is gone.
         cameras: those of its camera node; None: all.
         workers: those it runs; None: all.
     """
 
     nodes: Annotated[tuple[NodeKind, ...], Field(strict=False, min_length=1), Distinct]
     connect: Endpoints | None = None
+    listen: Endpoints | None = None
+    link: Endpoints | None = None
     cameras: Names | None = None
     workers: Names | None = None
 
@@ -380,7 +392,7 @@ class Profile(Section):
     task: TaskProfile = TaskProfile()
     session: SessionProfile = SessionProfile()
     hosts: dict[Name, HostProfile] = Field(
-        default_factory=lambda: {"here": HostProfile(nodes=NODE_KINDS)}
+        default_factory=lambda: {"here": HostProfile(nodes=SIMULATED)}
     )
     ros2: Ros2Profile | None = None
 

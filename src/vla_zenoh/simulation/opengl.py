@@ -72,6 +72,9 @@ class OpenGlCanvas:
         mujoco.mjr_readPixels(rgb, None, viewport, self._gl)
         return np.ascontiguousarray(rgb[::-1])  # OpenGL's first row is the lowest
 
+    def refresh(self) -> None:
+        """Nothing to do: every picture reads the model anew."""
+
     def close(self) -> None:
         """Give the context back."""
         self._gl.free()

@@ -6,11 +6,14 @@ A scene says in its MJCF where an object may stand::
       <numeric name="place/brick" data="x_min x_max y_min y_max yaw_min yaw_max"/>
       <numeric name="place_gap_m" data="0.05"/>
     </custom>
+
+``distract/NAME`` is the same for a distractor, which has a place only where one asks for it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import NamedTuple
 
 import mujoco
@@ -19,6 +22,7 @@ import numpy as np
 from vla_zenoh.errors import ResourceError
 
 REGION_PREFIX = "place/"
+DISTRACTOR_PREFIX = "distract/"
 GAP = "place_gap_m"
 MAX_DRAWS = 1000
 
@@ -45,8 +49,8 @@ def objects_of(model: mujoco.MjModel) -> dict[str, int]:
     return {model.body(i).name: i for i in sorted(free + placed)}
 
 
-def regions_of(model: mujoco.MjModel) -> dict[str, Region]:
-    """Regions by name of the object.
+def regions_of(model: mujoco.MjModel, prefix: str = REGION_PREFIX) -> dict[str, Region]:
+    """Regions by name of the object, of the entries that begin with `prefix`.
 
     Raises:
         ResourceError: a region is malformed, or of an object the scene does not have.
@@ -55,9 +59,9 @@ def regions_of(model: mujoco.MjModel) -> dict[str, Region]:
     regions: dict[str, Region] = {}
     for index in range(model.nnumeric):
         entry = model.numeric(index)
-        if not entry.name.startswith(REGION_PREFIX):
+        if not entry.name.startswith(prefix):
             continue
-        name = entry.name.removeprefix(REGION_PREFIX)
+        name = entry.name.removeprefix(prefix)
         if name not in known:
             raise ResourceError(
                 f"the scene places {name!r}, but can only place: {', '.join(known) or 'nothing'}"
@@ -84,10 +88,11 @@ def footprint_m(model: mujoco.MjModel, body: int) -> float:
     return radius
 
 
-def draw_places(model: mujoco.MjModel, seed: int) -> dict[str, Place]:
+def draw_places(model: mujoco.MjModel, seed: int, *, distractors: bool = False) -> dict[str, Place]:
     """Draw a place for every object that has a region; nothing overlaps anything.
 
-    Objects without a region stay where the scene puts them and are kept clear of.
+    Objects without a region stay where the scene puts them and are kept clear of. With or without
+    distractors, the other objects have the same places.
 
     Raises:
         ResourceError: the regions are too small for the objects.
@@ -107,9 +112,25 @@ def draw_places(model: mujoco.MjModel, seed: int) -> dict[str, Place]:
             for name, region in regions.items()
         }
         if _apart(fixed | drawn, radii, gap):
-            return drawn
-    raise ResourceError(
-        f"no room for {', '.join(regions)} in their regions with {gap:g} m between them; "
+            break
+    else:
+        raise _no_room(regions, gap)
+    if distractors:
+        for name, region in regions_of(model, DISTRACTOR_PREFIX).items():
+            del fixed[name]
+            for _ in range(MAX_DRAWS):
+                place = Place(*random.uniform(region.low, region.high).tolist())
+                if _apart(fixed | drawn | {name: place}, radii, gap):
+                    break
+            else:
+                raise _no_room([name], gap)
+            drawn[name] = place
+    return drawn
+
+
+def _no_room(names: Collection[str], gap_m: float) -> ResourceError:
+    return ResourceError(
+        f"no room for {', '.join(names)} in their regions with {gap_m:g} m between them; "
         f"make the regions of the scene larger or {GAP} smaller"
     )
 

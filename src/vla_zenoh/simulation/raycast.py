@@ -68,12 +68,18 @@ class RaycastCanvas:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
-        own = (model.geom_rgba != NO_COLOUR).any(axis=1) | (model.geom_matid < 0)
-        self._rgb = np.where(own[:, None], model.geom_rgba, model.mat_rgba[model.geom_matid])[:, :3]
         moving = np.flatnonzero(model.geom_group == MOVING_GROUP)
         self._outlines = {int(geom): _outline(model, int(geom)) for geom in moving}
         self._rays: dict[tuple[float, int, int, int], FloatArray] = {}
         self._backgrounds: dict[tuple[int, int, int], Background] = {}
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Take colours from the model, and forget what was drawn with others."""
+        model = self._model
+        own = (model.geom_rgba != NO_COLOUR).any(axis=1) | (model.geom_matid < 0)
+        self._rgb = np.where(own[:, None], model.geom_rgba, model.mat_rgba[model.geom_matid])[:, :3]
+        self._backgrounds.clear()
 
     def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> Pixels:
         """Draw what `camera` sees, (height, width, 3) RGB."""

@@ -6,6 +6,7 @@ Drawing belongs in a process of its own: it would disturb the control loop. That
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
 
@@ -25,6 +26,10 @@ class Canvas(Protocol):
 
     def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> NDArray[np.uint8]:
         """Draw (height, width, 3) RGB; positions in `data` are up to date."""
+        ...
+
+    def refresh(self) -> None:
+        """Colours, lights or cameras of the model have changed."""
         ...
 
     def close(self) -> None:
@@ -50,12 +55,14 @@ class Renderer:
         # Not before the choice: with a bad MUJOCO_GL in the environment the import itself fails.
         import mujoco
 
+        from vla_zenoh.simulation.look import Dresser
         from vla_zenoh.simulation.scene import build_model
 
         self.backend = chosen
         self._model = build_model(scene, robot)
         self._data = mujoco.MjData(self._model)
         self._canvas = _canvas(chosen.name, self._model)
+        self._dresser = Dresser(self._model)
         self._update()
 
     @property
@@ -72,6 +79,18 @@ class Renderer:
         from vla_zenoh.simulation.pose_vector import write_pose_vector
 
         write_pose_vector(self._model, self._data, vector)
+        self._update()
+
+    def vary(self, seed: int | None, vary: Collection[str]) -> None:
+        """Look as a reset with `seed` makes the scene look; None: as the scene file says.
+
+        Raises:
+            ResourceError: an unknown name in `vary`, or the scene has nothing to vary so.
+        """
+        from vla_zenoh.simulation.look import Look, draw_look
+
+        self._dresser.wear(Look() if seed is None else draw_look(seed, vary))
+        self._canvas.refresh()
         self._update()
 
     def render(self, camera: str, width: int, height: int) -> NDArray[np.uint8]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 
 import mujoco
 import numpy as np
@@ -24,6 +25,7 @@ from vla_zenoh.control.joint_impedance import (
 from vla_zenoh.errors import NodeError, ResourceError
 from vla_zenoh.simulation.arm import SimulatedArm
 from vla_zenoh.simulation.gripper import GripperServo
+from vla_zenoh.simulation.look import DISTRACTORS, draw_look
 from vla_zenoh.simulation.placement import draw_places, objects_of
 from vla_zenoh.simulation.pose_vector import read_pose_vector, write_pose_vector
 from vla_zenoh.simulation.robot_model import RobotModel
@@ -53,6 +55,7 @@ class World:
         joint_gains: of the joint impedance controller; None: the stiff ones.
         joint_friction_nm: dry friction in every arm joint, unknown to the controller.
         seed: see `reset`.
+        vary: what else a seeded reset changes, names of `look.VARIATIONS`.
 
     Raises:
         ResourceError: scene or robot are not there or do not fit.
@@ -69,7 +72,11 @@ class World:
         joint_gains: JointGains | None = None,
         joint_friction_nm: float = 0.0,
         seed: int | None = None,
+        vary: Collection[str] = (),
     ) -> None:
+        draw_look(0, vary)  # an unknown name is told here, not by the renderer
+        self._vary = frozenset(vary)
+        self.seed: int | None = None
         self.robot = robot
         self.model = build_model(scene, robot, joint_friction_nm=joint_friction_nm)
         self._data = mujoco.MjData(self.model)
@@ -110,11 +117,13 @@ class World:
                 None puts them where the scene file has them.
         """
         model, data = self.model, self._data
+        self.seed = seed
         mujoco.mj_resetData(model, data)
         self._arm.position_rad[:] = self._home_rad
         data.qpos[self._finger_q] = self._finger_open_m
         if seed is not None:
-            for name, place in draw_places(model, seed).items():
+            places = draw_places(model, seed, distractors=DISTRACTORS in self._vary)
+            for name, place in places.items():
                 height = float(model.body_pos[self._objects[name], 2])
                 half = place.yaw_rad / 2.0
                 turn = (0.0, 0.0, math.sin(half), math.cos(half))

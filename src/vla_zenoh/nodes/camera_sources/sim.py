@@ -58,6 +58,7 @@ class SimCameras:
             outlet.name: Coarseness(outlet.profile.rate_hz) for _, outlet in self._views
         }
         self._heard_ns = time.monotonic_ns()
+        self._seed: int | None = None
         self.renderer = "not ready yet"
 
     def run(self, stop: threading.Event) -> None:
@@ -95,7 +96,7 @@ class SimCameras:
             if isinstance(error, VlaZenohError):
                 raise
             raise MissingExtraError(error.name or str(error), "sim") from error
-        self.renderer = backend.name
+        self.renderer, self._seed = backend.name, None
         if backend.reason:
             advice = f"; on Debian: apt-get install {backend.install}" if backend.install else ""
             self.renderer += f", since {backend.reason}{advice}"
@@ -136,6 +137,9 @@ class SimCameras:
                 f"{self._profile.sim.scene!r}: start both with one profile",
             )
             return False
+        if scene.seed != self._seed and self._profile.sim.vary:
+            renderer.vary(scene.seed, self._profile.sim.vary)
+            self._seed = scene.seed
         try:
             renderer.set_qpos(scene.qpos)
         except RecordError as error:
