@@ -21,11 +21,14 @@ FORBIDDEN = {
     # folder, or "." for the modules beside them: what nothing in it may import
     ".": PURE,
     "bench": PURE - {"asyncio"},  # openpi's server is one of asyncio
+    "check": PURE,
     "codec": PURE,
     "control": PURE,
     "interop": PURE,
     "profile": PURE,
+    "recording": PURE,
     "simulation": PURE - {"mujoco"},
+    "tasks": PURE,
     "demo": PURE,
     "doctor": PURE,
     "nodes": frozenset({"typer", "torch", "mujoco", "asyncio", "vla_zenoh.cli"}),

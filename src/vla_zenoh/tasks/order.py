@@ -1,0 +1,61 @@
+"""What can be asked of the arm, apart from the words it is asked in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from vla_zenoh.errors import RecordError
+
+PUT, STACK, PUSH, STAY = "put", "stack", "push", "stay"
+FAMILIES = (PUT, STACK, PUSH)
+COLOURS = ("red", "blue", "green", "yellow")
+DIRECTIONS: Mapping[str, tuple[float, float]] = {
+    "left": (0.0, 1.0),
+    "right": (0.0, -1.0),
+    "away": (1.0, 0.0),
+    "closer": (-1.0, 0.0),
+}
+"""Unit vectors in the robot's base frame: left, right, away and closer as the robot sees it."""
+BOX = "box"
+
+
+def brick(colour: str) -> str:
+    """Name of the brick of this colour among a scene's objects."""
+    return f"{colour}_brick"
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What is to be done.
+
+    Args:
+        family: ``put`` into the box, ``stack`` on another brick, ``push`` over the table; ``stay``
+            is what a prompt without sense asks for.
+        target: colour of the brick that is to be moved; empty for ``stay``.
+        onto: colour of the brick below it; for ``stack`` alone.
+        direction: one of `DIRECTIONS`; for ``push`` alone.
+
+    Raises:
+        RecordError: the parts do not fit together.
+    """
+
+    family: str
+    target: str = ""
+    onto: str = ""
+    direction: str = ""
+
+    def __post_init__(self) -> None:
+        if self.family not in (*FAMILIES, STAY):
+            raise RecordError(f"no family {self.family!r} of tasks; {', '.join(FAMILIES)}, {STAY}")
+        for name, value, allowed, wanted in (
+            ("target", self.target, COLOURS, self.family != STAY),
+            ("onto", self.onto, COLOURS, self.family == STACK),
+            ("direction", self.direction, tuple(DIRECTIONS), self.family == PUSH),
+        ):
+            if wanted and value not in allowed:
+                raise RecordError(f"{name} is {value!r}, allowed: {', '.join(allowed)}")
+            if not wanted and value:
+                raise RecordError(f"a task {self.family!r} has no {name}, got {value!r}")
+        if self.family == STACK and self.target == self.onto:
+            raise RecordError(f"the {self.target} brick cannot stand on itself")
