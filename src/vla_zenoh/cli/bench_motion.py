@@ -19,12 +19,11 @@ from rich.progress import (
 )
 
 from vla_zenoh.bench.motion import PROTOCOL, STEPS, Conditions, Trial
-from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile
+from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
 from vla_zenoh.cli.output import console, errors
 from vla_zenoh.profile import Profile
 
 WIDTH = 124
-"""The tables are wide; on a narrower screen they wrap rather than lose figures."""
 Rows = list[dict[str, Any]]
 
 
@@ -65,11 +64,11 @@ def motion(
 
     if lockstep and out is not None:
         raise typer.BadParameter("--out draws what real nodes did: leave out --lockstep")
-    horizons = [int(part) for part in _numbers("--chunks", chunks, 1, 100)]
+    horizons = [int(part) for part in number_list("--chunks", chunks, 1, 100)]
     conditions = [
         Conditions(rate_hz, horizon, delay_ms, jitter)
         for horizon in horizons
-        for rate_hz in _numbers("--rates", rates, 0.2, 50)
+        for rate_hz in number_list("--rates", rates, 0.2, 50)
     ]
     stop = stop_on_signals()
     loaded = effective_profile(profile)
@@ -87,8 +86,7 @@ def motion(
     finally:
         _write(json_file, rows)
     beside = thesis_table(rows, virtual=lockstep)
-    screen = console()
-    screen.width = max(screen.width, WIDTH)
+    screen = console(WIDTH)
     screen.print(motion_table(rows))
     if beside.row_count:
         screen.print(beside)
@@ -208,16 +206,6 @@ def _trials(prompts: str) -> list[Trial]:
     if unknown:
         raise typer.BadParameter(f"{unknown[0]!r} is not a motion; there are: {', '.join(names)}")
     return [trial for trial in PROTOCOL if trial.name in wanted]
-
-
-def _numbers(option: str, text: str, low: float, high: float) -> list[float]:
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError as error:
-        raise typer.BadParameter(f"{option} wants numbers separated by commas: {error}") from error
-    if not all(low <= number <= high for number in numbers):
-        raise typer.BadParameter(f"{option} wants numbers from {low:g} to {high:g}")
-    return numbers
 
 
 def _write(path: Path | None, rows: Rows) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -42,16 +42,42 @@ HostOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for a script.")]
 
 
+def model_options(given: list[str]) -> dict[str, str]:
+    """``name=value`` texts as a map.
+
+    Raises:
+        typer.BadParameter: one is not of this form.
+    """
+    out: dict[str, str] = {}
+    for option in given:
+        key, equals, value = option.partition("=")
+        if not equals or not key.isidentifier():
+            raise typer.BadParameter(f"--set wants name=value, not {option!r}")
+        out[key] = value
+    return out
+
+
 def effective_profile(
-    name: str, connect: list[str] | None = None, listen: list[str] | None = None
+    name: str,
+    connect: list[str] | None = None,
+    listen: list[str] | None = None,
+    host: str | None = None,
 ) -> Profile:
     """The profile, with endpoints from the command line in place of its own.
+
+    Args:
+        name: of the profile, or its path.
+        connect: in place of session.connect.
+        listen: in place of session.listen.
+        host: which of the profile's hosts this computer is; decides whose certificates are used.
 
     Raises:
         ProfileError: it is wrong.
     """
     profile = load_profile(name)
-    changes: dict[str, list[str]] = {}
+    changes: dict[str, Any] = {}
+    if host is not None and profile.session.security is not None:
+        changes["security"] = {"host": host}
     if connect:
         changes["connect"] = connect
     if listen:
@@ -69,3 +95,18 @@ def client(profile_name: str, connect: list[str] | None) -> Iterator[Client]:
     profile = effective_profile(profile_name, connect)
     with open_session(profile.session) as session:
         yield Client(profile, session).follow()
+
+
+def number_list(option: str, text: str, low: float, high: float) -> list[float]:
+    """Numbers separated by commas.
+
+    Raises:
+        BadParameter: not numbers, or out of bounds; names the option.
+    """
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise typer.BadParameter(f"{option} wants numbers separated by commas: {error}") from error
+    if not all(low <= number <= high for number in numbers):
+        raise typer.BadParameter(f"{option} wants numbers from {low:g} to {high:g}")
+    return numbers

@@ -22,9 +22,15 @@ from rich.text import Text
 _NOT_PRINTED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
 
-def console() -> Console:
-    """A console on stdout."""
-    return Console(highlight=False)
+def console(least_width: int = 0) -> Console:
+    """A console on stdout.
+
+    Args:
+        least_width: for a wide table, which shall rather wrap on a narrow screen than lose figures.
+    """
+    screen = Console(highlight=False)
+    screen.width = max(screen.width, least_width)
+    return screen
 
 
 def errors() -> Console:

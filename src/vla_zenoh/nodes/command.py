@@ -44,6 +44,8 @@ TASK_PERIOD_S = 0.2
 CLOCK_PERIOD_S = 0.1
 BRAKE_BEFORE_EXIT_S = 1.0
 SWITCH_INTERVAL_S = 5e-4
+SPREAD_S = 8.0
+"""Status tells how cost and lateness of ticks were spread over so long."""
 STAGES = ("capture_to_worker", "inference", "worker_to_command", "command_to_pose", "end_to_end")
 
 
@@ -94,7 +96,8 @@ class CommandNode:
             for kind in (PoseState, JointState, GripperState)
         }
         self._latency = {stage: Percentiles() for stage in STAGES}
-        self._cost_us = Percentiles(2048)
+        ticks = round(SPREAD_S * profile.timing.command_hz)
+        self._cost_us, self._late_us = Percentiles(ticks), Percentiles(ticks)
         self._rate = RateMeter()
         self._last_task = self._last_clock = 0.0
         self._realtime = False
@@ -128,6 +131,7 @@ class CommandNode:
         give_up = 0.0
         while True:
             tick = loop.wait()
+            self._late_us.add(tick.stall_s * 1e6)
             extra: list[Setting] = []
             if tick.periods > 1:
                 self.node.counters["command.missed_ticks"] += tick.periods - 1
@@ -305,7 +309,6 @@ class CommandNode:
             if stamped is not None
         }
         latency = {name: meter.summary() for name, meter in self._latency.items()}
-        cost = self._cost_us.summary() or (0.0, 0.0)
         self.node.counters["command.smoothing_failures"] = mind.smoothing_failures
         self.node.counters["command.gripper_timeouts"] = mind.gripper.timeouts
         self.node.counters["command.chunks_dropped"] = self._chunks.dropped
@@ -324,7 +327,8 @@ class CommandNode:
                 "streaming": mind.streaming,
                 "tracking_mm": round(mind.tracking_m * 1e3, 3),
                 "tracking_mrad": round(mind.tracking_rad * 1e3, 3),
-                "tick_us": [round(cost[0], 1), round(cost[1], 1)],
+                "tick_us": self._cost_us.spread(),
+                "late_us": self._late_us.spread(),
                 "realtime": self._realtime,
                 "dry_run": mind.dry_run,
                 **self._goal(),

@@ -35,7 +35,7 @@ class RateMeter:
 
 
 class Percentiles:
-    """Median and 95th percentile of the last values."""
+    """How the last values are spread."""
 
     def __init__(self, size: int = 512) -> None:
         self._values: deque[float] = deque(maxlen=size)
@@ -51,3 +51,12 @@ class Percentiles:
         ordered = sorted(self._values)
         last = len(ordered) - 1
         return ordered[round(0.5 * last)], ordered[round(0.95 * last)]
+
+    def spread(self) -> dict[str, float]:
+        """p50, p95, p99 and max; empty without values."""
+        if not self._values:
+            return {}
+        ordered = sorted(self._values)
+        last = len(ordered) - 1
+        shares = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
+        return {name: round(ordered[round(share * last)], 1) for name, share in shares.items()}

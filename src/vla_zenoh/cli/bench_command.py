@@ -1,0 +1,88 @@
+"""vla-zenoh bench command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.box import SIMPLE
+from rich.progress import track
+from rich.table import Table
+
+from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
+from vla_zenoh.cli.output import console, errors
+
+WIDTH = 110
+SHARES = ("p50", "p95", "p99", "max")
+
+
+def command(
+    rates: Annotated[
+        str, typer.Option("--rates", help="Ticks a second, separated by commas.")
+    ] = "250,500,1000",
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=8, max=600, help="How long at each rate.")
+    ] = 10.0,
+    profile: Annotated[
+        str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
+    ] = DEFAULT_PROFILE,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the result to this file.")
+    ] = None,
+) -> None:
+    """Measure what a tick of the command node costs while the simulated arm moves.
+
+    The real chain is started once for every rate.
+    """
+    from vla_zenoh.cli.demo_run import own_address
+    from vla_zenoh.nodes.bench_command import measure_command
+    from vla_zenoh.nodes.demo import Interrupted
+    from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
+
+    rates_hz = number_list("--rates", rates, 50, 1000)
+    stop = stop_on_signals()
+    die_with_parent()
+    loaded = own_address(effective_profile(profile))
+    rows: list[dict[str, Any]] = []
+    lines: list[str] = []
+    try:
+        for rate_hz in track(rates_hz, "command node", console=errors()):
+            rows.append(
+                measure_command(
+                    loaded,
+                    rate_hz,
+                    seconds,
+                    stop,
+                    lambda node, line: lines.append(f"{node:>16} | {line}"),
+                )
+            )
+    except Interrupted:
+        raise typer.Exit(130) from None
+    except Exception:
+        errors().print("\n".join(lines[-20:]), style="dim", markup=False)
+        raise
+    finally:
+        if json_file is not None:
+            json_file.parent.mkdir(parents=True, exist_ok=True)
+            json_file.write_text(json.dumps(rows, indent=2) + "\n", "utf-8")
+    table = Table(box=SIMPLE, pad_edge=False)
+    for column in ("asked Hz", "held Hz", "missed", "core share"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for name in ("tick", "late"):
+        for share in SHARES:
+            table.add_column(f"{name} us {share}", justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(
+            f"{row['command_hz']:g}",
+            f"{row['held_hz']:g}",
+            f"{row['missed_ticks']}",
+            f"{row['core_share']:.2f}",
+            *(f"{row['tick_us'][share]:.0f}" for share in SHARES),
+            *(f"{row['late_us'][share]:.0f}" for share in SHARES),
+        )
+    table.caption = "tick: from waking until the command is out. late: waking behind its time" + (
+        "" if all(row["realtime"] for row in rows) else " (no real-time priority here)"
+    )
+    console(WIDTH).print(table)

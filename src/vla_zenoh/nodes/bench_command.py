@@ -1,0 +1,83 @@
+"""What a tick of the command node costs, in the real chain, at several rates."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from vla_zenoh.errors import NodeError
+from vla_zenoh.nodes.bench_process import cpu_s
+from vla_zenoh.nodes.command import SPREAD_S
+from vla_zenoh.nodes.demo import DemoRun, Interrupted
+from vla_zenoh.nodes.launch import Host
+from vla_zenoh.nodes.recording import Recorder
+from vla_zenoh.profile import Profile, override
+
+PROMPT = "HARD: go up within 0.2"
+RATE_HZ = 10.0
+STATUS_S = 1.0
+
+
+def measure_command(
+    profile: Profile,
+    command_hz: float,
+    seconds: float,
+    stop: threading.Event,
+    log: Callable[[str, str], None],
+) -> dict[str, Any]:
+    """Cost and lateness of ticks while the arm goes up and down, at one rate.
+
+    Args:
+        profile: of a simulated robot, at an address of its own.
+        command_hz: ticks a second.
+        seconds: how long to measure.
+        stop: set by Ctrl-C.
+        log: (node, line) for what nodes write.
+
+    Raises:
+        NodeError: the chain does not come up, or the arm is not obeyed to the end.
+        Interrupted: Ctrl-C.
+    """
+    profile = override(profile, {"timing": {"command_hz": command_hz}})
+    with Host(profile, None, log=log, tell=log, own_router=True) as host:
+        assert host.session is not None and host.client is not None
+        client = host.client
+
+        def watch() -> None:
+            if not host.supervisor.watch():
+                raise NodeError("a node dies again and again")
+
+        recorder = Recorder(host.session, profile.keys, profile.task.worker, camera=None)
+        run = DemoRun(client, recorder, stop, watch, lambda *_: None)
+        run.wait_until_ready()
+        run.activate(RATE_HZ)
+        recorder.close()  # what it hears costs time that is not the command node's
+        client.set_prompt(PROMPT)
+        if stop.wait(STATUS_S):
+            raise Interrupted
+        pid = host.supervisor.pids()["command"]
+        missed, spent_s, began_s = _missed(host), cpu_s(pid), time.monotonic()
+        if stop.wait(max(seconds, SPREAD_S)):
+            raise Interrupted
+        spent_s, took_s = cpu_s(pid) - spent_s, time.monotonic() - began_s
+        status = client.status("command")
+        if status is None or status.state != "active":
+            found = f"{status.state} ({status.detail.get('why')})" if status else "silent"
+            raise NodeError(f"the command node at {command_hz:g} Hz is {found}")
+        return {
+            "command_hz": command_hz,
+            "held_hz": round(status.rates_hz.get("loop", 0.0), 1),
+            "tick_us": status.detail["tick_us"],
+            "late_us": status.detail["late_us"],
+            "missed_ticks": _missed(host) - missed,
+            "core_share": round(spent_s / took_s, 3),
+            "realtime": status.detail["realtime"],
+            "seconds": round(took_s, 1),
+        }
+
+
+def _missed(host: Host) -> int:
+    status = host.client.status("command") if host.client else None
+    return int(status.counters.get("command.missed_ticks", 0)) if status else 0
