@@ -162,8 +162,8 @@ def told(path: str) -> list[str]:
         ("hosts: {a: {}}", "lab.yaml:2: hosts.a.nodes: is missing"),
         (
             "hosts:\n  a:\n    nodes: [router, camer]",
-            "lab.yaml:4: hosts.a.nodes.1: wants 'router', 'sim', 'camera', 'command' or 'worker'; "
-            "did you mean 'camera'?",
+            "lab.yaml:4: hosts.a.nodes.1: wants 'router', 'sim', 'ros2', 'camera', 'command' or "
+            "'worker'; did you mean 'camera'?",
         ),
         ("hosts: {a: {nodes: [sim, sim]}}", "hosts.a.nodes: sim: given more than once"),
         (
@@ -199,7 +199,27 @@ def told(path: str) -> list[str]:
             "'pose' is not a ROS topic: write its full name",
         ),
         (
-            "ros2: {pose_command: {topic: /p, type: a}, cameras: {frotn: {topic: /f}}}",
+            "ros2: {pose_command: {topic: /p, type: a}}",
+            "ros2.pose_command.type: 'a' is not a ROS type: write package/msg/Name",
+        ),
+        (
+            "robot: {driver: ros2}\nros2: {domain: 1}",
+            "ros2: lacks pose_command: robot.command is pose",
+        ),
+        (
+            "cameras: {front: {source: 'ros2:/a'}}\nros2: {cameras: {front: {topic: /b}}}",
+            "ros2.cameras.front.topic: is not that of cameras.front: 'ros2:/a'",
+        ),
+        (
+            "ros2: {gripper: {topic: /g, type: std_msgs/msg/Float64, grasp: /h}}",
+            "ros2.gripper.grasp: goes with type franka_msgs/action/Move only",
+        ),
+        (
+            "hosts: {a: {nodes: [ros2]}}",
+            "hosts.a.nodes: has ros2, which needs a section ros2",
+        ),
+        (
+            "ros2: {cameras: {frotn: {topic: /f}}}",
             "ros2.cameras: 'frotn' is not among cameras; did you mean 'front'?",
         ),
         ("session: {connect: []}", "session.connect: is empty: a client needs a router"),

@@ -19,6 +19,7 @@ from vla_zenoh.cli import (
     echo,
     keys,
     profile,
+    ros2,
     router,
     set_prompt,
     sim,
@@ -36,9 +37,10 @@ EXTRA_OF = {
     "mujoco": "sim",
     "matplotlib": "sim",
     "av": "sim",
+    "rosbags": "ros2",
 }
 """Modules of the extras, for whoever starts a node whose extra is not installed."""
-NODES = frozenset({"up", "router", "sim", "camera", "worker", "command"})
+NODES = frozenset({"up", "router", "sim", "ros2", "camera", "worker", "command"})
 """Commands whose output is a log: that of Zenoh belongs to it."""
 RUN, DRIVE, LOOK = "Run", "Drive the robot", "Look"
 
@@ -74,6 +76,7 @@ for panel, name, function in (
     (RUN, "up", up.up),
     (RUN, "router", router.router),
     (RUN, "sim", sim.sim),
+    (RUN, "ros2", ros2.ros2),
     (RUN, "camera", camera.camera),
     (RUN, "worker", worker.worker),
     (RUN, "command", command.command),

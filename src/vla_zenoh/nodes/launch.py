@@ -18,7 +18,7 @@ from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.supervisor import NodeCommand, Supervisor
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
 
-START_ORDER = ("router", "sim", "command", "camera", "worker")
+START_ORDER = ("router", "sim", "ros2", "command", "camera", "worker")
 ROUTER_PATIENCE_S = 10.0
 BRAKE_PATIENCE_S = 1.0
 STOP_BUDGET_S = 2.9

@@ -18,12 +18,19 @@ ONLY_ONE = {
     "router": "routers do not find each other",
     "command": "the robot obeys one command node",
     "sim": "there is one simulated robot",
+    "ros2": "the robot has one driver",
 }
 
 
 def faults(profile: Profile) -> list[Fault]:
     """(place, sentence) of everything that does not fit."""
-    return [*_robot(profile), *_cameras(profile), *_task(profile), *_hosts(profile)]
+    return [
+        *_robot(profile),
+        *_cameras(profile),
+        *_ros2(profile),
+        *_task(profile),
+        *_hosts(profile),
+    ]
 
 
 def cameras_of(profile: Profile, host: HostProfile) -> tuple[str, ...]:
@@ -67,6 +74,22 @@ def _cameras(profile: Profile) -> Iterator[Fault]:
         yield from _unknown(("ros2", "cameras"), profile.ros2.cameras, "cameras", profile.cameras)
 
 
+def _ros2(profile: Profile) -> Iterator[Fault]:
+    ros2, robot = profile.ros2, profile.robot
+    if ros2 is None:
+        return
+    wanted = f"{robot.command}_command"
+    if robot.driver == "ros2" and getattr(ros2, wanted) is None:
+        yield ("ros2",), f"lacks {wanted}: robot.command is {robot.command}"
+    for name, camera in ros2.cameras.items():
+        source = profile.cameras[name].source if name in profile.cameras else ""
+        if source.startswith("ros2:") and source.removeprefix("ros2:") != camera.topic:
+            yield ("ros2", "cameras", name, "topic"), f"is not that of cameras.{name}: {source!r}"
+    gripper = ros2.gripper
+    if gripper is not None and gripper.grasp and gripper.type != "franka_msgs/action/Move":
+        yield ("ros2", "gripper", "grasp"), "goes with type franka_msgs/action/Move only"
+
+
 def _task(profile: Profile) -> Iterator[Fault]:
     if profile.task.worker not in profile.workers:
         yield (
@@ -87,6 +110,8 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
         yield from _unknown((*place, "workers"), host.workers or (), "workers", profile.workers)
         if "sim" in host.nodes and profile.robot.driver != "sim":
             yield (*place, "nodes"), f"has sim, and robot.driver is {profile.robot.driver}"
+        if "ros2" in host.nodes and profile.ros2 is None:
+            yield (*place, "nodes"), "has ros2, which needs a section ros2"
         for kind in host.nodes:
             if kind in ONLY_ONE:
                 runs["nodes", kind].append(name)

@@ -1,0 +1,1 @@
+"""Other people's wires: what it takes to speak them, without a session."""

@@ -1,0 +1,172 @@
+"""openpi's wire: msgpack over WebSocket, one binary frame a request, one a reply, in turn.
+
+A server speaks first and says what it serves (a map, which may be empty). An observation is a map of
+names, an answer a map with ``actions`` (H, D). An error is a text frame, after which the connection
+is closed. ``GET /healthz`` is answered with ``OK``.
+
+vllm-omni serves the same with additions: ``{"endpoint": "reset"}``, a ``session_id`` in every
+observation, answers that are a bare array, and errors that are a map with ``type: error``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from vla_zenoh.codec import message
+from vla_zenoh.errors import CodecError, PeerError
+from vla_zenoh.interop.layout import Layout
+from vla_zenoh.policy import ActionSpec
+from vla_zenoh.types import shown
+
+PORT = 8000
+HEALTH_PATH = "/healthz"
+VLLM_PATH = "/v1/realtime/robot/openpi"
+MAX_BYTES = message.MAX_PAYLOAD_BYTES
+MAX_ERROR = 400
+SPEC = "vla_zenoh_action"
+"""Where a server of ours says what its actions mean."""
+
+
+# -- the asking end -------------------------------------------------------------------------------
+def request(fields: Mapping[str, Any], session: str | None = None) -> bytes:
+    """One observation; `session` only for servers that know it."""
+    extra = {} if session is None else {"session_id": session}
+    return message.pack({**fields, **extra})
+
+
+def reset_request() -> bytes:
+    """An episode begins; vllm-omni only."""
+    return message.pack({"endpoint": "reset"})
+
+
+def read_metadata(frame: bytes | str) -> dict[str, Any]:
+    """The first frame of a server.
+
+    Raises:
+        PeerError: it is an error, or no map.
+    """
+    found = _read(frame)
+    if not isinstance(found, dict):
+        raise PeerError("peer_reply", f"the server's first frame is no map: {shown(found)}")
+    return found
+
+
+def read_answer(frame: bytes | str) -> Any:
+    """A reply: a map with arrays, or an array.
+
+    Raises:
+        PeerError: it is an error, or neither.
+    """
+    answer = _read(frame)
+    if isinstance(answer, dict) and isinstance(answer.get("actions"), dict):
+        answer = answer["actions"]
+    return answer
+
+
+def read_reset(frame: bytes | str) -> None:
+    """The reply to a reset, as text or as a map.
+
+    Raises:
+        PeerError: it did not succeed.
+    """
+    if isinstance(frame, str) and "success" in frame[:MAX_ERROR]:
+        return
+    _read(frame)
+
+
+def _read(frame: bytes | str) -> Any:
+    if isinstance(frame, str):
+        lines = [line for line in frame.strip().splitlines() if line.strip()]
+        # A traceback says what happened in its last line.
+        raise PeerError("peer_error", f"the server says: {(lines or [''])[-1][:MAX_ERROR]}")
+    try:
+        found = message.unpack(frame)
+    except CodecError as error:
+        raise PeerError("peer_reply", f"the server's frame cannot be read: {error}") from error
+    if isinstance(found, dict) and found.get("type") == "error":
+        said = found.get("message", found.get("error"))
+        raise PeerError("peer_error", f"the server says: {shown(said)}")
+    return found
+
+
+def mismatches(metadata: Mapping[str, Any], layout: Layout) -> list[str]:
+    """What the server says of itself and the layout does not: one sentence each.
+
+    openpi's own server says nothing of its actions; vllm-omni's and ours do.
+    """
+    out: list[str] = []
+    wanted = layout.width
+    dim = metadata.get("action_dim")
+    if isinstance(dim, int):
+        if layout.columns is not None and max(layout.columns) >= dim:
+            out.append(f"it gives {dim} columns, column {max(layout.columns)} is wanted")
+        elif layout.columns is None and wanted is not None and dim != wanted:
+            out.append(f"it gives {dim} columns, {wanted} are wanted (columns=)")
+    space = metadata.get("action_space")
+    if isinstance(space, str) and space.startswith("joint") is not layout.needs_joints:
+        out.append(f"its action_space is {space}, action={layout.action} is set")
+    size = metadata.get("image_resolution")
+    if isinstance(size, list) and len(size) == 2:
+        for camera in layout.spec.observation.cameras:
+            if camera.height is not None and [camera.height, camera.width] != size:
+                out.append(
+                    f"it wants pictures of {size[1]}x{size[0]}, size="
+                    f"{camera.width}x{camera.height} is set"
+                )
+                break
+    theirs = metadata.get(SPEC)
+    if isinstance(theirs, dict):
+        ours = layout.spec.action.model_dump(mode="json")
+        out += [
+            f"its {name} is {shown(theirs[name])}, {shown(ours[name])} is set"
+            for name in _MEANING
+            if name in theirs and theirs[name] != ours[name]
+        ]
+    return out
+
+
+_MEANING = ("kind", "frame", "rotation", "gripper", "gripper_open_is_high", "dt_s")
+
+
+# -- the answering end ----------------------------------------------------------------------------
+def metadata(action: ActionSpec, names: Mapping[str, str]) -> bytes:
+    """The first frame of a server of ours.
+
+    Args:
+        action: what its actions mean.
+        names: name of an observation -> what it is, for people.
+    """
+    return message.pack(
+        {
+            "action_dim": action.dimension,
+            "action_horizon": action.horizon,
+            "observation": dict(names),
+            SPEC: action.model_dump(mode="json"),
+        }
+    )
+
+
+def read_observation(frame: bytes | str) -> dict[str, Any]:
+    """One request to a server of ours.
+
+    Raises:
+        PeerError: it is no map that can be read.
+    """
+    if isinstance(frame, str):
+        raise PeerError("peer_request", "a text frame; observations are msgpack in binary frames")
+    try:
+        found = message.unpack(frame)
+    except CodecError as error:
+        raise PeerError("peer_request", f"the frame cannot be read: {error}") from error
+    if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
+        raise PeerError("peer_request", f"an observation is a map of names, not {shown(found)}")
+    return found
+
+
+def answer(actions: Any, infer_ms: float, previous_ms: float | None) -> bytes:
+    """One reply of a server of ours; `previous_ms`: the whole request before this one took."""
+    timing = {"infer_ms": infer_ms}
+    if previous_ms is not None:
+        timing["prev_total_ms"] = previous_ms
+    return message.pack({"actions": actions, "server_timing": timing})

@@ -1,0 +1,90 @@
+"""origami-zenoh-v1: a policy that answers Zenoh queries, msgpack with arrays as openpi writes them.
+
+Three queryables, ``metadata``, ``reset`` and ``infer``. A request is ``{protocol_version, operation,
+request_id, session_id, observation?}``; the answer repeats the first four and adds ``metadata``,
+``ok: true``, or ``actions`` (T, 65) with ``server_timing``; an error is ``{code, message, retryable}``
+under ``error``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from vla_zenoh.codec import message
+from vla_zenoh.errors import CodecError, PeerError
+from vla_zenoh.interop.layout import Layout
+from vla_zenoh.types import shown
+
+PROTOCOL = "origami-zenoh-v1"
+Operation = Literal["metadata", "reset", "infer"]
+ENCODING = "application/msgpack"
+
+
+def request(
+    operation: Operation,
+    request_id: str,
+    session_id: str,
+    observation: Mapping[str, Any] | None = None,
+) -> bytes:
+    """A request; `observation` for ``infer`` only."""
+    asked: dict[str, Any] = {
+        "protocol_version": PROTOCOL,
+        "operation": operation,
+        "request_id": request_id,
+        "session_id": session_id,
+    }
+    if observation is not None:
+        asked["observation"] = dict(observation)
+    return message.pack(asked)
+
+
+def read_answer(payload: bytes, operation: Operation, request_id: str) -> Any:
+    """What was asked for: the metadata, True, or the actions.
+
+    Raises:
+        PeerError: it is an error, belongs to another request, or cannot be read.
+    """
+    try:
+        answer = message.unpack(payload)
+    except CodecError as error:
+        raise PeerError("peer_reply", f"the answer cannot be read: {error}") from error
+    if not isinstance(answer, dict):
+        raise PeerError("peer_reply", f"the answer is no map: {shown(answer)}")
+    if "error" in answer:
+        said = answer["error"]
+        said = said if isinstance(said, dict) else {"message": said}
+        raise PeerError(
+            "peer_error",
+            f"the server says {shown(said.get('code', ''))}: {shown(said.get('message', ''))}",
+        )
+    expected = {"protocol_version": PROTOCOL, "operation": operation, "request_id": request_id}
+    for name, value in expected.items():
+        if answer.get(name) != value:
+            raise PeerError(
+                "peer_reply", f"{name} of the answer is {shown(answer.get(name))}, not {value!r}"
+            )
+    part = {"metadata": "metadata", "reset": "ok", "infer": "actions"}[operation]
+    if part not in answer or (operation == "reset" and answer["ok"] is not True):
+        raise PeerError("peer_reply", f"the answer to {operation} has no {part}")
+    return answer[part]
+
+
+def mismatches(metadata: Any, layout: Layout) -> list[str]:
+    """What the server says of itself and the layout does not: one sentence each."""
+    if not isinstance(metadata, dict):
+        return [f"its metadata is no map: {shown(metadata)}"]
+    out: list[str] = []
+    dim, kind, units = (metadata.get(n) for n in ("action_dim", "action_type", "action_units"))
+    if isinstance(dim, int):
+        if layout.columns is not None and max(layout.columns) >= dim:
+            out.append(f"it gives {dim} columns, column {max(layout.columns)} is wanted")
+        elif layout.columns is None and layout.width not in (None, dim):
+            out.append(f"it gives {dim} columns, {layout.width} are wanted (columns=)")
+    if kind == "absolute_joint_position" and layout.action != "joint_position":
+        out.append(f"its actions are joint positions, action={layout.action} is set")
+    if kind == "absolute_joint_position" and units not in (None, "radians"):
+        out.append(f"its joints are in {shown(units)}, wanted radians")
+    if isinstance(kind, str) and kind != "absolute_joint_position" and layout.needs_joints:
+        out.append(f"its actions are {kind}, action={layout.action} is set")
+    return out

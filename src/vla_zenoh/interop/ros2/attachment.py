@@ -1,0 +1,53 @@
+"""What rmw_zenoh carries beside every sample, request and reply: 33 bytes.
+
+``int64 sequence number, int64 source time (ns), uint8 16, 16 bytes gid``, little-endian. A ROS 2
+subscriber drops samples without it; a reply repeats number and gid of its request.
+"""
+
+from __future__ import annotations
+
+import struct
+from hashlib import blake2b
+from typing import NamedTuple
+
+from vla_zenoh.errors import CodecError
+
+GID_BYTES = 16
+_LAYOUT = struct.Struct(f"<qqB{GID_BYTES}s")
+ATTACHMENT_BYTES = _LAYOUT.size
+
+
+class Attachment(NamedTuple):
+    """See the module."""
+
+    seq: int
+    stamp_ns: int
+    gid: bytes
+
+
+def encode(attachment: Attachment) -> bytes:
+    """The 33 bytes."""
+    return _LAYOUT.pack(attachment.seq, attachment.stamp_ns, GID_BYTES, attachment.gid)
+
+
+def decode(payload: bytes | None) -> Attachment:
+    """Read the 33 bytes.
+
+    Raises:
+        CodecError: ``no_attachment``, or ``malformed``.
+    """
+    if payload is None:
+        raise CodecError("no_attachment", "rmw_zenoh sends an attachment with everything")
+    if len(payload) != ATTACHMENT_BYTES:
+        raise CodecError(
+            "malformed", f"an attachment of {len(payload)} bytes, wanted {ATTACHMENT_BYTES}"
+        )
+    seq, stamp_ns, length, gid = _LAYOUT.unpack(payload)
+    if length != GID_BYTES or seq < 0 or stamp_ns < 0:
+        raise CodecError("malformed", "an attachment of another layout")
+    return Attachment(seq, stamp_ns, gid)
+
+
+def gid_of(token: str) -> bytes:
+    """Who writes: 16 bytes made of the liveliness token, which no two endpoints share."""
+    return blake2b(token.encode(), digest_size=GID_BYTES).digest()

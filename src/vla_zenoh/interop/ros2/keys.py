@@ -1,0 +1,153 @@
+"""Every key expression of the ROS 2 side, for both ways in. The only file with such text.
+
+``ros2dds``: the names zenoh-bridge-ros2dds gives to topics and services, and the liveliness tokens
+by which bridges tell each other what to route. ``rmw_zenoh``: those of robots that run rmw_zenoh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+from vla_zenoh.interop.ros2.names import dds_type, get_result_of, send_goal_of
+from vla_zenoh.interop.ros2.qos import DEFAULT, LATCHED, Qos
+
+CANCEL_GOAL = "action_msgs/srv/CancelGoal"
+GOAL_STATUS = "action_msgs/msg/GoalStatusArray"
+_SLASH_OF_BRIDGES = "§"
+_SLASH_OF_RMW = "%"
+
+
+class Role(Enum):
+    """What we are on a topic, service or action; the value is its name in tokens."""
+
+    PUBLISHER = "MP"
+    SUBSCRIBER = "MS"
+    SERVER = "SS"
+    CLIENT = "SC"
+    ACTION_CLIENT = "AC"
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """One of our ends in the ROS graph.
+
+    Args:
+        role: what we are there.
+        name: full name of topic, service or action, with its leading slash.
+        type: ROS type.
+        qos: of a topic.
+    """
+
+    role: Role
+    name: str
+    type: str
+    qos: Qos = DEFAULT
+
+
+class Wire(Protocol):
+    """How the ROS side names and announces endpoints."""
+
+    def key(self, endpoint: Endpoint) -> str:
+        """The key of its samples or queries."""
+        ...
+
+    def tokens(self, endpoint: Endpoint, number: int) -> list[str]:
+        """Liveliness tokens that make it seen; `number` differs for every endpoint."""
+        ...
+
+    def node_tokens(self) -> list[str]:
+        """Liveliness tokens of the node itself."""
+        ...
+
+
+def parts_of(action: Endpoint) -> dict[str, Endpoint]:
+    """What an action client uses: send_goal, get_result, cancel_goal and the topic status."""
+    at = f"{action.name}/_action"
+    return {
+        "send_goal": Endpoint(Role.CLIENT, f"{at}/send_goal", send_goal_of(action.type)),
+        "get_result": Endpoint(Role.CLIENT, f"{at}/get_result", get_result_of(action.type)),
+        "cancel_goal": Endpoint(Role.CLIENT, f"{at}/cancel_goal", CANCEL_GOAL),
+        "status": Endpoint(Role.SUBSCRIBER, f"{at}/status", GOAL_STATUS, LATCHED),
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Ros2Dds:
+    """zenoh-bridge-ros2dds: a key is the name without its first slash, payloads are plain CDR.
+
+    Args:
+        session_id: of our Zenoh session, in its own spelling.
+        type_hash: hash of a type; None where the distribution has none.
+    """
+
+    session_id: str
+    type_hash: Callable[[str], str] | None
+
+    def key(self, endpoint: Endpoint) -> str:
+        """See `Wire`."""
+        return endpoint.name.removeprefix("/")
+
+    def tokens(self, endpoint: Endpoint, number: int) -> list[str]:
+        """One; the parts of an action are not announced one by one."""
+        kind, key = endpoint.type, self.key(endpoint)
+        chunks = ["@", self.session_id, "@ros2_lv", endpoint.role.value]
+        chunks += [text.replace("/", _SLASH_OF_BRIDGES) for text in (key, kind)]
+        if endpoint.role in (Role.PUBLISHER, Role.SUBSCRIBER):
+            known = None if self.type_hash is None else self.type_hash(kind)
+            chunks.append(endpoint.qos.as_ros2dds(known))
+        return ["/".join(chunks)]
+
+    def node_tokens(self) -> list[str]:
+        """What a bridge declares of itself."""
+        return [f"@/{self.session_id}/@ros2_lv"]
+
+
+@dataclass(frozen=True, slots=True)
+class RmwZenoh:
+    """rmw_zenoh: a key is domain, name, type and hash.
+
+    Args:
+        session_id: of our Zenoh session.
+        node: our name in the ROS graph, in the root namespace.
+        domain: ROS domain id.
+        type_hash: hash of a type, or what stands in its place.
+    """
+
+    session_id: str
+    node: str
+    domain: int
+    type_hash: Callable[[str], str]
+
+    def key(self, endpoint: Endpoint) -> str:
+        """See `Wire`."""
+        kind = endpoint.type
+        name = endpoint.name.strip("/")
+        return f"{self.domain}/{name}/{dds_type(kind)}/{self.type_hash(kind)}"
+
+    def tokens(self, endpoint: Endpoint, number: int) -> list[str]:
+        """One a topic or service; an action is announced by its parts."""
+        if endpoint.role is Role.ACTION_CLIENT:
+            return []
+        return [
+            "/".join(
+                (
+                    self._at(number, endpoint.role.value),
+                    endpoint.name.replace("/", _SLASH_OF_RMW),
+                    dds_type(endpoint.type),
+                    self.type_hash(endpoint.type),
+                    endpoint.qos.as_rmw_zenoh(),
+                )
+            )
+        ]
+
+    def node_tokens(self) -> list[str]:
+        """One."""
+        return [self._at(0, "NN")]
+
+    def _at(self, number: int, role: str) -> str:
+        enclave = namespace = _SLASH_OF_RMW
+        start = f"@ros2_lv/{self.domain}/{self.session_id}/0/{number}/{role}"
+        return f"{start}/{enclave}/{namespace}/{self.node}"

@@ -1,0 +1,226 @@
+"""All message types of one ROS 2 distribution: values, CDR both ways, and type hashes.
+
+rosbags does the work. What is added: services and actions, the definitions of this package, and
+that a decoder raises nothing but `CodecError`, whatever the bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_typestore
+
+from vla_zenoh.errors import CodecError, ProfileError
+from vla_zenoh.faults import nearest
+from vla_zenoh.interop.ros2.definitions import parse, shipped
+from vla_zenoh.interop.ros2.names import request_of, response_of, split_type
+
+STORES = {
+    "humble": Stores.ROS2_HUMBLE,
+    "iron": Stores.ROS2_IRON,
+    "jazzy": Stores.ROS2_JAZZY,
+    "kilted": Stores.ROS2_KILTED,
+    "lyrical": Stores.ROS2_LYRICAL,
+}
+"""Distribution -> rosbags' definitions of it."""
+
+NO_HASH = "TypeHashNotSupported"
+"""What stands in place of a hash where the distribution has none (Humble)."""
+
+MAX_MESSAGE_BYTES = 4 * 1024 * 1024
+MAX_PICTURE_BYTES = 128 * 1024 * 1024
+
+_EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
+
+
+class Messages:
+    """See the module.
+
+    Args:
+        distribution: one of `STORES`.
+        extra: type -> text of definitions that neither ROS nor this package has.
+
+    Raises:
+        ProfileError: unknown distribution, or text that is no definition.
+    """
+
+    def __init__(self, distribution: str, extra: Mapping[str, str] | None = None) -> None:
+        if distribution not in STORES:
+            raise ProfileError(
+                f"{distribution!r} is not a ROS distribution we know: {', '.join(STORES)}"
+            )
+        self.distribution = distribution
+        self._store = get_typestore(STORES[distribution])
+        texts = shipped() | dict(extra or {})
+        definitions: dict[str, Any] = {}
+        for kind, text in texts.items():
+            if kind not in self._store.fielddefs or kind in (extra or {}):
+                definitions |= parse(kind, text)
+        self._register(definitions)
+        self._hash_chars_as_ros_does()
+
+    def _hash_chars_as_ros_does(self) -> None:
+        """ROS 2 makes a ``char`` of message text a ``uint8``; rosbags hashes it as a character."""
+        for kind, (constants, fields) in self._store.fielddefs.items():
+            if any(_is_char(described) for _, described in fields):
+                self._store.fielddefs[kind] = (
+                    constants,
+                    [(name, _as_uint8(described)) for name, described in fields],
+                )
+
+    def _register(self, definitions: Mapping[str, Any]) -> None:
+        known = {*self._store.fielddefs, *definitions}
+        for kind, (_, fields) in definitions.items():
+            for name, described in fields:
+                wanted = _named(described)
+                if wanted is not None and wanted not in known:
+                    raise ProfileError(
+                        f"{kind}.{name} is a {wanted}, which is not known: give its text as well"
+                    )
+        try:
+            self._store.register(dict(definitions))
+        except TypesysError as error:
+            raise ProfileError(str(error)) from error
+
+    # -- values -------------------------------------------------------------------------------
+    def __contains__(self, kind: str) -> bool:
+        return kind in self._store.fielddefs or request_of(kind) in self._store.fielddefs
+
+    def require(self, kind: str) -> None:
+        """Make sure that `kind` is a known message or service.
+
+        Raises:
+            ProfileError: it is not; names the nearest one.
+        """
+        split_type(kind)
+        if kind not in self:
+            known = sorted(self._store.fielddefs)
+            raise ProfileError(
+                f"{kind} is not a type of ROS 2 {self.distribution}{nearest(kind, known)}; "
+                "a definition of your own is named in ros2.messages"
+            )
+
+    def fields(self, kind: str) -> dict[str, Any]:
+        """Field -> rosbags' description of it, in order."""
+        return {
+            name: described
+            for name, described in self._store.fielddefs[kind][1]
+            if name != "structure_needs_at_least_one_member"
+        }
+
+    def new(self, kind: str, **values: Any) -> Any:
+        """A message with these fields; the others are zero, empty or false."""
+        made = self._store.types[kind]
+        defaults = {
+            name: self._zero(described)
+            for name, described in self.fields(kind).items()
+            if name not in values
+        }
+        return made(**defaults, **values)
+
+    def _zero(self, described: Any) -> Any:
+        node, what = described
+        if node == Nodetype.NAME:
+            return self.new(what)
+        if node == Nodetype.BASE:
+            if what[0] == "string":
+                return ""
+            return False if what[0] == "bool" else 0.0 if what[0].startswith("float") else 0
+        (inner, of), size = what
+        count = size if node == Nodetype.ARRAY else 0
+        if inner == Nodetype.BASE and of[0] != "string":
+            return np.zeros(count, np.uint8 if of[0] == "byte" else np.dtype(of[0]))
+        return [self._zero((inner, of)) for _ in range(count)]
+
+    # -- CDR ----------------------------------------------------------------------------------
+    def encode(self, message: Any) -> bytes:
+        """CDR, little-endian, with its header of four bytes.
+
+        Raises:
+            CodecError: a value that does not fit its field.
+        """
+        kind: str = message.__msgtype__
+        try:
+            return bytes(self._store.serialize_cdr(message, kind, little_endian=True))
+        except (SerdeError, struct.error, ValueError, TypeError, AttributeError) as error:
+            raise CodecError("unencodable", f"{kind}: {str(error)[:200]}") from error
+
+    def decode(self, kind: str, payload: bytes, limit: int = MAX_MESSAGE_BYTES) -> Any:
+        """A message of `kind`; its arrays are views into `payload` and read-only.
+
+        Raises:
+            CodecError: ``oversize`` (more than `limit` bytes) or ``malformed``.
+        """
+        if len(payload) > limit:
+            raise CodecError("oversize", f"{kind} of {len(payload)} bytes, at most {limit}")
+        try:
+            return self._store.deserialize_cdr(payload, kind)
+        except (SerdeError, struct.error, ValueError, IndexError, OverflowError) as error:
+            raise CodecError("malformed", f"{kind}: {str(error)[:200]}") from error
+
+    # -- hashes -------------------------------------------------------------------------------
+    def hash(self, kind: str) -> str:
+        """Type hash of a message or service (REP-2016), as ROS 2 of this distribution has it."""
+        if self.distribution == "humble":
+            return NO_HASH
+        if request_of(kind) in self._store.fielddefs:
+            self._define_service(kind)
+        return self._store.hash_rihs01(kind)
+
+    def _define_service(self, service: str) -> None:
+        """The types that exist for the sake of the hash: the service itself, and its event."""
+        if service in self._store.fielddefs:
+            return
+        request, response, event = request_of(service), response_of(service), f"{service}_Event"
+
+        def one(kind: str) -> Any:
+            return (Nodetype.NAME, kind)
+
+        def at_most_one(kind: str) -> Any:
+            return (Nodetype.SEQUENCE, (one(kind), 1))
+
+        self._store.fielddefs[event] = (
+            [],
+            [
+                ("info", one(_EVENT_INFO)),
+                ("request", at_most_one(request)),
+                ("response", at_most_one(response)),
+            ],
+        )
+        self._store.fielddefs[service] = (
+            [],
+            [
+                ("request_message", one(request)),
+                ("response_message", one(response)),
+                ("event_message", one(event)),
+            ],
+        )
+
+
+def _is_char(described: Any) -> bool:
+    node, what = described
+    if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return _is_char(what[0])
+    return node == Nodetype.BASE and what[0] == "char"
+
+
+def _as_uint8(described: Any) -> Any:
+    if not _is_char(described):
+        return described
+    node, what = described
+    if node == Nodetype.BASE:
+        return (node, ("uint8", 0))
+    return (node, (_as_uint8(what[0]), what[1]))
+
+
+def _named(described: Any) -> str | None:
+    """The message a field consists of, if it is one."""
+    node, what = described
+    if node == Nodetype.NAME:
+        return what
+    return _named(what[0]) if node in (Nodetype.ARRAY, Nodetype.SEQUENCE) else None

@@ -1,0 +1,78 @@
+"""What ROS 2 messages say, before it is known whose joints or which camera they are.
+
+Numbers are as they came: finiteness and meaning are checked where a record is made of them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.types import FloatArray
+
+
+class Joints(NamedTuple):
+    """A sensor_msgs/JointState.
+
+    Args:
+        stamp_ns: of its header, 0 where the robot did not stamp it.
+        names: of any joints.
+        position: (n,) rad or m.
+        velocity: (n,), or None where the robot does not say.
+        effort: (n,), or None.
+    """
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    position: FloatArray
+    velocity: FloatArray | None
+    effort: FloatArray | None
+
+
+class Picture(NamedTuple):
+    """An image of a camera.
+
+    Args:
+        stamp_ns: of its header.
+        frame: of its header.
+        rgb: (H, W, 3) uint8; may be a read-only view.
+    """
+
+    stamp_ns: int
+    frame: str
+    rgb: NDArray[np.uint8]
+
+
+class Transform(NamedTuple):
+    """Where `child` is in `parent`.
+
+    Args:
+        stamp_ns: of its header.
+        parent: frame.
+        child: frame.
+        position_m: (3,).
+        quat_xyzw: (4,).
+    """
+
+    stamp_ns: int
+    parent: str
+    child: str
+    position_m: FloatArray
+    quat_xyzw: FloatArray
+
+
+class Wrench(NamedTuple):
+    """A geometry_msgs/WrenchStamped: (6,) N and Nm in the axes of `frame`."""
+
+    stamp_ns: int
+    frame: str
+    wrench: FloatArray
+
+
+class Stamp(NamedTuple):
+    """What goes into the header of a message of ours."""
+
+    stamp_ns: int
+    frame: str

@@ -1,0 +1,115 @@
+"""ROS type -> what we make of it. A new type is one file in ``topics`` and one line here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from vla_zenoh.errors import CodecError
+from vla_zenoh.interop.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, Messages
+from vla_zenoh.interop.ros2.samples import Joints, Picture, Stamp, Transform, Wrench
+from vla_zenoh.interop.ros2.topics import (
+    compressed_image,
+    float_array,
+    image,
+    joint_state,
+    joint_trajectory,
+    plain,
+    pose,
+    transforms,
+    wrench,
+)
+from vla_zenoh.types import FloatArray, GripperCommand, JointCommand, PoseCommand
+
+Write = Callable[[Messages, str, Any, Stamp], Any]
+
+
+class Reading(NamedTuple):
+    """A type we listen to.
+
+    Args:
+        type: ROS type.
+        keys: which of our keys it feeds, as `vla_zenoh.keys.Keys` calls them.
+        sample: what it becomes.
+        read: message -> that.
+        limit: bytes that are read at most.
+    """
+
+    type: str
+    keys: tuple[str, ...]
+    sample: Any
+    read: Callable[[Any], Any]
+    limit: int = MAX_MESSAGE_BYTES
+
+
+class Writing(NamedTuple):
+    """A type we send.
+
+    Args:
+        type: ROS type.
+        key: which of our keys it carries on.
+        record: what comes on that key.
+        write: makes a message of the record.
+    """
+
+    type: str
+    key: str
+    record: type
+    write: Write
+
+
+_STATE = ("state_joint", "state_pose", "state_gripper")
+_CAMERA = ("camera_raw", "camera_jpeg")
+
+READINGS = (
+    Reading(joint_state.TYPE, _STATE, Joints, joint_state.read),
+    Reading(transforms.TYPE, ("state_pose",), Transform, transforms.read),
+    Reading(wrench.TYPE, ("state_pose",), Wrench, wrench.read),
+    Reading(image.TYPE, _CAMERA, Picture, image.read, MAX_PICTURE_BYTES),
+    Reading(compressed_image.TYPE, _CAMERA, Picture, compressed_image.read, MAX_PICTURE_BYTES),
+    Reading(plain.TEXT, ("prompt",), str, plain.read),
+    Reading(plain.TRUTH, ("active",), bool, plain.read),
+)
+
+
+def writings(posture_rad: FloatArray, lead_ns: int) -> tuple[Writing, ...]:
+    """What commands can be sent as.
+
+    Args:
+        posture_rad: (n,) what a nullspace prefers.
+        lead_ns: how far ahead a trajectory's point lies.
+    """
+    joints = joint_trajectory.writer(lead_ns)
+    poses = pose.writer(posture_rad)
+    return (
+        Writing(pose.STAMPED, "command_pose", PoseCommand, poses),
+        Writing(
+            "multi_mode_control_msgs/msg/CartesianImpedanceGoal",
+            "command_pose",
+            PoseCommand,
+            poses,
+        ),
+        Writing(joint_trajectory.TYPE, "command_joint", JointCommand, joints),
+        Writing(float_array.TYPE, "command_joint", JointCommand, float_array.write_joints),
+        Writing(float_array.TYPE, "command_gripper", GripperCommand, float_array.write_width),
+        Writing(plain.NUMBER, "command_gripper", GripperCommand, plain.write_width),
+    )
+
+
+_BY_TYPE = {reading.type: reading for reading in READINGS}
+
+
+def read(messages: Messages, kind: str, payload: bytes) -> Any:
+    """What CDR bytes of a type in `READINGS` say.
+
+    Raises:
+        CodecError: whatever else the bytes are.
+    """
+    reading = _BY_TYPE[kind]
+    message = messages.decode(kind, payload, reading.limit)
+    try:
+        return reading.read(message)
+    except (ValueError, OverflowError) as error:
+        if isinstance(error, CodecError):
+            raise
+        raise CodecError("malformed", f"{kind}: {str(error)[:200]}") from error

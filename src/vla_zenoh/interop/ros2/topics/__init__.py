@@ -1,0 +1,1 @@
+"""One file a topic type: what it says, or how it is written."""

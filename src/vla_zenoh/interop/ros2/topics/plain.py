@@ -1,0 +1,21 @@
+"""std_msgs/String, Bool and Float64: one field called data."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.interop.ros2.samples import Stamp
+from vla_zenoh.types import GripperCommand
+
+TEXT, TRUTH, NUMBER = "std_msgs/msg/String", "std_msgs/msg/Bool", "std_msgs/msg/Float64"
+
+
+def read(message: Any) -> Any:
+    """What the message holds."""
+    return message.data
+
+
+def write_width(messages: Messages, kind: str, command: GripperCommand, stamp: Stamp) -> Any:
+    """The opening of a gripper, in m."""
+    return messages.new(kind, data=command.width_m)
