@@ -170,6 +170,10 @@ class Keys:
         """Liveliness token."""
         return self._at("alive", chunk(node, "node name"))
 
+    def clock(self, node: str) -> str:
+        """Query: the four stamps of NTP; the node answers with when it heard and when it spoke."""
+        return self._at("clock", chunk(node, "node name"))
+
     # -- the simulator's own ------------------------------------------------------------------
     @property
     def sim_scene(self) -> str:
@@ -198,6 +202,19 @@ class Keys:
         return self._at("**")
 
     @property
+    def without_raw_pictures(self) -> tuple[str, ...]:
+        """The same without ``camera/*/raw``: listening to those makes cameras send 1 MB a picture.
+
+        Two-part keys that are added later are among them, too.
+        """
+        return (
+            self._at("*"),
+            self._at("*", "*"),
+            self._at("camera", "*", "jpeg"),
+            self._at("seen", "*", "*"),
+        )
+
+    @property
     def all_deltas(self) -> str:
         return self._at("delta", "*")
 
@@ -221,7 +238,44 @@ class Keys:
         """`key` without the root and robot, as people say it; other keys as they are."""
         return key.removeprefix(f"{self.root}/{self.robot}/")
 
+    def group(self, key: str) -> str:
+        """The first part below the robot: ``camera``, ``state``, ``prompt``; of others nothing."""
+        return self.short(key).split("/", 1)[0] if key.startswith(self._at("")) else ""
+
+    def on(self, other: Keys, key: str) -> str:
+        """The key of `other` that says what `key` says of this robot."""
+        return other._at(self.short(key))
+
+    @staticmethod
+    def of(key: str, root: str) -> Keys | None:
+        """The keys of the robot that `key` is of, None where it is of none below `root`."""
+        robot, _, rest = key.removeprefix(f"{root}/").partition("/")
+        if not key.startswith(f"{root}/") or not rest:
+            return None
+        try:
+            return Keys(robot, root)
+        except ProfileError:
+            return None
+
 
 def last(key: str) -> str:
     """The last part of a key: the node, worker or camera it is about."""
     return key.rsplit("/", 1)[-1]
+
+
+def covers(wide: str, narrow: str) -> bool:
+    """Whether every key that the expression `narrow` means is also meant by `wide`.
+
+    Of Zenoh's expressions ``*`` and ``**`` are known; that is all that is used here.
+    """
+    return _covers(wide.split("/"), narrow.split("/"))
+
+
+def _covers(wide: list[str], narrow: list[str]) -> bool:
+    if not wide:
+        return not narrow
+    if wide[0] == "**":
+        return any(_covers(wide[1:], narrow[at:]) for at in range(len(narrow) + 1))
+    if not narrow or narrow[0] == "**":
+        return False
+    return wide[0] in ("*", narrow[0]) and _covers(wide[1:], narrow[1:])

@@ -27,6 +27,7 @@ FORBIDDEN = {
     "interop": PURE,
     "profile": PURE,
     "recording": PURE,
+    "security": PURE,
     "simulation": PURE - {"mujoco"},
     "tasks": PURE,
     "demo": PURE,

@@ -37,6 +37,15 @@ def decode(kind: type[Record], payload: bytes) -> Record:
     """
     _check_length(kind, payload)
     data = message.unpack(payload)
+    return from_map(kind, data)
+
+
+def from_map(kind: type[Record], data: Any) -> Record:
+    """The record of what `encode` packs.
+
+    Raises:
+        CodecError: reason ``malformed`` or ``invalid``, as of `decode`.
+    """
     if not isinstance(data, dict):
         raise CodecError("malformed", f"{kind.__name__} is a map, this is a {type(data).__name__}")
     if kind is ModelSpec:

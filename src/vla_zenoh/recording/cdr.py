@@ -1,0 +1,154 @@
+"""Payloads to CDR messages and back, by way of rosbags' message types.
+
+A payload becomes a message only where the message can give the same payload back; who cannot say
+so raises `Unfit`, and the writer keeps the bytes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.codec import message
+from vla_zenoh.errors import CodecError, MissingExtraError
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.recording import definitions
+from vla_zenoh.recording.definitions import Unfit, fields_of, type_name
+from vla_zenoh.recording.kinds import RECORDS
+from vla_zenoh.types import Cause
+
+IMAGE, JPEG_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+TEXT = "std_msgs/msg/String"
+LAST_SECOND = 2**31
+
+
+@cache
+def typestore() -> Any:
+    """The message types of ROS 2 and ours.
+
+    Raises:
+        MissingExtraError: rosbags is not installed.
+    """
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError as error:
+        raise MissingExtraError("rosbags", "record") from error
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(
+        get_types_from_msg(definitions.definition(Cause, header=False), type_name(Cause))
+    )
+    for kind in RECORDS:
+        store.register(get_types_from_msg(definitions.definition(kind), type_name(kind)))
+    store.register(get_types_from_msg(definitions.SAMPLE, definitions.SAMPLE_NAME))
+    return store
+
+
+def schema_text(name: str) -> bytes:
+    """A message's definition and those it is made of, in the form MCAP calls ``ros2msg``."""
+    text, _ = typestore().generate_msgdef(name, ros_version=2)
+    return text.encode()
+
+
+def serialize(name: str, *values: Any) -> bytes:
+    """CDR of a message whose fields are `values`, in order."""
+    store = typestore()
+    return bytes(store.serialize_cdr(store.types[name](*values), name))
+
+
+def deserialize(name: str, data: bytes) -> Any:
+    """The message of `serialize`.
+
+    Raises:
+        CodecError: other bytes.
+    """
+    try:
+        return typestore().deserialize_cdr(data, name)
+    except Exception as error:  # whatever generated code does with bytes that are not its own
+        raise CodecError("malformed", f"not a CDR message {name}: {error}") from error
+
+
+def header(stamp_ns: int, frame: str) -> Any:
+    """A std_msgs/Header.
+
+    Raises:
+        Unfit: seconds after 2038 do not fit in.
+    """
+    types = typestore().types
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    if not 0 <= seconds < LAST_SECOND:
+        raise Unfit
+    stamp = types["builtin_interfaces/msg/Time"](seconds, nanoseconds)
+    return types["std_msgs/msg/Header"](stamp, frame)
+
+
+def stamp_of(head: Any) -> int:
+    """Nanoseconds of a std_msgs/Header."""
+    return head.stamp.sec * 1_000_000_000 + head.stamp.nanosec
+
+
+def fields_in(kind: type, payload: bytes) -> dict[str, Any]:
+    """What a record's payload says, absent fields with their defaults; values are not judged.
+
+    Raises:
+        Unfit: it is no map with the fields of this record.
+    """
+    try:
+        data = message.unpack(payload)
+    except CodecError as error:
+        raise Unfit from error
+    if kind is ModelSpec:
+        data = {"spec": data}
+    names = {field.name: field for field in fields_of(kind)}
+    if not isinstance(data, dict) or not data.keys() <= names.keys():
+        raise Unfit
+    for name, field in names.items():
+        if name not in data:
+            if field.default is dataclasses.MISSING:
+                raise Unfit
+            data[name] = field.default
+    return data
+
+
+def write_record(kind: type, data: dict[str, Any], stamp_ns: int, frame: str) -> bytes:
+    """CDR of a record.
+
+    Raises:
+        Unfit: a value is of another type than the record's.
+    """
+    values: list[Any] = [header(stamp_ns, frame)]
+    try:
+        for field in fields_of(kind):
+            value = field.write(data[field.name])
+            if field.shaped:
+                values += [value.ravel(), np.array(value.shape, np.uint32)]
+            elif field.name == "cause":
+                values.append([typestore().types[type_name(Cause)](**each) for each in value])
+            else:
+                values.append(value)
+        return serialize(type_name(kind), *values)
+    except Exception as error:  # whatever generated code does with values that are not its own
+        raise Unfit from error
+
+
+def read_record(kind: type, data: bytes) -> tuple[Any, dict[str, Any]]:
+    """The std_msgs/Header and the fields of a record, the latter as in a payload.
+
+    Raises:
+        CodecError: it is no such message.
+    """
+    found = deserialize(type_name(kind), data)
+    fields: dict[str, Any] = {}
+    for field in fields_of(kind):
+        value = getattr(found, field.name)
+        if field.shaped:
+            value = value.reshape(getattr(found, f"{field.name}_shape"))
+        fields[field.name] = field.read(value)
+    return found.header, fields
+
+
+def payload_of(kind: type, fields: dict[str, Any]) -> bytes:
+    """The payload that says `fields`."""
+    return message.pack(fields["spec"] if kind is ModelSpec else fields)
