@@ -51,6 +51,8 @@ class Scripted:
         jitter: vary that by up to this fraction either way.
     """
 
+    example_prompts = ("HARD: go up", "HARD: yaw left", "HARD: close gripper", "hold")
+
     def __init__(
         self,
         camera: str = "front",

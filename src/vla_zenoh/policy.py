@@ -11,7 +11,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import lru_cache
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -164,11 +164,10 @@ class ModelSpec(_Spec):
         """Plain types, ready for the wire."""
         return self.model_dump(mode="json")
 
-    @cached_property
+    @property
     def hash(self) -> str:
         """16 hex digits that differ when any declared meaning differs."""
-        canonical = json.dumps(self.to_dict(), sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+        return _digest(self)  # pyright: ignore[reportArgumentType]  # frozen, so it has a hash
 
     @staticmethod
     def from_dict(data: Any) -> ModelSpec:
@@ -185,6 +184,13 @@ class ModelSpec(_Spec):
                 for fault in error.errors(include_url=False)[:MAX_FAULTS]
             )
             raise SpecError(f"not a valid model spec: {faults}") from error
+
+
+@lru_cache(maxsize=256)
+def _digest(spec: ModelSpec) -> str:
+    # Not kept in the spec itself: a copy with other fields would take it along.
+    canonical = json.dumps(spec.to_dict(), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
 
 class ActionSteps(NamedTuple):
@@ -243,6 +249,7 @@ class Policy(Protocol):
     ``load()`` runs once before the first inference: heavy imports and weights belong there.
     ``reset()`` runs at the start of every episode. ``normalisation_keys``, where a model has it,
     names the statistics its weights came with: `ActionSpec.normalisation` must be one of them.
+    ``example_prompts`` likewise names prompts it knows, the first of which makes it move.
     """
 
     @property

@@ -43,6 +43,15 @@ def test_the_hash_of_a_known_spec_is_known() -> None:
     assert SPEC.hash == SPEC_HASH
 
 
+def test_a_copy_with_another_meaning_has_another_hash_also_when_the_first_was_asked_for() -> None:
+    before = SPEC.hash
+    other = SPEC.model_copy(
+        update={"action": SPEC.action.model_copy(update={"gripper_open_is_high": False})}
+    )
+    assert other.hash != before
+    assert other.hash == ModelSpec.from_dict(other.to_dict()).hash
+
+
 def test_the_hash_is_the_same_in_another_process() -> None:
     code = (
         "import json, sys; from vla_zenoh.policy import ModelSpec;"

@@ -11,6 +11,7 @@ import pytest
 from command_rig import MS, START_NS, WORKER, Rig, model_spec
 
 from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
+from vla_zenoh.policy import CameraSpec
 from vla_zenoh.types import GripperState, Header, PoseState, Stamped
 
 
@@ -135,6 +136,18 @@ def test_when_all_is_well_there_is_no_reason() -> None:
         (r"newest chunk is not sane: .*\(H, 7\)", another_chunk(steps=np.zeros((1, 6)))),
         (r"too slow: .* 1\.20 s after its observation, at most 1 s", lambda r: seen_ago(r, 1.2)),
         (r"saw something 0\.500 s before it happened", lambda r: seen_ago(r, -0.5)),
+        (
+            r"newest chunk is not sane: position_units: a step of 10 m, over 4 times",
+            another_chunk(steps=np.array([[10.0, 0, 0, 0, 0, 0, 0]])),
+        ),
+        (
+            r"newest chunk is not sane: rotation_units: a step of 2\.865 rad",
+            another_chunk(steps=np.array([[0, 0, 0, 2.865, 0, 0, 0]])),
+        ),
+        (
+            r"newest chunk is not sane: gripper_range: gripper 80",
+            another_chunk(steps=np.array([[0, 0, 0, 0, 0, 0, 80.0]])),
+        ),
         ("no living node serves camera 'front'", gone("camera")),
         ("no living node serves camera 'front'", around(camera_nodes={})),
         ("camera 'front' has sent no picture for 1.5 s", around(camera_ages_s={"front": 1.5})),
@@ -168,6 +181,19 @@ def test_all_reasons_come_at_once() -> None:
     ready.prompt = ""
     ready.around = without(ready.around, "sim", "camera")
     assert len(ready.reasons()) == 6
+
+
+def test_a_picture_of_a_size_the_spec_cannot_take_is_a_reason() -> None:
+    ready = Ready()
+    spec = ready.around.specs[WORKER]
+    small = CameraSpec(camera="front", width=64, height=48)
+    looks = spec.observation.model_copy(update={"cameras": (small,)})
+    spec = spec.model_copy(update={"observation": looks})
+    record = replace(ready.chunk.record, spec_hash=spec.hash)
+    ready.chunk = replace(ready.chunk, record=record)
+    ready.around = replace(ready.around, specs={WORKER: spec})
+    (reason,) = ready.reasons()
+    assert re.search(r"picture_size: camera 'front' sends \d+x\d+, the spec asks for 64x48", reason)
 
 
 def test_a_worker_that_needs_no_prompt_and_no_camera_gets_neither() -> None:

@@ -38,7 +38,7 @@ def _cameras(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
         if camera not in known:
             yield error(
                 "camera",
-                f"it needs camera {camera.camera!r}, the profile has: "
+                f"needs camera {camera.camera!r}, the profile has: "
                 f"{', '.join(profile.cameras) or 'none'}",
             )
             continue
@@ -100,7 +100,7 @@ def _task(profile: Profile, spec: ModelSpec, worker: str) -> Iterator[Finding]:
     if spec.action.gripper == "none" and profile.robot.finger_joints:
         yield note("no_gripper", f"robot {profile.robot.name!r} has a gripper, the model none")
     if spec.observation.prompt and not profile.task.prompt:
-        yield warning("no_prompt", "it needs a prompt; task.prompt of the profile is empty")
+        yield warning("no_prompt", "needs a prompt; task.prompt of the profile is empty")
     if worker not in profile.workers:
         yield note(
             "not_listed",

@@ -13,6 +13,7 @@ from vla_zenoh import __version__
 from vla_zenoh.cli import (
     bench,
     camera,
+    check,
     command,
     demo,
     doctor,
@@ -90,6 +91,7 @@ for panel, name, function in (
     (LOOK, "status", status.status),
     (LOOK, "echo", echo.echo),
     (LOOK, "keys", keys.keys),
+    (LOOK, "check", check.check),
     (LOOK, "doctor", doctor.doctor),
 ):
     app.command(name, rich_help_panel=panel)(function)

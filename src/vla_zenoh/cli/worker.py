@@ -13,6 +13,7 @@ from vla_zenoh.cli.options import (
     HostOption,
     ProfileOption,
     effective_profile,
+    model_options,
 )
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.nodes.environment import run_in_own_environment
@@ -44,7 +45,7 @@ def worker(
     """Run a model: observations in, action chunks out on its delta key."""
     loaded = effective_profile(profile, connect)
     found = find_model(model)
-    chosen = _options(options or [])
+    chosen = model_options(options or [])
     # Comes back only where this environment has what the model's header asks for.
     run_in_own_environment(found, python)
     policy = make_policy(found, chosen)
@@ -57,16 +58,6 @@ def worker(
     )
     # A model's library may leave threads behind that would keep the process.
     os._exit(0)
-
-
-def _options(given: list[str]) -> dict[str, str]:
-    out: dict[str, str] = {}
-    for option in given:
-        key, equals, value = option.partition("=")
-        if not equals or not key.isidentifier():
-            raise typer.BadParameter(f"--set wants name=value, not {option!r}")
-        out[key] = value
-    return out
 
 
 def _image_form(profile: Profile, host: str | None) -> Literal["raw", "jpeg"]:

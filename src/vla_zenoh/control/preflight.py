@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from vla_zenoh.check import fit, plausible
 from vla_zenoh.control.kinematics import Kinematics
 from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.names import worker_node
@@ -78,6 +79,7 @@ def reasons_not_to_activate(
         *_robot(profile, around, pose, now_ns),
         *_gripper(profile, gripper, now_ns),
         *_worker(worker, prompt, around),
+        *_spec(profile, worker, around, rate_hz),
         *_chunk(profile, worker, around, chunk, now_ns, rate_hz),
         *_cameras(profile, worker, around),
     ]
@@ -183,6 +185,18 @@ def _worker(worker: str, prompt: str, around: Surroundings) -> list[str]:
     return reasons
 
 
+def _spec(profile: Profile, worker: str, around: Surroundings, rate_hz: float) -> list[str]:
+    """What its spec asks for and the profile does not give."""
+    spec = around.specs.get(worker)
+    if spec is None:
+        return []
+    return [
+        f"worker {worker!r} {why}" if name == "camera" else f"worker {worker!r}: {name}: {why}"
+        for level, name, why in fit.findings(profile, spec, worker=worker, rate_hz=rate_hz)
+        if level == "error"
+    ]
+
+
 def _chunk(
     profile: Profile,
     worker: str,
@@ -214,10 +228,17 @@ def _chunk(
             f"{-delay_s:.3f} s before it happened; synchronise them (chrony or ptp)"
         ]
     try:
-        check_steps(spec.action, chunk.record.steps)
+        steps = check_steps(spec.action, chunk.record.steps)
     except SpecError as error:
         return [f"worker {worker!r}: its newest chunk is not sane: {error}"]
-    return []
+    found = plausible.findings(
+        spec.action, steps, profile.limits, profile.robot.gripper.max_width_m
+    )
+    return [
+        f"worker {worker!r}: its newest chunk is not sane: {name}: {why}"
+        for level, name, why in found
+        if level == "error"
+    ]
 
 
 def _cameras(profile: Profile, worker: str, around: Surroundings) -> list[str]:
@@ -228,11 +249,7 @@ def _cameras(profile: Profile, worker: str, around: Surroundings) -> list[str]:
     for wanted in spec.observation.cameras:
         camera = wanted.camera
         if camera not in profile.cameras:
-            reasons.append(
-                f"worker {worker!r} needs camera {camera!r}, the profile has: "
-                f"{', '.join(profile.cameras) or 'none'}"
-            )
-            continue
+            continue  # said already, by what the spec asks for
         age_s = around.camera_ages_s.get(camera, math.inf)
         node = around.camera_nodes.get(camera)
         if node is None or node not in around.alive:

@@ -53,7 +53,9 @@ def run_in_own_environment(model: ModelFile, python: str | None) -> None:
             f"model {model.name!r} needs {', '.join(missing)}. Install uv (pip install uv) and it "
             "gets an environment of its own, or name a prepared one with --python"
         )
-    print(f"preparing an environment for {model.name}: {', '.join(model.dependencies)}", flush=True)
+    # Not on stdout, where `vla-zenoh check --json` writes its result.
+    said = f"preparing an environment for {model.name}: {', '.join(model.dependencies)}"
+    print(said, file=sys.stderr, flush=True)
     command = [uv, "run", "--no-project", "--quiet"]
     if model.requires_python:
         command += ["--python", model.requires_python]

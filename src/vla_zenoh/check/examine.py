@@ -1,0 +1,423 @@
+"""Runs a model on examples and says everything that is wrong with it, each fault by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.check import fit, plausible
+from vla_zenoh.check.examples import MAX_WIDTH_M, PROMPTS, Look, Maker, looks, noise
+from vla_zenoh.check.finding import Finding, distinct, error, note, warning
+from vla_zenoh.errors import SpecError
+from vla_zenoh.policy import ActionSteps, ModelSpec, Policy, check_steps
+from vla_zenoh.profile import Limits, Profile, Timing
+
+DEFAULT_RUNS = 100
+ENOUGH_RUNS = 12
+"""With fewer timed runs nothing is said of memory."""
+GROWTH_KIB, GROWTH_TOTAL_KIB = 32.0, 4096.0
+"""Memory that every inference keeps, and in all, before it is taken for a leak."""
+ALIKE = 1e-7
+
+Result = TypeVar("Result")
+Steps = NDArray[np.float32]
+
+
+class Failed(Exception):
+    """The model raised."""
+
+    def __init__(self, error: BaseException) -> None:
+        super().__init__(f"{type(error).__name__}: {error}")
+        self.error = error
+
+
+class Hung(Exception):
+    """The model did not come back in time; nothing more can be asked of it."""
+
+
+class Bench(Protocol):
+    """Where the model runs: who has the clock, the patience, and knows the memory."""
+
+    def call(self, what: Callable[[], Result]) -> tuple[Result, float]:
+        """What `what` returns, and the seconds it took.
+
+        Raises:
+            Failed: it raised.
+            Hung: it did not come back.
+        """
+        ...
+
+    def memory_kib(self) -> float:
+        """Resident memory of the process."""
+        ...
+
+    def spent_s(self) -> float:
+        """Seconds since the examination began."""
+        ...
+
+
+@dataclass(slots=True)
+class Report:
+    """What was found out about a model.
+
+    Args:
+        worker: its name.
+        spec: what it declares; None where it could not be made.
+        findings: all that is wrong or worth knowing.
+        shape: (H, D) of the first answer.
+        load_s: time of ``load()``.
+        first_ms: time of the first inference.
+        latency_ms: ``[p50, p95, max]`` of the later ones.
+        runs: how many those were.
+        memory_mib: resident: before load, after it, after all runs.
+        growth_kib_per_run: resident memory that every inference adds, None: too few runs.
+        deterministic: the same answer to the same observation after ``reset()``.
+        depends_on: pictures, colour order, prompt: whether the answer does; None: cannot be told.
+        step_range: per number of a step ``[smallest, largest]`` over all answers.
+    """
+
+    worker: str
+    spec: ModelSpec | None = None
+    findings: list[Finding] = field(default_factory=list)
+    shape: tuple[int, int] | None = None
+    load_s: float = 0.0
+    first_ms: float | None = None
+    latency_ms: tuple[float, float, float] | None = None
+    runs: int = 0
+    memory_mib: tuple[float, float, float] | None = None
+    growth_kib_per_run: float | None = None
+    deterministic: bool | None = None
+    depends_on: dict[str, bool | None] = field(default_factory=dict)
+    step_range: list[tuple[float, float]] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        """Nothing found that forbids giving it the arm."""
+        return not any(finding.level == "error" for finding in self.findings)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain types."""
+        return {
+            "worker": self.worker,
+            "ok": self.ok,
+            "findings": [finding._asdict() for finding in self.findings],
+            "spec": self.spec.to_dict() if self.spec else None,
+            "spec_hash": self.spec.hash if self.spec else None,
+            **{
+                name: getattr(self, name)
+                for name in self.__dataclass_fields__
+                if name not in ("worker", "spec", "findings")
+            },
+        }
+
+
+class Examination:
+    """See the module.
+
+    Args:
+        policy: made, not loaded.
+        worker: its name.
+        bench: where it runs.
+        profile: what it is held against; None: only against its own spec and default limits.
+        rate_hz: chunks per second that will be asked of it; None: as the profile says.
+        prompts: to try, the first one most; None: the model's `example_prompts`, or `PROMPTS`.
+        runs: timed inferences.
+        budget_s: no new example after this time.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        worker: str,
+        bench: Bench,
+        *,
+        profile: Profile | None = None,
+        rate_hz: float | None = None,
+        prompts: Sequence[str] | None = None,
+        runs: int = DEFAULT_RUNS,
+        budget_s: float = 30.0,
+    ) -> None:
+        self._policy, self._bench, self._profile = policy, bench, profile
+        self._rate_hz = rate_hz or (profile.task.rate_hz if profile else None)
+        self._limits = profile.limits if profile else Limits()
+        self._timing = profile.timing if profile else Timing()
+        self._width_m = profile.robot.gripper.max_width_m if profile else MAX_WIDTH_M
+        named = prompts or getattr(policy, "example_prompts", None)
+        self._looks = looks(tuple(named) if named else PROMPTS)
+        self._runs, self._budget_s = runs, budget_s
+        self._maker = Maker(policy.spec, profile)
+        self._answers: list[tuple[Look, Steps]] = []
+        self._took_ms: list[float] = []
+        self.report = Report(worker, policy.spec)
+
+    def run(self) -> Report:
+        """Examine; never raises for what the model does."""
+        report = self.report
+        try:
+            self._run()
+        except Hung as hung:
+            report.findings.append(error("hangs", str(hung)))
+        report.findings = distinct(report.findings)
+        return report
+
+    def _run(self) -> None:
+        report = self.report
+        if self._profile is not None:
+            report.findings += fit.findings(
+                self._profile, self._policy.spec, worker=report.worker, rate_hz=self._rate_hz
+            )
+        before_kib = self._bench.memory_kib()
+        if not (self._load() and self._first()):
+            return
+        loaded_kib = self._bench.memory_kib()
+        self._compare()
+        for look in self._looks[1:]:
+            if not self._in_budget():
+                break
+            self._reset()
+            self._infer(look)
+        self._time_it()
+        report.memory_mib = (
+            before_kib / 1024,
+            loaded_kib / 1024,
+            self._bench.memory_kib() / 1024,
+        )
+        self._judge()
+
+    # -- stages -------------------------------------------------------------------------------
+    def _load(self) -> bool:
+        report, policy = self.report, self._policy
+        declared = policy.spec.hash
+        load = getattr(policy, "load", None)
+        if callable(load):
+            try:
+                _, report.load_s = self._bench.call(load)
+            except Failed as failed:
+                report.findings.append(error("load_failed", str(failed)))
+                return False
+        if policy.spec.hash != declared:
+            report.findings.append(
+                error(
+                    "spec_changed",
+                    "load() changed the spec, which was published before; declare it in __init__",
+                )
+            )
+        known = getattr(policy, "normalisation_keys", None)
+        key = policy.spec.action.normalisation
+        if known is not None and key not in known:
+            report.findings.append(
+                error(
+                    "normalisation",
+                    f"the spec says normalisation {key!r}, the weights came with: "
+                    f"{', '.join(sorted(map(str, known))) or 'none'}",
+                )
+            )
+        return True
+
+    def _first(self) -> bool:
+        """The first answer: what is wrong there is wrong everywhere."""
+        self._reset()
+        steps = self._infer(self._looks[0], again=True)
+        if steps is None:
+            return False
+        self.report.first_ms = self._took_ms.pop()
+        self.report.shape = (steps.shape[0], steps.shape[1])
+        return True
+
+    def _compare(self) -> None:
+        """Whether the answer is the same again, and whether it depends on what is seen."""
+        report, chart = self.report, self._looks[0]
+        cameras = bool(self._policy.spec.observation.cameras)
+        first, again = self._anew(chart), self._anew(chart)
+        if first is None or again is None:
+            return
+        report.deterministic = _alike(first, again)
+        if not report.deterministic:
+            report.findings.append(
+                note(
+                    "random",
+                    "answers to one observation differ after reset(); usual where noise "
+                    "is drawn, and then it is not known what the answer depends on",
+                )
+            )
+        trials = {
+            "pictures": Look(chart.name, picture=noise, prompt=chart.prompt) if cameras else None,
+            "colour order": Look(chart.name, prompt=chart.prompt, swapped=True)
+            if cameras
+            else None,
+            "prompt": Look(chart.name, prompt=self._another_prompt())
+            if self._policy.spec.observation.prompt
+            else None,
+        }
+        for name, look in trials.items():
+            if look is None or not report.deterministic or not self._in_budget():
+                continue
+            if name == "colour order" and report.depends_on.get("pictures") is False:
+                continue
+            other = self._anew(look)
+            report.depends_on[name] = None if other is None else not _alike(first, other)
+
+    def _another_prompt(self) -> str:
+        prompts = [look.prompt for look in self._looks if not look.strange]
+        return next((text for text in prompts if text != prompts[0]), PROMPTS[1])
+
+    def _time_it(self) -> None:
+        kib: list[float] = []
+        self._reset()
+        for index in range(self._runs):
+            if not self._in_budget():
+                break
+            if self._infer(self._looks[index % 2]) is None:
+                return
+            kib.append(self._bench.memory_kib())
+        report = self.report
+        if len(kib) < ENOUGH_RUNS:
+            return
+        third = len(kib) // 3
+        # The first third may still fill caches; from then on nothing should be kept.
+        rest = np.array(kib[third:])
+        report.growth_kib_per_run = float(np.polyfit(np.arange(len(rest)), rest, 1)[0])
+        total_kib = report.growth_kib_per_run * len(rest)
+        steady = rest[-third:].min() > rest[:third].max()
+        if steady and report.growth_kib_per_run > GROWTH_KIB and total_kib > GROWTH_TOTAL_KIB:
+            report.findings.append(
+                error(
+                    "memory_growth",
+                    f"every inference keeps {report.growth_kib_per_run:.0f} KiB",
+                )
+            )
+
+    # -- one inference ------------------------------------------------------------------------
+    def _anew(self, look: Look) -> Steps | None:
+        self._reset()
+        return self._infer(look, again=True)
+
+    def _reset(self) -> None:
+        reset = getattr(self._policy, "reset", None)
+        if not callable(reset):
+            return
+        try:
+            self._bench.call(reset)
+        except Failed as failed:
+            self.report.findings.append(error("reset_failed", str(failed)))
+
+    def _infer(self, look: Look, *, again: bool = False) -> Steps | None:
+        """A checked answer, None where there is none; what is wrong goes into the report."""
+        findings, action = self.report.findings, self._policy.spec.action
+        try:
+            observation = self._maker.make(look, again=again)
+        except SpecError as fault:
+            findings.append(error("picture_size", str(fault)))
+            return None
+        try:
+            answer, took_s = self._bench.call(lambda: self._policy.infer(observation))
+        except Failed as failed:
+            refused = look.strange and isinstance(failed.error, SpecError)
+            if not refused:
+                findings.append(error("inference_failed", f"{look.name}: {failed}"))
+            return None
+        self._took_ms.append(took_s * 1e3)
+        given = answer.steps if isinstance(answer, ActionSteps) else answer
+        try:
+            steps = check_steps(action, given)
+        except SpecError as fault:
+            findings.append(error(fault.reason, f"{look.name}: {fault}"))
+            return None
+        findings += plausible.findings(action, steps, self._limits, self._width_m)
+        self._answers.append((look, steps))
+        return steps
+
+    def _in_budget(self) -> bool:
+        if self._bench.spent_s() < self._budget_s:
+            return True
+        if not any(finding.name == "cut_short" for finding in self.report.findings):
+            self.report.findings.append(
+                note(
+                    "cut_short",
+                    f"not everything was tried in {self._budget_s:g} s; --budget gives more",
+                )
+            )
+        return False
+
+    # -- what it all means --------------------------------------------------------------------
+    def _judge(self) -> None:
+        report, spec = self.report, self._policy.spec
+        report.runs = len(self._took_ms)
+        if self._took_ms:
+            p50, p95 = np.percentile(self._took_ms, (50, 95))
+            report.latency_ms = (float(p50), float(p95), max(self._took_ms))
+            report.findings += self._slowness(p50 / 1e3, p95 / 1e3)
+        numbers = np.concatenate([steps for _, steps in self._answers])
+        low, high = numbers.min(axis=0).tolist(), numbers.max(axis=0).tolist()
+        report.step_range = list(zip(low, high, strict=True))
+        report.findings += self._polarity()
+        if spec.action.kind == "delta" and not np.any(np.abs(numbers[:, :3]) > ALIKE):
+            report.findings.append(
+                note("stands_still", "no example made it move; try --prompt with one it knows")
+            )
+        for what, name in (
+            ("pictures", "ignores_pictures"),
+            ("colour order", "ignores_colour_order"),
+            ("prompt", "ignores_prompt"),
+        ):
+            if report.depends_on.get(what) is False:
+                report.findings.append(warning(name, f"the answer does not depend on the {what}"))
+
+    def _slowness(self, p50_s: float, p95_s: float) -> list[Finding]:
+        found: list[Finding] = []
+        action, oldest_s = self._policy.spec.action, self._timing.max_observation_age_s
+        if p50_s > oldest_s:
+            found.append(
+                error(
+                    "too_slow",
+                    f"an inference takes {p50_s:.3g} s; the command node refuses chunks whose "
+                    f"observation is older than {oldest_s:g} s (timing.max_observation_age_s)",
+                )
+            )
+        chunk_s = action.horizon * action.dt_s
+        if p50_s > chunk_s:
+            # One step late is still the goal; of many late ones all but the last are lost.
+            level = error if action.horizon > 1 else warning
+            found.append(
+                level(
+                    "slower_than_chunk",
+                    f"an inference takes {p50_s:.3g} s, its {action.horizon} steps of "
+                    f"{action.dt_s:g} s are over by then",
+                )
+            )
+        if self._rate_hz is not None and p95_s > 1.0 / self._rate_hz:
+            found.append(
+                warning(
+                    "slower_than_rate",
+                    f"an inference takes up to {p95_s:.3g} s (p95), it is asked for "
+                    f"{self._rate_hz:g} times a second",
+                )
+            )
+        return found
+
+    def _polarity(self) -> list[Finding]:
+        """An open, empty gripper that every answer shuts is a sign of the wrong polarity."""
+        action = self._policy.spec.action
+        shares = [
+            opening
+            for look, steps in self._answers
+            if look.width_m == MAX_WIDTH_M
+            and (opening := plausible.opening(action, steps)) is not None
+        ]
+        if not shares or float(np.concatenate(shares).max()) > 0.5:
+            return []
+        return [
+            warning(
+                "gripper_polarity",
+                "every example with an open, empty gripper has it shut at once; is "
+                f"gripper_open_is_high: {action.gripper_open_is_high} right?",
+            )
+        ]
+
+
+def _alike(a: Steps, b: Steps) -> bool:
+    return a.shape == b.shape and bool(np.abs(a - b).max() <= ALIKE)

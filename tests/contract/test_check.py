@@ -1,0 +1,292 @@
+"""`vla-zenoh check` passes what keeps its contract, and names what does not."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from chain import command_line
+
+from vla_zenoh.check import fit, plausible
+from vla_zenoh.check.examine import Examination, Report
+from vla_zenoh.check.examples import chart, looks
+from vla_zenoh.check.finding import MEANINGS
+from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.nodes.check_bench import CheckBench
+from vla_zenoh.policy import (
+    ActionSpec,
+    CameraSpec,
+    GripperMeaning,
+    ModelSpec,
+    ObservationSpec,
+    check_steps,
+)
+from vla_zenoh.profile import Limits, load_profile, override
+
+BROKEN = Path(__file__).with_name("broken_worker.py")
+RUNS = 40
+PATIENCE_S = 5.0
+
+ERRORS = {
+    # fault: (name of the finding, what is said of it)
+    "load": ("load_failed", "weights.safetensors"),
+    "spec": ("spec_changed", "declare it in __init__"),
+    "key": ("normalisation", "'bridge', the weights came with: libero_goal, libero_spatial"),
+    "reset": ("reset_failed", "KeyError: 'episode'"),
+    "raises": ("inference_failed", "colour chart: RuntimeError: device-side assert"),
+    "writes": ("inference_failed", "read-only"),
+    "prompt": ("inference_failed", "a strange prompt: UnicodeEncodeError"),
+    "horizon": ("horizon", "a chunk of 8 steps, the spec says 1 to 4"),
+    "shape": ("shape", r"steps have shape \(4, 6\), the spec says \(H, 7\)"),
+    "objects": ("dtype", "steps are not numbers but object"),
+    "nan": ("not_finite", "NaN"),
+    "millimetres": ("position_units", "are these metres"),
+    "degrees": ("rotation_units", r"a step of 4\.96\d* rad, over 4 times the limit of 0\.2 rad"),
+    "norm": ("quaternion", r"norm 0\.5099, wanted 1"),
+    "order": ("quaternion", "the order is x, y, z, w"),
+    "gripper": ("gripper_range", "gripper 255, declared as open_fraction"),
+    "grows": ("memory_growth", r"every inference keeps \d+ KiB"),
+    "late": ("slower_than_chunk", r"its 4 steps of 0\.001 s are over by then"),
+    "camera": ("camera", "needs camera 'ceiling', the profile has: front, wrist"),
+    "size": ("picture_size", "sends 640x480, the spec asks for 32x24"),
+}
+WARNINGS = {
+    "polarity": "gripper_polarity",
+    "blind": "ignores_pictures",
+    "gray": "ignores_colour_order",
+    "deaf": "ignores_prompt",
+}
+NEEDS_A_PROFILE = ("camera", "size")
+
+
+def examined(fault: str, *, against: str | None = None, **more: Any) -> Report:
+    return Examination(
+        make_policy(find_model(str(BROKEN)), {"fault": fault}),
+        "broken",
+        CheckBench(more.pop("patience_s", PATIENCE_S)),
+        profile=load_profile(against) if against else None,
+        runs=RUNS,
+        **more,
+    ).run()
+
+
+def names(report: Report, *levels: str) -> set[str]:
+    return {finding.name for finding in report.findings if finding.level in levels}
+
+
+def test_a_worker_that_keeps_its_contract_passes_without_a_word() -> None:
+    report = examined("", against="panda_sim")
+    assert report.ok
+    assert names(report, "error", "warning") == set()
+    assert report.shape == (4, 7)
+    assert report.deterministic is True
+    assert report.depends_on == {"pictures": True, "colour order": True, "prompt": True}
+    assert report.latency_ms is not None
+    assert report.memory_mib is not None
+
+
+@pytest.mark.parametrize("fault", ERRORS)
+def test_a_broken_worker_fails_with_the_name_of_its_fault(fault: str) -> None:
+    name, why = ERRORS[fault]
+    report = examined(fault, against="panda_sim" if fault in NEEDS_A_PROFILE else None)
+    assert not report.ok
+    assert names(report, "error") == {name}
+    (finding,) = [finding for finding in report.findings if finding.level == "error"]
+    assert re.search(why, finding.why), finding.why
+
+
+def test_a_worker_too_slow_for_the_command_node_is_told_so_before_its_patience_ends() -> None:
+    report = examined("slow", budget_s=3.0)
+    assert names(report, "error") == {"slower_than_chunk", "too_slow"}
+    assert names(report, "note") == {"cut_short"}
+
+
+def test_a_worker_that_hangs_is_given_up() -> None:
+    report = examined("hangs", patience_s=0.3)
+    assert names(report, "error") == {"hangs"}
+    assert "nothing came back in 0.3 s" in report.findings[0].why
+
+
+@pytest.mark.parametrize("fault", WARNINGS)
+def test_what_a_person_should_look_at_is_a_warning(fault: str) -> None:
+    report = examined(fault)
+    assert report.ok
+    assert names(report, "warning") == {WARNINGS[fault]}
+
+
+def test_of_a_random_worker_nothing_is_said_that_cannot_be_known() -> None:
+    report = examined("random")
+    assert report.ok
+    assert report.deterministic is False
+    assert report.depends_on == {}
+    assert names(report, "note") == {"random"}
+
+
+@pytest.mark.parametrize("asked_hz", [2.0, 20.0])
+def test_inference_longer_than_a_period_is_named(asked_hz: float) -> None:
+    report = Examination(
+        make_policy(find_model("scripted"), {"delay_ms": "100", "dt_s": "1"}),
+        "scripted",
+        CheckBench(PATIENCE_S),
+        rate_hz=asked_hz,
+        runs=3,
+    ).run()
+    assert ("slower_than_rate" in names(report, "warning")) == (asked_hz > 10)
+
+
+def test_every_finding_has_a_meaning() -> None:
+    told = {name for name, _ in ERRORS.values()} | set(WARNINGS.values())
+    assert told <= set(MEANINGS)
+
+
+# -- spec and profile -----------------------------------------------------------------------------
+
+
+def spec(*cameras: CameraSpec, **action: Any) -> ModelSpec:
+    fields = {"horizon": 4, "dt_s": 0.1, **action}
+    return ModelSpec(
+        name="m", observation=ObservationSpec(cameras=cameras), action=ActionSpec(**fields)
+    )
+
+
+FRONT, WRIST = CameraSpec(camera="front"), CameraSpec(camera="wrist")
+
+
+@pytest.mark.parametrize(
+    ("declared", "changes", "wanted"),
+    [
+        (spec(FRONT), {}, set()),
+        (spec(CameraSpec(camera="top")), {}, {("error", "camera")}),
+        (
+            spec(CameraSpec(camera="front", width=224, height=224, resize="stretch")),
+            {},
+            {("note", "picture_shape")},
+        ),
+        (spec(CameraSpec(camera="front", width=224, height=224, resize="pad")), {}, set()),
+        (
+            spec(FRONT),
+            {"cameras": {"front": {"source": "sim:front", "rate_hz": 1}}},
+            {("error", "camera_rate")},
+        ),
+        (
+            spec(FRONT, WRIST),
+            {"cameras": {"wrist": {"source": "sim:wrist", "rate_hz": 5}}},
+            {("warning", "camera_rate")},
+        ),
+        (spec(FRONT, gripper="none"), {}, {("note", "no_gripper")}),
+        (spec(FRONT), {"task": {"prompt": ""}}, {("warning", "no_prompt")}),
+        (spec(FRONT, horizon=1), {}, {("note", "gaps")}),
+    ],
+)
+def test_what_does_not_fit_a_profile_is_named(
+    declared: ModelSpec, changes: dict[str, Any], wanted: set[tuple[str, str]]
+) -> None:
+    profile = override(load_profile("panda_sim"), {"workers": ["scripted", "m"], **changes})
+    found = fit.findings(profile, declared, worker="m")
+    assert {finding[:2] for finding in found} == wanted
+
+
+def test_a_worker_that_the_profile_does_not_run_is_noted() -> None:
+    found = fit.findings(load_profile("panda_sim"), spec(FRONT), worker="m")
+    assert [finding[:2] for finding in found] == [("note", "not_listed")]
+
+
+# -- numbers --------------------------------------------------------------------------------------
+
+MAX_WIDTH_M = 0.08
+DOWN_XYZW = [1.0, 0.0, 0.0, 0.0]
+
+
+def found_in(action: ActionSpec, row: list[float]) -> set[tuple[str, str]]:
+    steps = check_steps(action, [row])
+    return {f[:2] for f in plausible.findings(action, steps, Limits(), MAX_WIDTH_M)}
+
+
+@pytest.mark.parametrize(
+    ("row", "wanted"),
+    [
+        ([0.43, 0.0, 0.2, *DOWN_XYZW, 0.04], set()),
+        ([430.0, 0.0, 200.0, *DOWN_XYZW, 0.04], {("error", "position_units")}),
+        ([-0.43, 0.0, 0.2, *DOWN_XYZW, 0.04], {("warning", "workspace")}),
+        ([0.43, 0.0, 0.2, 2.0, 0.0, 0.0, 0.0, 0.04], {("error", "quaternion")}),
+        ([0.43, 0.0, 0.2, *DOWN_XYZW, 40.0], {("error", "gripper_range")}),
+    ],
+)
+def test_absolute_poses_are_held_against_the_workspace(
+    row: list[float], wanted: set[tuple[str, str]]
+) -> None:
+    action = ActionSpec(horizon=1, dt_s=0.1, kind="absolute", rotation="quaternion")
+    assert found_in(action, row) == wanted
+
+
+@pytest.mark.parametrize(
+    ("row", "wanted"),
+    [
+        ([0.05, 0.0, 0.0, 0.0, 0.0, 0.0], set()),
+        ([0.06, 0.0, 0.0, 0.0, 0.0, 0.0], {("warning", "step_limit"), ("warning", "speed_limit")}),
+        ([0.21, 0.0, 0.0, 0.0, 0.0, 0.0], {("error", "position_units")}),
+        ([0.0, 0.0, 0.0, 0.0, 0.0, 0.14], set()),
+        ([0.0, 0.0, 0.0, 0.0, 0.0, 0.81], {("error", "rotation_units")}),
+    ],
+)
+def test_deltas_are_held_against_the_limits(row: list[float], wanted: set[tuple[str, str]]) -> None:
+    assert found_in(ActionSpec(horizon=1, dt_s=0.1, gripper="none"), row) == wanted
+
+
+@pytest.mark.parametrize(
+    ("meaning", "fits", "breaks"),
+    [
+        ("delta_m", (-0.08, 0.0, 0.08), (-0.2, 1.0)),
+        ("absolute_m", (0.0, 0.08), (-0.05, 0.5)),
+        ("open_fraction", (0.0, 1.0), (-1.0, 80.0)),
+        ("binary", (-1.0, 0.0, 1.0), (255.0,)),
+    ],
+)
+def test_the_gripper_is_held_against_its_meaning(
+    meaning: GripperMeaning, fits: tuple[float, ...], breaks: tuple[float, ...]
+) -> None:
+    action = ActionSpec(horizon=1, dt_s=0.1, gripper=meaning)
+    for value in fits:
+        assert found_in(action, [0.0] * 6 + [value]) == set()
+    for value in breaks:
+        assert found_in(action, [0.0] * 6 + [value]) == {("error", "gripper_range")}
+
+
+def test_the_chart_differs_from_all_its_mirror_images_and_channel_orders() -> None:
+    picture = chart(24, 32)
+    others = [picture[::-1], picture[:, ::-1], picture[::-1, ::-1], picture[..., ::-1]]
+    for other in others:
+        assert np.abs(picture.astype(int) - other).mean() > 10
+    assert looks()[0].picture is chart
+
+
+# -- the command ----------------------------------------------------------------------------------
+
+
+def test_the_command_prints_json_and_fails_with_1() -> None:
+    words = ("check", str(BROKEN), "--set", "fault=millimetres", "--runs", "3", "--json")
+    done = command_line(*words)
+    assert done.returncode == 1, done.stderr
+    said = json.loads(done.stdout)
+    assert said["ok"] is False
+    assert [finding["name"] for finding in said["findings"]] == ["position_units"]
+
+
+def test_the_command_passes_a_good_one_and_a_warning_only_when_it_is_not_strict() -> None:
+    done = command_line("check", str(BROKEN), "--profile", "panda_sim", "--runs", "12")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "keeps its contract, 0 warnings" in done.stdout
+    deaf = ("check", str(BROKEN), "--set", "fault=deaf", "--runs", "3", "--strict")
+    assert command_line(*deaf).returncode == 1
+
+
+def test_a_file_that_is_no_model_is_named() -> None:
+    done = command_line("check", "replay", "--json")
+    assert done.returncode == 1
+    (finding,) = json.loads(done.stdout)["findings"]
+    assert finding["name"] == "cannot_be_made"
+    assert "options it takes: file" in finding["why"]
