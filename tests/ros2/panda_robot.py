@@ -19,8 +19,10 @@ whoever sends it: where the stream ends it stays at the last pose, as such contr
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import multiprocessing
+import os
 import signal
 import threading
 import time
@@ -65,6 +67,7 @@ FOLLOW_1_S = 50.0
 """How stiffly the desired pose is followed: 20 mm away it begins with 50 m/s^2 at most, and 0.4 m/s
 is never passed on the way."""
 CATCH_UP_NS = 50_000_000
+PRIORITY = 40
 
 
 class Follower:
@@ -116,6 +119,9 @@ class PandaRobot:
 
     def run(self, stop: threading.Event) -> None:
         """Simulate in real time until `stop` is set."""
+        # A robot's control loop does not share its processor; without permission it has to.
+        with contextlib.suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         next_ns = time.monotonic_ns()
         while not stop.is_set():
             next_ns += STEP_NS
@@ -221,6 +227,7 @@ def main() -> None:
     parser.add_argument("--domain", type=int, default=0, help="ROS domain id")
     parser.add_argument("--state-hz", type=float, default=200.0, help="rate of /joint_states")
     parser.add_argument("--camera", choices=CAMERAS, action="append", help="which; default: all")
+    parser.add_argument("--no-cameras", action="store_true", help="somebody else has them")
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=480)
     parser.add_argument("--camera-hz", type=float, default=30.0)
@@ -244,11 +251,13 @@ def main() -> None:
     cameras = context.Process(
         target=serve_cameras, args=(chosen.domain, *pictures, qpos), daemon=True
     )
-    cameras.start()
+    if not chosen.no_cameras:
+        cameras.start()
     print("ready", flush=True)
     robot.run(stop)
-    cameras.terminate()
-    cameras.join()
+    if cameras.is_alive():
+        cameras.terminate()
+        cameras.join()
 
 
 if __name__ == "__main__":

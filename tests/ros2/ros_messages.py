@@ -163,6 +163,39 @@ class TriggerResponse(IdlStruct, typename="std_srvs.srv.dds_.Trigger_Response_")
     message: str
 
 
+@dataclass
+class SetPromptRequest(IdlStruct, typename="vla_msgs.srv.dds_.SetPrompt_Request_"):
+    client: uint64
+    number: int64
+    prompt: str
+
+
+@dataclass
+class SetPromptResponse(IdlStruct, typename="vla_msgs.srv.dds_.SetPrompt_Response_"):
+    client: uint64
+    number: int64
+    success: bool
+    message: str
+
+
+@dataclass
+class SetRequestRequest(IdlStruct, typename="vla_msgs.srv.dds_.SetRequest_Request_"):
+    client: uint64
+    number: int64
+    prompt: str
+    worker: str
+    rate_hz: float64
+    active: bool
+
+
+@dataclass
+class SetRequestResponse(IdlStruct, typename="vla_msgs.srv.dds_.SetRequest_Response_"):
+    client: uint64
+    number: int64
+    success: bool
+    message: str
+
+
 # -- actions: franka_msgs/action/Move and what every action has ---------------------------------
 @dataclass
 class Uuid(IdlStruct, typename="unique_identifier_msgs.msg.dds_.UUID_"):

@@ -16,7 +16,15 @@ import time
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from cyclonedds.core import Policy, Qos
+from cyclonedds.core import (
+    InstanceState,
+    Policy,
+    Qos,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
@@ -224,8 +232,8 @@ class Server:
         self._say.write(reply)
 
 
-class Poller:
-    """Takes what arrives at readers and hands it on, in a thread of its own.
+class Listener:
+    """Hands on what arrives at readers, at once, in a thread of its own.
 
     Args:
         handlers: reader -> what to do with a message and the wall clock at its arrival.
@@ -234,16 +242,23 @@ class Poller:
     def __init__(self, handlers: dict[DataReader[Any], Callable[[Any, int], None]]) -> None:
         self._handlers = handlers
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="dds-poller", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="dds-listener", daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
+        mask = SampleState.NotRead | ViewState.Any | InstanceState.Any
+        participant = next(iter(self._handlers)).participant
+        anything = WaitSet(participant)
+        conditions = [ReadCondition(reader, mask) for reader in self._handlers]
+        for condition in conditions:
+            anything.attach(condition)
         while not self._stop.is_set():
+            anything.wait(duration(milliseconds=100))
+            arrived_ns = time.time_ns()
             for reader, handle in self._handlers.items():
                 for message in reader.take(100):
                     if message.sample_info.valid_data:
-                        handle(message, time.time_ns())
-            time.sleep(0.001)
+                        handle(message, arrived_ns)
 
     def close(self) -> None:
         self._stop.set()

@@ -1,0 +1,122 @@
+"""A whole ROS 2 lab on one computer: DDS robot, real bridge, our nodes, and a witness in DDS."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from bridge import Bridge
+from camera_rig import free_endpoint
+from chain import Chain, running_chain
+from ros_node import free_domain
+from witness import Witness
+
+ROBOT = Path(__file__).with_name("panda_robot.py")
+ROBOT_READY_S = 30.0
+WIDTH, HEIGHT, CAMERA_HZ, STATE_HZ = 160, 120, 20, 200
+
+PROFILE = """\
+extends: panda_ros2
+cameras:
+  front: {{width: {width}, height: {height}, rate_hz: {camera_hz}}}
+  wrist: null
+task: {{prompt: hold, rate_hz: 5, worker: scripted}}
+ros2:
+  cameras: {{wrist: null}}
+session:
+  listen: ["{endpoint}"]
+  connect: ["{endpoint}"]
+"""
+
+
+class Robot:
+    """The DDS robot as a process.
+
+    Args:
+        domain: ROS domain id.
+        arguments: further ones of its command line.
+    """
+
+    def __init__(self, domain: int, *arguments: str) -> None:
+        words = [sys.executable, str(ROBOT), "--domain", str(domain), *arguments]
+        self._process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        self._said: list[str] = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        give_up = time.monotonic() + ROBOT_READY_S
+        while "ready" not in self._said:
+            if self._process.poll() is not None or time.monotonic() > give_up:
+                self.end()
+                raise AssertionError("the DDS robot does not start; see what it wrote above")
+            time.sleep(0.01)
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        self._said.extend(line.strip() for line in self._process.stdout)
+
+    def freeze(self) -> None:
+        """It hangs: it neither says anything nor leaves."""
+        os.kill(self._process.pid, signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        os.kill(self._process.pid, signal.SIGCONT)
+
+    def end(self) -> None:
+        if self._process.poll() is None:
+            self.thaw()
+            self._process.terminate()
+        self._process.wait(10)
+        self._reader.join()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+
+@dataclass
+class Lab:
+    """What a test holds."""
+
+    domain: int
+    robot: Robot
+    bridge: Bridge
+    witness: Witness
+    chain: Chain
+
+    def story(self) -> str:
+        """For the message of a test that fails."""
+        return f"{self.chain.story()}\nbridge:\n{self.bridge.tail()}"
+
+
+@contextmanager
+def running_lab(folder: Path, program: Path, *, bridge_is_router: bool = False) -> Iterator[Lab]:
+    """Everything up while the block lasts.
+
+    Args:
+        folder: for profile, settings and logs.
+        program: the bridge.
+        bridge_is_router: as in a lab that starts the bridge as it comes: our nodes are its clients.
+    """
+    domain, endpoint = free_domain(), free_endpoint()
+    profile = folder / "ros2_lab.yaml"
+    profile.write_text(
+        PROFILE.format(width=WIDTH, height=HEIGHT, camera_hz=CAMERA_HZ, endpoint=endpoint)
+    )
+    pictures = ("--width", WIDTH, "--height", HEIGHT, "--camera-hz", CAMERA_HZ)
+    with ExitStack() as stack:
+        at = {"listen": endpoint} if bridge_is_router else {"connect": endpoint}
+        bridge = Bridge(program, folder, domain, **at).start()
+        stack.callback(bridge.kill)
+        robot = Robot(domain, "--camera", "front", "--state-hz", str(STATE_HZ), *map(str, pictures))
+        stack.callback(robot.end)
+        witness = Witness(domain)
+        stack.callback(witness.close)
+        chain = stack.enter_context(running_chain(folder, profile_file=profile))
+        chain.recorder.only = {"state": "ros2#", "command": "command#"}
+        yield Lab(domain, robot, bridge, witness, chain)
