@@ -11,6 +11,7 @@ import os
 import shutil
 import sys
 import sysconfig
+from collections.abc import Sequence
 from pathlib import Path
 
 from vla_zenoh import __version__
@@ -47,22 +48,37 @@ def run_in_own_environment(model: ModelFile, python: str | None) -> None:
         if shutil.which(python) is None:
             raise WorkerError(f"--python {python!r} is not an interpreter")
         os.execvpe(python, [python, *arguments], environment)
-    uv = _uv()
-    if uv is None:
-        raise WorkerError(
-            f"model {model.name!r} needs {', '.join(missing)}. Install uv (pip install uv) and it "
-            "gets an environment of its own, or name a prepared one with --python"
-        )
+    command = environment_command(model)
     # Not on stdout, where `vla-zenoh check --json` writes its result.
     said = f"preparing an environment for {model.name}: {', '.join(model.dependencies)}"
     print(said, file=sys.stderr, flush=True)
+    os.execve(command[0], [*command, "python", *arguments], environment)
+
+
+def environment_command(model: ModelFile, more: Sequence[str] = ()) -> list[str]:
+    """What runs a command in the environment that the model's header asks for.
+
+    uv makes it at the first time and keeps it.
+
+    Args:
+        model: the file.
+        more: further packages.
+
+    Raises:
+        WorkerError: there is no uv.
+    """
+    uv = _uv()
+    if uv is None:
+        raise WorkerError(
+            f"model {model.name!r} needs {', '.join(model.dependencies)}. Install uv (pip install "
+            "uv) and it gets an environment of its own, or name a prepared one with --python"
+        )
     command = [uv, "run", "--no-project", "--quiet"]
     if model.requires_python:
         command += ["--python", model.requires_python]
-    for requirement in model.dependencies:
+    for requirement in (*model.dependencies, *more):
         command += ["--with", requirement]
-    command += [*_this_package(), "python", *arguments]
-    os.execve(uv, command, environment)
+    return [*command, *_this_package()]
 
 
 def _uv() -> str | None:
