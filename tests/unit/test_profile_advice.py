@@ -10,7 +10,7 @@ from vla_zenoh.profile import advice, load_profile, override
 
 SIM = load_profile("panda_sim")
 ROBOT = {"robot": {"nodes": ["router", "sim", "camera", "command"]}}
-NET = "tcp/10.0.0.2:7447"
+NET = "tls/10.0.0.2:7447"
 
 
 def gpu(**more: Any) -> dict[str, Any]:
@@ -22,15 +22,21 @@ def test_a_plain_profile_needs_no_advice() -> None:
 
 
 def test_two_hosts_with_real_addresses_need_no_advice() -> None:
-    session = {"listen": [NET], "connect": [NET]}
+    session = {"listen": [NET], "connect": [NET], "security": {}}
     assert advice(override(SIM, {"session": session, "hosts": gpu()})) == []
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"session": {"listen": ["tcp/0.0.0.0:7447"]}}, "session.listen: everybody on the network"),
-        ({"session": {"listen": ["tcp/[::]:7447"]}}, "session.listen: everybody on the network"),
+        (
+            {"session": {"listen": ["tcp/0.0.0.0:7447"], "insecure": True}},
+            "session.insecure: everybody on any network of the router's computer can command",
+        ),
+        (
+            {"session": {"listen": ["tcp/10.0.0.2:7447"], "insecure": True}},
+            "session.insecure: everybody on the network of the router's computer can command",
+        ),
         ({"hosts": gpu()}, "session.listen: the router on robot is heard on that computer only"),
         ({"hosts": gpu()}, "hosts.gpu: looks for the router on itself, and it runs on robot"),
         ({"hosts": gpu(), "session": {"mode": "peer"}}, "session.mode: peers on several hosts"),
@@ -71,5 +77,6 @@ def test_what_is_odd_is_told(changes: dict[str, Any], said: str) -> None:
 
 
 def test_a_host_that_looks_elsewhere_is_not_warned_about_itself() -> None:
-    found = advice(override(SIM, {"hosts": gpu(connect=[NET])}))
+    elsewhere = gpu(connect=["tcp/10.0.0.2:7447"])
+    found = advice(override(SIM, {"hosts": elsewhere}))
     assert not any(line.startswith("hosts.gpu") for line in found)

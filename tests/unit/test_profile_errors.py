@@ -22,8 +22,10 @@ from vla_zenoh.profile import (
     override,
     profile_names,
 )
+from vla_zenoh.profile.session import SecurityProfile
 
 Write = Callable[..., str]
+
 SIM = load_profile("panda_sim")
 
 
@@ -181,7 +183,7 @@ def told(path: str) -> list[str]:
         ),
         (
             "hosts: {a: {nodes: [router]}, b: {nodes: [router]}}",
-            "hosts.b.nodes: router runs on a and b: routers do not find each other",
+            "hosts.b.link: is missing: routers do not find each other, and a runs one as well",
         ),
         (
             "hosts: {a: {nodes: [worker]}, b: {nodes: [worker]}}",
@@ -190,6 +192,42 @@ def told(path: str) -> list[str]:
         (
             "hosts: {a: {nodes: [camera], cameras: [wrist]}, b: {nodes: [camera]}}",
             "hosts.b.cameras: wrist runs on a and b: each key has one writer",
+        ),
+        (
+            "session: {listen: [tcp/10.0.0.2:7447]}",
+            "session.listen.0: lets everybody on that network command the robot. Make certificates",
+        ),
+        (
+            "session: {listen: [tls/10.0.0.2:7447]}",
+            "session.listen.0: tls needs certificates: make them with `vla-zenoh secure init`",
+        ),
+        (
+            "session: {security: {}, listen: [tls/a:1], connect: [tcp/a:1]}",
+            "session.connect.0: tcp checks no certificate, and there is a section security",
+        ),
+        (
+            "session: {security: {}, listen: [tls/a:1], connect: [tls/a:1], insecure: true}",
+            "session.insecure: is true, beside a section security: leave one out",
+        ),
+        (
+            "session: {security: {}, listen: [tls/a:1], connect: [tls/a:1], mode: peer}",
+            "session.mode: is peer: only a router controls access; write client",
+        ),
+        (
+            "session: {security: {people: {desk: boss}}, listen: [tls/a:1], connect: [tls/a:1]}",
+            "session.security.people.desk: wants 'operator' or 'viewer'",
+        ),
+        (
+            "session: {separate_links: true, connect: [tcp/127.0.0.1:65535]}",
+            "session.connect.0: separate_links needs PROTOCOL/HOST:PORT, and the next port too",
+        ),
+        (
+            "hosts: {a: {nodes: [router], listen: [tcp/10.0.0.3:7447]}}",
+            "hosts.a.listen.0: lets everybody on that network command the robot",
+        ),
+        (
+            "hosts: {a: {nodes: [command], link: [tcp/127.0.0.1:7447]}}",
+            "hosts.a.link: is for a router, and this host runs none",
         ),
         ("robot: {driver: ros2}", "ros2: is missing: robot.driver is ros2"),
         ("robot: {driver: ros2}", "cameras.wrist.source: is 'sim:wrist', and robot.driver is ros2"),
@@ -403,7 +441,10 @@ def test_values_given_otherwise_are_checked_as_a_whole() -> None:
     ],
 )
 def test_an_endpoint_that_is_taken_is_one_that_zenoh_takes(endpoint: str) -> None:
-    assert SessionProfile(connect=(endpoint,)).connect == (endpoint,)
+    security = SecurityProfile() if endpoint.startswith(("tls", "quic")) else None
+    listen = ("tls/127.0.0.1:7447" if security else "tcp/127.0.0.1:7447",)
+    session = SessionProfile(connect=(endpoint,), listen=listen, security=security)
+    assert session.connect == (endpoint,)
     zenoh.Config.from_json5(f'{{connect: {{endpoints: ["{endpoint}"]}}}}')
 
 

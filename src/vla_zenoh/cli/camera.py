@@ -39,4 +39,5 @@ def camera(
     run_node(
         loaded,
         lambda session, stop: CameraNode(loaded, session, name=name, cameras=chosen).run(stop),
+        identity=name,
     )

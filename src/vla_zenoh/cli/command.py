@@ -34,4 +34,5 @@ def command(
     run_node(
         loaded,
         lambda session, stop: CommandNode(loaded, session, dry_run=dry_run, latch=latch).run(stop),
+        identity="command",
     )

@@ -22,6 +22,7 @@ from vla_zenoh.cli import (
     profile,
     ros2,
     router,
+    secure,
     set_prompt,
     sim,
     status,
@@ -98,6 +99,7 @@ for panel, name, function in (
 
 app.add_typer(bench.bench_app, name="bench", rich_help_panel=LOOK)
 app.add_typer(profile.profile_app, name="profile", rich_help_panel=LOOK)
+app.add_typer(secure.secure_app, name="secure", rich_help_panel=RUN)
 
 
 def app_entry() -> None:

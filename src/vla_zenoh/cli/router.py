@@ -2,20 +2,49 @@
 
 from __future__ import annotations
 
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
+    HostOption,
     ListenOption,
     ProfileOption,
     effective_profile,
 )
+from vla_zenoh.nodes.orphan import RUN_FOLDER_VARIABLE
 from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
-from vla_zenoh.nodes.router import run_router
+from vla_zenoh.nodes.router import router_config, run_router, run_zenohd
 
 
-def router(profile: ProfileOption = DEFAULT_PROFILE, listen: ListenOption = None) -> None:
+def router(
+    profile: ProfileOption = DEFAULT_PROFILE,
+    listen: ListenOption = None,
+    host: HostOption = None,
+    also: Annotated[
+        list[str] | None,
+        typer.Option("--also", help="Profile of another robot to serve; may be repeated."),
+    ] = None,
+    show_config: Annotated[
+        bool, typer.Option("--config", help="Print Zenoh's configuration of it, and end.")
+    ] = False,
+) -> None:
     """Run the Zenoh router that all nodes of a lab meet at."""
-    stop = stop_on_signals()
+    loaded = effective_profile(profile, listen=listen, host=host)
+    others = [effective_profile(name) for name in also or ()]
+    if show_config:
+        print(json.dumps(router_config(loaded, host=host, also=others), indent=2))
+        return
     die_with_parent()
-    loaded = effective_profile(profile, listen=listen)
-    print(f"routing on {', '.join(loaded.session.listen)}", flush=True)
-    run_router(loaded, stop)
+    if loaded.session.router == "zenohd":
+        given = os.environ.get(RUN_FOLDER_VARIABLE)
+        folder = Path(given) if given else Path(tempfile.mkdtemp(prefix="vla-zenoh-"))
+        run_zenohd(loaded, folder, host=host, also=others)
+    stop = stop_on_signals()
+    print(f"routing, {loaded.name}", flush=True)
+    run_router(loaded, stop, host=host, also=others)

@@ -29,4 +29,8 @@ def sim(
     from vla_zenoh.nodes.sim import SimNode  # MuJoCo takes a while; other commands need not wait
 
     loaded = effective_profile(profile, connect)
-    run_node(loaded, lambda session, stop: SimNode(loaded, session, lockstep=lockstep).run(stop))
+    run_node(
+        loaded,
+        lambda session, stop: SimNode(loaded, session, lockstep=lockstep).run(stop),
+        identity="sim",
+    )

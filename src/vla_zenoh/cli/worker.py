@@ -15,6 +15,7 @@ from vla_zenoh.cli.options import (
     effective_profile,
     model_options,
 )
+from vla_zenoh.control.names import worker_node
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.nodes.environment import run_in_own_environment
 from vla_zenoh.nodes.process import run_node
@@ -43,7 +44,7 @@ def worker(
     ] = None,
 ) -> None:
     """Run a model: observations in, action chunks out on its delta key."""
-    loaded = effective_profile(profile, connect)
+    loaded = effective_profile(profile, connect, host=host)
     found = find_model(model)
     chosen = model_options(options or [])
     # Comes back only where this environment has what the model's header asks for.
@@ -55,6 +56,7 @@ def worker(
         lambda session, stop: WorkerNode(
             loaded, session, policy, name or found.name, images=form
         ).run(stop),
+        identity=worker_node(name or found.name),
     )
     # A model's library may leave threads behind that would keep the process.
     os._exit(0)

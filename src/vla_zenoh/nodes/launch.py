@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import zenoh
 
@@ -17,6 +18,7 @@ from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.supervisor import NodeCommand, Supervisor
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
+from vla_zenoh.profile.fit import node_name
 
 START_ORDER = ("router", "sim", "ros2", "command", "camera", "worker")
 ROUTER_PATIENCE_S = 10.0
@@ -55,6 +57,7 @@ def node_commands(
     common = ("--profile", str(profile_file))
     commands: list[NodeCommand] = []
     for kind in sorted(part.nodes, key=START_ORDER.index):
+        name = node_name(profile, host, kind)
         if kind == "worker":
             for worker in part.workers or profile.workers:
                 arguments = ["worker", worker, *common, "--host", host]
@@ -62,7 +65,10 @@ def node_commands(
                     arguments += ["--set", option]
                 commands.append(NodeCommand(worker_node(worker), kind, tuple(arguments)))
         elif kind == "camera":
-            commands.append(NodeCommand(kind, kind, ("camera", *(part.cameras or ()), *common)))
+            arguments = ["camera", *(part.cameras or ()), *common, "--name", name]
+            commands.append(NodeCommand(name, kind, tuple(arguments)))
+        elif kind == "router":
+            commands.append(NodeCommand(name, kind, (kind, *common, "--host", host)))
         else:
             commands.append(NodeCommand(kind, kind, (kind, *common)))
     return commands
@@ -94,8 +100,13 @@ class Host:
         worker_options: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         self.host, part = choose_host(profile, host)
+        changes: dict[str, Any] = {}
         if part.connect is not None:
-            profile = override(profile, {"session": {"connect": list(part.connect)}})
+            changes["connect"] = list(part.connect)
+        if profile.session.security is not None:
+            changes["security"] = {"host": self.host}
+        if changes:
+            profile = override(profile, {"session": changes})
         self.profile, self._part, self._tell = profile, part, tell
         self._folder = tempfile.TemporaryDirectory(prefix="vla-zenoh-")
         # Children read the very profile that is in force here, whatever its options were.

@@ -29,6 +29,7 @@ def run_node(
     profile: Profile,
     run: Callable[[zenoh.Session, threading.Event], None],
     *,
+    identity: str,
     wait_s: float | None = None,
 ) -> None:
     """Open a session and run a node in it until a signal comes.
@@ -36,10 +37,12 @@ def run_node(
     Args:
         profile: the session section is used.
         run: makes the node and runs it.
+        identity: the node's name, for its certificate.
         wait_s: patience with a router that does not answer; longer under a supervisor, which may
             be starting it.
 
     Raises:
+        SecurityError: its certificate is not there.
         SessionError: no router answers.
     """
     stop = stop_on_signals()
@@ -47,7 +50,7 @@ def run_node(
     if wait_s is None:
         wait_s = ROUTER_PATIENCE_S if PARENT_VARIABLE in os.environ else 0.0
     try:
-        session = open_session(profile.session, wait_s=wait_s, stop=stop)
+        session = open_session(profile.session, identity=identity, wait_s=wait_s, stop=stop)
     except SessionError:
         if stop.is_set():
             return

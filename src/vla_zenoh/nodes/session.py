@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import zenoh
@@ -12,8 +13,13 @@ import zenoh
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import SessionProfile
+from vla_zenoh.profile.session import SecurityProfile, second_link
+from vla_zenoh.security.store import Store
 
 RETRY_S = 0.1
+FAST, BULK = "0-3", "4-7"
+"""Priorities of Zenoh on the first and on the second of separate links; see `QOS`."""
+MAX_LINKS = 4
 
 _DROP = zenoh.CongestionControl.DROP
 _BLOCK = zenoh.CongestionControl.BLOCK
@@ -35,17 +41,36 @@ QOS: dict[Kind, dict[str, Any]] = {
 
 
 def config(
-    profile: SessionProfile, *, mode: str | None = None, connect: tuple[str, ...] | None = None
+    profile: SessionProfile,
+    *,
+    mode: str | None = None,
+    connect: tuple[str, ...] | None = None,
+    identity: str | None = None,
+    access: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Zenoh's configuration as plain data, before it is handed to its strict parser."""
+    """Zenoh's configuration as plain data, before it is handed to its strict parser.
+
+    Args:
+        profile: the session section.
+        mode: overrides the profile's, for the router.
+        connect: overrides the profile's endpoints; of a router: other routers.
+        identity: which node's certificate is shown; None: that of the people at this computer.
+        access: section ``access_control``, of a router.
+
+    Raises:
+        SecurityError: the certificate is not there.
+    """
     mode = mode or profile.mode
-    return {
+    routes = mode == "router"
+    targets = (connect or ()) if routes else (connect or profile.connect)
+    settings: dict[str, Any] = {
         "mode": mode,
-        "listen": {"endpoints": list(profile.listen) if mode == "router" else []},
+        "listen": {"endpoints": _listening(profile) if routes else []},
         "connect": {
-            "endpoints": [] if mode == "router" else list(connect or profile.connect),
-            "timeout_ms": 0,
-            "exit_on_failure": True,
+            "endpoints": [_connecting(profile, endpoint) for endpoint in targets],
+            # A router waits for nobody, and goes on looking for the others.
+            "timeout_ms": -1 if routes else 0,
+            "exit_on_failure": not routes,
             "retry": {
                 "period_init_ms": 100,
                 "period_max_ms": 500,
@@ -54,6 +79,7 @@ def config(
         },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": mode == "peer"}},
         "transport": {
+            "unicast": {"max_links": MAX_LINKS if profile.separate_links else 1},
             "shared_memory": {"enabled": profile.shared_memory},
             "link": {
                 "tx": {
@@ -66,6 +92,40 @@ def config(
             },
         },
     }
+    if profile.security is not None:
+        settings["transport"]["link"]["tls"] = _tls(profile.security, identity, routes)
+    if access is not None:
+        settings["access_control"] = dict(access)
+    return settings
+
+
+def _listening(profile: SessionProfile) -> list[str]:
+    if not profile.separate_links:
+        return list(profile.listen)
+    return [link for endpoint in profile.listen for link in _links(endpoint)]
+
+
+def _connecting(profile: SessionProfile, endpoint: str) -> Any:
+    if not profile.separate_links:
+        return endpoint
+    return {"strategy": "allOf", "locators": _links(endpoint)}
+
+
+def _links(endpoint: str) -> list[str]:
+    return [f"{endpoint}?prio={FAST}", f"{second_link(endpoint)}?prio={BULK}"]
+
+
+def _tls(security: SecurityProfile, identity: str | None, routes: bool) -> dict[str, Any]:
+    files = Store(security.folder).identity_files(security.host, identity)
+    own = {"private_key": str(files.key), "certificate": str(files.certificate)}
+    sides = ("connect", "listen") if routes else ("connect",)
+    return {
+        "root_ca_certificate": str(files.authority),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+        **{f"{side}_{what}": path for side in sides for what, path in own.items()},
+    }
 
 
 def open_session(
@@ -73,6 +133,8 @@ def open_session(
     *,
     mode: str | None = None,
     connect: tuple[str, ...] | None = None,
+    identity: str | None = None,
+    access: Mapping[str, Any] | None = None,
     wait_s: float = 0.0,
     stop: threading.Event | None = None,
 ) -> zenoh.Session:
@@ -81,14 +143,17 @@ def open_session(
     Args:
         profile: the session section.
         mode: overrides the profile's, for the router.
-        connect: overrides the profile's endpoints.
+        connect: overrides the profile's endpoints; of a router: other routers.
+        identity: which node this is, for its certificate; None: the people at this computer.
+        access: who may do what, of a router.
         wait_s: keep trying for this long.
         stop: give up at once when it is set.
 
     Raises:
+        SecurityError: the certificate is not there.
         SessionError: nobody answers there, or the address is taken; says what to do.
     """
-    settings = config(profile, mode=mode, connect=connect)
+    settings = config(profile, mode=mode, connect=connect, identity=identity, access=access)
     give_up = time.monotonic() + wait_s
     stop = stop or threading.Event()
     while True:
@@ -107,8 +172,19 @@ def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
             f"the router cannot listen on {where}: {error}. Is another router or program there? "
             "`vla-zenoh doctor` tells; choose another address with --listen or session.listen"
         )
-    where = ", ".join(settings["connect"]["endpoints"])
+    where = ", ".join(map(_shown, settings["connect"]["endpoints"]))
+    tls = settings["transport"]["link"].get("tls")
+    if tls is not None:
+        return SessionError(
+            f"no Zenoh router answers at {where}, or it refuses the certificate "
+            f"{tls['connect_certificate']}. `vla-zenoh secure show` says whether that is good; "
+            "start a router with `vla-zenoh router` or `vla-zenoh up`"
+        )
     return SessionError(
         f"no Zenoh router answers at {where}. Start one with `vla-zenoh router`, or everything "
         "with `vla-zenoh up`; another address is given with --connect or session.connect"
     )
+
+
+def _shown(endpoint: Any) -> str:
+    return endpoint if isinstance(endpoint, str) else " and ".join(endpoint["locators"])

@@ -18,10 +18,11 @@ def advice(profile: Profile) -> list[str]:
 
 def _network(profile: Profile) -> Iterator[str]:
     session = profile.session
-    if any(address_of(endpoint).startswith(ANYWHERE) for endpoint in session.listen):
+    if session.insecure:
+        where = "any network" if any(map(_is_anywhere, session.listen)) else "the network"
         yield (
-            "session.listen: everybody on the network can command this robot; "
-            "give the address of one network only, or use a firewall"
+            f"session.insecure: everybody on {where} of the router's computer can command this "
+            "robot; make certificates with `vla-zenoh secure init`"
         )
     if len(profile.hosts) < 2:
         return
@@ -40,6 +41,10 @@ def _network(profile: Profile) -> Iterator[str]:
                 f"hosts.{name}: looks for the router on itself, and it runs on {routers[0]}; "
                 f"give that computer's address in hosts.{name}.connect (a tunnel excepted)"
             )
+
+
+def _is_anywhere(endpoint: str) -> bool:
+    return address_of(endpoint).startswith(ANYWHERE)
 
 
 def _placement(profile: Profile) -> Iterator[str]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from vla_zenoh.faults import nearest
 from vla_zenoh.profile.section import Place
+from vla_zenoh.profile.session import endpoint_faults
 
 if TYPE_CHECKING:
     from vla_zenoh.profile.schema import HostProfile, Profile
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
 Fault = tuple[Place, str]
 
 ONLY_ONE = {
-    "router": "routers do not find each other",
     "command": "the robot obeys one command node",
     "sim": "there is one simulated robot",
     "ros2": "the robot has one driver",
@@ -45,6 +45,12 @@ def workers_of(profile: Profile, host: HostProfile) -> tuple[str, ...]:
     if "worker" not in host.nodes:
         return ()
     return profile.workers if host.workers is None else host.workers
+
+
+def node_name(profile: Profile, host: str, kind: str) -> str:
+    """What a node of this kind is called on the bus: two hosts may each have one."""
+    hosts = [name for name, part in profile.hosts.items() if kind in part.nodes]
+    return kind if len(hosts) < 2 else f"{kind}-{host}"
 
 
 def _robot(profile: Profile) -> Iterator[Fault]:
@@ -119,6 +125,8 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
             runs["cameras", camera].append(name)
         for worker in workers_of(profile, host):
             runs["workers", worker].append(name)
+        yield from _endpoints(profile, name, host)
+    yield from _routers(profile)
     for (what, name), hosts in runs.items():
         if len(hosts) > 1:
             why = ONLY_ONE.get(name) if what == "nodes" else "each key has one writer"
@@ -127,6 +135,28 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
                 ("hosts", hosts[-1], what),
                 f"{name} runs on {' and '.join(hosts)}: {why}{hint}",
             )
+
+
+def _endpoints(profile: Profile, name: str, host: HostProfile) -> Iterator[Fault]:
+    for what in ("connect", "listen", "link"):
+        endpoints = getattr(host, what)
+        for index, why in endpoint_faults(
+            endpoints or (), profile.session, listen=what == "listen"
+        ):
+            yield ("hosts", name, what, str(index)), why
+        if endpoints is not None and what != "connect" and "router" not in host.nodes:
+            yield ("hosts", name, what), "is for a router, and this host runs none"
+
+
+def _routers(profile: Profile) -> Iterator[Fault]:
+    """Every router but one has to be told of another: they do not find each other."""
+    alone = [n for n, host in profile.hosts.items() if "router" in host.nodes and not host.link]
+    for name in alone[1:]:
+        yield (
+            ("hosts", name, "link"),
+            f"is missing: routers do not find each other, and {alone[0]} runs one as well. Name "
+            "its address, as link: [tcp/10.0.0.2:7447]",
+        )
 
 
 def _unknown(

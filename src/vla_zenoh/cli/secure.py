@@ -1,0 +1,215 @@
+"""vla-zenoh secure: certificates of a lab, and who may do what."""
+
+from __future__ import annotations
+
+import datetime as dt
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from vla_zenoh.cli.options import DEFAULT_PROFILE, JsonOption, ProfileOption
+from vla_zenoh.cli.output import console, errors, fail, print_json
+from vla_zenoh.errors import SecurityError
+from vla_zenoh.profile import Profile, load_profile, profile_file
+from vla_zenoh.profile.session import DEFAULT_FOLDER
+from vla_zenoh.security.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
+from vla_zenoh.security.identity import Identity, Role, identities, identities_of
+from vla_zenoh.security.store import Entry, Store
+from vla_zenoh.security.written import (
+    profile_text,
+    secured,
+    serving_addresses,
+    with_person,
+)
+
+secure_app = typer.Typer(
+    help="Certificates for a lab: nobody else is heard, and each role does only its part.",
+    no_args_is_help=True,
+)
+
+FolderOption = Annotated[
+    str | None, typer.Option("--folder", help=f"Of the certificates; else {DEFAULT_FOLDER}.")
+]
+AddressOption = Annotated[
+    list[str] | None,
+    typer.Option("--address", help="Another name or address of the router; may be repeated."),
+]
+DaysOption = Annotated[
+    int, typer.Option("--days", min=1, max=AUTHORITY_DAYS, help="How long they are valid.")
+]
+
+
+@secure_app.command("init")
+def init(
+    profile: ProfileOption = DEFAULT_PROFILE,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Profile to write; NAME_secure.yaml else.")
+    ] = None,
+    folder: FolderOption = None,
+    lab: Annotated[str, typer.Option("--lab", help="Name of the lab, in its certificates.")] = (
+        "vla-zenoh lab"
+    ),
+    address: AddressOption = None,
+    days: DaysOption = CERTIFICATE_DAYS,
+) -> None:
+    """Make the lab's authority, certificates for all hosts of a profile, and a secured profile."""
+    plain = load_profile(profile)
+    if plain.session.security is not None:
+        fail(f"profile {plain.name} is secured already; `vla-zenoh secure add HOST` adds to it")
+    file = output or Path(f"{plain.name}_secure.yaml")
+    if file.exists():
+        fail(f"{file} is there already and is not overwritten; give another one with --output")
+    store, now = Store(folder or DEFAULT_FOLDER), _now()
+    text = profile_text(plain, _extends(profile, file), store.folder.absolute())
+    made = [store.make_authority(lab, now)]
+    made += store.add(
+        identities(plain), now, days=days, addresses=serving_addresses(plain, address or ())
+    )
+    _write(file, text)
+    written = load_profile(str(file))
+    out = console()
+    for path in made:
+        out.print(f"made {path}", highlight=False, soft_wrap=True)
+    out.print(f"made {file}", highlight=False, soft_wrap=True)
+    out.print(f"\nOn every host use --profile {file}, and give each its own folder:")
+    for host in written.hosts:
+        source, target = store.folder / host, Path(DEFAULT_FOLDER) / host
+        out.print(f"  scp -rp {source} {host}:{target}", highlight=False, soft_wrap=True)
+    out.print(f"Keep {store.folder / 'ca.key'} here: who has it can make certificates.")
+    _complain_about_places(written)
+
+
+@secure_app.command("add")
+def add(
+    host: Annotated[str, typer.Argument(help="Host of the profile, or another computer.")],
+    profile: ProfileOption = DEFAULT_PROFILE,
+    role: Annotated[
+        Literal["operator", "viewer"] | None,
+        typer.Option("--role", help="What people at that computer may do."),
+    ] = None,
+    address: AddressOption = None,
+    days: DaysOption = CERTIFICATE_DAYS,
+    renew: Annotated[
+        bool, typer.Option("--renew", help="Make new ones in place of those that are there.")
+    ] = False,
+) -> None:
+    """Make the certificates of one more host, or of people at a computer."""
+    loaded = load_profile(profile)
+    security = loaded.session.security
+    if security is None:
+        fail(f"profile {loaded.name} is not secured: begin with `vla-zenoh secure init`")
+    new = ""
+    if role is not None:
+        path = profile_file(profile)
+        try:
+            new = with_person(path.read_text("utf-8"), host, Role(role))
+        except SecurityError as error:
+            raise SecurityError(f"{path} {error}") from error
+        chosen = [Identity(Role(role), role, host)]
+        if host in loaded.hosts:
+            nodes = identities_of(loaded, host)[:-1]
+            chosen = [*nodes, *chosen] if renew else chosen
+    else:
+        chosen = identities_of(loaded, host)
+    store = Store(security.folder)
+    made = store.add(
+        chosen, _now(), days=days, addresses=serving_addresses(loaded, address or ()), renew=renew
+    )
+    if new:
+        _write(profile_file(profile), new)
+        load_profile(profile)
+        console().print(f"{host} is in {profile_file(profile)} now; start the router again")
+    for path in made:
+        console().print(f"made {path}", highlight=False, soft_wrap=True)
+
+
+@secure_app.command("show")
+def show(
+    profile: ProfileOption = DEFAULT_PROFILE,
+    folder: FolderOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show every certificate here: whose, how long, and what is wrong. Exits with 1 if any is."""
+    security = load_profile(profile).session.security
+    store = Store(folder or (security.folder if security is not None else DEFAULT_FOLDER))
+    now = _now()
+    entries = store.entries(now)
+    if as_json:
+        print_json([_plain(entry, now) for entry in entries])
+    else:
+        _print(entries, now)
+    if not entries:
+        fail(f"{store.folder} has no certificates; `vla-zenoh secure init` makes them")
+    if any(entry.faults for entry in entries):
+        raise typer.Exit(1)
+
+
+def _now() -> dt.datetime:
+    return dt.datetime.now(dt.UTC)
+
+
+def _extends(name: str, output: Path) -> str:
+    """How the new profile names the one it stands on."""
+    path = profile_file(name)
+    if path.stem == name:
+        return name
+    return path.stem if path.absolute().parent == output.absolute().parent else str(path.absolute())
+
+
+def _write(file: Path, text: str) -> None:
+    try:
+        file.write_text(text, "utf-8")
+    except OSError as error:
+        raise SecurityError(f"{file} cannot be written: {error.strerror}") from error
+
+
+def _complain_about_places(profile: Profile) -> None:
+    """A router that several hosts are to find has to listen on the network."""
+    if len(profile.hosts) > 1 and all(
+        "127.0.0.1" in endpoint for endpoint in profile.session.listen
+    ):
+        said = secured("tcp/10.0.0.2:7447")
+        errors().print(
+            f"[yellow]the router listens on its own computer only: write its address in "
+            f"session.listen and hosts.NAME.connect, as {said}, then `vla-zenoh secure add HOST "
+            "--renew` for the router's host[/]"
+        )
+
+
+def _print(entries: list[Entry], now: dt.datetime) -> None:
+    table = Table(header_style="bold")
+    for column in ("host", "node", "valid until", "days", "serves as", "what is wrong"):
+        table.add_column(column, overflow="fold")
+    for entry in entries:
+        found, colour = entry.certificate, "green"
+        if entry.faults:
+            colour = "bold red"
+        elif entry.warning:
+            colour = "yellow"
+        table.add_row(
+            entry.host or "(the lab)",
+            entry.node,
+            f"[{colour}]{found.not_after:%Y-%m-%d}[/]" if found else "",
+            f"[{colour}]{found.days_left(now)}[/]" if found else "",
+            ", ".join(found.addresses) if found else "",
+            f"[{colour}]{escape('; '.join(entry.faults) or entry.warning)}[/]",
+        )
+    console().print(table)
+
+
+def _plain(entry: Entry, now: dt.datetime) -> dict[str, object]:
+    found = entry.certificate
+    return {
+        "host": entry.host,
+        "node": entry.node,
+        "file": str(entry.path),
+        "common_name": found.common_name if found else None,
+        "not_after": found.not_after.isoformat() if found else None,
+        "days_left": found.days_left(now) if found else None,
+        "addresses": list(found.addresses) if found else [],
+        "faults": list(entry.faults),
+        "warning": entry.warning,
+    }

@@ -1,0 +1,1 @@
+"""Who may say what: certificates, roles, and rules for the router. Pure."""

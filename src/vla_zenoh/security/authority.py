@@ -1,0 +1,313 @@
+"""A lab's own certificate authority: makes certificates and reads them. Bytes in, bytes out.
+
+X.509 version 3 (RFC 5280), keys on the curve P-256, signatures ECDSA with SHA-256: what every TLS
+library of today takes. Certificates of routers may serve and connect, all others only connect, so a
+stolen worker's key cannot pose as the router.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import ipaddress
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from vla_zenoh.errors import MissingExtraError, SecurityError
+
+if TYPE_CHECKING:
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+EXTRA = "secure"
+AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 365
+WARN_DAYS = 30
+"""A certificate that ends within this is to be renewed."""
+BACKDATE = dt.timedelta(minutes=10)
+"""Certificates begin a little in the past: the clocks of a lab's hosts differ."""
+MAX_COMMON_NAME = 64
+"""Of RFC 5280, ub-common-name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """A certificate and its private key, as PEM text."""
+
+    certificate: bytes
+    key: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """What a certificate says.
+
+    Args:
+        common_name: who it is about.
+        issuer: who signed it.
+        not_before: valid from, UTC.
+        not_after: valid until, UTC.
+        addresses: names and IP addresses under which it may serve.
+        authority: it may sign others.
+    """
+
+    common_name: str
+    issuer: str
+    not_before: dt.datetime
+    not_after: dt.datetime
+    addresses: tuple[str, ...]
+    authority: bool
+
+    def days_left(self, now: dt.datetime) -> int:
+        """Whole days until it ends, negative when it has."""
+        return math.floor((self.not_after - now) / dt.timedelta(days=1))
+
+    def fault(self, now: dt.datetime) -> str:
+        """Why it is of no use at `now`, empty when it is good."""
+        if now < self.not_before:
+            return f"is not valid before {self.not_before:%Y-%m-%d %H:%M} UTC (is the clock right?)"
+        if now > self.not_after:
+            return f"expired on {self.not_after:%Y-%m-%d}; renew it"
+        return ""
+
+    def warning(self, now: dt.datetime) -> str:
+        """What is to be done soon, empty when nothing is."""
+        left = self.days_left(now)
+        if self.fault(now) or left >= WARN_DAYS:
+            return ""
+        return f"ends in {left} day{'s' if left != 1 else ''}; renew it"
+
+
+def make_authority(name: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> Pair:
+    """A new authority: a key, and a certificate that it signed itself.
+
+    Args:
+        name: of the lab, at most 64 characters.
+        now: UTC.
+        days: how long it is valid.
+
+    Raises:
+        MissingExtraError: the library ``cryptography`` is not installed.
+        SecurityError: the name cannot be used.
+    """
+    x509, ec = _library()
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = _name(name)
+    usage = _usage(sign_others=True)
+    builder = (
+        _builder(subject, subject, key.public_key(), now, days)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(usage, critical=True)
+    )
+    return _signed(builder, key, key)
+
+
+def issue(
+    authority: Pair,
+    common_name: str,
+    now: dt.datetime,
+    *,
+    days: int = CERTIFICATE_DAYS,
+    addresses: Iterable[str] | None = None,
+) -> Pair:
+    """A certificate for `common_name`, signed by `authority`.
+
+    Args:
+        authority: of the lab.
+        common_name: at most 64 characters.
+        now: UTC.
+        days: how long it is valid; never longer than the authority.
+        addresses: host names and IP addresses it may serve under; None: it may only connect.
+
+    Raises:
+        MissingExtraError: the library ``cryptography`` is not installed.
+        SecurityError: the name, an address or the authority cannot be used.
+    """
+    x509, ec = _library()
+    from cryptography.x509.oid import ExtendedKeyUsageOID
+
+    signer, signer_key = _load(authority)
+    end = signer.not_valid_after_utc
+    if now > end:
+        raise SecurityError(f"the lab's authority expired on {end:%Y-%m-%d}: make a new one")
+    key = ec.generate_private_key(ec.SECP256R1())
+    days_left = (end - now) / dt.timedelta(days=1)
+    purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
+    if addresses is not None:
+        purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
+    builder = (
+        _builder(_name(common_name), signer.subject, key.public_key(), now, min(days, days_left))
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(sign_others=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer_key.public_key()),
+            critical=False,
+        )
+    )
+    if addresses is not None:
+        names = [_address(address) for address in dict.fromkeys(addresses)]
+        builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+    return _signed(builder, key, signer_key)
+
+
+def read(pem: bytes) -> Certificate:
+    """What a certificate says.
+
+    Raises:
+        MissingExtraError: the library ``cryptography`` is not installed.
+        SecurityError: it is none.
+    """
+    x509, _ = _library()
+    try:
+        found = x509.load_pem_x509_certificate(pem)
+        constraints = found.extensions.get_extension_for_class(x509.BasicConstraints).value
+        try:
+            names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        except x509.ExtensionNotFound:
+            names = ()
+        return Certificate(
+            _common_name(found.subject),
+            _common_name(found.issuer),
+            found.not_valid_before_utc,
+            found.not_valid_after_utc,
+            tuple(str(name.value) for name in names),
+            bool(constraints.ca),
+        )
+    except (ValueError, x509.ExtensionNotFound) as error:
+        raise SecurityError(f"is not a certificate as we make them: {error}") from error
+
+
+def signed_by(pem: bytes, authority: bytes) -> bool:
+    """Whether `authority` signed the certificate `pem`.
+
+    Raises:
+        SecurityError: one of them is no certificate.
+    """
+    x509, _ = _library()
+    from cryptography.exceptions import InvalidSignature
+
+    try:
+        found, signer = map(x509.load_pem_x509_certificate, (pem, authority))
+    except ValueError as error:
+        raise SecurityError(f"is not a certificate: {error}") from error
+    try:
+        found.verify_directly_issued_by(signer)
+    except (ValueError, TypeError, InvalidSignature):
+        return False
+    return True
+
+
+def key_fits(pair: Pair) -> bool:
+    """Whether the private key is the certificate's.
+
+    Raises:
+        SecurityError: one of them cannot be read.
+    """
+    certificate, key = _load(pair)
+    return certificate.public_key() == key.public_key()
+
+
+def _library():
+    try:
+        from cryptography import x509
+        from cryptography.hazmat.primitives.asymmetric import ec
+    except ImportError as error:
+        raise MissingExtraError("cryptography", EXTRA) from error
+    return x509, ec
+
+
+def _name(common_name: str) -> x509.Name:
+    x509, _ = _library()
+    if not 0 < len(common_name) <= MAX_COMMON_NAME:
+        raise SecurityError(
+            f"{common_name[:80]!r} cannot be the name in a certificate: give 1 to "
+            f"{MAX_COMMON_NAME} characters; shorter names of node and host help"
+        )
+    return x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, common_name)])
+
+
+def _common_name(name: x509.Name) -> str:
+    x509, _ = _library()
+    found = name.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
+    return str(found[0].value) if found else ""
+
+
+def _address(address: str) -> x509.GeneralName:
+    x509, _ = _library()
+    try:
+        return x509.IPAddress(ipaddress.ip_address(address.partition("%")[0]))
+    except ValueError:
+        pass
+    try:
+        return x509.DNSName(address)
+    except ValueError as error:
+        raise SecurityError(f"{address!r} is no host name and no IP address") from error
+
+
+def _usage(*, sign_others: bool) -> x509.KeyUsage:
+    x509, _ = _library()
+    return x509.KeyUsage(
+        digital_signature=not sign_others,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=sign_others,
+        crl_sign=sign_others,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _builder(
+    subject: x509.Name,
+    issuer: x509.Name,
+    public_key: ec.EllipticCurvePublicKey,
+    now: dt.datetime,
+    days: float,
+) -> x509.CertificateBuilder:
+    x509, _ = _library()
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(public_key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(min(now, now + dt.timedelta(days=days)) - BACKDATE)
+        .not_valid_after(now + dt.timedelta(days=days))
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(public_key), critical=False)
+    )
+
+
+def _signed(
+    builder: x509.CertificateBuilder,
+    key: ec.EllipticCurvePrivateKey,
+    signer: ec.EllipticCurvePrivateKey,
+) -> Pair:
+    from cryptography.hazmat.primitives import hashes, serialization
+
+    certificate = builder.sign(signer, hashes.SHA256())
+    return Pair(
+        certificate.public_bytes(serialization.Encoding.PEM),
+        key.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.NoEncryption(),
+        ),
+    )
+
+
+def _load(pair: Pair) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    x509, _ = _library()
+    from cryptography.hazmat.primitives import serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    try:
+        certificate = x509.load_pem_x509_certificate(pair.certificate)
+        key = serialization.load_pem_private_key(pair.key, password=None)
+    except (ValueError, TypeError) as error:
+        raise SecurityError(f"cannot be read as certificate and private key: {error}") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise SecurityError("the private key is not one of an elliptic curve, as we make them")
+    return certificate, key

@@ -1,0 +1,131 @@
+"""Who there is in a lab: one identity for each node of each host, and one for the people there.
+
+An identity is the common name of a certificate, ``NODE@HOST``, and what the router goes by.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from vla_zenoh.control.names import worker_node
+from vla_zenoh.errors import ProfileError, SecurityError
+from vla_zenoh.profile import Profile
+from vla_zenoh.profile.fit import cameras_of, node_name, workers_of
+
+
+class Role(Enum):
+    """What somebody is for. What each may do is in `vla_zenoh.security.roles`."""
+
+    ROUTER = "router"  # carries everything, for all others
+    ROBOT = "robot"
+    CAMERA = "camera"
+    WORKER = "worker"
+    COMMAND = "command"
+    OPERATOR = "operator"  # a person who drives the robot
+    VIEWER = "viewer"  # a person or screen that looks on, without pictures
+
+
+ROLE_OF_KIND = {
+    "router": Role.ROUTER,
+    "sim": Role.ROBOT,
+    "ros2": Role.ROBOT,
+    "camera": Role.CAMERA,
+    "worker": Role.WORKER,
+    "command": Role.COMMAND,
+}
+"""Kind of node in a profile -> its role."""
+PEOPLE = (Role.OPERATOR, Role.VIEWER)
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Somebody with a certificate.
+
+    Args:
+        role: what for.
+        node: its name on the bus; of people ``operator`` or ``viewer``.
+        host: where.
+        worker: the worker it is, if it is one.
+        cameras: the cameras it serves.
+    """
+
+    role: Role
+    node: str
+    host: str
+    worker: str = ""
+    cameras: tuple[str, ...] = ()
+
+    @property
+    def common_name(self) -> str:
+        """As in its certificate."""
+        return f"{self.node}@{self.host}"
+
+
+def person(profile: Profile, host: str) -> Role | None:
+    """What a person at `host` may do; None: the profile does not know that computer."""
+    security = profile.session.security
+    if security is not None and host in security.people:
+        return Role(security.people[host])
+    part = profile.hosts.get(host)
+    if part is None:
+        return None
+    return Role.OPERATOR if "command" in part.nodes else Role.VIEWER
+
+
+def identities_of(profile: Profile, host: str) -> list[Identity]:
+    """Everybody at `host`: its nodes and its people.
+
+    Raises:
+        ProfileError: neither hosts nor session.security.people know it.
+        SecurityError: a kind of node has no role.
+    """
+    role = person(profile, host)
+    if role is None:
+        known = ", ".join(sorted({*profile.hosts, *_people(profile)}))
+        raise ProfileError(
+            f"profile {profile.name} knows no host {host!r}, it knows: {known}. For a computer "
+            "from which people look or drive, say --role viewer or --role operator"
+        )
+    found = [*_nodes(profile, host)] if host in profile.hosts else []
+    return [*found, Identity(role, role.value, host)]
+
+
+def identities(profile: Profile) -> list[Identity]:
+    """Everybody in the lab.
+
+    Raises:
+        SecurityError: a kind of node has no role.
+    """
+    hosts = dict.fromkeys([*profile.hosts, *_people(profile)])
+    return [identity for host in hosts for identity in identities_of(profile, host)]
+
+
+def _people(profile: Profile) -> tuple[str, ...]:
+    security = profile.session.security
+    return tuple(security.people) if security is not None else ()
+
+
+def _nodes(profile: Profile, host: str) -> list[Identity]:
+    part = profile.hosts[host]
+    from_ros2 = tuple(n for n, c in profile.cameras.items() if c.source.startswith("ros2:"))
+    found: list[Identity] = []
+    for kind in part.nodes:
+        role = ROLE_OF_KIND.get(kind)
+        if role is None:
+            raise SecurityError(
+                f"nodes of kind {kind!r} have no role: name it in security/identity.py"
+            )
+        if role is Role.WORKER:
+            found += [
+                Identity(role, worker_node(worker), host, worker=worker)
+                for worker in workers_of(profile, part)
+            ]
+            continue
+        cameras = {
+            Role.CAMERA: tuple(c for c in cameras_of(profile, part) if c not in from_ros2),
+            Role.ROBOT: from_ros2 if kind == "ros2" else (),
+        }
+        name = node_name(profile, host, kind)
+        found.append(Identity(role, name, host, cameras=cameras.get(role, ())))
+    return found

@@ -1,0 +1,205 @@
+"""Which role may do what on which key: the one table, and what it means for one identity.
+
+A key of `keys.py` without a row here is allowed to nobody, and a test says so.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+from itertools import product
+
+from vla_zenoh.keys import Keys
+from vla_zenoh.security.identity import Identity, Role
+
+ROBOT, CAMERA, WORKER, COMMAND, OPERATOR, VIEWER = (
+    Role.ROBOT,
+    Role.CAMERA,
+    Role.WORKER,
+    Role.COMMAND,
+    Role.OPERATOR,
+    Role.VIEWER,
+)
+NODES = frozenset({ROBOT, CAMERA, WORKER, COMMAND})
+LOOKERS = frozenset({OPERATOR, VIEWER})
+NOBODY: frozenset[Role] = frozenset()
+
+_ANY = "any"
+"""Stands for `*` while a key is made: a key's parts may not be that."""
+
+
+class Act(Enum):
+    """What is done on a key."""
+
+    PUT = "put"
+    SUBSCRIBE = "subscribe"
+    ANSWER = "answer"  # be asked by queries
+    ASK = "ask"
+    ANNOUNCE = "announce"  # hold a liveliness token
+    WATCH = "watch"  # see such tokens
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Who may do what on one member of `Keys`.
+
+    Where a key has parameters, a node that writes fills in itself: its own name, worker, cameras.
+    Who reads may read all of them.
+    """
+
+    member: str
+    put: frozenset[Role] = NOBODY
+    subscribe: frozenset[Role] = NOBODY
+    answer: frozenset[Role] = NOBODY
+    ask: frozenset[Role] = NOBODY
+    announce: frozenset[Role] = NOBODY
+    watch: frozenset[Role] = NOBODY
+
+    def roles(self, act: Act) -> frozenset[Role]:
+        """Who may do `act`."""
+        return getattr(self, act.value)
+
+
+def _setting(member: str) -> Row:
+    """Said by the operator, kept by the command node, which tells those who look."""
+    return Row(
+        member,
+        put=frozenset({OPERATOR}),
+        subscribe=frozenset({COMMAND}) | LOOKERS,
+        answer=frozenset({COMMAND}),
+        ask=LOOKERS,
+    )
+
+
+def _stream(member: str, writers: set[Role], readers: set[Role]) -> Row:
+    return Row(member, put=frozenset(writers), subscribe=frozenset(readers))
+
+
+TABLE = (
+    # Pictures show people: whoever may only look on does not see them.
+    _stream("camera_raw", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
+    _stream("camera_jpeg", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
+    _stream("seen", {WORKER}, {OPERATOR}),
+    _stream("state_joint", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
+    _stream("state_pose", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
+    _stream("state_gripper", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
+    _setting("prompt"),
+    _setting("active"),
+    _setting("worker"),
+    _setting("rate"),
+    _stream("stop", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
+    _stream("reset", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
+    Row(
+        "task",
+        put=frozenset({COMMAND}),
+        subscribe=frozenset({ROBOT, WORKER}) | LOOKERS,
+        answer=frozenset({COMMAND}),
+        ask=frozenset({WORKER}) | LOOKERS,
+    ),
+    _stream("delta", {WORKER}, {COMMAND, OPERATOR, VIEWER}),
+    Row(
+        "spec",
+        put=frozenset({WORKER}),
+        subscribe=frozenset({COMMAND, OPERATOR, VIEWER}),
+        answer=frozenset({WORKER}),
+        ask=frozenset({COMMAND, OPERATOR, VIEWER}),
+    ),
+    _stream("command_pose", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
+    _stream("command_joint", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
+    _stream("command_gripper", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
+    Row("status", put=NODES, subscribe=frozenset({COMMAND}) | LOOKERS),
+    Row("event", put=NODES, subscribe=frozenset({COMMAND}) | LOOKERS),
+    Row("alive", announce=NODES, watch=NODES | LOOKERS),
+    Row("clock", answer=NODES, ask=NODES | LOOKERS),
+    _stream("sim_scene", {ROBOT}, {CAMERA, OPERATOR}),
+    _stream("sim_objects", {ROBOT}, {OPERATOR, VIEWER}),
+    _stream("sim_reset", {OPERATOR}, {ROBOT, OPERATOR}),
+    Row("sim_step", answer=frozenset({ROBOT}), ask=frozenset({OPERATOR})),
+)
+
+NO_KEYS = ("everything", "short", "group", "on")
+"""Members of `Keys` that give text and no key of their own."""
+OWN = frozenset({Act.PUT, Act.ANSWER, Act.ANNOUNCE})
+"""What a node does only in its own name."""
+
+
+def key_members() -> dict[str, tuple[str, ...]]:
+    """Every member of `Keys` that makes one key -> its parameters. Selectors are left out."""
+    out: dict[str, tuple[str, ...]] = {}
+    for name, value in vars(Keys).items():
+        make = value.fget if isinstance(value, property) else value
+        if name.startswith(("_", "all_")) or name in NO_KEYS or not inspect.isfunction(make):
+            continue
+        signature = inspect.signature(make)
+        if signature.return_annotation == "str":
+            out[name] = tuple(signature.parameters)[1:]
+    return out
+
+
+def expressions(keys: Keys, member: str, identity: Identity, act: Act) -> Iterator[str]:
+    """The key expressions on which `identity` does `act`, where its role may do it at all.
+
+    Args:
+        keys: of the robot.
+        member: of `Keys`.
+        identity: who.
+        act: what. Only in its own name, for what is in `OWN`.
+    """
+    parameters = key_members()[member]
+    if not parameters:
+        yield str(getattr(keys, member))
+        return
+    choices = [_choices(name, identity, act) for name in parameters]
+    for chosen in product(*choices):
+        yield _with_stars(keys, member, chosen)
+
+
+def _choices(parameter: str, identity: Identity, act: Act) -> tuple[str, ...]:
+    if act not in OWN:
+        return ("*",)
+    if parameter == "node":
+        return (identity.node,)
+    if parameter == "worker":
+        return (identity.worker,) if identity.worker else ()
+    if parameter == "camera":  # a worker shows what it saw of any camera
+        return ("*",) if identity.role is Role.WORKER else identity.cameras
+    return ()
+
+
+def _with_stars(keys: Keys, member: str, chosen: tuple[str, ...]) -> str:
+    make = getattr(keys, member)
+    fixed = [_ANY if part == "*" else part for part in chosen]
+    key, parts = str(make(*fixed)), list(chosen)
+    if "*" not in parts:
+        return key
+    # Parameters stand in a key in their order, each once: take them from behind.
+    chunks = key.split("/")
+    at = len(chunks) - 1
+    for part, text in zip(reversed(parts), reversed(fixed), strict=True):
+        while chunks[at] != text:
+            at -= 1
+        chunks[at] = part
+        at -= 1
+    return "/".join(chunks)
+
+
+@dataclass(frozen=True, slots=True)
+class Right:
+    """One thing that one identity may do."""
+
+    identity: Identity
+    act: Act
+    key: str
+
+
+def rights(keys: Keys, identity: Identity) -> list[Right]:
+    """Everything `identity` may do; of a router nothing is listed, as it carries all."""
+    return [
+        Right(identity, act, key)
+        for row in TABLE
+        for act in Act
+        if identity.role in row.roles(act)
+        for key in expressions(keys, row.member, identity, act)
+    ]

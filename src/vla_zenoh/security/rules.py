@@ -1,0 +1,170 @@
+"""Rights as Zenoh's access control, and what such a configuration allows.
+
+Zenoh looks at messages where they enter and leave the router, so one right takes several rules. A
+writer must be let in with its samples, and must be *told* that somebody listens, else it never
+sends; a reader must be let in with its wish, and be handed the samples. Whatever lacks a rule is
+dropped without a word, which is why `missing` exists.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from vla_zenoh.keys import Keys, covers
+from vla_zenoh.profile import Profile
+from vla_zenoh.security.identity import Identity, Role, identities
+from vla_zenoh.security.roles import Act, rights
+
+IN, OUT = "ingress", "egress"
+EVERY_MESSAGE = (
+    "put",
+    "delete",
+    "declare_subscriber",
+    "query",
+    "reply",
+    "declare_queryable",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+)
+WISHES = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
+"""Leave the router with the key of whoever asks, which may be wider than what it is answered on."""
+
+MESSAGES: Mapping[Act, Sequence[tuple[str, str]]] = {
+    # what is done: (way through the router, message)
+    Act.PUT: ((IN, "put"), (OUT, "declare_subscriber")),
+    Act.SUBSCRIBE: ((IN, "declare_subscriber"), (OUT, "put")),
+    Act.ANSWER: ((IN, "declare_queryable"), (IN, "reply"), (OUT, "query")),
+    Act.ASK: ((IN, "query"), (OUT, "declare_queryable"), (OUT, "reply")),
+    Act.ANNOUNCE: (
+        (IN, "liveliness_token"),
+        (OUT, "declare_liveliness_subscriber"),
+        (OUT, "liveliness_query"),
+    ),
+    Act.WATCH: (
+        (IN, "declare_liveliness_subscriber"),
+        (IN, "liveliness_query"),
+        (OUT, "liveliness_token"),
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Passage:
+    """A message of somebody on its way through the router."""
+
+    flow: str
+    message: str
+    key: str
+
+    def __str__(self) -> str:
+        return f"{self.flow} {self.message} {self.key}"
+
+
+def passages(act: Act, key: str) -> list[Passage]:
+    """What has to pass the router for `act` on `key`."""
+    return [Passage(flow, message, key) for flow, message in MESSAGES[act]]
+
+
+def access_control(profiles: Iterable[Profile]) -> dict[str, Any]:
+    """Zenoh's section ``access_control`` for a router that serves the robots of these profiles.
+
+    Whatever is not named is denied.
+
+    Raises:
+        SecurityError: a kind of node has no role.
+    """
+    rules: dict[str, dict[str, Any]] = {}
+    subjects: dict[str, dict[str, Any]] = {}
+    of_subject: dict[str, list[str]] = {}
+    for profile in profiles:
+        for identity in identities(profile):
+            name = identity.common_name
+            subjects[name] = {"id": name, "cert_common_names": [name]}
+            own = of_subject.setdefault(name, [])
+            for rule in _rules(identity, profile.keys):
+                if rule["id"] not in rules:
+                    rules[rule["id"]] = rule
+                if rule["id"] not in own:
+                    own.append(rule["id"])
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": list(rules.values()),
+        "subjects": list(subjects.values()),
+        "policies": [{"rules": own, "subjects": [name]} for name, own in of_subject.items()],
+    }
+
+
+def _rules(identity: Identity, keys: Keys) -> list[dict[str, Any]]:
+    if identity.role is Role.ROUTER:
+        return [_rule("router", (IN, OUT), EVERY_MESSAGE, ["**"])]
+    granted: dict[tuple[str, str], dict[str, None]] = {}
+    for right in rights(keys, identity):
+        for flow, message in MESSAGES[right.act]:
+            wish = flow == OUT and message in WISHES
+            # Who listens may ask for more than this key: the writer is told all the same.
+            key = "**" if wish else right.key
+            granted.setdefault((flow, message), {})[key] = None
+            if right.act is Act.SUBSCRIBE and identity.role is Role.OPERATOR:
+                granted[flow, message][keys.everything] = None
+    who = f"{keys.root}/{keys.robot}:{identity.common_name}"
+    return [
+        _rule(f"{who}:{flow}:{message}", (flow,), (message,), list(found))
+        for (flow, message), found in granted.items()
+    ]
+
+
+def _rule(
+    name: str, flows: Sequence[str], messages: Sequence[str], keys: Sequence[str]
+) -> dict[str, Any]:
+    return {
+        "id": name,
+        "messages": list(messages),
+        "flows": list(flows),
+        "permission": "allow",
+        "key_exprs": list(keys),
+    }
+
+
+def allows(config: Mapping[str, Any], common_name: str, passage: Passage) -> bool:
+    """Whether a section ``access_control`` lets a message of `common_name` pass.
+
+    Reads certificates' names as subjects, which is what `access_control` makes. Of two rules that
+    apply the one that denies wins, as in Zenoh.
+    """
+    if not config.get("enabled", False):
+        return True
+    subjects = {
+        subject["id"]
+        for subject in config.get("subjects") or ()
+        if common_name in (subject.get("cert_common_names") or (common_name,))
+    }
+    ruled = {
+        rule
+        for policy in config.get("policies") or ()
+        if subjects.intersection(policy["subjects"])
+        for rule in policy["rules"]
+    }
+    verdicts = {
+        rule["permission"]
+        for rule in config.get("rules") or ()
+        if rule["id"] in ruled
+        and passage.flow in (rule.get("flows") or (IN, OUT))
+        and passage.message in rule["messages"]
+        and any(covers(key, passage.key) for key in rule["key_exprs"])
+    }
+    if "deny" in verdicts:
+        return False
+    return "allow" in verdicts or config.get("default_permission") == "allow"
+
+
+def missing(config: Mapping[str, Any], identity: Identity, act: Act, key: str) -> list[Passage]:
+    """What `config` drops of what `identity` needs for `act` on `key`."""
+    return [
+        passage
+        for passage in passages(act, key)
+        if not allows(config, identity.common_name, passage)
+    ]

@@ -1,0 +1,284 @@
+"""Where a lab's certificates lie, and what is wrong with them.
+
+::
+
+    FOLDER/ca.pem, ca.key         the authority; the key stays on the computer it was made on
+    FOLDER/HOST/ca.pem            copy FOLDER/HOST to that host, into its own FOLDER
+    FOLDER/HOST/NODE.pem, .key    one pair for each node there, and for its people
+
+Private keys are readable by their owner alone. Nothing is ever overwritten unless asked for.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import os
+import stat
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_zenoh.errors import SecurityError
+from vla_zenoh.security import authority as ca
+from vla_zenoh.security.authority import Certificate, Pair
+from vla_zenoh.security.identity import PEOPLE, Identity, Role
+
+AUTHORITY = "ca"
+KEY_MODE = 0o600
+FOLDER_MODE = 0o700
+
+
+@dataclass(frozen=True, slots=True)
+class Files:
+    """The files of one identity."""
+
+    authority: Path
+    certificate: Path
+    key: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A certificate in the folder.
+
+    Args:
+        host: whose; empty: the authority itself.
+        node: which node's, or ``operator``, ``viewer``, ``ca``.
+        path: of the certificate.
+        certificate: what it says; None where it cannot be read.
+        faults: why it is of no use, or unsafe.
+        warning: what is to be done soon.
+    """
+
+    host: str
+    node: str
+    path: Path
+    certificate: Certificate | None
+    faults: tuple[str, ...]
+    warning: str
+
+
+class Store:
+    """See the module.
+
+    Args:
+        folder: may begin with ``~``.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder).expanduser()
+
+    # -- making -------------------------------------------------------------------------------
+    def make_authority(self, lab: str, now: dt.datetime) -> Path:
+        """Make the lab's authority.
+
+        Raises:
+            SecurityError: there is one, or the folder cannot be written.
+        """
+        path = self.folder / f"{AUTHORITY}.pem"
+        self._write(self.folder, AUTHORITY, ca.make_authority(lab, now), renew=False)
+        return path
+
+    def add(
+        self,
+        identities: Iterable[Identity],
+        now: dt.datetime,
+        *,
+        days: int = ca.CERTIFICATE_DAYS,
+        addresses: Iterable[str] = (),
+        renew: bool = False,
+    ) -> list[Path]:
+        """Make a certificate for each of `identities`; returns their files.
+
+        Args:
+            identities: who.
+            now: UTC.
+            days: how long they are valid.
+            addresses: under which routers among them serve.
+            renew: put new ones in place of those that are there.
+
+        Raises:
+            SecurityError: one is there already, the authority's key is not, or a file cannot be
+                written. Nothing is written then.
+        """
+        identities = list(identities)
+        if not renew:
+            for identity in identities:
+                self._refuse_to_overwrite(self.files(identity.host, identity.node))
+        authority = self._authority()
+        pairs = [
+            (
+                identity,
+                ca.issue(
+                    authority,
+                    identity.common_name,
+                    now,
+                    days=days,
+                    addresses=tuple(addresses) if identity.role is Role.ROUTER else None,
+                ),
+            )
+            for identity in identities
+        ]
+        made: list[Path] = []
+        for identity, pair in pairs:
+            folder = self.folder / identity.host
+            made.append(self._write(folder, identity.node, pair, renew=renew))
+            _put(folder / f"{AUTHORITY}.pem", authority.certificate, 0o644)
+        return made
+
+    def _authority(self) -> Pair:
+        certificate, key = (self.folder / f"{AUTHORITY}.{end}" for end in ("pem", "key"))
+        if not certificate.exists():
+            raise SecurityError(f"{certificate} is not there: begin with `vla-zenoh secure init`")
+        if not key.exists():
+            raise SecurityError(
+                f"{key} is not there: certificates are made on the computer where "
+                "`vla-zenoh secure init` was run"
+            )
+        return Pair(_get(certificate), _get(key))
+
+    def _write(self, folder: Path, name: str, pair: Pair, *, renew: bool) -> Path:
+        files = Files(folder, folder / f"{name}.pem", folder / f"{name}.key")
+        if not renew:
+            self._refuse_to_overwrite(files)
+        for made in (self.folder, folder):
+            try:
+                made.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
+            except OSError as error:
+                raise SecurityError(f"{made} cannot be made: {error.strerror}") from error
+        _put(files.key, pair.key, KEY_MODE)
+        _put(files.certificate, pair.certificate, 0o644)
+        return files.certificate
+
+    @staticmethod
+    def _refuse_to_overwrite(files: Files) -> None:
+        for path in (files.certificate, files.key):
+            if path.exists():
+                raise SecurityError(
+                    f"{path} is there already and is not overwritten; --renew makes new ones of a "
+                    "host, another --folder holds another lab"
+                )
+
+    # -- using --------------------------------------------------------------------------------
+    def files(self, host: str, node: str) -> Files:
+        """Where the files of one identity are to be."""
+        folder = self.folder / host
+        return Files(folder / f"{AUTHORITY}.pem", folder / f"{node}.pem", folder / f"{node}.key")
+
+    def this_host(self, host: str | None) -> str:
+        """Which host this computer is: `host`, or the only one there are certificates for.
+
+        Raises:
+            SecurityError: there are none, or those of several hosts.
+        """
+        if host is not None:
+            return host
+        hosts = self.hosts()
+        if len(hosts) == 1:
+            return hosts[0]
+        if not hosts:
+            raise SecurityError(
+                f"{self.folder} has no certificates: make them with `vla-zenoh secure init`, or "
+                "copy this host's folder from the computer where that was done"
+            )
+        raise SecurityError(
+            f"{self.folder} has certificates of {', '.join(hosts)}: say which of them this "
+            "computer is, with --host or session.security.host"
+        )
+
+    def hosts(self) -> list[str]:
+        """Hosts there are certificates for."""
+        return sorted(path.parent.name for path in self.folder.glob(f"*/{AUTHORITY}.pem"))
+
+    def identity_files(self, host: str | None, node: str | None) -> Files:
+        """The files of a node of this computer, or, without a node, of its people.
+
+        Raises:
+            SecurityError: they are not there, or others can read the key.
+        """
+        host = self.this_host(host)
+        names = [node] if node is not None else [role.value for role in PEOPLE]
+        for name in names:
+            files = self.files(host, name)
+            if files.certificate.exists() and files.key.exists():
+                if fault := open_to_others(files.key):
+                    raise SecurityError(fault)
+                return files
+        raise SecurityError(
+            f"{self.files(host, names[0]).certificate} is not there: make it with `vla-zenoh "
+            f"secure add {host}` on the computer of `secure init`, then copy the folder {host}"
+        )
+
+    # -- looking ------------------------------------------------------------------------------
+    def entries(self, now: dt.datetime, host: str | None = None) -> list[Entry]:
+        """Every certificate there is, or those of one host, with its faults.
+
+        Raises:
+            MissingExtraError: the library ``cryptography`` is not installed.
+        """
+        own = self.folder / f"{AUTHORITY}.pem"
+        out = [self._entry(own, own, "", now)] if own.exists() and host is None else []
+        for name in self.hosts():
+            if host is None or name == host:
+                paths = sorted((self.folder / name).glob("*.pem"))
+                signer = self.folder / name / f"{AUTHORITY}.pem"
+                out += [self._entry(path, signer, name, now) for path in paths if path != signer]
+        return out
+
+    def _entry(self, path: Path, signer: Path, host: str, now: dt.datetime) -> Entry:
+        node, found, warning = path.stem, None, ""
+        faults: list[str] = []
+        try:
+            pem = _get(path)
+            found = ca.read(pem)
+            faults += [fault] if (fault := found.fault(now)) else []
+            warning = found.warning(now)
+            if not ca.signed_by(pem, _get(signer)):
+                faults.append("was signed by another authority")
+            if host and found.common_name != f"{node}@{host}":
+                faults.append(f"is about {found.common_name!r}")
+            faults += self._key_faults(path, host)
+        except SecurityError as error:
+            faults.append(str(error))
+        return Entry(host, node, path, found, tuple(faults), warning)
+
+    @staticmethod
+    def _key_faults(path: Path, host: str) -> Iterator[str]:
+        key = path.with_suffix(".key")
+        if not key.exists():
+            if host:
+                yield f"{key.name} is not there"
+            return
+        if fault := open_to_others(key):
+            yield fault
+        if not ca.key_fits(Pair(_get(path), _get(key))):
+            yield f"{key.name} belongs to another certificate"
+
+
+def open_to_others(key: Path) -> str:
+    """Who else can read a private key, empty when nobody can."""
+    mode = stat.S_IMODE(key.stat().st_mode)
+    if mode & 0o077:
+        return f"{key} can be read by others (mode {mode:o}): chmod 600 {key}"
+    return ""
+
+
+def _get(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SecurityError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def _put(path: Path, content: bytes, mode: int) -> None:
+    """Write a file that has its mode from its first byte on."""
+    beside = path.with_name(f".{path.name}.new")
+    try:
+        beside.unlink(missing_ok=True)
+        number = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        with os.fdopen(number, "wb") as file:
+            file.write(content)
+        beside.chmod(mode)
+        beside.replace(path)
+    except OSError as error:
+        raise SecurityError(f"{path} cannot be written: {error.strerror}") from error

@@ -1,0 +1,221 @@
+"""The table of roles, and the rules for Zenoh that are made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.keys import Keys, covers
+from vla_zenoh.profile import Profile, load_profile, override
+from vla_zenoh.profile.schema import NODE_KINDS
+from vla_zenoh.security.identity import (
+    ROLE_OF_KIND,
+    Identity,
+    Role,
+    identities,
+    identities_of,
+)
+from vla_zenoh.security.roles import TABLE, Act, Right, expressions, key_members, rights
+from vla_zenoh.security.rules import Passage, access_control, allows, missing, passages
+
+KEYS = Keys("panda")
+LAB = {
+    "session": {
+        "listen": ["tls/10.0.0.2:7447"],
+        "connect": ["tls/10.0.0.2:7447"],
+        "security": {"people": {"desk": "operator", "wall": "viewer"}},
+    },
+    "workers": ["scripted", "replay"],
+    "hosts": {
+        "robot": {"nodes": ["router", "sim", "command"]},
+        "eyes": {"nodes": ["camera"], "cameras": ["front"]},
+        "gpu": {"nodes": ["worker", "camera"], "cameras": ["wrist"]},
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def lab() -> Profile:
+    return override(load_profile("panda_sim"), LAB)
+
+
+def who(lab: Profile, common_name: str) -> Identity:
+    return next(one for one in identities(lab) if one.common_name == common_name)
+
+
+def test_every_key_has_a_row_in_the_table_of_roles() -> None:
+    assert sorted(row.member for row in TABLE) == sorted(key_members())
+
+
+def test_every_kind_of_node_has_a_role() -> None:
+    assert set(NODE_KINDS) <= set(ROLE_OF_KIND)
+
+
+@pytest.mark.parametrize("row", TABLE, ids=lambda row: row.member)
+def test_every_key_is_written_by_somebody_and_read_by_somebody(row) -> None:
+    said = row.put | row.answer | row.announce
+    heard = row.subscribe | row.ask | row.watch
+    assert said
+    assert heard
+
+
+def test_a_lab_has_one_identity_for_each_node_and_for_its_people(lab: Profile) -> None:
+    assert {one.common_name: one.role for one in identities(lab)} == {
+        "router@robot": Role.ROUTER,
+        "sim@robot": Role.ROBOT,
+        "command@robot": Role.COMMAND,
+        "operator@robot": Role.OPERATOR,
+        "camera-eyes@eyes": Role.CAMERA,
+        "viewer@eyes": Role.VIEWER,
+        "worker-scripted@gpu": Role.WORKER,
+        "worker-replay@gpu": Role.WORKER,
+        "camera-gpu@gpu": Role.CAMERA,
+        "viewer@gpu": Role.VIEWER,
+        "operator@desk": Role.OPERATOR,
+        "viewer@wall": Role.VIEWER,
+    }
+
+
+def test_an_unknown_host_is_refused_with_those_that_are_known(lab: Profile) -> None:
+    with pytest.raises(ProfileError, match=r"knows: desk, eyes, gpu, robot, wall.*--role viewer"):
+        identities_of(lab, "attic")
+
+
+def may(lab: Profile, common_name: str, act: Act) -> set[str]:
+    return {
+        KEYS.short(right.key) for right in rights(KEYS, who(lab, common_name)) if right.act is act
+    }
+
+
+def test_a_worker_writes_its_own_keys_only(lab: Profile) -> None:
+    assert may(lab, "worker-scripted@gpu", Act.PUT) == {
+        "delta/scripted",
+        "spec/scripted",
+        "seen/scripted/*",
+        "status/worker-scripted",
+        "event/worker-scripted",
+    }
+
+
+def test_a_camera_host_writes_its_own_cameras_only(lab: Profile) -> None:
+    assert may(lab, "camera-eyes@eyes", Act.PUT) == {
+        "camera/front/raw",
+        "camera/front/jpeg",
+        "status/camera-eyes",
+        "event/camera-eyes",
+    }
+
+
+def test_only_the_command_node_writes_commands_and_only_the_robot_writes_states(
+    lab: Profile,
+) -> None:
+    for identity in identities(lab):
+        written = may(lab, identity.common_name, Act.PUT)
+        assert bool({"command/pose", "command/joint"} & written) == (identity.role is Role.COMMAND)
+        assert bool({"state/pose", "state/joint"} & written) == (identity.role is Role.ROBOT)
+
+
+def test_only_an_operator_says_what_is_to_be_done(lab: Profile) -> None:
+    orders = {"prompt", "active", "worker", "rate", "stop", "reset", "sim/reset"}
+    for identity in identities(lab):
+        written = may(lab, identity.common_name, Act.PUT)
+        assert written & orders == (orders if identity.role is Role.OPERATOR else set())
+
+
+def test_a_viewer_writes_nothing_and_sees_no_picture(lab: Profile) -> None:
+    assert may(lab, "viewer@wall", Act.PUT) == set()
+    seen = may(lab, "viewer@wall", Act.SUBSCRIBE)
+    assert "status/*" in seen
+    assert not any(key.startswith(("camera/", "seen/")) for key in seen)
+
+
+def test_a_wild_key_covers_those_it_means() -> None:
+    assert covers("vla/panda/**", "vla/panda/delta/*")
+    assert covers("**", "vla")
+    assert covers("a/**/d", "a/b/c/d")
+    assert not covers("vla/panda/delta/scripted", "vla/panda/delta/*")
+    assert not covers("vla/panda/*", "vla/panda/delta/x")
+    assert not covers("vla/panda/*", "vla/panda/**")
+    assert not covers("vla/panda/delta", "vla/panda/deltas")
+
+
+@given(st.lists(st.sampled_from(["a", "b", "*", "**"]), min_size=1, max_size=5))
+def test_every_key_covers_itself_and_is_covered_by_everything(parts: list[str]) -> None:
+    key = "/".join(parts)
+    assert covers(key, key) or "**" in parts[1:]
+    assert covers("**", key)
+
+
+def every_possible_act(lab: Profile) -> Iterator[Right]:
+    """Everything anybody could try, in anybody's name."""
+    people = [one for one in identities(lab) if one.role is not Role.ROUTER]
+    for one in people:
+        for other in people:
+            for row in TABLE:
+                for act in Act:
+                    for key in expressions(KEYS, row.member, other, act):
+                        yield Right(one, act, key)
+
+
+def test_the_rules_allow_exactly_what_the_table_says(lab: Profile) -> None:
+    config = access_control([lab])
+    granted = {(r.identity, r.act, r.key) for one in identities(lab) for r in rights(KEYS, one)}
+    tried = 0
+    for right in every_possible_act(lab):
+        lacking = missing(config, right.identity, right.act, right.key)
+        allowed = (right.identity, right.act, right.key) in granted
+        reads_all = right.identity.role is Role.OPERATOR and right.act is Act.SUBSCRIBE
+        assert (not lacking) == (allowed or reads_all), (right, lacking)
+        tried += 1
+    assert tried > 1000
+
+
+def test_a_rule_that_was_taken_out_is_named(lab: Profile) -> None:
+    config = access_control([lab])
+    worker = who(lab, "worker-scripted@gpu")
+    key = KEYS.delta("scripted")
+    assert missing(config, worker, Act.PUT, key) == []
+    config["rules"] = [
+        rule for rule in config["rules"] if "worker-scripted@gpu:egress:decl" not in rule["id"]
+    ]
+    lacking = missing(config, worker, Act.PUT, key)
+    assert [str(passage) for passage in lacking] == [f"egress declare_subscriber {key}"]
+
+
+def test_a_rule_that_denies_wins_and_a_disabled_section_allows_all(lab: Profile) -> None:
+    config = access_control([lab])
+    passage = Passage("ingress", "put", KEYS.prompt)
+    assert allows(config, "operator@desk", passage)
+    config["rules"].append({**config["rules"][0], "id": "no", "permission": "deny"})
+    config["rules"][-1].update(flows=["ingress"], messages=["put"], key_exprs=["vla/**"])
+    config["policies"].append({"rules": ["no"], "subjects": ["operator@desk"]})
+    assert not allows(config, "operator@desk", passage)
+    assert allows({**config, "enabled": False}, "stranger", passage)
+    assert not allows(config, "stranger", passage)
+
+
+def test_a_router_of_two_robots_lets_each_lab_at_its_own_robot_only(lab: Profile) -> None:
+    other = override(
+        lab, {"robot": {"name": "ur"}, "session": {"security": {"people": {"desk": "viewer"}}}}
+    )
+    other = override(
+        other, {"hosts": {"robot2": {"nodes": ["sim", "command", "camera", "worker"]}}}
+    )
+    config = access_control([lab, other])
+    robots = {"sim@robot": "panda", "sim@robot2": "ur"}
+    for common_name, own in robots.items():
+        for name in ("panda", "ur"):
+            put = Passage("ingress", "put", Keys(name).state_pose)
+            assert allows(config, common_name, put) == (name == own)
+    # One computer may drive one robot and only look at another.
+    assert allows(config, "operator@desk", Passage("ingress", "put", KEYS.prompt))
+    assert not allows(config, "operator@desk", Passage("ingress", "put", Keys("ur").prompt))
+
+
+@pytest.mark.parametrize("act", Act)
+def test_every_act_needs_the_router_on_the_way_in_and_on_the_way_out(act: Act) -> None:
+    assert {passage.flow for passage in passages(act, "k")} == {"ingress", "egress"}
