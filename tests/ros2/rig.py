@@ -17,10 +17,11 @@ from bridge import Bridge
 from camera_rig import free_endpoint
 from chain import Chain, running_chain
 from ros_node import free_domain
-from witness import Witness
+from witness import FloatArray, Witness
 
 ROBOT = Path(__file__).with_name("panda_robot.py")
 ROBOT_READY_S = 30.0
+STEP_M, MIDDLE_M, MOVING_M_S = 0.01, 0.45, 0.05
 WIDTH, HEIGHT, CAMERA_HZ, STATE_HZ = 160, 120, 20, 200
 
 PROFILE = """\
@@ -88,6 +89,48 @@ class Lab:
     bridge: Bridge
     witness: Witness
     chain: Chain
+
+    def settle(self) -> None:
+        """Whatever was before: inactive, standing, prompt ``hold``."""
+        self.chain.settle()
+        self.witness.wait_still()
+        self.witness.forget()
+        self.chain.recorder.forget()
+        self.chain.client.take_events()
+        assert not self.chain.failure, self.chain.failure
+
+    def activate_at_rest(self) -> FloatArray:
+        """Activate with prompt ``hold``; returns where the arm then stands."""
+        self.chain.client.set_prompt("hold")
+        self.chain.activate_when_ready()
+        return self.witness.wait_still()
+
+    def go_down_to(self, height_m: float) -> None:
+        """Bring the arm to this height or below, and leave it inactive."""
+        steps = round((self.witness.position_m()[2] - height_m) / STEP_M)
+        if steps > 0:
+            self.activate_at_rest()
+            self.chain.client.set_rate(15.0)
+            self.chain.go("down", steps, timeout_s=30.0)
+        self.settle()
+
+    def move(self) -> None:
+        """Activate with an endless motion away from the nearer end; returns when it is fast."""
+        up = self.witness.position_m()[2] < MIDDLE_M
+        self.chain.client.set_rate(10.0)
+        self.chain.client.set_prompt("HARD: go up" if up else "HARD: go down")
+        self.chain.activate_when_ready()
+        self.chain.until("it moves", lambda: self.witness.speed_m_s() > MOVING_M_S)
+
+    def when(self, what: str, since_ns: int) -> float:
+        """Seconds from `since_ns` to the first event of this name."""
+        found = [
+            header.stamp_wall_ns
+            for _, header, event in list(self.chain.client.events)
+            if event.what == what and header.stamp_wall_ns > since_ns
+        ]
+        assert found, f"no event {what}\n{self.story()}"
+        return (found[0] - since_ns) / 1e9
 
     def story(self) -> str:
         """For the message of a test that fails."""

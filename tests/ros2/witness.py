@@ -108,6 +108,11 @@ class Witness:
 
         return until("a pose of the robot", lambda: newest() is not None) and newest()
 
+    def width_m(self) -> float:
+        """How far the fingers are apart now."""
+        with self._lock:
+            return self.fingers_m[-1][1] if self.fingers_m else float("nan")
+
     def speed_m_s(self) -> float:
         """How fast it is, over the last 50 ms."""
         track = self.track(time.time_ns() - 60_000_000)
