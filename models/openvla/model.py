@@ -1,0 +1,251 @@
+# /// script
+# requires-python = ">=3.11,<3.14"
+# dependencies = [
+#     "bitsandbytes==0.50.2",
+#     "numpy>=1.26",
+#     "opencv-python-headless>=4.9",
+#     "safetensors==0.8.0",
+#     "timm==1.0.31",
+#     "tokenizers>=0.22",
+#     "torch==2.11.0",
+#     "torchvision==0.26.0",
+#     "transformers==5.23.0",
+# ]
+# ///
+"""OpenVLA (Kim et al., CoRL 2024) from a directory of weights, as published or fine-tuned.
+
+One picture and the prompt in, one step out: metres and radians by which the TCP shall go, in the
+axes of the robot's base, and how far the gripper shall be open. No code of the checkpoint runs.
+
+    vla-zenoh worker openvla --set checkpoint=DIR --set unnorm_key=bridge_orig
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from vla_zenoh_model_openvla.checkpoint import TOKENIZER, Checkpoint, read_checkpoint
+from vla_zenoh_model_openvla.picture import trained_form
+from vla_zenoh_model_openvla.statistics import AXES, choose, read_range
+from vla_zenoh_model_openvla.tokens import PROMPTS, ActionBins, prompt_text, prompt_tokens
+
+from vla_zenoh.errors import SpecError, WorkerError
+from vla_zenoh.policy import (
+    ActionSpec,
+    ActionSteps,
+    CameraSpec,
+    ModelSpec,
+    Observation,
+    ObservationSpec,
+)
+
+Device = str
+Dtype = Literal["auto", "bfloat16", "float16", "float32"]
+Quantise = Literal["none", "int8", "nf4"]
+Choice = Literal["auto", "yes", "no"]
+
+STEP_S: Mapping[str, float] = {
+    "bridge_orig": 1 / 5,
+    "fractal20220817_data": 1 / 3,
+    "libero_10_no_noops": 1 / 20,
+    "libero_goal_no_noops": 1 / 20,
+    "libero_object_no_noops": 1 / 20,
+    "libero_spatial_no_noops": 1 / 20,
+}
+"""How long a step lasts in data sets that say so: a delta at another rate is another speed."""
+AUGMENTED = "image_aug"
+"""What the published fine-tuning writes into the name of a run whose pictures were cropped."""
+
+
+class OpenVLA:
+    """See the module.
+
+    Args:
+        checkpoint: directory with ``config.json``, ``*.safetensors`` and ``tokenizer.json``.
+        unnorm_key: data set whose statistics turn numbers into metres; may be left out where there
+            is only one.
+        adapter: directory of a LoRA adapter that was not merged.
+        camera: the picture that the model is given.
+        dt_s: duration of a step; known for some data sets, and asked for otherwise.
+        center_crop: give it the middle 90 % of the picture. ``auto``: where the directory's name
+            says that it was trained with ``image_aug``.
+        template: prompt it was trained with, ``7b`` or ``v01``; ``auto``: by its Llama.
+        device: as torch names it; ``auto``: a GPU where there is one.
+        dtype: of weights; ``auto``: bfloat16 on a GPU, else float32.
+        quantise: ``int8`` or ``nf4``: Llama's layers in less memory.
+    """
+
+    def __init__(
+        self,
+        checkpoint: str = "",
+        unnorm_key: str = "",
+        adapter: str = "",
+        camera: str = "front",
+        dt_s: str = "auto",
+        center_crop: str = "auto",
+        template: str = "auto",
+        device: str = "auto",
+        dtype: str = "auto",
+        quantise: str = "none",
+    ) -> None:
+        if not checkpoint:
+            raise WorkerError("it needs weights: --set checkpoint=DIRECTORY")
+        _one_of("dtype", dtype, get_args(Dtype))
+        _one_of("quantise", quantise, get_args(Quantise))
+        _one_of("center_crop", center_crop, get_args(Choice))
+        _one_of("template", template, ("auto", *PROMPTS))
+        self._adapter = Path(adapter).expanduser() if adapter else None
+        self.checkpoint: Checkpoint = read_checkpoint(Path(checkpoint).expanduser(), self._adapter)
+        found = self.checkpoint
+        self._key = choose(found.statistics, unnorm_key, found.statistics_file)
+        self._range = read_range(found.statistics, self._key)
+        self.bins = ActionBins(found.text_vocabulary, found.bins)
+        self._template = found.template if template == "auto" else template
+        trained = AUGMENTED in str(self._adapter or found.folder.resolve())
+        self._crop = trained if center_crop == "auto" else center_crop == "yes"
+        self._device, self._dtype, self._quantise = device, dtype, quantise
+        self._camera = camera
+        self.spec = ModelSpec(
+            name="openvla",
+            observation=ObservationSpec(
+                # The picture as it comes: shrinking it is a part of what the model was trained on.
+                cameras=(CameraSpec(camera=camera),),
+                state=(),
+                prompt=True,
+            ),
+            action=ActionSpec(
+                horizon=1,
+                dt_s=_step_s(dt_s, self._key),
+                kind="delta",
+                frame="base",
+                rotation="rpy",
+                gripper="open_fraction",
+                gripper_open_is_high=True,
+                normalisation=self._key,
+            ),
+        )
+        self._network: Any = None
+        self._tokenizer: Any = None
+        self._details: dict[str, Any] = {}
+
+    @property
+    def last_details(self) -> Mapping[str, Any]:
+        """Of the last `infer`: ``prompt``, ``ids``, ``tokens``, ``normalised``, ``picture``.
+
+        The text and its tokens as the model read them, the action's tokens, their numbers in
+        [-1, 1], and the (224, 224, 3) picture before it is normalised. Empty before the first one.
+        """
+        return self._details
+
+    def load(self) -> None:
+        """Read the weights and try them once.
+
+        Raises:
+            WorkerError: they are damaged, or not those of the config.
+        """
+        import torch
+        from tokenizers import Tokenizer
+        from vla_zenoh_model_openvla.load import load_network
+        from vla_zenoh_model_openvla.quantise import quantise
+
+        device = self._device
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        name = self._dtype
+        if name == "auto":
+            name = "float32" if device == "cpu" else "bfloat16"
+        file = self.checkpoint.folder / TOKENIZER
+        try:
+            self._tokenizer = Tokenizer.from_file(str(file))
+            torch.zeros(1, device=device)
+        except Exception as error:  # tokenizers and torch raise plain Exception or AssertionError
+            culprit = file if self._tokenizer is None else f"device {device!r}"
+            raise WorkerError(f"{culprit} cannot be used: {error}") from error
+        self._tokenizer.no_truncation()
+        self._tokenizer.no_padding()
+        network = load_network(
+            self.checkpoint, device=device, dtype=getattr(torch, name), adapter=self._adapter
+        )
+        quantise(network, self._quantise)
+        self._network = network
+        self._must_see()
+
+    def _must_see(self) -> None:
+        """Two pictures must look different: on newer libraries the published code sees none."""
+        import torch
+
+        noise = np.random.default_rng(0).integers(0, 256, (224, 224, 3), dtype=np.uint8)
+        with torch.inference_mode():
+            eyes = self._network.vision_backbone
+            gray, mixed = (eyes(self._pixels(p)) for p in (np.full_like(noise, 128), noise))
+            if not torch.isfinite(mixed).all():
+                raise WorkerError("the picture encoders compute NaN or infinity")
+            if torch.equal(gray, mixed):
+                raise WorkerError("the picture encoders answer alike whatever the picture is")
+        # The first inference of a process costs much more than the others.
+        self._network.act(self.ids("stand still"), self._pixels(noise), AXES)
+
+    def ids(self, task: str) -> list[int]:
+        """Tokens of the prompt for a task in a person's words.
+
+        Raises:
+            SpecError: more than the model reads.
+        """
+        text = prompt_text(self._template, task)
+        config = self._network.language_model.config
+        found = self._tokenizer.encode(text, add_special_tokens=True).ids
+        if not found or found[0] != config.bos_token_id:
+            found = [config.bos_token_id, *found]
+        ids = prompt_tokens(found)
+        if len(ids) + self._network.vision_backbone.patches + AXES > config.max_position_embeddings:
+            raise SpecError(f"a prompt of {len(ids)} tokens is more than the model reads")
+        return ids
+
+    def _pixels(self, picture: Any) -> Any:
+        return self._network.vision_backbone.look(
+            picture, device=self._network.device, dtype=self._network.dtype
+        )
+
+    def infer(self, observation: Observation) -> ActionSteps:
+        """One step for the newest picture.
+
+        Raises:
+            SpecError: the model answered with something that is no action.
+            WorkerError: it computes NaN.
+        """
+        picture = trained_form(observation.images[self._camera], crop=self._crop)
+        ids = self.ids(observation.prompt)
+        tokens = self._network.act(ids, self._pixels(picture), AXES)
+        self._details = {
+            "prompt": prompt_text(self._template, observation.prompt),
+            "ids": ids,
+            "tokens": tokens,
+            "picture": picture,
+        }
+        normalised = self.bins.decode(tokens)
+        self._details["normalised"] = normalised.tolist()
+        step = self._range.expand(normalised)
+        step[-1] = np.clip(step[-1], 0.0, 1.0)
+        return ActionSteps(step[None])
+
+
+def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise WorkerError(f"{name} is {value!r}; it may be {', '.join(allowed)}")
+
+
+def _step_s(given: str, key: str) -> float:
+    if given == "auto":
+        if key not in STEP_S:
+            raise WorkerError(
+                f"how long does a step of {key!r} last? Say so with --set dt_s=SECONDS "
+                "(a delta that is carried out at another rate is another speed)"
+            )
+        return STEP_S[key]
+    try:
+        return float(given)
+    except ValueError as error:
+        raise WorkerError(f"dt_s is {given!r}; wanted seconds") from error

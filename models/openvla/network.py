@@ -1,0 +1,192 @@
+"""The network of OpenVLA on current torch, timm and transformers: two eyes, projector, Llama.
+
+Names of parameters are those of the published checkpoints. Nothing of a checkpoint is executed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import timm
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from transformers import DynamicCache, LlamaConfig, LlamaForCausalLM
+from vla_zenoh_model_openvla.checkpoint import Backbone, Checkpoint
+
+from vla_zenoh.errors import WorkerError
+
+PROJECTOR_GROWTH = 4
+"""The first layer behind two eyes is so many times wider than what they see."""
+
+
+class Eyes(nn.Module):
+    """One or two picture encoders whose features are put side by side.
+
+    Args:
+        backbones: architectures.
+    """
+
+    def __init__(self, backbones: Sequence[Backbone]) -> None:
+        super().__init__()
+        self.featurizer = _encoder(backbones[0])
+        self.fused_featurizer = _encoder(backbones[1]) if len(backbones) > 1 else None
+        self.sides = [backbone.side for backbone in backbones]
+        counts = {encoder.patch_embed.num_patches for encoder in self.encoders()}
+        if len(counts) > 1:
+            raise WorkerError(f"encoders that cut a picture into {sorted(counts)} patches")
+        self.patches: int = counts.pop()
+
+    def encoders(self) -> list[Any]:
+        """In the order of the picture's channels."""
+        return [self.featurizer] + ([self.fused_featurizer] if self.fused_featurizer else [])
+
+    @property
+    def width(self) -> int:
+        """Numbers that are seen in each patch."""
+        return sum(encoder.embed_dim for encoder in self.encoders())
+
+    def look(
+        self, rgb: NDArray[np.uint8], *, device: torch.device, dtype: torch.dtype
+    ) -> list[Tensor]:
+        """One normalised (1, 3, S, S) picture for each encoder, from one (H, W, 3) uint8 RGB."""
+        pixels = torch.from_numpy(np.ascontiguousarray(rgb)).permute(2, 0, 1)[None].float()
+        return [
+            _normalised(_square(pixels, side), encoder.pretrained_cfg).to(device, dtype)
+            for encoder, side in zip(self.encoders(), self.sides, strict=True)
+        ]
+
+    def forward(self, pixels: Sequence[Tensor]) -> Tensor:
+        """(1, patches, width) from one normalised (1, 3, S, S) picture for each encoder."""
+        seen = [
+            # The last block is left out, as in training: its features are made for its own task.
+            encoder.get_intermediate_layers(picture, n=[len(encoder.blocks) - 2])[0]
+            for encoder, picture in zip(self.encoders(), pixels, strict=True)
+        ]
+        return torch.cat(seen, dim=2)
+
+
+def _square(pixels: Tensor, side: int) -> Tensor:
+    if pixels.shape[-2:] == (side, side):
+        return pixels
+    scaled = nn.functional.interpolate(
+        pixels, (side, side), mode="bicubic", align_corners=False, antialias=True
+    )
+    return scaled.round().clamp(0, 255)
+
+
+def _normalised(pixels: Tensor, trained: Mapping[str, Any]) -> Tensor:
+    mean, std = (torch.tensor(trained[name]).view(1, 3, 1, 1) for name in ("mean", "std"))
+    return (pixels / 255 - mean) / std
+
+
+def _encoder(backbone: Backbone) -> nn.Module:
+    try:
+        return timm.create_model(
+            backbone.name,
+            pretrained=False,
+            num_classes=0,
+            img_size=backbone.side,
+            act_layer=backbone.activation,
+            **backbone.arguments,
+        )
+    except (RuntimeError, TypeError, ValueError, AssertionError) as error:
+        raise WorkerError(f"timm cannot make {backbone.name!r}: {error}") from error
+
+
+class Projector(nn.Module):
+    """From what the eyes see to what Llama reads; deeper behind two eyes than behind one."""
+
+    def __init__(self, seen: int, read: int, *, deep: bool) -> None:
+        super().__init__()
+        first = PROJECTOR_GROWTH * seen if deep else read
+        self.fc1 = nn.Linear(seen, first)
+        self.fc2 = nn.Linear(first, read)
+        self.fc3 = nn.Linear(read, read) if deep else None
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(1, patches, read) of (1, patches, seen)."""
+        out = self.fc2(nn.functional.gelu(self.fc1(features)))
+        return out if self.fc3 is None else self.fc3(nn.functional.gelu(out))
+
+
+class Network(nn.Module):
+    """Pictures and prompt in, action tokens out.
+
+    Args:
+        checkpoint: sizes; weights come later, see `load.load_network`.
+    """
+
+    def __init__(self, checkpoint: Checkpoint) -> None:
+        super().__init__()
+        try:
+            text = LlamaConfig(**checkpoint.text)
+            self.language_model = LlamaForCausalLM(text)
+        except (RuntimeError, TypeError, ValueError) as error:
+            raise WorkerError(f"text_config of {checkpoint.folder}: {error}") from error
+        self.vision_backbone = Eyes(checkpoint.backbones)
+        self.projector = Projector(
+            self.vision_backbone.width, text.hidden_size, deep=len(checkpoint.backbones) > 1
+        )
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.projector.fc1.weight.dtype
+
+    @property
+    def device(self) -> torch.device:
+        return self.projector.fc1.weight.device
+
+    def read(self, ids: Sequence[int], patches: Tensor) -> Tensor:
+        """(1, T + P, width): the prompt's embeddings with the picture's patches behind the first.
+
+        Args:
+            ids: T tokens of the prompt, the first one is the beginning of the text.
+            patches: (1, P, width) of the projector.
+        """
+        words = self.language_model.get_input_embeddings()(
+            torch.tensor([list(ids)], device=self.device)
+        )
+        return torch.cat([words[:, :1], patches.to(words.dtype), words[:, 1:]], dim=1)
+
+    def begin(self, embeddings: Tensor) -> tuple[Tensor, DynamicCache]:
+        """Read the whole prompt; the (1, vocabulary) logits of the next token and the cache."""
+        return self._step(DynamicCache(), inputs_embeds=embeddings)
+
+    def go_on(self, token: Tensor, cache: DynamicCache) -> tuple[Tensor, DynamicCache]:
+        """Read one more (1,) token; likewise."""
+        return self._step(cache, input_ids=token[:, None])
+
+    def _step(self, cache: DynamicCache, **given: Tensor) -> tuple[Tensor, DynamicCache]:
+        out = self.language_model(**given, past_key_values=cache, use_cache=True, logits_to_keep=1)
+        return out.logits[:, -1], cache
+
+    @torch.inference_mode()
+    def act(self, ids: Sequence[int], pixels: Sequence[Tensor], count: int) -> list[int]:
+        """The `count` most likely tokens, each after the ones before it.
+
+        No end-of-text ends it early: an action always has all its numbers.
+
+        Raises:
+            WorkerError: a logit is not a number.
+        """
+        logits, cache = self.begin(self.read(ids, self.projector(self.vision_backbone(pixels))))
+        tokens = [best(logits)]
+        for _ in range(count - 1):
+            logits, cache = self.go_on(tokens[-1], cache)
+            tokens.append(best(logits))
+        return [int(token) for token in torch.cat(tokens).tolist()]
+
+
+def best(logits: Tensor) -> Tensor:
+    """(1,) the most likely token.
+
+    Raises:
+        WorkerError: a logit is not a number, so none is the most likely one.
+    """
+    most, token = logits.max(dim=-1)
+    if not torch.isfinite(most).all():
+        raise WorkerError("the network computes NaN or infinity; try --set dtype=float32")
+    return token
