@@ -238,6 +238,10 @@ class Keys:
         """`key` without the root and robot, as people say it; other keys as they are."""
         return key.removeprefix(f"{self.root}/{self.robot}/")
 
+    def whole(self, key: str) -> str:
+        """The way back of `short`; what begins with the root is taken as whole already."""
+        return key if key.startswith(f"{self.root}/") else self._at(key)
+
     def group(self, key: str) -> str:
         """The first part below the robot: ``camera``, ``state``, ``prompt``; of others nothing."""
         return self.short(key).split("/", 1)[0] if key.startswith(self._at("")) else ""

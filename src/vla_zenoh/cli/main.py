@@ -20,6 +20,7 @@ from vla_zenoh.cli import (
     echo,
     keys,
     profile,
+    record,
     ros2,
     router,
     secure,
@@ -39,7 +40,10 @@ EXTRA_OF = {
     "mujoco": "sim",
     "matplotlib": "sim",
     "av": "sim",
-    "rosbags": "ros2",
+    "mcap": "record",
+    "plotly": "record",
+    "jinja2": "record",
+    "rosbags": "record",
 }
 """Modules of the extras, for whoever starts a node whose extra is not installed."""
 NODES = frozenset({"up", "router", "sim", "ros2", "camera", "worker", "command"})
@@ -89,6 +93,7 @@ for panel, name, function in (
     (DRIVE, "rate", switches.rate),
     (DRIVE, "stop", switches.stop),
     (DRIVE, "reset", switches.reset),
+    (LOOK, "record", record.record),
     (LOOK, "status", status.status),
     (LOOK, "echo", echo.echo),
     (LOOK, "keys", keys.keys),

@@ -29,7 +29,7 @@ def run_node(
     profile: Profile,
     run: Callable[[zenoh.Session, threading.Event], None],
     *,
-    identity: str,
+    identity: str | None,
     wait_s: float | None = None,
 ) -> None:
     """Open a session and run a node in it until a signal comes.
@@ -37,7 +37,7 @@ def run_node(
     Args:
         profile: the session section is used.
         run: makes the node and runs it.
-        identity: the node's name, for its certificate.
+        identity: the node's name, for its certificate; None: the people's at this computer.
         wait_s: patience with a router that does not answer; longer under a supervisor, which may
             be starting it.
 

@@ -28,7 +28,7 @@ from vla_zenoh.keys import Keys
 from vla_zenoh.recording import cdr
 from vla_zenoh.recording.definitions import SAMPLE_NAME, Unfit, type_name
 from vla_zenoh.recording.kinds import Kinds
-from vla_zenoh.recording.sample import JPEG, MSGPACK, RAW, TEXT, Sample
+from vla_zenoh.recording.sample import JPEG, MSGPACK, RAW, Sample
 from vla_zenoh.recording.spool import Spool
 from vla_zenoh.recording.views import VIEWS
 
@@ -146,8 +146,6 @@ class RunWriter:
     def _write_message(self, sample: Sample) -> None:
         header, encoding = sample.header, sample.encoding
         if header is None:
-            if sample.attachment is not None or not encoding.startswith(TEXT):
-                raise Unfit
             self._write_text(sample)
         elif header.seq >= MAX_SEQ or not header.source:
             raise Unfit
@@ -161,6 +159,9 @@ class RunWriter:
             raise Unfit
 
     def _write_text(self, sample: Sample) -> None:
+        # Any client may put a setting, and few say that it is text.
+        if sample.attachment is not None or self._kind(sample.key) is not None:
+            raise Unfit
         try:
             text = sample.payload.decode()
             data = cdr.serialize(cdr.TEXT, text)

@@ -1,0 +1,206 @@
+"""A recorded run as records: what evaluation, viewers and exports work on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from vla_zenoh.errors import CodecError
+from vla_zenoh.keys import Keys, last
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.recording.reader import RunFile, open_recording
+from vla_zenoh.recording.sample import JPEG
+from vla_zenoh.types import (
+    ActionChunk,
+    Cause,
+    Event,
+    GripperCommand,
+    GripperState,
+    Header,
+    JointCommand,
+    JointState,
+    NodeStatus,
+    ObjectPoses,
+    PoseCommand,
+    PoseState,
+    Task,
+)
+
+MAX_PROBLEMS = 20
+
+
+class Heard(NamedTuple):
+    """A record, its header, when it was heard (wall clock of the recorder), and on which key."""
+
+    header: Header
+    record: Any
+    heard_ns: int
+    key: str
+
+
+class Picture(NamedTuple):
+    """A JPEG file, when it was heard, and when it was taken."""
+
+    heard_ns: int
+    stamp_ns: int
+    seq: int
+    jpeg: bytes
+
+
+class Setting(NamedTuple):
+    """What somebody put on a setting's key."""
+
+    heard_ns: int
+    name: str
+    text: str
+
+
+@dataclass(slots=True)
+class Run:
+    """All records of one robot in a file, oldest first; a minute is some 60 MB of memory.
+
+    Pictures stay in the file: see `pictures`.
+    """
+
+    file: RunFile
+    poses: list[Heard] = field(default_factory=list)
+    joints: list[Heard] = field(default_factory=list)
+    grippers: list[Heard] = field(default_factory=list)
+    commands: list[Heard] = field(default_factory=list)
+    joint_commands: list[Heard] = field(default_factory=list)
+    gripper_commands: list[Heard] = field(default_factory=list)
+    chunks: list[Heard] = field(default_factory=list)
+    tasks: list[Heard] = field(default_factory=list)
+    events: list[Heard] = field(default_factory=list)
+    objects: list[Heard] = field(default_factory=list)
+    specs: dict[str, ModelSpec] = field(default_factory=dict)
+    """By hash."""
+    statuses: dict[str, NodeStatus] = field(default_factory=dict)
+    """The last of every node."""
+    first_statuses: dict[str, NodeStatus] = field(default_factory=dict)
+    """The first of every node."""
+    settings: list[Setting] = field(default_factory=list)
+    picture_counts: Counter[str] = field(default_factory=Counter)
+    """Pictures by camera."""
+    problems: list[str] = field(default_factory=list)
+    """What could not be read, in words."""
+    began_ns: int = 0
+    """When the first sample was heard."""
+    ended_ns: int = 0
+    """When the last one was."""
+
+    @property
+    def path(self) -> Path:
+        """Of the file."""
+        return self.file.path
+
+    @property
+    def keys(self) -> Keys:
+        """Of the robot."""
+        return self.file.keys
+
+    @property
+    def seconds(self) -> float:
+        """From the first sample to the last."""
+        return (self.ended_ns - self.began_ns) / 1e9
+
+    def prompts(self) -> list[tuple[int, str]]:
+        """(wall ns, prompt) of each prompt that was put."""
+        return [(put.heard_ns, put.text) for put in self.settings if put.name == "prompt"]
+
+    def first_commands(self) -> list[tuple[Cause, int]]:
+        """For each chunk the first command that carries it out, and when it was heard."""
+        out: list[tuple[Cause, int]] = []
+        newest: tuple[str, int] | None = None
+        for entry in self.commands or self.joint_commands:
+            cause = entry.record.cause
+            if cause is not None and (cause.worker, cause.chunk_seq) != newest:
+                newest = (cause.worker, cause.chunk_seq)
+                out.append((cause, entry.heard_ns))
+        return out
+
+
+def load_run(path: Path) -> Run:
+    """Read a file of ``vla-zenoh record``; what cannot be read is in `Run.problems`.
+
+    Raises:
+        RecordingError: it cannot be opened at all, or is of another program.
+        MissingExtraError: rosbags is not installed.
+    """
+    file = open_recording(path)
+    run, keys, refused = Run(file), file.keys, Counter[str]()
+    lists = {
+        PoseState: run.poses,
+        JointState: run.joints,
+        GripperState: run.grippers,
+        PoseCommand: run.commands,
+        JointCommand: run.joint_commands,
+        GripperCommand: run.gripper_commands,
+        ActionChunk: run.chunks,
+        Task: run.tasks,
+        Event: run.events,
+        ObjectPoses: run.objects,
+    }
+    for entry in file.entries(_of_interest(keys)):
+        run.began_ns = run.began_ns or entry.heard_ns
+        run.ended_ns = max(run.ended_ns, entry.heard_ns)
+        if entry.kind is None:
+            if entry.header is None and entry.attachment is None:
+                run.settings.append(Setting(entry.heard_ns, keys.short(entry.key), entry.text))
+            elif entry.encoding == JPEG:
+                run.picture_counts[_camera(keys, entry.key)] += 1
+            else:
+                refused[f"{keys.short(entry.key)}: bytes that are no record"] += 1
+            continue
+        try:
+            record = entry.record()
+        except CodecError as error:
+            refused[f"{keys.short(entry.key)}: {error.reason} records"] += 1
+            continue
+        if entry.header is None:
+            continue
+        _keep(run, lists, Heard(entry.header, record, entry.heard_ns, entry.key))
+    if file.damage:
+        run.problems.append(f"{path.name} is {file.damage}; evaluated up to there")
+    run.problems += [f"{what} ({count})" for what, count in refused.most_common(MAX_PROBLEMS)]
+    return run
+
+
+def _of_interest(keys: Keys) -> Callable[[str], bool]:
+    """Everything of the robot but raw pictures, and what models saw of them."""
+
+    def wanted(key: str) -> bool:
+        group = keys.group(key)
+        if group == "camera":
+            return key == keys.camera_jpeg(_camera(keys, key))
+        return group not in ("", "seen")
+
+    return wanted
+
+
+def _camera(keys: Keys, key: str) -> str:
+    return keys.short(key).split("/")[1]
+
+
+def _keep(run: Run, lists: dict[type, list[Heard]], heard: Heard) -> None:
+    kept = lists.get(type(heard.record))
+    if kept is not None:
+        kept.append(heard)
+    elif isinstance(heard.record, ModelSpec):
+        run.specs[heard.record.hash] = heard.record
+    elif isinstance(heard.record, NodeStatus):
+        node = last(heard.key)
+        run.first_statuses.setdefault(node, heard.record)
+        run.statuses[node] = heard.record
+
+
+def pictures(file: RunFile, camera: str) -> Iterator[Picture]:
+    """Every JPEG of a camera, oldest first, one in memory at a time."""
+    key = file.keys.camera_jpeg(camera)
+    for entry in file.entries(lambda each: each == key):
+        if entry.header is not None and entry.encoding == JPEG:
+            stamp_ns, seq = entry.header.stamp_wall_ns, entry.header.seq
+            yield Picture(entry.heard_ns, stamp_ns, seq, entry.data)
