@@ -38,6 +38,9 @@ def worker(
         Literal["auto", "raw", "jpeg"],
         typer.Option(help="Pictures to listen to; auto: raw when the cameras are on this host."),
     ] = "auto",
+    delay_ms: Annotated[
+        float, typer.Option("--delay", min=0, help="Let every inference take so many ms longer.")
+    ] = 0.0,
     host: HostOption = None,
     python: Annotated[
         str | None, typer.Option("--python", help="Interpreter of a prepared environment.")
@@ -54,7 +57,7 @@ def worker(
     run_node(
         loaded,
         lambda session, stop: WorkerNode(
-            loaded, session, policy, name or found.name, images=form
+            loaded, session, policy, name or found.name, images=form, delay_s=delay_ms / 1e3
         ).run(stop),
         identity=worker_node(name or found.name),
     )

@@ -51,6 +51,7 @@ def node_commands(
     host: str,
     profile_file: Path,
     worker_options: Mapping[str, Sequence[str]] | None = None,
+    worker_arguments: Sequence[str] = (),
 ) -> list[NodeCommand]:
     """Command lines of all nodes of `host`, in the order to start them."""
     part = profile.hosts[host]
@@ -60,7 +61,7 @@ def node_commands(
         name = node_name(profile, host, kind)
         if kind == "worker":
             for worker in part.workers or profile.workers:
-                arguments = ["worker", worker, *common, "--host", host]
+                arguments = ["worker", worker, *common, "--host", host, *worker_arguments]
                 for option in (worker_options or {}).get(worker, ()):
                     arguments += ["--set", option]
                 commands.append(NodeCommand(worker_node(worker), kind, tuple(arguments)))
@@ -84,6 +85,7 @@ class Host:
         tell: (node, sentence) for what happens to them.
         own_router: refuse to use a router that answers already.
         worker_options: worker -> ``name=value`` options.
+        worker_arguments: more of the command line of every worker.
 
     Raises:
         NodeError: a router answers although `own_router`.
@@ -98,6 +100,7 @@ class Host:
         tell: Callable[[str, str], None],
         own_router: bool = False,
         worker_options: Mapping[str, Sequence[str]] | None = None,
+        worker_arguments: Sequence[str] = (),
     ) -> None:
         self.host, part = choose_host(profile, host)
         changes: dict[str, Any] = {}
@@ -113,7 +116,7 @@ class Host:
         self.profile_file = Path(self._folder.name) / f"{profile.name}.yaml"
         self.profile_file.write_text(to_yaml(profile), "utf-8")
         self.supervisor = Supervisor(
-            node_commands(profile, self.host, self.profile_file, worker_options),
+            node_commands(profile, self.host, self.profile_file, worker_options, worker_arguments),
             log=log,
             tell=tell,
             folder=Path(self._folder.name),

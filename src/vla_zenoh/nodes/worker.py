@@ -63,6 +63,7 @@ class WorkerNode:
         name: of the worker.
         images: which form of pictures to listen to. Between processes of one host raw ones travel
             through shared memory and cost least; between hosts JPEG is a tenth of the bytes.
+        delay_s: let every inference take so much longer: what a slower computer would do.
     """
 
     def __init__(
@@ -73,7 +74,9 @@ class WorkerNode:
         name: str,
         *,
         images: Literal["raw", "jpeg"] = "raw",
+        delay_s: float = 0.0,
     ) -> None:
+        self._delay_s = delay_s
         node = self.node = Node(worker_node(name), profile, session)
         self.policy, self.name, self.spec = policy, name, policy.spec
         keys = node.keys
@@ -261,6 +264,8 @@ class WorkerNode:
             return self._failed(error.reason, str(error))
         except Exception as error:
             return self._failed("inference_failed", f"{type(error).__name__}: {error}")
+        if self._delay_s:
+            time.sleep(self._delay_s)
         end_ns = self.node.clock.wall_ns()
         self._inference_ms.add((end_ns - start_ns) / 1e6)
         horizon_ns = int(len(steps) * self.spec.action.dt_s * 1e9)
