@@ -20,7 +20,7 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     client,
 )
-from vla_zenoh.cli.output import console, fail, print_json
+from vla_zenoh.cli.output import console, fail, print_json, printable
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.types import Event, Header, NodeStatus
 
@@ -96,7 +96,25 @@ def _picture(robot: Client, events: list[tuple[str, Header, Event]]) -> Group:
         )
     lines = [_latency(name, found) for name, (found, _, _) in robot.snapshot().items()]
     news = [_event(*happened) for happened in events[-MAX_EVENTS:]]
-    return Group(table, *(line for line in lines if line), *news)
+    return Group(table, *_open_to_all(robot), *(line for line in lines if line), *news)
+
+
+def _open_to_all(robot: Client) -> list[Text]:
+    """In red: that strangers may command the robot, by the profile's word or a router's."""
+    said = {
+        name: found.detail.get("listen")
+        for name, (found, _, _) in robot.snapshot().items()
+        if found.detail.get("security") == "insecure"
+    }
+    if not said and not robot.profile.session.insecure:
+        return []
+    where = "; ".join(
+        f"{name} listens on {', '.join(map(str, listen))}"
+        for name, listen in said.items()
+        if isinstance(listen, (list, tuple))
+    )
+    words = "insecure: everybody on the network can command this robot"
+    return [Text(printable(f"{words} ({where})" if where else words), style="bold red")]
 
 
 def _latency(name: str, found: NodeStatus) -> Text | None:
