@@ -18,8 +18,6 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 from vla_zenoh.types import (
-    EVENT_KINDS,
-    EVENT_LEVELS,
     ActionChunk,
     Cause,
     Event,
@@ -36,6 +34,7 @@ from vla_zenoh.types import (
     SceneState,
     Task,
 )
+from vla_zenoh.types.reports import EVENT_KINDS, EVENT_LEVELS
 
 MAX_COMPONENT = 1e6
 

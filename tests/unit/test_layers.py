@@ -23,6 +23,7 @@ FORBIDDEN = {
     "bench": PURE - {"asyncio"},  # openpi's server is one of asyncio
     "check": PURE,
     "codec": PURE,
+    "types": PURE,
     "control": PURE,
     "interop": PURE,
     "profile": PURE,

@@ -1,0 +1,54 @@
+"""Records that travel on keys: frozen, checked, units in their names.
+
+A record that exists is valid: arrays have their shape, are finite, contiguous and read-only,
+quaternions are unit. Who makes one from bad values gets a `RecordError` that names the field.
+The stamp is not part of a record: it travels beside it as a `Header`.
+
+Frames: poses are those of the tool centre point (TCP) in the robot's base frame. A twist is
+``[linear m/s, angular rad/s]``, a wrench ``[force N, torque Nm]``, both with respect to the base
+frame's axes and the TCP's origin. Quaternions are stored ``x, y, z, w``.
+"""
+
+from vla_zenoh.types.checks import (
+    MAX_NAMES,
+    MAX_TEXT,
+    QUATERNION_NORM_TOLERANCE,
+    FloatArray,
+    shown,
+    unit_quaternion,
+    vector,
+)
+from vla_zenoh.types.chunk import ActionChunk
+from vla_zenoh.types.commands import Cause, GripperCommand, JointCommand, PoseCommand
+from vla_zenoh.types.image import Image
+from vla_zenoh.types.reports import Event, NodeStatus
+from vla_zenoh.types.scene import ObjectPoses, SceneState
+from vla_zenoh.types.stamped import Header, Stamped
+from vla_zenoh.types.states import GripperState, JointState, PoseState
+from vla_zenoh.types.task import Task
+
+__all__ = [
+    "MAX_NAMES",
+    "MAX_TEXT",
+    "QUATERNION_NORM_TOLERANCE",
+    "ActionChunk",
+    "Cause",
+    "Event",
+    "FloatArray",
+    "GripperCommand",
+    "GripperState",
+    "Header",
+    "Image",
+    "JointCommand",
+    "JointState",
+    "NodeStatus",
+    "ObjectPoses",
+    "PoseCommand",
+    "PoseState",
+    "SceneState",
+    "Stamped",
+    "Task",
+    "shown",
+    "unit_quaternion",
+    "vector",
+]

@@ -1,0 +1,110 @@
+"""What nodes say of themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from vla_zenoh.errors import RecordError
+from vla_zenoh.types.checks import (
+    details,
+    entries,
+    integer,
+    number,
+    set_field,
+    shown,
+    text,
+    vector,
+)
+
+EVENT_LEVELS = ("info", "warning", "error")
+EVENT_KINDS = ("refusal", "transition", "limit", "fault", "notice")
+
+
+@dataclass(frozen=True, slots=True)
+class NodeStatus:
+    """A node's word on itself.
+
+    Args:
+        node: its name.
+        state: one word.
+        host: where it runs.
+        pid: process number.
+        started_wall_ns: when it started; tells a restart.
+        ages_s: age of the newest of every input.
+        rates_hz: of what it writes and loops.
+        latency_ms: stage -> ``[p50, p95]``.
+        counters: everything counted; refusals as ``refused.<reason>``.
+        detail: whatever else a person wants to know: text, finite numbers, bools and None, in
+            lists and maps that are not nested deep.
+    """
+
+    node: str
+    state: str
+    host: str
+    pid: int
+    started_wall_ns: int
+    ages_s: Mapping[str, float] = field(default_factory=dict)
+    rates_hz: Mapping[str, float] = field(default_factory=dict)
+    latency_ms: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    counters: Mapping[str, int] = field(default_factory=dict)
+    detail: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("node", "state", "host"):
+            text(name, getattr(self, name), 256)
+        set_field(self, "pid", integer("pid", self.pid))
+        set_field(self, "started_wall_ns", integer("started_wall_ns", self.started_wall_ns))
+        for name in ("ages_s", "rates_hz"):
+            given = entries(name, getattr(self, name))
+            set_field(self, name, {key: number(f"{name}.{key}", v) for key, v in given.items()})
+        given = entries("counters", self.counters)
+        set_field(
+            self, "counters", {key: integer(f"counters.{key}", v) for key, v in given.items()}
+        )
+        given = entries("latency_ms", self.latency_ms)
+        set_field(
+            self, "latency_ms", {key: _pair(f"latency_ms.{key}", v) for key, v in given.items()}
+        )
+        set_field(self, "detail", details("detail", entries("detail", self.detail)))
+
+
+def _pair(name: str, value: Any) -> tuple[float, float]:
+    low, high = vector(name, value, 2).tolist()
+    return low, high
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something happened that a person may ask about later.
+
+    Args:
+        level: ``info``, ``warning`` or ``error``.
+        kind: ``refusal``, ``transition``, ``limit``, ``fault`` or ``notice``.
+        what: short stable name, for example ``stale_chunk``.
+        why: a sentence.
+        value: the value that led to it, where there is one.
+        limit: the bound it met, where there is one.
+        count: how many of the same this stands for.
+    """
+
+    level: str
+    kind: str
+    what: str
+    why: str = ""
+    value: float | None = None
+    limit: float | None = None
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("level", "kind", "what", "why"):
+            text(name, getattr(self, name))
+        for name, allowed in (("level"), ("kind")):
+            if getattr(self, name) not in allowed:
+                given = shown(getattr(self, name))
+                raise RecordError(f"{name} is {given}, allowed: {', '.join(allowed)}")
+        set_field(self, "count", integer("count", self.count, 1))
+        for name in ("value", "limit"):
+            if getattr(self, name) is not None:
+                set_field(self, name, number(name, getattr(self, name)))

@@ -1,0 +1,115 @@
+"""What the robot says of itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vla_zenoh.errors import RecordError
+from vla_zenoh.types.checks import (
+    FloatArray,
+    boolean,
+    joint_names,
+    number,
+    set_field,
+    text,
+    texts,
+    unit_quaternion,
+    vector,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointState:
+    """Arm joints, without the fingers: all arrays have one entry per name.
+
+    Args:
+        names: of the joints.
+        position_rad: (n,) measured.
+        velocity_rad_s: (n,) measured.
+        effort_nm: (n,) what the motors apply.
+        reference_rad: (n,) positions the robot's controller holds right now, or None where it
+            holds none, or the robot does not tell.
+    """
+
+    names: tuple[str, ...]
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+    effort_nm: FloatArray
+    reference_rad: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        names = joint_names(self.names)
+        set_field(self, "names", names)
+        for name in ("position_rad", "velocity_rad_s", "effort_nm"):
+            set_field(self, name, vector(name, getattr(self, name), len(names)))
+        if self.reference_rad is not None:
+            set_field(
+                self, "reference_rad", vector("reference_rad", self.reference_rad, len(names))
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseState:
+    """Measured TCP pose in the base frame.
+
+    Args:
+        position_m: (3,).
+        quat_xyzw: (4,) unit.
+        twist: (6,) m/s and rad/s, base axes.
+        wrench: (6,) external N and Nm, or None where the robot does not know it.
+        reference_position_m: (3,) pose the robot's controller holds right now, or None.
+        reference_quat_xyzw: (4,), or None. Both or neither.
+    """
+
+    position_m: FloatArray
+    quat_xyzw: FloatArray
+    twist: FloatArray
+    wrench: FloatArray | None = None
+    reference_position_m: FloatArray | None = None
+    reference_quat_xyzw: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        set_field(self, "position_m", vector("position_m", self.position_m, 3))
+        set_field(self, "quat_xyzw", unit_quaternion("quat_xyzw", self.quat_xyzw))
+        set_field(self, "twist", vector("twist", self.twist, 6))
+        if self.wrench is not None:
+            set_field(self, "wrench", vector("wrench", self.wrench, 6))
+        if (self.reference_position_m is None) != (self.reference_quat_xyzw is None):
+            raise RecordError("a reference pose needs both position and quaternion")
+        if self.reference_position_m is not None and self.reference_quat_xyzw is not None:
+            set_field(
+                self,
+                "reference_position_m",
+                vector("reference_position_m", self.reference_position_m, 3),
+            )
+            set_field(
+                self,
+                "reference_quat_xyzw",
+                unit_quaternion("reference_quat_xyzw", self.reference_quat_xyzw),
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class GripperState:
+    """Gripper and robot condition.
+
+    Args:
+        width_m: opening between the fingers.
+        moving: the fingers move.
+        holding: an object is held.
+        mode: the robot's own word for its mode, ``ready`` when it will move.
+        faults: what the robot complains of, empty when well.
+    """
+
+    width_m: float
+    moving: bool
+    holding: bool
+    mode: str = "ready"
+    faults: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        set_field(self, "width_m", number("width_m", self.width_m, -0.01, 1.0))
+        set_field(self, "moving", boolean("moving", self.moving))
+        set_field(self, "holding", boolean("holding", self.holding))
+        text("mode", self.mode, 128)
+        set_field(self, "faults", texts("faults", self.faults, 512))

@@ -1,0 +1,34 @@
+"""What is to be done."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vla_zenoh.types.checks import boolean, integer, number, set_field, text
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is to be done now, as the command node has agreed to it.
+
+    Args:
+        episode: grows with every activation and every change of prompt or worker; a policy
+            starts afresh with it and a chunk of an older episode is refused.
+        active: the arm obeys the worker.
+        prompt: plain text.
+        worker: name of the worker whose chunks are obeyed.
+        rate_hz: chunks per second asked of the workers.
+    """
+
+    episode: int
+    active: bool
+    prompt: str
+    worker: str
+    rate_hz: float
+
+    def __post_init__(self) -> None:
+        set_field(self, "episode", integer("episode", self.episode))
+        set_field(self, "active", boolean("active", self.active))
+        text("prompt", self.prompt)
+        text("worker", self.worker, 128)
+        set_field(self, "rate_hz", number("rate_hz", self.rate_hz, 0.01, 1000.0))
