@@ -12,8 +12,8 @@ n1.6     ``{observation: {video: {NAME: (B,T,H,W,3)}, state:      ``[{NAME: (B,H
          {NAME: (B,T,D)}, language: {NAME: [[text]]}}, options}``
 =======  =======================================================  ===========================
 
-Early servers, and some derived ones, send torch's files instead, which are pickles and run code when
-read; they are refused.
+Early servers, and some derived ones, send torch's files instead, which are pickles and run code
+when read; they are refused.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from vla_zenoh.types import shown
 
 Version = Literal["n1.5", "n1.6"]
 PORT = 5555
+MAX_BYTES = MAX_PAYLOAD_BYTES
 VIDEO, STATE, ACTION = "video.", "state.", "action."
 _ARRAY, _CONFIG = "__ndarray_class__", "__ModalityConfig_class__"
 _PICKLES = (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05", b"PK\x03\x04")

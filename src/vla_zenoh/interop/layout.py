@@ -194,7 +194,7 @@ def _matrix(name: str, value: Any, named: bool) -> NDArray[np.float64]:
     """(H, C); a batch of one is unpacked. One row of numbers is H single ones if it is `named`."""
     try:
         array = np.asarray(value)
-    except ValueError as error:
+    except (ValueError, OverflowError, TypeError) as error:
         raise PeerError("peer_reply", f"{name} is not a table of numbers: {error}") from error
     if array.dtype.kind not in "iuf":
         raise PeerError("peer_reply", f"{name} is not numbers but {shown(value)}")

@@ -1,8 +1,8 @@
 """openpi's wire: msgpack over WebSocket, one binary frame a request, one a reply, in turn.
 
-A server speaks first and says what it serves (a map, which may be empty). An observation is a map of
-names, an answer a map with ``actions`` (H, D). An error is a text frame, after which the connection
-is closed. ``GET /healthz`` is answered with ``OK``.
+A server speaks first and says what it serves (a map, which may be empty). An observation is a map
+of names, an answer a map with ``actions`` (H, D). An error is a text frame, after which the
+connection is closed. ``GET /healthz`` is answered with ``OK``.
 
 vllm-omni serves the same with additions: ``{"endpoint": "reset"}``, a ``session_id`` in every
 observation, answers that are a bare array, and errors that are a map with ``type: error``.

@@ -1,7 +1,7 @@
 """OpenVLA's wire: JSON over ``POST /act``, arrays as json_numpy writes them.
 
-An array is ``{"__numpy__": base64, "dtype": "<f4", "shape": [..]}``. The answer is an array (7,), for
-OFT a list of them. Where json_numpy is not wanted on the wire, the request is
+An array is ``{"__numpy__": base64, "dtype": "<f4", "shape": [..]}``. The answer is an array (7,),
+for OFT a list of them. Where json_numpy is not wanted on the wire, the request is
 ``{"encoded": "<the same as text>"}`` and the answer a text with JSON in it. A server that fails
 answers 200 with the text ``error``.
 """
@@ -104,11 +104,11 @@ def read_answer(status: int, body: bytes) -> Any:
     answer = unpack(body)
     if isinstance(answer, str) and answer != "error":
         answer = unpack(answer)  # the double encoding
-    if answer == "error" if isinstance(answer, str) else isinstance(answer, dict):
+    if isinstance(answer, (str, dict)):
         raise PeerError("peer_error", f"the server says {shown(answer)}; its log says why")
     if isinstance(answer, list):
         try:
             return np.asarray(answer)
-        except ValueError as error:
+        except (ValueError, OverflowError) as error:
             raise PeerError("peer_reply", f"steps of different lengths: {error}") from error
     return answer

@@ -198,6 +198,18 @@ def _number(name: str, text: str) -> float:
     return value
 
 
+def read_timeout(text: str) -> float:
+    """The option `timeout_s`.
+
+    Raises:
+        SpecError: it is no number of seconds up to a minute.
+    """
+    value = _number("timeout_s", text)
+    if not 0.01 <= value <= 60:
+        raise SpecError(f"timeout_s is {text!r}, wanted 0.01 to 60: a late answer is of no use")
+    return value
+
+
 def _keys(text: str) -> tuple[str, ...]:
     keys = tuple(key.strip() for key in text.split(","))
     if not all(keys) or len(set(keys)) != len(keys) or len(keys) > MAX_KEYS:

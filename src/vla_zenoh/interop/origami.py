@@ -1,9 +1,9 @@
-"""origami-zenoh-v1: a policy that answers Zenoh queries, msgpack with arrays as openpi writes them.
+"""origami-zenoh-v1: a policy that answers Zenoh queries, msgpack with arrays in openpi's form.
 
-Three queryables, ``metadata``, ``reset`` and ``infer``. A request is ``{protocol_version, operation,
-request_id, session_id, observation?}``; the answer repeats the first four and adds ``metadata``,
-``ok: true``, or ``actions`` (T, 65) with ``server_timing``; an error is ``{code, message, retryable}``
-under ``error``.
+Three queryables, ``metadata``, ``reset`` and ``infer``. A request is ``{protocol_version,
+operation, request_id, session_id, observation?}``; the answer repeats the first four and adds
+``metadata``, ``ok: true``, or ``actions`` (T, 65) with ``server_timing``; an error is ``{code,
+message, retryable}`` under ``error``.
 """
 
 from __future__ import annotations
