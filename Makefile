@@ -7,7 +7,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow test-ros2 check format bench build ros2-bridge clean
+.PHONY: help setup demo test slow test-ros2 test-models check format bench bench-ros2 build ros2-bridge clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -25,10 +25,13 @@ test: $(READY) ## Run the tests
 	$(BIN)/python -m pytest $(ARGS)
 
 slow: $(READY) ## Run the tests that take long, too
-	$(BIN)/python -m pytest -m "slow or not slow" $(ARGS)
+	$(BIN)/python -m pytest -m "not models" $(ARGS)
 
 test-ros2: $(READY) ros2-bridge ## Run the tests with a real ROS 2 bridge and a DDS robot
 	$(BIN)/python -m pytest -m ros2 $(ARGS)
+
+test-models: $(READY) ## Run the tests of OpenVLA and LeRobot, each in its environment (12 GB, once)
+	$(BIN)/python scripts/test_models.py $(ARGS)
 
 check: $(READY) ## Lint, format and types, as CI does
 	$(BIN)/ruff check .
@@ -41,6 +44,9 @@ format: $(READY) ## Let ruff put files into shape
 
 bench: $(READY) ## Measure camera to command on this machine
 	$(BIN)/vla-zenoh bench chain $(ARGS)
+
+bench-ros2: $(READY) ros2-bridge ## Measure a picture's way to a pose through ROS 2
+	$(BIN)/python tests/ros2/bench.py $(ARGS)
 
 build: $(READY) ## Build wheel and sdist into dist/ and try each in an empty environment
 	$(BIN)/python scripts/check_wheel.py $(ARGS)

@@ -3,7 +3,7 @@
 The one on PATH is taken where there is one. Otherwise the program of tests/ros2_bridge/ is built:
 the plugin's crate with a small main. It is built once and kept in the user's cache folder, and
 built anew only when its sources change. Needs Python alone, like the other scripts here; and, to
-build, Rust, CMake, a C compiler and libclang.
+build, Rust (1.95 is tried), CMake, a C compiler and libclang.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def missing() -> dict[str, str]:
     if not has_libclang():
         lacking["libclang"] = "libclang-dev"
     if shutil.which("cargo") is None:
-        lacking["cargo 1.75 or newer"] = "cargo (where that is too old: Rust's own installer)"
+        lacking["cargo 1.85 or newer"] = "cargo"
     return lacking
 
 
@@ -118,8 +118,11 @@ def build() -> Path:
 
 
 def main() -> None:
-    """Build unless there is one, and print its path."""
+    """Build unless there is one, and print its path; ``--packages``: what Debian lacks for it."""
     found = find_bridge()
+    if sys.argv[1:] == ["--packages"]:
+        print("" if found else " ".join(missing().values()))
+        return
     say(f"the bridge is {found or build()}")
 
 
