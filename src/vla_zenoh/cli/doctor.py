@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime as dt
 import functools
 import json
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -13,10 +15,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.doctor import Finding, Needs, examine, needs_of
-from vla_zenoh.errors import SessionError
+from vla_zenoh.doctor.access import access
+from vla_zenoh.errors import SecurityError, SessionError
+from vla_zenoh.nodes.rehearsal import Verdict, read_access, rehearse, try_identity
 from vla_zenoh.nodes.session import open_session
-from vla_zenoh.profile import SessionProfile, load_profile
+from vla_zenoh.profile import Profile, SessionProfile
 
 COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
 
@@ -27,6 +32,8 @@ def try_zenoh(profile: SessionProfile, endpoint: str) -> str:
         open_session(profile, mode="client", connect=(endpoint,)).close()
     except SessionError as error:
         return str(error.__cause__ or error).split(" at ", maxsplit=1)[0].rstrip("! ")
+    except SecurityError as error:
+        return str(error)
     return ""
 
 
@@ -40,6 +47,12 @@ def doctor(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print a list of objects instead of a table.")
     ] = False,
+    rules: Annotated[
+        Path | None,
+        typer.Option(
+            "--rules", help="Try the rules of access in this configuration of Zenoh instead."
+        ),
+    ] = None,
 ) -> None:
     """Look at this computer: what is missing, and the package or setting that helps.
 
@@ -48,18 +61,29 @@ def doctor(
     if host is not None and profile is None:
         raise typer.BadParameter("it is the name of a host in a profile: give --profile too")
     zenoh.init_log_from_env_or("off")
-    needs, session = Needs(), SessionProfile()
+    needs, session, loaded = Needs(), SessionProfile(), None
     if profile is not None:
-        loaded = load_profile(profile)
+        loaded = effective_profile(profile, host=host)
         needs, session = needs_of(loaded, host), loaded.session
     with Console(stderr=True).status("Looking at this computer"):
         findings = list(examine(needs, functools.partial(try_zenoh, session)))
+        if loaded is not None:
+            findings += access(
+                loaded,
+                dt.datetime.now(dt.UTC),
+                functools.partial(_rehearse, loaded, rules),
+                functools.partial(try_identity, loaded),
+            )
     if as_json:
         print(json.dumps([dataclasses.asdict(finding) for finding in findings], indent=2))
     else:
         show(findings, Console())
     if any(finding.level == "fail" for finding in findings):
         raise typer.Exit(1)
+
+
+def _rehearse(profile: Profile, rules: Path | None) -> list[Verdict]:
+    return rehearse(profile, None if rules is None else read_access(rules))
 
 
 def show(findings: list[Finding], console: Console) -> None:

@@ -168,6 +168,8 @@ def open_session(
 def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
     if settings["mode"] == "router":
         where = ", ".join(settings["listen"]["endpoints"])
+        if "access_control" in settings and "Access control" in str(error):
+            return SessionError(f"the router does not take its rules of access: {error}")
         return SessionError(
             f"the router cannot listen on {where}: {error}. Is another router or program there? "
             "`vla-zenoh doctor` tells; choose another address with --listen or session.listen"

@@ -137,6 +137,21 @@ def allows(config: Mapping[str, Any], common_name: str, passage: Passage) -> boo
     """
     if not config.get("enabled", False):
         return True
+    verdicts = {rule["permission"] for rule in _applying(config, common_name, passage)}
+    if "deny" in verdicts:
+        return False
+    return "allow" in verdicts or config.get("default_permission") == "allow"
+
+
+def allowing(config: Mapping[str, Any], common_name: str, passage: Passage) -> list[str]:
+    """Names of the rules by which a message of `common_name` passes."""
+    found = _applying(config, common_name, passage)
+    return [str(rule["id"]) for rule in found if rule["permission"] == "allow"]
+
+
+def _applying(
+    config: Mapping[str, Any], common_name: str, passage: Passage
+) -> list[Mapping[str, Any]]:
     subjects = {
         subject["id"]
         for subject in config.get("subjects") or ()
@@ -148,17 +163,14 @@ def allows(config: Mapping[str, Any], common_name: str, passage: Passage) -> boo
         if subjects.intersection(policy["subjects"])
         for rule in policy["rules"]
     }
-    verdicts = {
-        rule["permission"]
+    return [
+        rule
         for rule in config.get("rules") or ()
         if rule["id"] in ruled
         and passage.flow in (rule.get("flows") or (IN, OUT))
         and passage.message in rule["messages"]
         and any(covers(key, passage.key) for key in rule["key_exprs"])
-    }
-    if "deny" in verdicts:
-        return False
-    return "allow" in verdicts or config.get("default_permission") == "allow"
+    ]
 
 
 def missing(config: Mapping[str, Any], identity: Identity, act: Act, key: str) -> list[Passage]:

@@ -1,0 +1,120 @@
+"""Whether strangers are kept out, and whether everybody else can do their part."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol
+
+from vla_zenoh.doctor.finding import Finding
+from vla_zenoh.errors import MissingExtraError, SecurityError, VlaZenohError
+from vla_zenoh.profile import Profile
+from vla_zenoh.profile.session import is_loopback
+from vla_zenoh.security.identity import Identity
+from vla_zenoh.security.store import Entry, Store
+
+SHOWN_FAULTS = 6
+
+
+class Tried(Protocol):
+    """What came of trying everything in the name of one identity."""
+
+    @property
+    def identity(self) -> Identity: ...
+    @property
+    def must(self) -> int: ...
+    @property
+    def must_not(self) -> int: ...
+    @property
+    def faults(self) -> tuple[str, ...]: ...
+
+
+def access(
+    profile: Profile,
+    now: dt.datetime,
+    rehearse: Callable[[], Sequence[Tried]],
+    try_identity: Callable[[str], str],
+) -> Iterator[Finding]:
+    """The certificates of this computer, the rules of the profile, and what the router makes of it.
+
+    Args:
+        profile: the lab.
+        now: UTC.
+        rehearse: tries the rules with real sessions.
+        try_identity: shows the certificate of a node of this computer to the running router;
+            returns what is wrong.
+    """
+    security = profile.session.security
+    if security is None:
+        yield _without(profile)
+        return
+    try:
+        store = Store(security.folder)
+        host = store.this_host(security.host)
+        entries = store.entries(now, host)
+    except (MissingExtraError, SecurityError) as error:
+        yield Finding("certificates", "fail", str(error))
+        return
+    yield certificates(host, entries)
+    try:
+        yield from map(rules, rehearse())
+    except VlaZenohError as error:
+        yield Finding("access", "fail", f"the rules could not be tried: {error}")
+    for entry in entries:
+        if entry.node != "router" and not entry.faults:
+            yield _accepted(entry, try_identity)
+
+
+def certificates(host: str, entries: Sequence[Entry]) -> Finding:
+    """Whether those of this host are good, and for how long."""
+    name = f"certificates of {host}"
+    if not entries:
+        return Finding(name, "fail", "there are none", f"vla-zenoh secure add {host}")
+    faults = [f"{entry.path.name} {fault}" for entry in entries for fault in entry.faults]
+    if faults:
+        return Finding(
+            name, "fail", "; ".join(faults), f"vla-zenoh secure add {host} --renew, and copy them"
+        )
+    soon = [f"{entry.path.name} {entry.warning}" for entry in entries if entry.warning]
+    if soon:
+        return Finding(name, "warn", "; ".join(soon), f"vla-zenoh secure add {host} --renew")
+    end = min(entry.certificate.not_after for entry in entries if entry.certificate)
+    return Finding(name, "ok", f"{len(entries)}, all valid until {end:%Y-%m-%d}")
+
+
+def rules(tried: Tried) -> Finding:
+    """What one identity could and could not do."""
+    name = f"access {tried.identity.common_name}"
+    if not tried.faults:
+        said = f"can do all {tried.must} things of its role, none of {tried.must_not} others"
+        return Finding(name, "ok", said)
+    shown = list(tried.faults[:SHOWN_FAULTS])
+    if len(tried.faults) > SHOWN_FAULTS:
+        shown.append(f"and {len(tried.faults) - SHOWN_FAULTS} more")
+    return Finding(
+        name,
+        "fail",
+        "\n".join(shown),
+        "write the router's rules anew: vla-zenoh router --config > FILE",
+    )
+
+
+def _accepted(entry: Entry, try_identity: Callable[[str], str]) -> Finding:
+    name = f"router takes {entry.node}@{entry.host}"
+    try:
+        why = try_identity(entry.node)
+    except VlaZenohError as error:
+        return Finding(name, "warn", str(error))
+    return Finding(name, "fail" if why else "ok", why or "and knows it")
+
+
+def _without(profile: Profile) -> Finding:
+    if all(map(is_loopback, profile.session.listen)):
+        said = "no certificates; the router listens on this computer only"
+        return Finding("access", "ok", said)
+    return Finding(
+        "access",
+        "warn",
+        "everybody on the network can command this robot",
+        "vla-zenoh secure init makes certificates and rules",
+    )
