@@ -1,0 +1,168 @@
+"""What the real bridge carries between DDS and our messages, without any node of ours."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import zenoh
+from camera_rig import free_endpoint, until
+
+from vla_zenoh.interop.ros2 import table
+from vla_zenoh.interop.ros2.keys import Endpoint, Role, Ros2Dds
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.interop.ros2.qos import SENSOR
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.profile import SessionProfile
+from vla_zenoh.types import PoseCommand
+
+if TYPE_CHECKING:
+    from ros_node import RosNode
+
+ros = pytest.importorskip("ros_messages", exc_type=ImportError)
+
+pytestmark = pytest.mark.ros2
+
+PATIENCE_S = 10.0
+STAMP_NS = 1_700_000_000_123_456_789
+
+
+@dataclass
+class Border:
+    """A DDS node on one side of the bridge, a Zenoh session on the other."""
+
+    node: RosNode
+    session: zenoh.Session
+    messages: Messages
+    wire: Ros2Dds
+
+    def announce(self, endpoint: Endpoint) -> list[Any]:
+        """Tokens of one of our endpoints; it is announced while they are kept."""
+        liveliness = self.session.liveliness()
+        keys = [*self.wire.node_tokens(), *self.wire.tokens(endpoint, 1)]
+        return [liveliness.declare_token(key) for key in keys]
+
+    def hear(self, endpoint: Endpoint) -> tuple[list[bytes], Any]:
+        """Payloads on the key of `endpoint` from now on, and their subscriber."""
+        heard: list[bytes] = []
+        handler = zenoh.handlers.Callback(
+            lambda sample: heard.append(sample.payload.to_bytes()), indirect=False
+        )
+        return heard, self.session.declare_subscriber(self.wire.key(endpoint), handler)
+
+
+@pytest.fixture(scope="module")
+def border(tmp_path_factory: pytest.TempPathFactory, bridge_program: Path) -> Iterator[Border]:
+    from bridge import Bridge
+    from ros_node import RosNode, free_domain
+
+    domain, endpoint = free_domain(), free_endpoint()
+    profile = SessionProfile(listen=(endpoint,), connect=(endpoint,))
+    folder = tmp_path_factory.mktemp("bridge")
+    with open_session(profile, mode="router"), open_session(profile) as session:
+        bridge = Bridge(bridge_program, folder, domain, connect=endpoint).start()
+        node = RosNode("peer", domain)
+        messages = Messages("jazzy")
+        yield Border(node, session, messages, Ros2Dds(str(session.zid()), messages.hash))
+        node.close()
+        bridge.kill()
+
+
+def test_pictures_of_a_dds_camera_are_read_to_the_pixel(border: Border) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
+    # The bridge reads DDS as the first subscriber that is announced wants it: a reliable one would
+    # get nothing from a camera that is not.
+    kind = "sensor_msgs/msg/Image"
+    endpoint = Endpoint(Role.SUBSCRIBER, "/camera/color/image_raw", kind, SENSOR)
+    heard, subscriber = border.hear(endpoint)
+    tokens = border.announce(endpoint)
+    writer = border.node.publisher(endpoint.name, ros.Image, reliable=False, depth=1)
+    header = ros.Header(ros.Time.of(STAMP_NS), "camera_color_optical_frame")
+    picture = ros.Image(header, 480, 640, "rgb8", 0, 1920, rgb.tobytes())
+    until("a picture", lambda: writer.write(picture) or heard, PATIENCE_S)
+    read = table.read(border.messages, endpoint.type, heard[0])
+    assert (read.stamp_ns, read.frame) == (STAMP_NS, "camera_color_optical_frame")
+    assert np.array_equal(read.rgb, rgb)
+    subscriber.undeclare()
+    del tokens
+
+
+def test_joint_states_of_a_dds_robot_are_read_to_the_bit(border: Border) -> None:
+    endpoint = Endpoint(Role.SUBSCRIBER, "/joint_states", "sensor_msgs/msg/JointState")
+    heard, subscriber = border.hear(endpoint)
+    writer = border.node.publisher(endpoint.name, ros.JointState)
+    position = [0.1 * k for k in range(7)]
+    names = [f"panda_joint{k + 1}" for k in range(7)]
+    state = ros.JointState(ros.Header(ros.Time.of(STAMP_NS), ""), names, position, [], position)
+    until("a state", lambda: writer.write(state) or heard, PATIENCE_S)
+    read = table.read(border.messages, endpoint.type, heard[0])
+    assert (read.stamp_ns, read.names) == (STAMP_NS, tuple(names))
+    assert read.position.tolist() == position
+    assert read.velocity is None
+    assert read.effort.tolist() == position
+    subscriber.undeclare()
+
+
+@pytest.mark.parametrize("kind", ["CartesianImpedanceGoal", "PoseStamped"])
+def test_a_pose_command_arrives_in_dds_to_the_bit(border: Border, kind: str) -> None:
+    package = "multi_mode_control_msgs" if kind == "CartesianImpedanceGoal" else "geometry_msgs"
+    endpoint = Endpoint(Role.PUBLISHER, f"/desired/{kind.lower()}", f"{package}/msg/{kind}")
+    tokens = border.announce(endpoint)
+    reader = border.node.subscription(endpoint.name, getattr(ros, kind))
+    position, quat = np.array([0.4, -0.1, 1 / 3]), np.array([1.0, 0.0, 0.0, 0.0])
+    zero = np.zeros(6)
+    command = PoseCommand(position, quat, zero, zero, position, quat, "active")
+    posture = np.linspace(0.0, 1.0, 7)
+    write = {row.type: row.write for row in table.writings(posture, 0) if row.key == "command_pose"}
+    made = write[endpoint.type](
+        border.messages, endpoint.type, command, table.Stamp(STAMP_NS, "panda_link0")
+    )
+    payload = border.messages.encode(made)
+    arrived: list[Any] = []
+
+    def try_once() -> list[Any]:
+        border.session.put(border.wire.key(endpoint), payload)
+        time.sleep(0.02)
+        arrived.extend(reader.take(10))
+        return arrived
+
+    until("the command in DDS", try_once, PATIENCE_S)
+    p, q = arrived[0].pose.position, arrived[0].pose.orientation
+    if kind == "PoseStamped":
+        header = arrived[0].header
+        assert (header.stamp.ns, header.frame_id) == (STAMP_NS, "panda_link0")
+    else:
+        assert arrived[0].q_n == posture.tolist()
+    assert [p.x, p.y, p.z] == position.tolist()
+    assert [q.x, q.y, q.z, q.w] == quat.tolist()
+    del tokens
+
+
+def test_a_dds_client_finds_and_calls_a_service_that_we_announce(border: Border) -> None:
+    endpoint = Endpoint(Role.SERVER, "/vla_test/set_active", "std_srvs/srv/SetBool")
+    asked: list[bool] = []
+
+    def answer(query: zenoh.Query) -> None:
+        payload = query.payload
+        assert payload is not None
+        request = border.messages.decode("std_srvs/srv/SetBool_Request", payload.to_bytes())
+        asked.append(request.data)
+        response = border.messages.new(
+            "std_srvs/srv/SetBool_Response", success=request.data, message=f"{request.data}"
+        )
+        with query:
+            query.reply(border.wire.key(endpoint), border.messages.encode(response))
+
+    queryable = border.session.declare_queryable(border.wire.key(endpoint), answer, complete=True)
+    tokens = border.announce(endpoint)
+    client = border.node.client(endpoint.name, ros.SetBoolRequest, ros.SetBoolResponse)
+    said = [client.call(data, timeout_s=PATIENCE_S) for data in (True, False)]
+    assert [(reply.success, reply.message) for reply in said] == [(True, "True"), (False, "False")]
+    assert asked == [True, False]
+    del tokens
+    queryable.undeclare()
