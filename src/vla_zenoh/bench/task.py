@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -223,7 +222,7 @@ def _figures(ended: Sequence[Ended]) -> dict[str, Any]:
     times_s = [each.time_s for each in ended if each.success]
     kinds = Counter(each.failure for each in ended if not each.success)
     return {
-        "success_rate": successes / len(ended) if ended else math.nan,
+        "success_rate": successes / len(ended) if ended else None,
         "successes": successes,
         "episodes": len(ended),
         "wilson_95": list(wilson_95(successes, len(ended))),
