@@ -100,7 +100,7 @@ class Event:
     def __post_init__(self) -> None:
         for name in ("level", "kind", "what", "why"):
             text(name, getattr(self, name))
-        for name, allowed in (("level"), ("kind")):
+        for name, allowed in (("level", EVENT_LEVELS), ("kind", EVENT_KINDS)):
             if getattr(self, name) not in allowed:
                 given = shown(getattr(self, name))
                 raise RecordError(f"{name} is {given}, allowed: {', '.join(allowed)}")
