@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vla_zenoh import types
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types import (
     ActionChunk,
@@ -25,6 +24,8 @@ from vla_zenoh.types import (
     PoseState,
     SceneState,
     Task,
+    checks,
+    reports,
 )
 
 UNIT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -63,10 +64,10 @@ def test_a_record_cannot_be_changed() -> None:
 
 
 def test_a_quaternion_that_is_nearly_unit_is_made_so() -> None:
-    pose = PoseState(np.zeros(3), UNIT * (1 + 0.9 * types.QUATERNION_NORM_TOLERANCE), np.zeros(6))
+    pose = PoseState(np.zeros(3), UNIT * (1 + 0.9 * checks.QUATERNION_NORM_TOLERANCE), np.zeros(6))
     assert abs(np.linalg.norm(pose.quat_xyzw) - 1) < QUATERNION_TOLERANCE
     with pytest.raises(RecordError, match=r"quat_xyzw has norm 1\.0011"):
-        PoseState(np.zeros(3), UNIT * (1 + 1.1 * types.QUATERNION_NORM_TOLERANCE), np.zeros(6))
+        PoseState(np.zeros(3), UNIT * (1 + 1.1 * checks.QUATERNION_NORM_TOLERANCE), np.zeros(6))
 
 
 def test_an_image_does_not_lock_the_array_it_was_made_of() -> None:
@@ -119,13 +120,13 @@ def test_what_is_no_image_is_refused(rgb: Any, said: str) -> None:
 )
 def test_what_is_no_vector_is_refused(value: Any, said: str) -> None:
     with pytest.raises(RecordError, match=said):
-        types.vector("v", value, 3)
+        checks.vector("v", value, 3)
 
 
 def test_a_vector_has_a_bound_even_where_any_size_will_do() -> None:
-    assert SceneState("table", np.zeros(types.MAX_VECTOR)).qpos.shape == (types.MAX_VECTOR,)
+    assert SceneState("table", np.zeros(checks.MAX_VECTOR)).qpos.shape == (checks.MAX_VECTOR,)
     with pytest.raises(RecordError, match="qpos has 10001 numbers, at most 10000"):
-        SceneState("table", np.zeros(types.MAX_VECTOR + 1))
+        SceneState("table", np.zeros(checks.MAX_VECTOR + 1))
 
 
 @pytest.mark.parametrize(
@@ -133,13 +134,13 @@ def test_a_vector_has_a_bound_even_where_any_size_will_do() -> None:
 )
 def test_what_is_no_number_within_bounds_is_refused(value: Any) -> None:
     with pytest.raises(RecordError, match=r"^x is "):
-        types.number("x", value, 0.0, 1.0)
+        checks.number("x", value, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("value", [True, np.True_, "1", None, 1.0, np.float64(1), -1, 2**63])
 def test_what_is_no_whole_number_within_bounds_is_refused(value: Any) -> None:
     with pytest.raises(RecordError, match=r"^x is "):
-        types.integer("x", value)
+        checks.integer("x", value)
 
 
 def test_numbers_of_numpy_become_plain_ones() -> None:
@@ -284,12 +285,12 @@ def deep() -> list[Any]:
     ids=["unprintable", "deep", "long", "wide", "deep map"],
 )
 def test_an_error_can_always_be_written(make: Callable[[], Any]) -> None:
-    assert len(types.shown(make())) < 400
+    assert len(checks.shown(make())) < 400
 
 
 def test_an_event_is_of_a_known_kind_and_level() -> None:
-    for level in types.EVENT_LEVELS:
-        for kind in types.EVENT_KINDS:
+    for level in reports.EVENT_LEVELS:
+        for kind in reports.EVENT_KINDS:
             assert Event(level, kind, "x").level == level
     with pytest.raises(RecordError, match="level is 'debug', allowed: info, warning, error"):
         Event("debug", "notice", "x")
