@@ -12,10 +12,9 @@ from enum import Enum
 from typing import Protocol
 
 from vla_zenoh.interop.ros2.names import dds_type, get_result_of, send_goal_of
-from vla_zenoh.interop.ros2.qos import DEFAULT, LATCHED, Qos
+from vla_zenoh.interop.ros2.qos import DEFAULT, Qos
 
 CANCEL_GOAL = "action_msgs/srv/CancelGoal"
-GOAL_STATUS = "action_msgs/msg/GoalStatusArray"
 _SLASH_OF_BRIDGES = "§"
 _SLASH_OF_RMW = "%"
 
@@ -62,15 +61,18 @@ class Wire(Protocol):
         """Liveliness tokens of the node itself."""
         ...
 
+    def others(self) -> str:
+        """Key expression of the tokens of all other nodes or bridges."""
+        ...
+
 
 def parts_of(action: Endpoint) -> dict[str, Endpoint]:
-    """What an action client uses: send_goal, get_result, cancel_goal and the topic status."""
+    """The services an action client uses: send_goal, get_result and cancel_goal."""
     at = f"{action.name}/_action"
     return {
         "send_goal": Endpoint(Role.CLIENT, f"{at}/send_goal", send_goal_of(action.type)),
         "get_result": Endpoint(Role.CLIENT, f"{at}/get_result", get_result_of(action.type)),
         "cancel_goal": Endpoint(Role.CLIENT, f"{at}/cancel_goal", CANCEL_GOAL),
-        "status": Endpoint(Role.SUBSCRIBER, f"{at}/status", GOAL_STATUS, LATCHED),
     }
 
 
@@ -103,6 +105,10 @@ class Ros2Dds:
     def node_tokens(self) -> list[str]:
         """What a bridge declares of itself."""
         return [f"@/{self.session_id}/@ros2_lv"]
+
+    def others(self) -> str:
+        """Those of bridges."""
+        return "@/*/@ros2_lv"
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +152,10 @@ class RmwZenoh:
     def node_tokens(self) -> list[str]:
         """One."""
         return [self._at(0, "NN")]
+
+    def others(self) -> str:
+        """Those of nodes."""
+        return f"@ros2_lv/{self.domain}/*/*/*/NN/**"
 
     def _at(self, number: int, role: str) -> str:
         enclave = namespace = _SLASH_OF_RMW

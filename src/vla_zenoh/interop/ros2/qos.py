@@ -36,5 +36,4 @@ SENSOR = Qos(depth=5, reliable=False)
 """rclcpp's SensorDataQoS: matches both reliable and best-effort publishers."""
 COMMAND = Qos(depth=1)
 """Setpoints: reliable, so that it matches every subscriber; the newest replaces older ones."""
-LATCHED = Qos(depth=1, transient_local=True)
 STATIC_TRANSFORMS = Qos(depth=100, transient_local=True)

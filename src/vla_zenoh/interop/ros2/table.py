@@ -72,6 +72,12 @@ READINGS = (
 )
 
 
+GRIPPER_WRITINGS = (
+    Writing(float_array.TYPE, "command_gripper", GripperCommand, float_array.write_width),
+    Writing(plain.NUMBER, "command_gripper", GripperCommand, plain.write_width),
+)
+
+
 def writings(posture_rad: FloatArray, lead_ns: int) -> tuple[Writing, ...]:
     """What commands can be sent as.
 
@@ -91,8 +97,7 @@ def writings(posture_rad: FloatArray, lead_ns: int) -> tuple[Writing, ...]:
         ),
         Writing(joint_trajectory.TYPE, "command_joint", JointCommand, joints),
         Writing(float_array.TYPE, "command_joint", JointCommand, float_array.write_joints),
-        Writing(float_array.TYPE, "command_gripper", GripperCommand, float_array.write_width),
-        Writing(plain.NUMBER, "command_gripper", GripperCommand, plain.write_width),
+        *GRIPPER_WRITINGS,
     )
 
 

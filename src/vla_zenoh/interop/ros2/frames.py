@@ -1,0 +1,67 @@
+"""Where one frame is in another, of the transforms on /tf and /tf_static."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from vla_zenoh.control.so3 import Pose, rotation_from_quat
+from vla_zenoh.errors import CodecError, RecordError
+from vla_zenoh.interop.ros2.samples import Transform
+from vla_zenoh.types import unit_quaternion, vector
+
+MAX_FRAMES = 1000
+MAX_CHAIN = 64
+
+
+class Frames:
+    """The newest transform to every child frame."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, int, Pose, bool]] = {}
+
+    def take(self, transforms: Iterable[Transform], *, static: bool) -> None:
+        """Keep these transforms; an older one than what is known is passed over.
+
+        Raises:
+            CodecError: ``invalid`` (not finite, no unit quaternion) or ``flood``.
+        """
+        for entry in transforms:
+            known = self._parents.get(entry.child)
+            if known is not None and entry.stamp_ns < known[1] and not static:
+                continue
+            if known is None and len(self._parents) >= MAX_FRAMES:
+                raise CodecError("flood", f"more than {MAX_FRAMES} frames; {entry.child[:60]!r}")
+            try:
+                pose = Pose(
+                    vector("translation", entry.position_m, 3),
+                    rotation_from_quat(unit_quaternion("rotation", entry.quat_xyzw)),
+                )
+            except RecordError as error:
+                raise CodecError("invalid", f"frame {entry.child[:60]!r}: {error}") from error
+            self._parents[entry.child] = (entry.parent, entry.stamp_ns, pose, static)
+
+    def find(self, base: str, tip: str) -> tuple[Pose, int] | None:
+        """Pose of `tip` in `base` and the oldest stamp it stands on, None where it is not known.
+
+        The way is up from `tip`; static transforms have no age.
+        """
+        stamp_ns: float = math.inf
+        frame, position, rotation = tip, None, None
+        for _ in range(MAX_CHAIN):
+            if frame == base:
+                break
+            found = self._parents.get(frame)
+            if found is None:
+                return None
+            frame, at_ns, pose, static = found
+            if position is None or rotation is None:
+                position, rotation = pose.position_m, pose.rotation
+            else:
+                position = pose.position_m + pose.rotation @ position
+                rotation = pose.rotation @ rotation
+            if not static:
+                stamp_ns = min(stamp_ns, at_ns)
+        if frame != base or position is None or rotation is None or math.isinf(stamp_ns):
+            return None
+        return Pose(position, rotation), int(stamp_ns)

@@ -1,0 +1,77 @@
+"""One goal of an action at a time, and the newest wish wins.
+
+A wish that comes while a goal runs cancels it, and is sent when the robot says that it has ended:
+never two goals at once, never a stop that overtakes the move it was meant for.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import NamedTuple
+
+from vla_zenoh.types import GripperCommand
+
+
+class Step(Enum):
+    """What is to be done now."""
+
+    SEND = "send"
+    CANCEL = "cancel"
+
+
+class Goal(NamedTuple):
+    """A goal in flight, told apart by its number."""
+
+    number: int
+    command: GripperCommand
+
+
+class GoalKeeper:
+    """Decides when a goal is sent or cancelled. Time is given in ns of any clock.
+
+    Args:
+        timeout_s: a goal of which nothing is heard for so long is given up.
+    """
+
+    def __init__(self, timeout_s: float) -> None:
+        self._timeout_ns = int(timeout_s * 1e9)
+        self._wish: GripperCommand | None = None
+        self._accepted = self._cancelling = False
+        self._since_ns = 0
+        self._number = 0
+        self.goal: Goal | None = None
+        self.timeouts = 0
+
+    def want(self, command: GripperCommand) -> None:
+        """Ask for an opening; replaces every wish that was not sent."""
+        self._wish = command
+
+    def accepted(self, number: int, now_ns: int) -> None:
+        """The robot took the goal."""
+        if self.goal is not None and number == self.goal.number:
+            self._accepted, self._since_ns = True, now_ns
+
+    def ended(self, number: int) -> bool:
+        """The goal was refused, or has ended in any way; False where it is an old one's end."""
+        if self.goal is None or number != self.goal.number:
+            return False
+        self.goal = None
+        return True
+
+    def step(self, now_ns: int) -> Step | None:
+        """What to do now: `Step.SEND` the `goal` that was just made, or `Step.CANCEL` it."""
+        if self.goal is not None and now_ns - self._since_ns > self._timeout_ns:
+            self.timeouts += 1
+            self.goal = None
+        if self._wish is None:
+            return None
+        if self.goal is None:
+            self._number += 1
+            self.goal, self._wish = Goal(self._number, self._wish), None
+            self._accepted = self._cancelling = False
+            self._since_ns = now_ns
+            return Step.SEND
+        if self._accepted and not self._cancelling:
+            self._cancelling, self._since_ns = True, now_ns
+            return Step.CANCEL
+        return None

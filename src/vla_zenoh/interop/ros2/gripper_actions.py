@@ -1,0 +1,89 @@
+"""The actions a gripper may be commanded by: goals out, results in."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.interop.ros2.names import request_of, send_goal_of
+from vla_zenoh.types import GripperCommand
+
+MOVE, GRASP = "franka_msgs/action/Move", "franka_msgs/action/Grasp"
+GRIPPER_COMMAND = "control_msgs/action/GripperCommand"
+SUCCEEDED = 4
+"""action_msgs/GoalStatus.STATUS_SUCCEEDED."""
+
+
+class Outcome(NamedTuple):
+    """How a goal ended: as asked, with something between the fingers, and what was said."""
+
+    reached: bool
+    holding: bool
+    said: str
+
+
+def send_goal(
+    messages: Messages,
+    action: str,
+    goal_id: bytes,
+    command: GripperCommand,
+    *,
+    per_finger: bool,
+    max_width_m: float,
+) -> Any:
+    """The request that begins a goal.
+
+    Args:
+        messages: of the robot's distribution.
+        action: one of the three.
+        goal_id: 16 bytes.
+        command: opening, speed and force.
+        per_finger: the robot's positions are those of one finger.
+        max_width_m: a grasp succeeds at whatever width up to this.
+    """
+    width_m = command.width_m / 2 if per_finger else command.width_m
+    if action == MOVE:
+        goal = {"width": width_m, "speed": command.speed_m_s}
+    elif action == GRASP:
+        epsilon = messages.new("franka_msgs/msg/GraspEpsilon", inner=max_width_m, outer=max_width_m)
+        goal = {
+            "width": width_m,
+            "epsilon": epsilon,
+            "speed": command.speed_m_s,
+            "force": command.force_n,
+        }
+    else:
+        order = messages.new(
+            "control_msgs/msg/GripperCommand", position=width_m, max_effort=command.force_n
+        )
+        goal = {"command": order}
+    return messages.new(
+        request_of(send_goal_of(action)),
+        goal_id=uuid(messages, goal_id),
+        goal=messages.new(f"{action}_Goal", **goal),
+    )
+
+
+def uuid(messages: Messages, goal_id: bytes) -> Any:
+    """A unique_identifier_msgs/UUID of 16 bytes."""
+    return messages.new(
+        "unique_identifier_msgs/msg/UUID", uuid=np.frombuffer(goal_id, np.uint8).copy()
+    )
+
+
+def cancel(messages: Messages, goal_id: bytes) -> Any:
+    """The request that ends this goal alone."""
+    info = messages.new("action_msgs/msg/GoalInfo", goal_id=uuid(messages, goal_id))
+    return messages.new("action_msgs/srv/CancelGoal_Request", goal_info=info)
+
+
+def outcome(action: str, response: Any) -> Outcome:
+    """What the answer of get_result means."""
+    result = response.result
+    reached = response.status == SUCCEEDED
+    if action == GRIPPER_COMMAND:
+        return Outcome(reached and bool(result.reached_goal), bool(result.stalled), "")
+    success = reached and bool(result.success)
+    return Outcome(success, success and action == GRASP, str(result.error)[:300])

@@ -1,0 +1,42 @@
+"""Where the robot's own controller holds the arm when nothing is sent to it."""
+
+from __future__ import annotations
+
+from vla_zenoh.control.so3 import Pose, distance
+
+SETTLE_NS = 500_000_000
+"""After the last command the arm comes to rest within this time."""
+MOVED_M, MOVED_RAD = 0.005, 0.02
+"""An arm at rest that is moved by more than this is moved by somebody else."""
+
+
+class Hold:
+    """Remembers whether the last command sent still counts.
+
+    A controller goes on holding what it was sent last, some way from where the arm is measured; the
+    next stream has to begin there. When somebody else moves the arm that is no longer so.
+    """
+
+    def __init__(self) -> None:
+        self._sent_ns: int | None = None
+        self._settled: Pose | None = None
+
+    @property
+    def held(self) -> bool:
+        """What was sent last is what the controller holds."""
+        return self._sent_ns is not None
+
+    def sent(self, now_ns: int) -> None:
+        """A command was sent."""
+        self._sent_ns, self._settled = now_ns, None
+
+    def look(self, measured: Pose, now_ns: int) -> bool:
+        """Whether `held` still; call it while nothing is sent."""
+        if self._sent_ns is None or now_ns - self._sent_ns < SETTLE_NS:
+            return self.held
+        if self._settled is None:
+            self._settled = measured
+        apart_m, apart_rad = distance(self._settled, measured)
+        if apart_m > MOVED_M or apart_rad > MOVED_RAD:
+            self._sent_ns = self._settled = None
+        return self.held

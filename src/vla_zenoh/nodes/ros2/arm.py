@@ -1,0 +1,393 @@
+"""The arm of a ROS 2 robot: its joint states in, our commands out.
+
+Between the command stream and the robot stands the same guard as in the simulator. When the stream
+falls silent in motion it brakes here; then nothing more is sent, and the robot's own controller
+holds what it was sent last.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.control.arm import make_kinematics
+from vla_zenoh.control.arm_guard import ArmGuard, Measured, make_arm_guard
+from vla_zenoh.control.impedance import Reference
+from vla_zenoh.control.joint_impedance import JointReference
+from vla_zenoh.control.so3 import Pose, quat_from_rotation
+from vla_zenoh.errors import CodecError, ProfileError
+from vla_zenoh.interop.ros2 import table
+from vla_zenoh.interop.ros2.arm_state import ArmState, pose_state
+from vla_zenoh.interop.ros2.frames import Frames
+from vla_zenoh.interop.ros2.hold import Hold
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.interop.ros2.qos import COMMAND, SENSOR, STATIC_TRANSFORMS
+from vla_zenoh.interop.ros2.robot_clock import RobotClock
+from vla_zenoh.interop.ros2.samples import Stamp, Wrench
+from vla_zenoh.interop.ros2.topics import joint_state, pose, transforms, wrench
+from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.meter import RateMeter
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.ros2.link import Link
+from vla_zenoh.nodes.slots import Arrival, Inbox
+from vla_zenoh.profile.ros2 import Ros2Output, Ros2Profile
+from vla_zenoh.types import Event, FloatArray, JointCommand, PoseCommand
+
+TF, TF_STATIC = "/tf", "/tf_static"
+INBOX = 64
+WRENCH_PATIENCE_NS = 200_000_000
+FINGER_PATIENCE_NS = 1_000_000_000
+"""Gripper nodes publish more slowly than arms."""
+LEAD_PERIODS = 2
+"""A trajectory's point lies this many command periods ahead."""
+STREAMING = "streaming"
+
+
+class Arm:
+    """See the module.
+
+    Args:
+        node: on whose behalf.
+        link: to the ROS graph.
+        messages: of the robot's distribution.
+        ros2: the profile's section.
+        gripper: (busy, width asked for last, holding) of the gripper.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        link: Link,
+        messages: Messages,
+        ros2: Ros2Profile,
+        gripper: Callable[[], tuple[bool, float | None, bool]],
+    ) -> None:
+        profile = self._profile = node.profile
+        self._node, self._messages, self._ros2, self._ask_gripper = node, messages, ros2, gripper
+        self._kinematics = make_kinematics(profile)
+        self._state = ArmState(profile, self._kinematics)
+        self.clock = RobotClock()
+        self.rate = RateMeter()
+        self._guard: ArmGuard | None = None
+        self._hold = Hold()
+        self._deaf = False
+        self._was = ""
+        self._tcp: Pose | None = None
+        self._wrench: Wrench | None = None
+        self._frames = Frames() if ros2.tcp == "tf" else None
+        self._heard_ns: int | None = None
+        self._published_ns = 0
+        self._clock_told = False
+        self._fingers_lost = False
+        self._listen(link)
+        keys = node.keys
+        self._joint_out = node.stream(keys.state_joint, Kind.STATE)
+        self._pose_out = node.stream(keys.state_pose, Kind.STATE)
+        self._gripper_out = node.stream(keys.state_gripper, Kind.STATE)
+        output = self._output()
+        self._frame = output.frame or profile.robot.base_frame
+        self._kind, self._write = output.type, self._writing(output)
+        self._orders = node.listen(
+            keys.command_joint if profile.robot.command == "joint" else keys.command_pose,
+            Inbox(INBOX),
+        )
+        self._writer = link.write(output.topic, output.type, COMMAND)
+
+    # -- setting up ---------------------------------------------------------------------------
+    def _listen(self, link: Link) -> None:
+        ros2 = self._ros2
+        topics = dict.fromkeys((ros2.joint_states, ros2.finger_states or ros2.joint_states))
+        self._joint_slots = [
+            link.read(topic, joint_state.TYPE, Inbox(INBOX), SENSOR) for topic in topics
+        ]
+        self._tf_slots = []
+        if self._frames is not None:
+            self._tf_slots = [
+                (link.read(TF, transforms.TYPE, Inbox(INBOX), SENSOR), False),
+                (link.read(TF_STATIC, transforms.TYPE, Inbox(INBOX), STATIC_TRANSFORMS), True),
+            ]
+        self._wrench_slot = None
+        if ros2.wrench is not None:
+            self._wrench_slot = link.read(ros2.wrench.topic, wrench.TYPE, Inbox(4), SENSOR)
+
+    def _output(self) -> Ros2Output:
+        ros2 = self._ros2
+        joints = self._profile.robot.command == "joint"
+        output = ros2.joint_command if joints else ros2.pose_command
+        if output is None:
+            raise ProfileError(f"ros2 lacks {self._profile.robot.command}_command")
+        return output
+
+    def _writing(self, output: Ros2Output) -> table.Write:
+        """How commands are written.
+
+        Raises:
+            ProfileError: what the type cannot carry.
+        """
+        posture_rad = np.array(self._profile.robot.home_rad)
+        lead_ns = round(LEAD_PERIODS * 1e9 / self._profile.timing.command_hz)
+        key = f"command_{self._profile.robot.command}"
+        for row in table.writings(posture_rad, lead_ns):
+            if (row.type, row.key) == (output.type, key):
+                return row.write
+        if key == "command_joint":
+            raise ProfileError(f"joint positions cannot be sent as {output.type}")
+        pose.check(self._messages, output.type)
+        return pose.writer(posture_rad)
+
+    # -- one turn -----------------------------------------------------------------------------
+    def turn(self, now_ns: int) -> None:
+        """Take what arrived, publish the state, and send what the arm has to follow."""
+        self._take_transforms()
+        self._take_wrench()
+        if self._take_joints():
+            self._publish(now_ns)
+        self._take_orders(now_ns)
+        self._follow(now_ns)
+        self._tell()
+
+    def _refuse(self, topic: str, error: CodecError) -> None:
+        self._node.refuse(error.reason, f"{topic}: {error}", topic)
+
+    def _take_joints(self) -> bool:
+        """Whether the arm's joints are known anew."""
+        fresh = False
+        for slot in self._joint_slots:
+            for arrival in slot.take_all():
+                topic = str(arrival.sample.key_expr)
+                try:
+                    joints = self._read(joint_state.TYPE, arrival)
+                    stamp_ns = self.clock.take(joints.stamp_ns, self._node.wall_of(arrival))
+                    fresh = self._state.take(joints, stamp_ns) is not None or fresh
+                except CodecError as error:
+                    self._refuse(topic, error)
+                else:
+                    self._heard_ns = arrival.mono_ns
+                    self.rate.tick()
+        return fresh
+
+    def _read(self, kind: str, arrival: Arrival) -> Any:
+        return table.read(self._messages, kind, arrival.sample.payload.to_bytes())
+
+    def _take_transforms(self) -> None:
+        for slot, static in self._tf_slots:
+            for arrival in slot.take_all():
+                assert self._frames is not None
+                try:
+                    self._frames.take(self._read(transforms.TYPE, arrival), static=static)
+                except CodecError as error:
+                    self._refuse(TF_STATIC if static else TF, error)
+
+    def _take_wrench(self) -> None:
+        if self._wrench_slot is None or self._ros2.wrench is None:
+            return
+        frame = self._ros2.wrench.frame or self._profile.robot.base_frame
+        for arrival in self._wrench_slot.take_all():
+            try:
+                found: Wrench = self._read(wrench.TYPE, arrival)
+                if found.frame != frame:
+                    raise CodecError("frame", f"in frame {found.frame[:60]!r}, wanted {frame!r}")
+                if not np.isfinite(found.wrench).all():
+                    raise CodecError("invalid", "a wrench that is NaN or infinite")
+            except CodecError as error:
+                self._refuse(self._ros2.wrench.topic, error)
+            else:
+                stamp_ns = found.stamp_ns or self._node.wall_of(arrival)
+                self._wrench = found._replace(stamp_ns=stamp_ns)
+
+    # -- state out ----------------------------------------------------------------------------
+    def _publish(self, now_ns: int) -> None:
+        joints, stamp_ns = self._state.joints, self._state.stamp_ns
+        assert joints is not None
+        if now_ns - self._published_ns < 0.9e9 / self._profile.timing.state_hz:
+            return
+        self._published_ns = now_ns
+        tcp, twist = self._state.tcp()
+        if self._frames is not None:
+            found = self._tcp_of_frames(stamp_ns)
+            if found is None:
+                return
+            tcp = found
+        self._tcp = tcp
+        if self._guard is None:
+            self._guard = self._make_guard()
+        reference = self._guard.reference if self._hold.held else None
+        seq = self._joint_out.seq
+        if isinstance(reference, JointReference):
+            joints = replace(joints, reference_rad=reference.position_rad)
+        self._joint_out.put(joints, stamp_wall_ns=stamp_ns, seq=seq)
+        record = pose_state(tcp, twist, self._external_wrench(stamp_ns), _pose_of(reference))
+        self._pose_out.put(record, stamp_wall_ns=stamp_ns, seq=seq)
+        self._publish_gripper(stamp_ns, seq)
+
+    def _tcp_of_frames(self, stamp_ns: int) -> Pose | None:
+        assert self._frames is not None
+        robot = self._profile.robot
+        found = self._frames.find(robot.base_frame, robot.tcp_frame)
+        if found is None:
+            way = f"{robot.base_frame} -> {robot.tcp_frame}"
+            self._refuse(TF, CodecError("no_transform", f"{way} is not known"))
+            return None
+        late_s = (stamp_ns - found[1]) / 1e9
+        if late_s > self._profile.timing.state_timeout_s:
+            self._refuse(TF, CodecError("stale", f"the TCP is {late_s:.3f} s behind the joints"))
+            return None
+        return found[0]
+
+    def _external_wrench(self, stamp_ns: int) -> FloatArray | None:
+        found = self._wrench
+        if found is None or abs(stamp_ns - found.stamp_ns) > WRENCH_PATIENCE_NS:
+            return None
+        return found.wrench
+
+    def _publish_gripper(self, stamp_ns: int, seq: int) -> None:
+        busy, wanted_m, held = self._ask_gripper()
+        record = self._state.gripper(busy=busy, wanted_m=wanted_m, held=held)
+        if record is None:
+            return
+        silent_ns = stamp_ns - self._state.width_stamp_ns
+        lost = bool(self._profile.robot.finger_joints) and silent_ns > FINGER_PATIENCE_NS
+        if lost and not self._fingers_lost:
+            why = f"no joint state of {', '.join(self._profile.robot.finger_joints)}"
+            self._node.tell(Event("warning", "fault", "fingers_lost", why))
+        self._fingers_lost = lost
+        if lost:
+            return
+        if self._guard is not None and self._guard.braking:
+            record = replace(record, mode="braking")
+        self._gripper_out.put(record, stamp_wall_ns=stamp_ns, seq=seq)
+
+    # -- commands -----------------------------------------------------------------------------
+    def _measure(self) -> Measured:
+        joints = self._state.joints
+        assert joints is not None and self._tcp is not None
+        return Measured(self._tcp, joints.position_rad, joints.velocity_rad_s)
+
+    def _make_guard(self) -> ArmGuard:
+        kinematics, names = self._kinematics, self._profile.robot.arm_joints
+        order = [kinematics.arm_joints.index(name) for name in names]
+        ends = (kinematics.lower_rad[order], kinematics.upper_rad[order])
+        return make_arm_guard(
+            self._profile, self._measure, ends, 1.0 / self._profile.timing.command_hz
+        )
+
+    def _take_orders(self, now_ns: int) -> None:
+        guard, mode = self._guard, self._profile.robot.command
+        for arrival in self._orders.take_all():
+            if guard is None or self._deaf:
+                continue
+            if not (guard.following or guard.braking or self._hold.held):
+                guard.restart()  # nobody holds the arm at what was sent last: it is where it is
+            if mode == "joint":
+                joints = self._node.read(JointCommand, arrival)
+                reason = None if joints is None else guard.offer_joint(joints, now_ns)
+            else:
+                order = self._node.read(PoseCommand, arrival)
+                reason = None if order is None else guard.offer_pose(order, now_ns)
+            if reason is not None:
+                self._node.refuse(f"{mode}_{reason}", f"command/{mode}: {reason}")
+
+    def _follow(self, now_ns: int) -> None:
+        guard = self._guard
+        if guard is None:
+            return
+        was_braking = guard.braking
+        reference = guard.tick(now_ns)
+        if guard.following or guard.braking or was_braking:
+            self._hold.sent(now_ns)
+            self._send(reference, now_ns)
+        elif self._tcp is not None:
+            self._hold.look(self._tcp, now_ns)
+
+    def _send(self, reference: Reference | JointReference, now_ns: int) -> None:
+        command: Any
+        if isinstance(reference, JointReference):
+            command = JointCommand(self._profile.robot.arm_joints, *reference, STREAMING)
+        else:
+            quat_xyzw = quat_from_rotation(reference.rotation)
+            command = PoseCommand(
+                reference.position_m,
+                quat_xyzw,
+                reference.twist,
+                reference.acceleration,
+                reference.position_m,
+                quat_xyzw,
+                STREAMING,
+            )
+        message = self._write(self._messages, self._kind, command, Stamp(now_ns, self._frame))
+        self._writer.put(self._messages.encode(message))
+        self._node.counters["ros2.commands_sent"] += 1
+
+    # -- ending and telling -------------------------------------------------------------------
+    def deafen(self) -> None:
+        """Take no more commands: what moves is braked."""
+        self._deaf = True
+
+    @property
+    def sending(self) -> bool:
+        """The robot is being sent commands."""
+        return self._guard is not None and (self._guard.following or self._guard.braking)
+
+    @property
+    def state(self) -> str:
+        """One word."""
+        age_s = self.age_s
+        if age_s is None:
+            return "waiting"
+        if age_s > self._profile.timing.state_timeout_s:
+            return "silent"
+        return "braking" if self._guard is not None and self._guard.braking else "running"
+
+    @property
+    def age_s(self) -> float | None:
+        """Of the newest joint state, None before the first."""
+        return None if self._heard_ns is None else (time.monotonic_ns() - self._heard_ns) / 1e9
+
+    def _tell(self) -> None:
+        state = self.state
+        if state != self._was:
+            if self._was:
+                bad = state in ("silent", "braking")
+                level = "warning" if bad else "info"
+                change = f"{self._was}->{state}"
+                self._node.tell(Event(level, "transition", change, self._why(state)))
+            self._was = state
+        if self.clock.differs != self._clock_told and self.clock.offset_s is not None:
+            self._clock_told = self.clock.differs
+            if self._clock_told:
+                why = (
+                    f"the robot's stamps are {self.clock.offset_s:+.3f} s behind this clock; "
+                    "synchronise both (chrony or ptp)"
+                )
+                self._node.tell(Event("warning", "notice", "robot_clock", why))
+
+    def _why(self, state: str) -> str:
+        if state == "silent":
+            return f"nothing on {self._ros2.joint_states}; is the robot or the bridge gone?"
+        if state == "braking":
+            return "the command stream fell silent in motion"
+        return ""
+
+    def detail(self) -> dict[str, Any]:
+        """For status."""
+        guard = self._guard
+        self._node.counters["ros2.unstamped"] = self.clock.unstamped
+        self._node.counters["ros2.efforts_missing"] = self._state.efforts_missing
+        if guard is not None:
+            self._node.counters["ros2.stream_silences"] = guard.silences
+        return {
+            "following": guard is not None and guard.following,
+            "held": self._hold.held,
+            "robot_clock_behind_s": self.clock.offset_s,
+            "width_m": self._state.width_m,
+        }
+
+
+def _pose_of(reference: Reference | JointReference | None) -> Pose | None:
+    if isinstance(reference, Reference):
+        return Pose(reference.position_m, reference.rotation)
+    return None

@@ -1,0 +1,120 @@
+"""Camera topics: a thread each, which decodes what is wanted and keeps the stamps."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from vla_zenoh.errors import CodecError
+from vla_zenoh.interop.ros2 import table
+from vla_zenoh.interop.ros2.arm_state import Newness
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.interop.ros2.qos import SENSOR
+from vla_zenoh.interop.ros2.samples import Picture
+from vla_zenoh.nodes.camera_sources.outlet import OK, Outlet
+from vla_zenoh.nodes.camera_sources.picture import fit
+from vla_zenoh.nodes.camera_sources.source import STALL_S
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.ros2.link import Link
+from vla_zenoh.nodes.slots import Arrival, Latest
+from vla_zenoh.profile import Profile
+from vla_zenoh.profile.ros2 import Ros2Camera
+from vla_zenoh.types import Event
+
+SOURCE = "ros2:"
+WAIT_S = 0.1
+LOOK_S = 0.5
+"""A picture is decoded this often even when nobody wants it: a broken camera is to be seen."""
+
+Tell = Callable[[Event], None]
+Refuse = Callable[[str, str, str], None]
+
+
+def camera_topics(profile: Profile) -> dict[str, Ros2Camera]:
+    """Camera -> its topic, of all that come from ROS 2."""
+    named = profile.ros2.cameras if profile.ros2 is not None else {}
+    return {
+        name: named.get(name) or Ros2Camera(topic=camera.source.removeprefix(SOURCE))
+        for name, camera in profile.cameras.items()
+        if camera.source.startswith(SOURCE)
+    }
+
+
+class Camera:
+    """One camera: `run` is the body of its thread.
+
+    Args:
+        name: the camera's.
+        topic: where its pictures come from.
+        node: on whose behalf; only its streams and clock are used by the thread.
+        link: to the ROS graph.
+        messages: of the robot's distribution, for this thread alone.
+        tell: writes an event; may be called from any thread.
+        refuse: counts a refusal likewise.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        topic: Ros2Camera,
+        node: Node,
+        link: Link,
+        messages: Messages,
+        tell: Tell,
+        refuse: Refuse,
+    ) -> None:
+        self._topic, self._node, self._messages, self._refuse = topic, node, messages, refuse
+        self.outlet = Outlet(name, node.profile.cameras[name], topic.topic, node, tell)
+        self.outlet.backend = topic.type
+        self._newness = Newness()
+        self._looked_s = -LOOK_S
+        self._slot = link.read(topic.topic, topic.type, Latest(), SENSOR)
+
+    def run(self, stop: threading.Event) -> None:
+        """Serve until `stop` is set."""
+        last_s = time.monotonic()
+        while not stop.is_set():
+            if self._slot.wait(WAIT_S):
+                arrival = self._slot.take()
+                if arrival is not None and self._take(arrival):
+                    last_s = time.monotonic()
+            silent_s = time.monotonic() - last_s
+            if silent_s > STALL_S:
+                self.outlet.lose(f"no picture on {self._topic.topic} for {silent_s:.0f} s")
+
+    def _take(self, arrival: Arrival) -> bool:
+        """Whether it was a picture."""
+        outlet, now_s = self.outlet, time.monotonic()
+        due = outlet.in_time(arrival.mono_ns)
+        if not (due and outlet.wanted) and now_s - self._looked_s < LOOK_S:
+            if outlet.state == OK:
+                outlet.seen(arrival.mono_ns)
+            return outlet.state == OK
+        self._looked_s = now_s
+        try:
+            picture = self._read(arrival)
+        except CodecError as error:
+            self._refuse(error.reason, f"{self._topic.topic}: {error}", outlet.name)
+            if error.reason in ("encoding", "frame"):  # they will all be like that
+                outlet.lose(str(error))
+            return False
+        outlet.seen(arrival.mono_ns)
+        outlet.change(OK)
+        if due and outlet.wanted:
+            settings = outlet.profile
+            rgb = fit(picture.rgb, settings.width, settings.height)
+            stamp_ns = picture.stamp_ns or self._node.clock.wall_at(arrival.mono_ns)
+            outlet.put_rgb(rgb, arrival.mono_ns, stamp_ns)
+        return True
+
+    def _read(self, arrival: Arrival) -> Picture:
+        payload = arrival.sample.payload.to_bytes()
+        picture: Picture = table.read(self._messages, self._topic.type, payload)
+        if self._topic.frame is not None and picture.frame != self._topic.frame:
+            raise CodecError(
+                "frame", f"in frame {picture.frame[:60]!r}, wanted {self._topic.frame!r}"
+            )
+        if picture.stamp_ns:
+            self._newness.check(picture.stamp_ns)
+        return picture

@@ -1,0 +1,173 @@
+"""The gripper of a ROS 2 robot: by an action, one goal at a time, or by a topic of widths."""
+
+from __future__ import annotations
+
+import secrets
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from vla_zenoh.errors import CodecError
+from vla_zenoh.interop.ros2 import gripper_actions, table
+from vla_zenoh.interop.ros2.goals import Goal, GoalKeeper, Step
+from vla_zenoh.interop.ros2.gripper_actions import GRASP
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.interop.ros2.names import get_result_of, request_of, response_of, send_goal_of
+from vla_zenoh.interop.ros2.qos import COMMAND
+from vla_zenoh.interop.ros2.samples import Stamp
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.ros2.link import Caller, Link
+from vla_zenoh.nodes.slots import Inbox
+from vla_zenoh.nodes.speaker import Speaker
+from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Gripper
+from vla_zenoh.types import Event, GripperCommand
+
+GIVE_UP_S = 5.0
+"""A goal of which nothing is heard for so long is given up."""
+ID_BYTES = 16
+
+
+class Gripper:
+    """Takes our gripper commands.
+
+    Args:
+        node: on whose behalf.
+        link: to the ROS graph.
+        messages: of the robot's distribution.
+        profile: the gripper's section; None: this robot's gripper is not ours to command.
+    """
+
+    def __init__(
+        self, node: Node, link: Link, messages: Messages, profile: Ros2Gripper | None
+    ) -> None:
+        self._node, self._messages, self._profile = node, messages, profile
+        self._orders = node.listen(node.keys.command_gripper, Inbox(16))
+        self._speaker = Speaker(node.profile.timing.command_timeout_s)
+        self._keeper = GoalKeeper(GIVE_UP_S)
+        self._news: deque[Callable[[], None]] = deque()
+        self._goal_id = b""
+        self._closing = False
+        self._action = ""
+        self._now_ns = 0
+        self.wanted_m: float | None = None
+        self.holding = False
+        self._callers: dict[str, dict[str, Caller]] = {}
+        self._topic = None
+        if profile is None:
+            return
+        if profile.type in GRIPPER_ACTIONS:
+            self._callers[profile.type] = link.call_action(profile.topic, profile.type)
+            if profile.grasp is not None:
+                self._callers[GRASP] = link.call_action(profile.grasp, GRASP)
+        else:
+            self._topic = link.write(profile.topic, profile.type, COMMAND)
+
+    @property
+    def busy(self) -> bool:
+        """A goal is in flight."""
+        return self._keeper.goal is not None
+
+    def turn(self, now_ns: int) -> None:
+        """Take commands and answers, and do what is due."""
+        self._now_ns = now_ns
+        while self._news:
+            self._news.popleft()()
+        for arrival in self._orders.take_all():
+            order = self._node.read(GripperCommand, arrival, self._speaker)
+            if order is not None:
+                self._take(order.record, now_ns)
+        step = self._keeper.step(now_ns)
+        self._node.counters["ros2.gripper_timeouts"] = self._keeper.timeouts
+        goal = self._keeper.goal
+        if step is Step.SEND and goal is not None:
+            self._send(goal)
+        elif step is Step.CANCEL and goal is not None:
+            self._cancel()
+
+    def _take(self, command: GripperCommand, now_ns: int) -> None:
+        if self._profile is None:
+            self._node.refuse("no_gripper", "command/gripper: the profile has no ros2.gripper")
+            return
+        self._closing = self.wanted_m is None or command.width_m < self.wanted_m
+        self.wanted_m = command.width_m
+        if self._topic is None:
+            self._keeper.want(command)
+            return
+        share = 0.5 if self._profile.per_finger else 1.0
+        order = GripperCommand(command.width_m * share, command.speed_m_s, command.force_n)
+        message = _WIDTHS[self._profile.type](
+            self._messages, self._profile.type, order, Stamp(now_ns, "")
+        )
+        self._topic.put(self._messages.encode(message))
+
+    # -- the action ---------------------------------------------------------------------------
+    def _send(self, goal: Goal) -> None:
+        assert self._profile is not None
+        use_grasp = self._closing and GRASP in self._callers
+        self._action = GRASP if use_grasp else self._profile.type
+        self._goal_id = secrets.token_bytes(ID_BYTES)
+        self.holding = False
+        request = gripper_actions.send_goal(
+            self._messages,
+            self._action,
+            self._goal_id,
+            goal.command,
+            per_finger=self._profile.per_finger,
+            max_width_m=self._node.profile.robot.gripper.max_width_m,
+        )
+        self._node.counters["ros2.gripper_goals"] += 1
+        self._call("send_goal", request, lambda answer: self._accepted(goal.number, answer))
+
+    def _call(self, part: str, request: Any, done: Callable[[bytes | None], None]) -> None:
+        # Answers come on Zenoh's thread; they are looked at in the next turn.
+        self._callers[self._action][part].call(
+            self._messages.encode(request), lambda answer: self._news.append(lambda: done(answer))
+        )
+
+    def _accepted(self, number: int, answer: bytes | None) -> None:
+        response = self._read(response_of(send_goal_of(self._action)), answer)
+        if response is None or not response.accepted:
+            if self._keeper.ended(number):
+                self._complain("refused the goal" if response is not None else "does not answer")
+            return
+        self._keeper.accepted(number, self._now_ns)
+        request = self._messages.new(
+            request_of(get_result_of(self._action)),
+            goal_id=gripper_actions.uuid(self._messages, self._goal_id),
+        )
+        self._call("get_result", request, lambda answer: self._ended(number, answer))
+
+    def _ended(self, number: int, answer: bytes | None) -> None:
+        if not self._keeper.ended(number):
+            return
+        response = self._read(response_of(get_result_of(self._action)), answer)
+        if response is None:
+            self._complain("does not say how the goal ended")
+            return
+        outcome = gripper_actions.outcome(self._action, response)
+        self.holding = outcome.holding
+        if not (outcome.reached or outcome.holding):
+            self._complain(f"did not get there (status {response.status}) {outcome.said}")
+
+    def _cancel(self) -> None:
+        self._node.counters["ros2.gripper_cancelled"] += 1
+        request = gripper_actions.cancel(self._messages, self._goal_id)
+        self._call("cancel_goal", request, lambda _: None)  # the goal's result says the rest
+
+    def _read(self, kind: str, answer: bytes | None) -> Any:
+        if answer is None:
+            return None
+        try:
+            return self._messages.decode(kind, answer)
+        except CodecError as error:
+            self._node.refuse(error.reason, f"answer of {self._action}: {error}", self._action)
+            return None
+
+    def _complain(self, what: str) -> None:
+        assert self._profile is not None
+        where = self._profile.topic if self._action != GRASP else self._profile.grasp
+        why = f"the gripper at {where or self._profile.topic} {what}"
+        self._node.tell(Event("warning", "fault", "gripper", why[:1000]))
+
+
+_WIDTHS: dict[str, table.Write] = {row.type: row.write for row in table.GRIPPER_WRITINGS}

@@ -1,0 +1,227 @@
+"""A ROS 2 robot on the bus: takes command keys, gives state and camera keys.
+
+No ROS and no DDS here: messages are CDR on keys of zenoh-bridge-ros2dds, or of a robot that runs
+rmw_zenoh. The main loop runs at the rate of the command stream; cameras and services have threads.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import zenoh
+
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.nodes.clock import FixedRate, make_this_thread_realtime
+from vla_zenoh.nodes.meter import RateMeter
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.process import ROUTER_PATIENCE_S
+from vla_zenoh.nodes.ros2.arm import Arm
+from vla_zenoh.nodes.ros2.cameras import Camera, camera_topics
+from vla_zenoh.nodes.ros2.gripper import Gripper
+from vla_zenoh.nodes.ros2.link import Link
+from vla_zenoh.nodes.ros2.people import People
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.profile import Profile, SessionProfile
+from vla_zenoh.profile.ros2 import Ros2Profile
+from vla_zenoh.types import Event
+
+NAME = "ros2"
+SWITCH_INTERVAL_S = 5e-4
+BRAKE_BEFORE_EXIT_S = 1.0
+GOODBYE_S = 0.3
+CLOCK_PERIOD_S = 0.1
+MAX_DEFINITION_BYTES = 65_536
+
+
+def read_messages(ros2: Ros2Profile) -> Messages:
+    """The messages of the profile's distribution, and those of its files.
+
+    Raises:
+        ProfileError: a file that is not there or no definition.
+    """
+    texts: dict[str, str] = {}
+    for kind, path in ros2.messages.items():
+        try:
+            with Path(path).expanduser().open("rb") as file:
+                texts[kind] = file.read(MAX_DEFINITION_BYTES).decode("utf-8")
+        except (OSError, ValueError, RuntimeError) as error:
+            raise ProfileError(f"ros2.messages.{kind}: {path} cannot be read: {error}") from error
+    return Messages(ros2.distribution, texts)
+
+
+class Ros2Node:
+    """See the module.
+
+    Args:
+        profile: the effective profile, with its section ros2.
+        session: open session to our own router, closed by whoever opened it.
+
+    Raises:
+        ProfileError: the section ros2 is missing or names what is not known.
+        NodeError: a node of this name is alive already.
+        SessionError: ros2.connect does not answer.
+    """
+
+    def __init__(self, profile: Profile, session: zenoh.Session) -> None:
+        if profile.ros2 is None:
+            raise ProfileError(f"profile {profile.name!r} has no section ros2")
+        ros2 = profile.ros2
+        messages = read_messages(ros2)
+        node = self.node = Node(NAME, profile, session)
+        self._own_session = None
+        if ros2.connect is not None:
+            way = SessionProfile(connect=ros2.connect, lease_ms=profile.session.lease_ms)
+            self._own_session = open_session(way, wait_s=ROUTER_PATIENCE_S)
+        self.link = Link(
+            self._own_session or session, ros2, messages, f"vla_{_ros_name(profile.robot.name)}"
+        )
+        self._halt = threading.Event()
+        self._news: deque[Callable[[], None]] = deque(maxlen=256)
+        self._bridges = 0
+        self._gripper: Gripper | None = None
+        self._arm: Arm | None = None
+        if profile.robot.driver == NAME:
+            gripper = self._gripper = Gripper(node, self.link, messages, ros2.gripper)
+            self._arm = Arm(
+                node,
+                self.link,
+                messages,
+                ros2,
+                lambda: (gripper.busy, gripper.wanted_m, gripper.holding),
+            )
+        self._cameras = [
+            Camera(name, topic, node, self.link, read_messages(ros2), self._tell, self._refuse)
+            for name, topic in camera_topics(profile).items()
+        ]
+        self._people = None
+        if ros2.services is not None:
+            self._people = People(
+                profile, session, self.link, read_messages(ros2), ros2.services, self._refuse
+            )
+        self._rate = RateMeter()
+        self._realtime = False
+        self._clock_s = 0.0
+
+    # -- for the threads ----------------------------------------------------------------------
+    def _tell(self, event: Event) -> None:
+        self._news.append(lambda: self.node.tell(event))
+
+    def _refuse(self, reason: str, why: str, about: str) -> None:
+        self._news.append(lambda: self.node.refuse(reason, why, about))
+
+    # -- running ------------------------------------------------------------------------------
+    def run(self, stop: threading.Event) -> None:
+        """Drive until `stop` is set; a motion is braked first."""
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        bodies = [camera.run for camera in self._cameras]
+        if self._people is not None:
+            bodies.append(self._people.run)
+        threads = [
+            threading.Thread(target=body, args=(self._halt,), name=f"ros2 {index}", daemon=True)
+            for index, body in enumerate(bodies)
+        ]
+        for thread in threads:
+            thread.start()
+        self._realtime = make_this_thread_realtime()
+        gc.collect()
+        gc.freeze()
+        try:
+            self._loop(stop)
+        finally:
+            self._halt.set()
+            give_up = time.monotonic() + GOODBYE_S
+            for thread in threads:
+                thread.join(max(0.0, give_up - time.monotonic()))
+            self.node.report("stopped", now=True)
+            self.node.close()
+            self.link.close()
+            if self._own_session is not None:
+                self._own_session.close()
+
+    def _loop(self, stop: threading.Event) -> None:
+        loop = FixedRate(self.node.profile.timing.command_hz)
+        give_up = 0.0
+        while True:
+            tick = loop.wait()
+            if tick.periods > 1:
+                self.node.counters["ros2.missed_ticks"] += tick.periods - 1
+            if stop.is_set():
+                give_up = give_up or time.monotonic() + BRAKE_BEFORE_EXIT_S
+                if self._arm is None or not self._arm.sending or time.monotonic() > give_up:
+                    return
+                self._arm.deafen()
+            now_ns = self.node.clock.wall_at(tick.nominal_ns)
+            if self._gripper is not None:
+                self._gripper.turn(now_ns)
+            if self._arm is not None:
+                self._arm.turn(now_ns)
+            while self._news:
+                self._news.popleft()()
+            self._rate.tick()
+            self._watch()
+
+    # -- status -------------------------------------------------------------------------------
+    def _watch(self) -> None:
+        if time.monotonic() - self._clock_s >= CLOCK_PERIOD_S:
+            self._clock_s = time.monotonic()
+            step_s = self.node.clock.follow()
+            if step_s:
+                self.node.refuse("clock_step", f"the wall clock was set by {step_s:+.3f} s")
+            self._watch_bridges()
+        state = "running" if self._arm is None else self._arm.state
+        if not self.node.report_due(state):
+            return
+        figures = {camera.outlet.name: camera.outlet.figures() for camera in self._cameras}
+        for camera in self._cameras:
+            for what, count in camera.outlet.counters().items():
+                self.node.counters[what] = count
+        age_s = None if self._arm is None else self._arm.age_s
+        rates_hz = {"loop": self._rate.rate_hz}
+        if self._arm is not None:
+            rates_hz["joint_states"] = self._arm.rate.rate_hz
+        self.node.report(
+            state,
+            detail={
+                **({} if self._arm is None else self._arm.detail()),
+                "cameras": {camera.outlet.name: camera.outlet.detail() for camera in self._cameras},
+                "bridge": self._ros2.bridge,
+                "others": self.link.others,
+                "realtime": self._realtime,
+            },
+            ages_s={} if age_s is None else {"joint_states": age_s},
+            rates_hz=rates_hz | {name: rate_hz for name, (rate_hz, _) in figures.items()},
+            latency_ms={name: late for name, (_, late) in figures.items() if late is not None},
+        )
+
+    @property
+    def _ros2(self) -> Ros2Profile:
+        assert self.node.profile.ros2 is not None
+        return self.node.profile.ros2
+
+    def _watch_bridges(self) -> None:
+        """Tell when the other side is there, or gone."""
+        others, before = self.link.others, self._bridges
+        self._bridges = others
+        if bool(others) == bool(before):
+            return
+        what = "bridge" if self._ros2.bridge == "ros2dds" else "ROS 2 node"
+        event = (
+            Event("info", "transition", "bridge:gone->there", f"a {what} is there")
+            if others
+            else Event(
+                "warning", "transition", "bridge:there->gone", f"no {what} is there any more"
+            )
+        )
+        self.node.tell(event)
+
+
+def _ros_name(name: str) -> str:
+    """A robot's name as ROS takes it: letters, digits and underscores."""
+    return "".join(letter if letter.isalnum() else "_" for letter in name)

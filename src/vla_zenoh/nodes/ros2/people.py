@@ -1,0 +1,207 @@
+"""Services and topics for ROS people: what they ask becomes a setting of ours.
+
+A thread of its own, because a setting has to be agreed to by the command node before it is
+answered. A stop waits for nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+
+from vla_zenoh.codec import settings
+from vla_zenoh.errors import CodecError, SessionError
+from vla_zenoh.interop.ros2 import diagnostics, table
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.interop.ros2.names import request_of, response_of
+from vla_zenoh.interop.ros2.samples import Stamp
+from vla_zenoh.interop.ros2.services import (
+    ACTIVE_TOPIC,
+    PROMPT_TOPIC,
+    RESET,
+    SERVICES,
+    SET_ACTIVE,
+    SET_PROMPT,
+    SET_REQUEST,
+    STATUS_TOPIC,
+    STOP,
+    Service,
+)
+from vla_zenoh.interop.ros2.topics import plain
+from vla_zenoh.nodes.client import Client
+from vla_zenoh.nodes.ros2.link import Link, Request
+from vla_zenoh.nodes.slots import Inbox
+from vla_zenoh.profile import Profile
+
+STATUS_PERIOD_S = 1.0
+TURN_S = 0.05
+MAX_WAITING = 32
+STOP_PATIENCE_S = 2.0
+
+Refuse = Callable[[str, str, str], None]
+
+
+class People:
+    """See the module.
+
+    Args:
+        profile: the effective profile.
+        session: to our own router.
+        link: to the ROS graph.
+        messages: of the robot's distribution, for this thread alone.
+        prefix: what names of services and topics begin with.
+        refuse: counts a refusal; may be called from any thread.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        session: zenoh.Session,
+        link: Link,
+        messages: Messages,
+        prefix: str,
+        refuse: Refuse,
+    ) -> None:
+        self._robot, self._messages, self._refuse = profile.robot.name, messages, refuse
+        self._client = Client(profile, session).follow()
+        self._calls: queue.Queue[tuple[Service, Request]] = queue.Queue(MAX_WAITING)
+        self._do: dict[str, Callable[[Any], str]] = {
+            SET_ACTIVE.name: self._set_active,
+            STOP.name: self._stop,
+            RESET.name: self._reset,
+            SET_PROMPT.name: self._set_prompt,
+            SET_REQUEST.name: self._set_request,
+        }
+        for service in SERVICES:
+            link.serve(f"{prefix}/{service.name}", service.type, self._taker(service))
+        self._prefix = prefix
+        self._prompts = link.read(f"{prefix}/{PROMPT_TOPIC}", plain.TEXT, Inbox(8))
+        self._switches = link.read(f"{prefix}/{ACTIVE_TOPIC}", plain.TRUTH, Inbox(8))
+        self._status = link.write(f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)
+
+    def _taker(self, service: Service) -> Callable[[Request], None]:
+        def take(request: Request) -> None:
+            if service is STOP:  # before all that wait
+                self._client.put(self._client.keys.stop, "")
+            try:
+                self._calls.put_nowait((service, request))
+            except queue.Full:
+                request.drop("too many calls at once")
+
+        return take
+
+    def run(self, stop: threading.Event) -> None:
+        """Serve until `stop` is set."""
+        next_status_s = time.monotonic()
+        while not stop.is_set():
+            with contextlib.suppress(queue.Empty):
+                self._answer(*self._calls.get(timeout=TURN_S))
+            self._take_topics()
+            if time.monotonic() >= next_status_s:
+                next_status_s = time.monotonic() + STATUS_PERIOD_S
+                self._tell_status()
+
+    # -- services -----------------------------------------------------------------------------
+    def _answer(self, service: Service, request: Request) -> None:
+        try:
+            asked = self._messages.decode(request_of(service.type), request.payload)
+            said, success = self._do[service.name](asked), True
+        except CodecError as error:
+            self._refuse(error.reason, f"{service.name}: {error}", service.name)
+            request.drop(str(error))
+            return
+        except (SessionError, zenoh.ZError) as error:
+            said, success = str(error), False
+        response = self._messages.new(response_of(service.type), success=success, message=said)
+        request.answer(self._messages.encode(response))
+
+    def _set_active(self, asked: Any) -> str:
+        return self._activate(bool(asked.data))
+
+    def _activate(self, wanted: bool) -> str:
+        if wanted:
+            task = self._client.activate()
+            return f"active: worker {task.worker}, {task.prompt!r}"
+        if not self._client.deactivate():
+            raise SessionError("the command node does not say that the arm stands")
+        return "inactive, the arm stands"
+
+    def _stop(self, asked: Any) -> str:
+        self._await_state("stopped")
+        return "stopped; call reset, then activate"
+
+    def _reset(self, asked: Any) -> str:
+        self._client.put(self._client.keys.reset, "")
+        self._await_state("inactive")
+        return "inactive"
+
+    def _await_state(self, wanted: str) -> None:
+        def reached() -> bool:
+            status = self._client.status("command")
+            return status is not None and status.state == wanted
+
+        if not self._client.wait_for(reached, STOP_PATIENCE_S):
+            status = self._client.status("command")
+            now = "silent" if status is None else status.state
+            raise SessionError(f"the command node is {now}, not {wanted}")
+
+    def _set_prompt(self, asked: Any) -> str:
+        return f"prompt {self._client.set_prompt(_text(asked.prompt)).prompt!r}"
+
+    def _set_request(self, asked: Any) -> str:
+        """One after the other: inactive first where that is asked, active last.
+
+        What is refused ends it; what came before stays.
+        """
+        done = []
+        if not asked.active:
+            done.append(self._activate(False))
+        if asked.worker:
+            worker = settings.decode_name(asked.worker.encode())
+            done.append(f"worker {self._client.set_worker(worker).worker}")
+        if asked.rate_hz:
+            rate_hz = settings.decode_rate(repr(float(asked.rate_hz)).encode())
+            done.append(f"rate {self._client.set_rate(rate_hz).rate_hz:g} Hz")
+        if asked.prompt:
+            done.append(self._set_prompt(asked))
+        if asked.active:
+            done.append(self._activate(True))
+        return "; ".join(done)
+
+    # -- topics -------------------------------------------------------------------------------
+    def _take_topics(self) -> None:
+        task = self._client.task
+        keys = self._client.keys
+        for slot, kind, topic in (
+            (self._prompts, plain.TEXT, PROMPT_TOPIC),
+            (self._switches, plain.TRUTH, ACTIVE_TOPIC),
+        ):
+            for arrival in slot.take_all():
+                try:
+                    value = table.read(self._messages, kind, arrival.sample.payload.to_bytes())
+                    wanted = _text(value) if kind == plain.TEXT else bool(value)
+                except CodecError as error:
+                    self._refuse(error.reason, f"{self._prefix}/{topic}: {error}", topic)
+                    continue
+                # ROS people publish again and again what is so already.
+                if isinstance(wanted, str):
+                    if task is None or task.prompt != wanted:
+                        self._client.put(keys.prompt, wanted)
+                elif task is None or task.active != wanted:
+                    self._client.put(keys.active, settings.encode_bool(wanted).decode())
+
+    def _tell_status(self) -> None:
+        message = diagnostics.write(
+            self._messages, self._robot, self._client.snapshot(), Stamp(time.time_ns(), "")
+        )
+        self._status.put(self._messages.encode(message))
+
+
+def _text(value: str) -> str:
+    return settings.decode_text(value.encode("utf-8", "surrogatepass"))
