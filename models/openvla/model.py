@@ -4,6 +4,7 @@
 #     "bitsandbytes==0.50.2",
 #     "numpy>=1.26",
 #     "opencv-python-headless>=4.9",
+#     "pillow>=11",
 #     "safetensors==0.8.0",
 #     "timm==1.0.31",
 #     "tokenizers>=0.22",

@@ -12,6 +12,7 @@ import numpy as np
 import timm
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor, nn
 from transformers import DynamicCache, LlamaConfig, LlamaForCausalLM
 from vla_zenoh_model_openvla.checkpoint import Backbone, Checkpoint
@@ -52,9 +53,8 @@ class Eyes(nn.Module):
         self, rgb: NDArray[np.uint8], *, device: torch.device, dtype: torch.dtype
     ) -> list[Tensor]:
         """One normalised (1, 3, S, S) picture for each encoder, from one (H, W, 3) uint8 RGB."""
-        pixels = torch.from_numpy(np.ascontiguousarray(rgb)).permute(2, 0, 1)[None].float()
         return [
-            _normalised(_square(pixels, side), encoder.pretrained_cfg).to(device, dtype)
+            _normalised(_square(rgb, side), encoder.pretrained_cfg).to(device, dtype)
             for encoder, side in zip(self.encoders(), self.sides, strict=True)
         ]
 
@@ -68,18 +68,15 @@ class Eyes(nn.Module):
         return torch.cat(seen, dim=2)
 
 
-def _square(pixels: Tensor, side: int) -> Tensor:
-    if pixels.shape[-2:] == (side, side):
-        return pixels
-    scaled = nn.functional.interpolate(
-        pixels, (side, side), mode="bicubic", align_corners=False, antialias=True
-    )
-    return scaled.round().clamp(0, 255)
+def _square(rgb: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
+    picture = Image.fromarray(rgb).resize((side, side), Image.Resampling.BICUBIC)
+    return np.asarray(picture, np.uint8)
 
 
-def _normalised(pixels: Tensor, trained: Mapping[str, Any]) -> Tensor:
+def _normalised(rgb: NDArray[np.uint8], trained: Mapping[str, Any]) -> Tensor:
     mean, std = (torch.tensor(trained[name]).view(1, 3, 1, 1) for name in ("mean", "std"))
-    return (pixels / 255 - mean) / std
+    # Copied, because what Pillow hands over may not be written to.
+    return (torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None] / 255 - mean) / std
 
 
 def _encoder(backbone: Backbone) -> nn.Module:
