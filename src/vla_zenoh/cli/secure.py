@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,8 +20,8 @@ from vla_zenoh.security.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
 from vla_zenoh.security.identity import Identity, Role, identities, identities_of
 from vla_zenoh.security.store import Entry, Store
 from vla_zenoh.security.written import (
+    moved,
     profile_text,
-    secured,
     serving_addresses,
     with_person,
 )
@@ -52,6 +53,10 @@ def init(
     lab: Annotated[str, typer.Option("--lab", help="Name of the lab, in its certificates.")] = (
         "vla-zenoh lab"
     ),
+    at: Annotated[
+        list[str] | None,
+        typer.Option("--at", help="HOST=ADDRESS of a router on the network; may be repeated."),
+    ] = None,
     address: AddressOption = None,
     days: DaysOption = CERTIFICATE_DAYS,
 ) -> None:
@@ -63,11 +68,12 @@ def init(
     if file.exists():
         fail(f"{file} is there already and is not overwritten; give another one with --output")
     store, now = Store(folder or DEFAULT_FOLDER), _now()
-    text = profile_text(plain, _extends(profile, file), store.folder.absolute())
+    addresses = _places(at or ())
+    places = moved(plain, addresses)
+    text = profile_text(plain, _extends(profile, file), store.folder.absolute(), places)
     made = [store.make_authority(lab, now)]
-    made += store.add(
-        identities(plain), now, days=days, addresses=serving_addresses(plain, address or ())
-    )
+    serving = serving_addresses(plain, (*addresses.values(), *(address or ())))
+    made += store.add(identities(plain), now, days=days, addresses=serving)
     _write(file, text)
     written = load_profile(str(file))
     out = console()
@@ -147,6 +153,16 @@ def show(
         raise typer.Exit(1)
 
 
+def _places(given: Sequence[str]) -> dict[str, str]:
+    out: dict[str, str] = {}
+    for text in given:
+        host, equals, address = text.partition("=")
+        if not equals or not host or not address:
+            raise typer.BadParameter(f"--at wants HOST=ADDRESS, not {text!r}")
+        out[host] = address
+    return out
+
+
 def _now() -> dt.datetime:
     return dt.datetime.now(dt.UTC)
 
@@ -171,11 +187,9 @@ def _complain_about_places(profile: Profile) -> None:
     if len(profile.hosts) > 1 and all(
         "127.0.0.1" in endpoint for endpoint in profile.session.listen
     ):
-        said = secured("tcp/10.0.0.2:7447")
         errors().print(
-            f"[yellow]the router listens on its own computer only: write its address in "
-            f"session.listen and hosts.NAME.connect, as {said}, then `vla-zenoh secure add HOST "
-            "--renew` for the router's host[/]"
+            "[yellow]the router listens on its own computer only; for a network say where it is: "
+            "--at HOST=ADDRESS[/]"
         )
 
 

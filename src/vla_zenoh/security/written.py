@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,40 @@ HEAD = """\
 PEOPLE = "    people:"
 
 
-def secured(endpoint: str) -> str:
-    """The endpoint with TLS in place of a plain protocol."""
+def secured(endpoint: str, places: Mapping[str, str] | None = None) -> str:
+    """The endpoint with TLS in place of a plain protocol.
+
+    Args:
+        endpoint: as in a profile.
+        places: ``HOST:PORT`` -> where that is now, see `moved`.
+    """
     protocol, _, rest = endpoint.partition("/")
-    return endpoint if protocol in ("tls", "quic") else f"tls/{rest}"
+    address = address_of(endpoint)
+    rest = (places or {}).get(address, address) + rest[len(address) :]
+    return f"{protocol if protocol in ('tls', 'quic') else 'tls'}/{rest}"
+
+
+def moved(profile: Profile, at: Mapping[str, str]) -> dict[str, str]:
+    """Where the routers are: ``HOST:PORT`` of the profile -> the same port at another address.
+
+    Args:
+        profile: as it is.
+        at: host of the profile that runs a router -> its address on the network.
+
+    Raises:
+        SecurityError: no router runs there.
+    """
+    out: dict[str, str] = {}
+    for name, address in at.items():
+        host = profile.hosts.get(name)
+        if host is None or "router" not in host.nodes:
+            runs = [n for n, h in profile.hosts.items() if "router" in h.nodes]
+            raise SecurityError(f"no router runs on {name!r}; it does on: {', '.join(runs)}")
+        shown = f"[{address}]" if ":" in address else address
+        for endpoint in host.listen or profile.session.listen:
+            port = address_of(endpoint).rpartition(":")[2]
+            out[address_of(endpoint)] = f"{shown}:{port}"
+    return out
 
 
 def serving_addresses(profile: Profile, more: Iterable[str] = ()) -> list[str]:
@@ -38,18 +68,25 @@ def serving_addresses(profile: Profile, more: Iterable[str] = ()) -> list[str]:
     return [name for name in dict.fromkeys([*named, "127.0.0.1", "localhost", *more]) if name]
 
 
-def profile_text(profile: Profile, extends: str, folder: Path) -> str:
+def profile_text(
+    profile: Profile, extends: str, folder: Path, places: Mapping[str, str] | None = None
+) -> str:
     """A profile file that extends `extends` and secures it.
 
     Args:
         profile: what `extends` leads to.
         extends: name of a profile, or a path.
         folder: of the certificates.
+        places: see `moved`.
     """
     shown = _with_tilde(folder)
+
+    def secure(endpoints: Sequence[str]) -> list[str]:
+        return [secured(endpoint, places) for endpoint in endpoints]
+
     session: dict[str, Any] = {
-        "listen": _secured(profile.session.listen),
-        "connect": _secured(profile.session.connect),
+        "listen": secure(profile.session.listen),
+        "connect": secure(profile.session.connect),
         "insecure": False,
         "security": {"folder": shown, "people": {}},
     }
@@ -60,7 +97,7 @@ def profile_text(profile: Profile, extends: str, folder: Path) -> str:
     }
     if any(host.connect or host.listen or host.link for host in profile.hosts.values()):
         # A profile's hosts are replaced whole, so all of them are written.
-        body["hosts"] = {name: _host(host) for name, host in profile.hosts.items()}
+        body["hosts"] = {name: _host(host, secure) for name, host in profile.hosts.items()}
     text = yaml.safe_dump(body, sort_keys=False, width=100, default_flow_style=None)
     return HEAD.format(name=profile.name, folder=shown) + _people_on_lines(text)
 
@@ -97,21 +134,17 @@ def _people_on_lines(text: str) -> str:
     return text[: found.start()] + block + text[found.end() :]
 
 
-def _host(host: HostProfile) -> dict[str, Any]:
+def _host(host: HostProfile, secure: Callable[[Sequence[str]], list[str]]) -> dict[str, Any]:
     out: dict[str, Any] = {"nodes": list(host.nodes)}
     for name in ("connect", "listen", "link"):
         endpoints: Sequence[str] | None = getattr(host, name)
         if endpoints is not None:
-            out[name] = _secured(endpoints)
+            out[name] = secure(endpoints)
     for name in ("cameras", "workers"):
         names = getattr(host, name)
         if names is not None:
             out[name] = list(names)
     return out
-
-
-def _secured(endpoints: Sequence[str]) -> list[str]:
-    return [secured(endpoint) for endpoint in endpoints]
 
 
 def _with_tilde(folder: Path) -> str:
