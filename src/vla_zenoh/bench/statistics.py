@@ -103,4 +103,7 @@ def wilson_95(successes: int, trials: int) -> tuple[float, float]:
     z, rate = 1.959963984540054, successes / trials
     spread = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
     middle, scale = rate + z * z / (2 * trials), 1 + z * z / trials
-    return max(0.0, (middle - spread) / scale), min(1.0, (middle + spread) / scale)
+    # At the ends rounding would put the rate itself outside.
+    return max(0.0, min(rate, (middle - spread) / scale)), min(
+        1.0, max(rate, (middle + spread) / scale)
+    )
