@@ -25,6 +25,7 @@ FORBIDDEN = {
     "codec": PURE,
     "types": PURE,
     "control": PURE,
+    "evaluation": PURE,
     "interop": PURE,
     "profile": PURE,
     "recording": PURE,

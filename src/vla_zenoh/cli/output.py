@@ -44,7 +44,7 @@ def print_json(value: Any) -> None:
     Records, profiles, arrays, paths, sets and numpy numbers are written as what they hold; NaN and
     infinity, which JSON does not have, as null.
     """
-    print(json.dumps(_plain_types(value), indent=2))
+    print(json.dumps(plain_types(value), indent=2))
 
 
 def fail(message: str, code: int = 1) -> NoReturn:
@@ -65,18 +65,19 @@ def printable(text: str) -> str:
     )
 
 
-def _plain_types(value: Any) -> Any:
+def plain_types(value: Any) -> Any:
+    """`value` made of what JSON knows, see `print_json`."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = dataclasses.fields(value)
-        return {field.name: _plain_types(getattr(value, field.name)) for field in fields}
+        return {field.name: plain_types(getattr(value, field.name)) for field in fields}
     if isinstance(value, Mapping):
-        return {str(key): _plain_types(item) for key, item in value.items()}
+        return {str(key): plain_types(item) for key, item in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):
-        return _plain_types(value.tolist())
+        return plain_types(value.tolist())
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [_plain_types(item) for item in value]
+        return [plain_types(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, (str, int, bool)):

@@ -1,0 +1,141 @@
+"""vla-zenoh eval."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+
+from vla_zenoh.cli.output import console, errors, fail, plain_types, printable
+from vla_zenoh.evaluation import tables
+from vla_zenoh.evaluation.files import evaluate
+from vla_zenoh.evaluation.result import STAGES, Evaluation, overall, to_mapping
+
+PICTURES = 8
+WIDE = 110
+"""Columns of a terminal in which every column has room."""
+STDOUT = Path("-")
+
+
+def evaluation(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(help="Recordings (.mcap), the thesis's CSV, or folders that hold such."),
+    ],
+    first: Annotated[
+        int | None, typer.Option("--first", help="Only so many requests of each run.", min=1)
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write everything to this file; - is stdout.")
+    ] = None,
+    csv_file: Annotated[
+        Path | None, typer.Option("--csv", help="Write one row per run to this file; - is stdout.")
+    ] = None,
+    html_file: Annotated[
+        Path | None, typer.Option("--html", help="Write a page with plots to this file.")
+    ] = None,
+    pictures: Annotated[
+        int, typer.Option("--pictures", help="Moments shown of each camera.", min=0, max=50)
+    ] = PICTURES,
+) -> None:
+    """Evaluate recorded runs: latency, motion, drift, smoothness, refusals.
+
+    Exits with 0 when at least one file could be evaluated; what could not is said on stderr.
+    """
+    runs, faults = evaluate(paths, first, pictures=pictures if html_file else 0)
+    if STDOUT not in (json_file, csv_file):
+        _show(runs)
+    for run in runs:
+        for problem in run.problems:
+            errors().print(f"[yellow]{escape(printable(f'{run.name}: {problem}'))}[/]")
+    for why in faults.values():
+        errors().print(f"[red]not evaluated: {escape(printable(why))}[/]")
+    if json_file is not None:
+        _write(json_file, json.dumps(plain_types(to_mapping(runs, faults)), indent=2) + "\n")
+    if csv_file is not None:
+        _write(csv_file, _rows(runs))
+    if html_file is not None:
+        from vla_zenoh.evaluation.report import page
+
+        _write(html_file, page(runs, faults))
+    if not runs:
+        fail("nothing could be evaluated")
+
+
+def _write(path: Path, text: str) -> None:
+    if path == STDOUT:
+        sys.stdout.write(text)
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, "utf-8")
+    except OSError as error:
+        fail(f"{path} cannot be written: {error.strerror}")
+
+
+def _rows(runs: Sequence[Evaluation]) -> str:
+    rows = [run.row() for run in (*runs, *([overall(runs)] if len(runs) > 1 else ()))]
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    out = io.StringIO(newline="")
+    writer = csv.DictWriter(out, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return out.getvalue()
+
+
+def _show(runs: Sequence[Evaluation]) -> None:
+    if not runs:
+        return
+    screen = console()
+    table = Table(header_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    shown_columns = None if screen.width >= WIDE else tables.NARROW
+    for column in tables.SUMMARY_COLUMNS[:shown_columns]:
+        left = column == "run"
+        table.add_column(column, justify="left" if left else "right", overflow="fold")
+    for run in runs:
+        row = tables.summary_row(run)[:shown_columns]
+        table.add_row(*(escape(printable(word)) for word in row))
+    if len(runs) > 1:
+        table.add_section()
+        table.add_row(*tables.summary_row(overall(runs))[:shown_columns], style="bold")
+    screen.print(table)
+    shown = runs[0] if len(runs) == 1 else overall(runs)
+    _show_latency(shown)
+    if len(runs) == 1:
+        _show_segments(shown)
+    for name, value in tables.figures(shown):
+        screen.print(f"{name}: {escape(printable(value))}")
+
+
+def _show_latency(run: Evaluation) -> None:
+    rows = tables.latency_rows(run)
+    if not rows:
+        return
+    table = Table(title="latency in ms", title_justify="left", header_style="bold")
+    table.add_column("stage")
+    for column in tables.LATENCY_COLUMNS:
+        table.add_column(column, justify="right")
+    wide = console().width >= WIDE
+    if wide:
+        table.add_column("")
+    for row in rows:
+        table.add_row(*row, *([STAGES[row[0]]] if wide else []))
+    console().print(table)
+
+
+def _show_segments(run: Evaluation) -> None:
+    table = Table(title="asked and reached", title_justify="left", header_style="bold")
+    for column in tables.SEGMENT_COLUMNS:
+        table.add_column(column, justify="left" if column == "prompt" else "right")
+    for row in tables.segment_rows(run):
+        table.add_row(*(escape(printable(word)) for word in row))
+    console().print(table)
