@@ -244,11 +244,12 @@ class Observation:
 
 @runtime_checkable
 class Policy(Protocol):
-    """A model. Only `spec` and `infer` are needed; ``load()`` and ``reset()`` are called if there.
+    """A model. Only `spec` and `infer` are needed; the others are called if they are there.
 
     ``load()`` runs once before the first inference: heavy imports and weights belong there.
-    ``reset()`` runs at the start of every episode. ``normalisation_keys``, where a model has it,
-    names the statistics its weights came with: `ActionSpec.normalisation` must be one of them.
+    ``reset()`` runs at the start of every episode, ``close()`` when the worker ends.
+    ``normalisation_keys``, where a model has it, names the statistics its weights came with:
+    `ActionSpec.normalisation` must be one of them.
     ``example_prompts`` likewise names prompts it knows, the first of which makes it move.
     """
 
