@@ -53,12 +53,12 @@ class Wire(Protocol):
         """The key of its samples or queries."""
         ...
 
-    def tokens(self, endpoint: Endpoint, number: int) -> list[str]:
-        """Liveliness tokens that make it seen; `number` differs for every endpoint."""
+    def token(self, endpoint: Endpoint, number: int) -> str:
+        """The liveliness token that makes it seen; `number` differs for every endpoint."""
         ...
 
-    def node_tokens(self) -> list[str]:
-        """Liveliness tokens of the node itself."""
+    def node_token(self) -> str:
+        """That of the node itself."""
         ...
 
     def others(self) -> str:
@@ -92,19 +92,19 @@ class Ros2Dds:
         """See `Wire`."""
         return endpoint.name.removeprefix("/")
 
-    def tokens(self, endpoint: Endpoint, number: int) -> list[str]:
-        """One; the parts of an action are not announced one by one."""
+    def token(self, endpoint: Endpoint, number: int) -> str:
+        """See `Wire`; an action has one for all its parts."""
         kind, key = endpoint.type, self.key(endpoint)
         chunks = ["@", self.session_id, "@ros2_lv", endpoint.role.value]
         chunks += [text.replace("/", _SLASH_OF_BRIDGES) for text in (key, kind)]
         if endpoint.role in (Role.PUBLISHER, Role.SUBSCRIBER):
             known = None if self.type_hash is None else self.type_hash(kind)
             chunks.append(endpoint.qos.as_ros2dds(known))
-        return ["/".join(chunks)]
+        return "/".join(chunks)
 
-    def node_tokens(self) -> list[str]:
+    def node_token(self) -> str:
         """What a bridge declares of itself."""
-        return [f"@/{self.session_id}/@ros2_lv"]
+        return f"@/{self.session_id}/@ros2_lv"
 
     def others(self) -> str:
         """Those of bridges."""
@@ -133,25 +133,21 @@ class RmwZenoh:
         name = endpoint.name.strip("/")
         return f"{self.domain}/{name}/{dds_type(kind)}/{self.type_hash(kind)}"
 
-    def tokens(self, endpoint: Endpoint, number: int) -> list[str]:
-        """One a topic or service; an action is announced by its parts."""
-        if endpoint.role is Role.ACTION_CLIENT:
-            return []
-        return [
-            "/".join(
-                (
-                    self._at(number, endpoint.role.value),
-                    endpoint.name.replace("/", _SLASH_OF_RMW),
-                    dds_type(endpoint.type),
-                    self.type_hash(endpoint.type),
-                    endpoint.qos.as_rmw_zenoh(),
-                )
+    def token(self, endpoint: Endpoint, number: int) -> str:
+        """See `Wire`; an action is announced by its parts."""
+        return "/".join(
+            (
+                self._at(number, endpoint.role.value),
+                endpoint.name.replace("/", _SLASH_OF_RMW),
+                dds_type(endpoint.type),
+                self.type_hash(endpoint.type),
+                endpoint.qos.as_rmw_zenoh(),
             )
-        ]
+        )
 
-    def node_tokens(self) -> list[str]:
-        """One."""
-        return [self._at(0, "NN")]
+    def node_token(self) -> str:
+        """See `Wire`."""
+        return self._at(0, "NN")
 
     def others(self) -> str:
         """Those of nodes."""

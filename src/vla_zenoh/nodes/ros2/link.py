@@ -140,14 +140,13 @@ class Link:
         self._lock = threading.Lock()
         self._others: set[str] = set()
         self._declared: list[Any] = []
-        for token in self._wire.node_tokens():
-            self._declared.append(session.liveliness().declare_token(token))
-        own = set(self._wire.node_tokens())
+        own = self._wire.node_token()
+        self._declared.append(session.liveliness().declare_token(own))
 
         def seen(sample: zenoh.Sample) -> None:
             token = str(sample.key_expr)
             with self._lock:
-                if sample.kind == zenoh.SampleKind.PUT and token not in own:
+                if sample.kind == zenoh.SampleKind.PUT and token != own:
                     self._others.add(token)
                 else:
                     self._others.discard(token)
@@ -166,11 +165,9 @@ class Link:
 
     def _declare(self, endpoint: Endpoint) -> tuple[str, bytes | None]:
         """Announce an endpoint; its key, and its gid where the wire has gids."""
-        tokens = self._wire.tokens(endpoint, next(self._numbers))
-        for token in tokens:
-            self._declared.append(self.session.liveliness().declare_token(token))
-        key = self._wire.key(endpoint)
-        return key, attachments.gid_of(tokens[0] if tokens else key) if self._rmw else None
+        token = self._wire.token(endpoint, next(self._numbers))
+        self._declared.append(self.session.liveliness().declare_token(token))
+        return self._wire.key(endpoint), attachments.gid_of(token) if self._rmw else None
 
     def read(self, name: str, kind: str, slot: Slot, qos: Qos = DEFAULT) -> Slot:
         """Let samples of a topic fall into `slot`."""
@@ -211,12 +208,13 @@ class Link:
     def call_action(self, name: str, kind: str) -> dict[str, Caller]:
         """Callers of an action's services: ``send_goal``, ``get_result``, ``cancel_goal``."""
         action = Endpoint(Role.ACTION_CLIENT, name, kind)
-        self._declare(action)
+        if not self._rmw:  # a bridge is told of the action, rmw_zenoh of each of its parts
+            self._declare(action)
         callers: dict[str, Caller] = {}
         for part, endpoint in parts_of(action).items():
             if self._rmw:
                 key, gid = self._declare(endpoint)
-            else:  # the bridge announces the parts of an action itself
+            else:
                 key, gid = self._wire.key(endpoint), None
             wait_s = RESULT_S if part == "get_result" else CALL_S
             callers[part] = Caller(self.session, key, gid, wait_s)
