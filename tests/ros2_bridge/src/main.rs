@@ -12,7 +12,10 @@ use zenoh::{
 
 const USAGE: &str = "usage: zenoh-bridge-ros2dds -c FILE    (a Zenoh configuration, JSON5)";
 
-async fn serve(config: Config) -> Result<()> {
+async fn serve(mut config: Config) -> Result<()> {
+    // The caches of transient-local topics need them, and only a router has them by itself. Without
+    // them no action is routed: its status is such a topic.
+    config.insert_json5("timestamping/enabled", "true")?;
     let mut plugins = PluginsManager::static_plugins_only();
     plugins.declare_static_plugin::<zenoh_plugin_ros2dds::ROS2Plugin, _>("ros2dds", true);
     let mut runtime = RuntimeBuilder::new(config).plugins_manager(plugins).build().await?;
