@@ -128,7 +128,7 @@ class OpenVLA:
                 normalisation=self._key,
             ),
         )
-        self._network: Any = None
+        self.network: Any = None
         self._tokenizer: Any = None
         self._details: dict[str, Any] = {}
 
@@ -171,7 +171,7 @@ class OpenVLA:
             self.checkpoint, device=device, dtype=getattr(torch, name), adapter=self._adapter
         )
         quantise(network, self._quantise)
-        self._network = network
+        self.network = network
         self._must_see()
 
     def _must_see(self) -> None:
@@ -180,14 +180,14 @@ class OpenVLA:
 
         noise = np.random.default_rng(0).integers(0, 256, (224, 224, 3), dtype=np.uint8)
         with torch.inference_mode():
-            eyes = self._network.vision_backbone
+            eyes = self.network.vision_backbone
             gray, mixed = (eyes(self._pixels(p)) for p in (np.full_like(noise, 128), noise))
             if not torch.isfinite(mixed).all():
                 raise WorkerError("the picture encoders compute NaN or infinity")
             if torch.equal(gray, mixed):
                 raise WorkerError("the picture encoders answer alike whatever the picture is")
         # The first inference of a process costs much more than the others.
-        self._network.act(self.ids("stand still"), self._pixels(noise), AXES)
+        self.network.act(self.ids("stand still"), self._pixels(noise), AXES)
 
     def ids(self, task: str) -> list[int]:
         """Tokens of the prompt for a task in a person's words.
@@ -196,18 +196,18 @@ class OpenVLA:
             SpecError: more than the model reads.
         """
         text = prompt_text(self._template, task)
-        config = self._network.language_model.config
+        config = self.network.language_model.config
         found = self._tokenizer.encode(text, add_special_tokens=True).ids
         if not found or found[0] != config.bos_token_id:
             found = [config.bos_token_id, *found]
         ids = prompt_tokens(found)
-        if len(ids) + self._network.vision_backbone.patches + AXES > config.max_position_embeddings:
+        if len(ids) + self.network.vision_backbone.patches + AXES > config.max_position_embeddings:
             raise SpecError(f"a prompt of {len(ids)} tokens is more than the model reads")
         return ids
 
     def _pixels(self, picture: Any) -> Any:
-        return self._network.vision_backbone.look(
-            picture, device=self._network.device, dtype=self._network.dtype
+        return self.network.vision_backbone.look(
+            picture, device=self.network.device, dtype=self.network.dtype
         )
 
     def infer(self, observation: Observation) -> ActionSteps:
@@ -219,7 +219,7 @@ class OpenVLA:
         """
         picture = trained_form(observation.images[self._camera], crop=self._crop)
         ids = self.ids(observation.prompt)
-        tokens = self._network.act(ids, self._pixels(picture), AXES)
+        tokens = self.network.act(ids, self._pixels(picture), AXES)
         self._details = {
             "prompt": prompt_text(self._template, observation.prompt),
             "ids": ids,

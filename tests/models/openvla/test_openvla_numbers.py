@@ -188,7 +188,7 @@ def test_the_first_version_with_one_encoder_and_its_own_prompt(tmp_path: Path) -
 def test_bfloat16_computes_in_bfloat16(folder: Path) -> None:
     policy = loaded(folder, dtype="bfloat16")
     policy.infer(looking(policy, mosaic(0)))
-    network: Any = vars(policy)["_network"]
+    network: Any = policy.network
     assert {p.dtype for p in network.parameters()} == {torch.bfloat16}
 
 
@@ -199,7 +199,7 @@ def test_quantised_layers_answer_nearly_alike_with_less_memory(folder: Path, kin
     ids, picture = whole.last_details["ids"], whole.last_details["picture"]
     logits, memory = [], []
     for policy in (whole, small):
-        network: Any = vars(policy)["_network"]
+        network: Any = policy.network
         with torch.inference_mode():
             eyes = network.vision_backbone
             pixels = eyes.look(picture, device=network.device, dtype=network.dtype)
@@ -226,7 +226,7 @@ def test_resizing_is_that_of_a_known_library() -> None:
 
 
 def test_encoders_with_a_larger_side_get_a_larger_picture(policy: Any) -> None:
-    network: Any = vars(policy)["_network"]
+    network: Any = policy.network
     eyes = network.vision_backbone
     sides, eyes.sides = eyes.sides, [384, 224]
     try:
@@ -264,13 +264,11 @@ def test_an_adapter_is_added_as_peft_adds_it(folder: Path, tmp_path: Path) -> No
 
     policy = loaded(folder, adapter=str(tmp_path / "adapter"))
     plain = loaded(folder)
-    ours = vars(policy)["_network"].state_dict()
+    ours = policy.network.state_dict()
     for name, tensor in parts.published().items():
         name = name.replace(".scale_factor", ".gamma")
         torch.testing.assert_close(ours[name], tensor, rtol=1e-5, atol=1e-6)
-    changed = [
-        name for name, t in vars(plain)["_network"].state_dict().items() if not t.equal(ours[name])
-    ]
+    changed = [name for name, t in plain.network.state_dict().items() if not t.equal(ours[name])]
     assert len(changed) == 2 * 3 + 3 + 3 + 1 + 2
     policy.infer(looking(policy, mosaic(6)))
     with torch.inference_mode():

@@ -1,0 +1,7 @@
+"""Makes the parts of the OpenVLA worker importable, as its own files import each other."""
+
+from __future__ import annotations
+
+from vla_zenoh.loader import find_model, import_model
+
+import_model(find_model("openvla"))
