@@ -141,6 +141,10 @@ class Keys:
         """JPEG of exactly what the model saw; written while someone listens."""
         return self._at("seen", chunk(worker, "worker name"), chunk(camera, "camera name"))
 
+    def seen_record(self, worker: str) -> str:
+        """`Seen`: prompt, raw output and steps of the same inference; likewise."""
+        return self._at("seen", chunk(worker, "worker name"))
+
     # -- command node -------------------------------------------------------------------------
     @property
     def command_pose(self) -> str:
@@ -221,6 +225,18 @@ class Keys:
     @property
     def all_specs(self) -> str:
         return self._at("spec", "*")
+
+    @property
+    def all_seen(self) -> str:
+        return self._at("seen", "*", "*")
+
+    @property
+    def all_seen_records(self) -> str:
+        return self._at("seen", "*")
+
+    def all_seen_of(self, worker: str) -> str:
+        """The pictures of one worker."""
+        return self._at("seen", chunk(worker, "worker name"), "*")
 
     @property
     def all_status(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import time
@@ -10,7 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from chain import MOVING_M_S, READY_PATIENCE_S, Chain
+from chain import MOVING_M_S, READY_PATIENCE_S, Chain, command_line
+
+from vla_zenoh.codec.image import decode_jpeg
+from vla_zenoh.nodes.seen import SeenListener, Sight
 
 COMMAND_TOLERANCE, ARM_TOLERANCE = 1.1, 2.7
 """As in tests/fault/test_dead_nodes.py."""
@@ -33,6 +37,38 @@ class Riser:
     def infer(self, observation):
         return ActionSteps([[0.0, 0.0, 0.01, 0.0, 0.0, 0.0]])
 '''
+
+
+LOOKER = '''
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["numpy"]
+# ///
+"""Stands still and tells the mean colour of what it sees."""
+import numpy as np
+from vla_zenoh.policy import (
+    ActionSpec, ActionSteps, CameraSpec, ModelSpec, ObservationSpec
+)
+
+class Looker:
+    spec = ModelSpec(
+        name="looker",
+        observation=ObservationSpec(
+            cameras=(
+                CameraSpec(camera="front", width=64, height=64, resize="crop", colour="bgr"),
+            ),
+            state=("pose",),
+        ),
+        action=ActionSpec(horizon=2, dt_s=0.1, gripper="none"),
+    )
+
+    def infer(self, observation):
+        picture = observation.images["front"]
+        raw = {"mean_bgr": picture.mean(axis=(0, 1)), "tokens": [31999, 7], "score": np.nan}
+        return ActionSteps(np.zeros((2, 6)), raw=raw)
+'''
+COLOUR_TOLERANCE = 2.0
+"""Of 255: what JPEG changes in the mean of a picture."""
 
 
 @contextmanager
@@ -124,3 +160,50 @@ def test_a_file_that_is_no_model_is_refused_with_its_reason(
     assert process.returncode == 1
     assert why in out
     assert "Traceback" not in out
+
+
+def test_what_a_model_sees_is_shown_with_its_prompt_raw_output_and_steps(
+    chain: Chain, tmp_path: Path
+) -> None:
+    model = tmp_path / "looker.py"
+    model.write_text(LOOKER)
+    chain.client.set_prompt("hold")
+    with worker(chain, str(model)):
+        chain.until(
+            "the looker infers",
+            lambda: chain.state("worker-looker") == "inferring",
+            READY_PATIENCE_S,
+        )
+        listener = SeenListener(chain.session, chain.profile.keys, "looker")
+        sights: list[Sight] = []
+
+        def shown() -> bool:
+            sights.extend(listener.take())
+            return len([sight for sight in sights if sight.jpegs]) >= 3
+
+        chain.until("it is shown", shown)
+        listener.close()
+        for sight in [sight for sight in sights if sight.jpegs]:
+            rgb = decode_jpeg(sight.jpegs["front"]).rgb
+            assert rgb.shape == (64, 64, 3)
+            mean = sight.record.raw["mean_bgr"][::-1]
+            assert rgb.mean(axis=(0, 1)) == pytest.approx(mean, abs=COLOUR_TOLERANCE)
+            assert sight.record.raw["tokens"] == [31999, 7]
+            assert sight.record.raw["score"] == "nan"
+            assert sight.record.prompt == "hold"
+            assert sight.record.steps.shape == (2, 6)
+
+        out = tmp_path / "out"
+        said = command_line(
+            *("seen", "--count", "2", "--json", "--out", str(out)), profile=chain.profile_file
+        )
+        assert said.returncode == 0, said.stderr
+        lines = [json.loads(line) for line in said.stdout.splitlines()]
+        assert {line["worker"] for line in lines} <= {"looker", "scripted"}
+        assert len(list(out.glob("*/*.json"))) == 2
+
+
+def test_who_shows_nothing_is_named(chain: Chain) -> None:
+    said = command_line("seen", "ghost", "--json", profile=chain.profile_file)
+    assert said.returncode == 1
+    assert "ghost shows nothing; does it infer?" in said.stderr

@@ -25,6 +25,7 @@ from vla_zenoh.cli import (
     ros2,
     router,
     secure,
+    seen,
     set_prompt,
     sim,
     status,
@@ -99,6 +100,7 @@ for panel, name, function in (
     (LOOK, "status", status.status),
     (LOOK, "echo", echo.echo),
     (LOOK, "keys", keys.keys),
+    (LOOK, "seen", seen.seen),
     (LOOK, "check", check.check),
     (LOOK, "doctor", doctor.doctor),
 ):

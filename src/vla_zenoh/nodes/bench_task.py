@@ -37,7 +37,7 @@ READY_PATIENCE_S = 60.0
 LOAD_PATIENCE_S = 600.0
 """With a worker that says it is loading; it may be making its environment."""
 RESET_PATIENCE_S, RESET_PERIOD_S = 8.0, 1.0
-ACTIVATE_PATIENCE_S = 5.0
+ACTIVATE_PATIENCE_S = 15.0
 HEARD_PATIENCE_S = 3.0
 LOOK_S = 0.02
 FRESH_PICTURES_S = 0.2

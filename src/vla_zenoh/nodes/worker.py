@@ -20,6 +20,7 @@ from vla_zenoh.errors import CodecError, PeerError, SpecError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
 from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.seen import SeenOutlet
 from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
 from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.observe import History, NotYet, assemble
@@ -82,6 +83,7 @@ class WorkerNode:
         keys = node.keys
         self._chunk_out = node.stream(keys.delta(name), Kind.ORDER)
         self._spec_out = node.stream(keys.spec(name), Kind.NEWS)
+        self._seen = SeenOutlet(node, name, self.spec)
         node.answer(
             keys.spec(name),
             lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
@@ -150,6 +152,9 @@ class WorkerNode:
             self._report()
         self.node.report("stopped", now=True)
         self.node.close()
+        close = getattr(self.policy, "close", None)
+        if callable(close):
+            close()
 
     def _wait_for_news(self, stop: threading.Event) -> None:
         """Sleep until the slowest input brings something, or a little while."""
@@ -287,6 +292,7 @@ class WorkerNode:
         )
         self._not_before_ns = header.stamp_wall_ns
         self._rate.tick()
+        self._seen.show(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
         return True
 
     def _failed(self, reason: str, why: str) -> bool:

@@ -1,0 +1,141 @@
+"""vla-zenoh seen."""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.live import Live
+from rich.table import Table
+
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    ConnectOption,
+    ProfileOption,
+    client,
+)
+from vla_zenoh.cli.output import console, errors, fail, printable
+from vla_zenoh.codec.image import decode_jpeg
+from vla_zenoh.errors import CodecError
+from vla_zenoh.nodes.seen import SeenListener, Sight
+
+POLL_S = 0.05
+PATIENCE_S = 5.0
+MAX_RAW = 160
+
+
+def seen(
+    worker: Annotated[
+        str | None, typer.Argument(help="Whose view; that of all workers else.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for a JPEG of every picture and a JSON file of words."),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", "-s", help="End after so long.")
+    ] = None,
+    count: Annotated[
+        int | None, typer.Option("--count", "-n", help="End after so many inferences.", min=1)
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one line of JSON for every inference.")
+    ] = False,
+    profile: ProfileOption = DEFAULT_PROFILE,
+    connect: ConnectOption = None,
+) -> None:
+    """Show or save what models see: pictures as they got them, prompt, raw output, final action.
+
+    Workers show it only while somebody looks.
+    """
+    live = console().is_terminal and not as_json
+    if not live and seconds is None and count is None:
+        count = 1
+    with client(profile, connect) as robot:
+        listener = SeenListener(robot.session, robot.keys, worker)
+        began_s = time.monotonic()
+        told = 0
+        newest: dict[str, Sight] = {}
+        with Live(console=console(), auto_refresh=False) if live else nullcontext() as screen:
+            while not (count is not None and told >= count):
+                waited_s = time.monotonic() - began_s
+                if seconds is not None and waited_s > seconds:
+                    break
+                if not told and waited_s > PATIENCE_S:
+                    break
+                for sight in listener.take()[: None if count is None else count - told]:
+                    told += 1
+                    newest[sight.record.worker] = sight
+                    if out is not None:
+                        _save(out, sight)
+                    if as_json:
+                        print(json.dumps(_plain(sight)), flush=True)
+                if screen is not None:
+                    screen.update(_table(newest), refresh=True)
+                time.sleep(POLL_S)
+        listener.close()
+    if not told:
+        fail(f"{worker or 'no worker'} shows nothing; does it infer? (`vla-zenoh status`)")
+    if not live and not as_json:
+        console().print(_table(newest))
+    if out is not None:
+        errors().print(f"{told} inferences in {out}", markup=False)
+
+
+def _plain(sight: Sight) -> dict[str, Any]:
+    record = sight.record
+    return {
+        "worker": record.worker,
+        "chunk_seq": record.chunk_seq,
+        "spec_hash": record.spec_hash,
+        "episode": record.episode,
+        "observation_stamp_ns": record.observation_stamp_ns,
+        "prompt": record.prompt,
+        "raw": record.raw,
+        "steps": [[round(float(v), 6) for v in row] for row in record.steps],
+        "done": record.done,
+        "inference_ms": round(record.inference_ms, 3),
+        "pictures": sorted(sight.jpegs),
+    }
+
+
+def _save(folder: Path, sight: Sight) -> None:
+    record = sight.record
+    # Two runs of a worker may have the same numbers; no two observations the same stamp.
+    stem = f"{record.observation_stamp_ns}-{record.chunk_seq}"
+    into = folder / record.worker
+    into.mkdir(parents=True, exist_ok=True)
+    for camera, jpeg in sight.jpegs.items():
+        (into / f"{stem}-{camera}.jpg").write_bytes(jpeg)
+    (into / f"{stem}.json").write_text(json.dumps(_plain(sight), indent=2) + "\n", "utf-8")
+
+
+def _table(newest: dict[str, Sight]) -> Table:
+    table = Table(header_style="bold")
+    for column in ("worker", "sees", "prompt", "raw", "first step", "inference"):
+        table.add_column(column, overflow="fold")
+    for name, sight in sorted(newest.items()):
+        record = sight.record
+        raw = json.dumps(record.raw) if record.raw else ""
+        table.add_row(
+            name,
+            "\n".join(f"{camera} {_size(jpeg)}" for camera, jpeg in sorted(sight.jpegs.items())),
+            printable(record.prompt),
+            printable(raw if len(raw) <= MAX_RAW else f"{raw[:MAX_RAW]}..."),
+            " ".join(f"{value:.4g}" for value in record.steps[0])
+            + (f"\n+ {len(record.steps) - 1} more" if len(record.steps) > 1 else ""),
+            f"{record.inference_ms:.1f} ms\nchunk {record.chunk_seq}",
+        )
+    return table
+
+
+def _size(jpeg: bytes) -> str:
+    try:
+        height, width, _ = decode_jpeg(jpeg).rgb.shape
+    except CodecError as error:
+        return str(error)
+    return f"{width}x{height}"

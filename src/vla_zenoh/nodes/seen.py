@@ -1,0 +1,169 @@
+"""What a model saw, on its way out of the worker and into the hands of who asks."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
+from vla_zenoh.codec.image import encode_jpeg
+from vla_zenoh.errors import CodecError, RecordError
+from vla_zenoh.keys import Keys, Kind
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
+from vla_zenoh.types import Header, Image, Seen
+from vla_zenoh.types.seen import plain_raw
+
+JPEG_QUALITY = 95
+MAX_WAITING = 64
+
+
+class SeenOutlet:
+    """Writes what the model saw and said, while somebody listens.
+
+    It is called when the chunk is out already, so it never makes one late.
+
+    Args:
+        node: the worker's.
+        worker: its name.
+        spec: of its model.
+    """
+
+    def __init__(self, node: Node, worker: str, spec: ModelSpec) -> None:
+        self._node, self._worker, self._spec = node, worker, spec
+        keys = node.keys
+        # All with one priority: who has the record has its pictures before.
+        self._record = node.stream(keys.seen_record(worker), Kind.FRAME)
+        self._pictures = {
+            camera.camera: node.stream(keys.seen(worker, camera.camera), Kind.FRAME)
+            for camera in spec.observation.cameras
+        }
+
+    def show(
+        self,
+        observation: Observation,
+        answer: ActionSteps,
+        steps: NDArray[np.float32],
+        chunk: Header,
+        inference_ms: float,
+    ) -> None:
+        """Write one inference to whoever listens.
+
+        Args:
+            observation: what the model was given.
+            answer: what it returned.
+            steps: the same, checked.
+            chunk: header of the published chunk.
+            inference_ms: time it took.
+        """
+        stamp_ns, seq = observation.stamp_wall_ns, chunk.seq
+        try:
+            for camera in self._spec.observation.cameras:
+                stream = self._pictures[camera.camera]
+                if stream.wanted:
+                    rgb = self._rgb(camera.camera, camera.colour, observation, answer)
+                    stream.put(
+                        encode_jpeg(Image(rgb), JPEG_QUALITY),
+                        stamp_wall_ns=stamp_ns,
+                        seq=seq,
+                        encoding=zenoh.Encoding.IMAGE_JPEG,
+                    )
+            if self._record.wanted:
+                seen = Seen(
+                    self._worker,
+                    seq,
+                    self._spec.hash,
+                    observation.task.episode,
+                    stamp_ns,
+                    observation.prompt,
+                    steps,
+                    inference_ms,
+                    plain_raw(answer.raw),
+                    bool(answer.done),
+                )
+                self._record.put(seen, stamp_wall_ns=stamp_ns, seq=seq)
+        except (RecordError, CodecError) as error:
+            self._node.refuse("seen", f"what the model saw cannot be shown: {error}")
+
+    @staticmethod
+    def _rgb(
+        camera: str, colour: str, observation: Observation, answer: ActionSteps
+    ) -> NDArray[np.uint8]:
+        shown = (answer.pictures or {}).get(camera)
+        if shown is not None:
+            return np.asarray(shown)
+        picture = observation.images[camera]
+        return np.ascontiguousarray(picture[..., ::-1]) if colour == "bgr" else picture
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """One inference with its pictures.
+
+    Args:
+        record: see `Seen`.
+        jpegs: camera -> JPEG file of what the model was given.
+    """
+
+    record: Seen
+    jpegs: Mapping[str, bytes]
+
+
+class SeenListener:
+    """Collects what workers show; they show it because this listens.
+
+    Args:
+        session: open session.
+        keys: of the robot.
+        worker: whose; None: of all.
+    """
+
+    def __init__(self, session: zenoh.Session, keys: Keys, worker: str | None = None) -> None:
+        self._keys = keys
+        self._lock = threading.Lock()
+        self._samples: deque[zenoh.Sample] = deque(maxlen=4 * MAX_WAITING)
+        self._pictures: dict[tuple[str, int], dict[str, bytes]] = {}
+        selectors = (
+            (keys.all_seen_records, keys.all_seen)
+            if worker is None
+            else (keys.seen_record(worker), keys.all_seen_of(worker))
+        )
+        handler = zenoh.handlers.Callback(self._samples.append, indirect=False)
+        self._subscribers = [session.declare_subscriber(key, handler) for key in selectors]
+
+    def take(self) -> list[Sight]:
+        """All that came since the last call, oldest first; what cannot be read is left out."""
+        out: list[Sight] = []
+        while self._samples:
+            sample = self._samples.popleft()
+            try:
+                sight = self._read(sample)
+            except CodecError:
+                continue
+            if sight is not None:
+                out.append(sight)
+        return out
+
+    def _read(self, sample: zenoh.Sample) -> Sight | None:
+        attachment, payload = sample.attachment, sample.payload.to_bytes()
+        header = header_codec.decode(attachment.to_bytes() if attachment else None)
+        _, worker, *camera = self._keys.short(str(sample.key_expr)).split("/")
+        if camera:
+            if len(self._pictures) > MAX_WAITING:
+                self._pictures.pop(next(iter(self._pictures)))
+            self._pictures.setdefault((worker, header.seq), {})[camera[0]] = payload
+            return None
+        record = records.decode(Seen, payload)
+        return Sight(record, self._pictures.pop((worker, header.seq), {}))
+
+    def close(self) -> None:
+        """Stop listening."""
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
