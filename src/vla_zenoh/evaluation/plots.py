@@ -1,4 +1,4 @@
-"""Plots of a run for the page, by plotly: each a piece of HTML without the library itself."""
+"""Plots of a run for the page, as plotly's JSON: its JavaScript draws them."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ MEASURED, COMMANDED, FLOOR = "#1f77b4", "#ff7f0e", "#9aa5b1"
 STAGE_COLOURS = {"outbound": "#4c9be8", "inference": "#f2a541", "inbound": "#6bbf59"}
 LAYOUT: dict[str, Any] = {
     "template": "plotly_white",
-    "margin": {"l": 55, "r": 15, "t": 35, "b": 40},
-    "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0},
+    "margin": {"l": 60, "r": 15, "t": 40, "b": 40},
+    "legend": {"orientation": "h", "y": -0.2, "yanchor": "top", "x": 0},
     "font": {"family": "system-ui, sans-serif", "size": 12},
 }
 
@@ -37,7 +37,7 @@ def library() -> str:
 
 
 def plots_of(run: Evaluation) -> list[str]:
-    """All plots of a run that it has the figures for."""
+    """All plots of a run that it has the figures for, ready to stand in a script."""
     made = (
         _path(run),
         _position(run),
@@ -46,21 +46,21 @@ def plots_of(run: Evaluation) -> list[str]:
         _histogram(run),
         _width(run),
     )
-    return [
-        figure.to_html(
-            full_html=False,
-            include_plotlyjs=False,
-            config={"displaylogo": False, "responsive": True},
-        )
-        for figure in made
-        if figure is not None
-    ]
+    # A prompt may hold what ends a script; JSON says the same without it.
+    return [figure.to_json().replace("<", "\\u003c") for figure in made if figure is not None]
 
 
 def _figure(title: str, height: int = 330, **layout: Any) -> Any:
     import plotly.graph_objects as go
 
-    return go.Figure(layout={**LAYOUT, "title": {"text": title}, "height": height, **layout})
+    return go.Figure(
+        layout={
+            **LAYOUT,
+            "title": {"text": title, "x": 0.01, "font": {"size": 14}},
+            "height": height,
+            **layout,
+        }
+    )
 
 
 def _thin(trace: Trace) -> Trace:
@@ -112,6 +112,8 @@ def _path(run: Evaluation) -> Any:
         )
     )
     figure.update_layout(
+        legend={"y": 0.0},
+        margin={"l": 0, "r": 0, "b": 0},
         scene={
             "aspectmode": "cube",
             **{
@@ -121,7 +123,7 @@ def _path(run: Evaluation) -> Any:
                 }
                 for index, axis in enumerate(AXES)
             },
-        }
+        },
     )
     return figure
 
