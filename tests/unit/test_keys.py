@@ -16,7 +16,18 @@ from vla_zenoh.keys import DEFAULT_ROOT, MAX_CHUNK, Keys, chunk, last
 MAX_SENTENCE = 1000  # characters of an error message
 
 KEYS = Keys("panda")
-SELECTORS = ("everything", "all_deltas", "all_specs", "all_status", "all_events", "all_alive")
+SELECTORS = (
+    "everything",
+    "all_deltas",
+    "all_specs",
+    "all_seen",
+    "all_seen_records",
+    "all_status",
+    "all_events",
+    "all_alive",
+)
+NO_KEYS = ("short", "of", "all_seen_of")
+"""Methods that give something else than one key."""
 GOOD_CHUNKS = st.from_regex(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,20}", fullmatch=True)
 
 
@@ -30,7 +41,7 @@ def named_keys(keys: Keys, name: str) -> dict[str, str]:
     """Every key that takes names, made with `name`."""
     made: dict[str, str] = {}
     for method, function in inspect.getmembers(Keys, inspect.isfunction):
-        if method.startswith("_") or method == "short":
+        if method.startswith("_") or method in NO_KEYS:
             continue
         count = len(inspect.signature(function).parameters) - 1
         made[method] = getattr(keys, method)(*[name] * count)
@@ -61,6 +72,8 @@ def test_selectors_find_their_own_keys_and_no_others() -> None:
     own = {
         "all_deltas": named["delta"],
         "all_specs": named["spec"],
+        "all_seen": named["seen"],
+        "all_seen_records": named["seen_record"],
         "all_status": named["status"],
         "all_events": named["event"],
         "all_alive": named["alive"],
