@@ -15,6 +15,7 @@ from vla_zenoh.control.collision import TABLE, CollisionModel
 from vla_zenoh.control.kinematics import smallest_singular_value
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.reach import ReachLimits, Shadow
+from vla_zenoh.control.slowdown import SLOWEST
 from vla_zenoh.control.so3 import Pose, angle_between, log3
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types import FloatArray
@@ -433,3 +434,34 @@ def test_joints_that_are_none_are_refused(joints: FloatArray) -> None:
 def test_a_stop_above_its_slow_is_refused() -> None:
     with pytest.raises(RecordError, match=r"collision_slow \(0.01\) .* collision_stop \(0.02\)"):
         Shadow(KINEMATICS, HOME_RAD, ReachLimits(collision_slow_m=0.01))
+
+
+@pytest.mark.parametrize(
+    ("direction", "rotvec", "name"),
+    [(FORWARD, STILL, "singularity"), (STILL, PITCH, "self_collision")],
+)
+def test_the_nearer_a_bound_the_slower_the_arm(
+    direction: FloatArray, rotvec: FloatArray, name: str
+) -> None:
+    shadow = at(MIDDLE_RAD)
+    pose, shares = KINEMATICS.forward(shadow.joints_rad), []
+    for _ in range(400):
+        wish = moved(pose, 0.2 * STEP_M * direction, 0.2 * STEP_RAD * rotvec)
+        pose, hits = shadow.bound(pose, wish)
+        if hits:
+            break
+        shares.append(1.0 if shadow.slowdown is None else shadow.slowdown.share)
+    assert hits[0].name == shadow.slowdown.name == name if shadow.slowdown else hits
+    assert shares[0] == 1.0
+    approach = shares[len(shares) - shares[::-1].index(1.0) :]
+    assert approach == sorted(approach, reverse=True)
+    assert SLOWEST <= approach[-1] < 0.9
+
+
+def test_away_from_a_bound_the_arm_has_its_full_speed() -> None:
+    shadow = at(MIDDLE_RAD)
+    last = walk(shadow, STEP_M * FORWARD, STILL, 60).poses[-1]
+    assert shadow.slowdown is not None or shadow.margins.singular_value < LIMITS.singularity_slow
+    _, hits = shadow.bound(last, moved(last, STEP_M * BACK, STILL))
+    assert not hits
+    assert shadow.slowdown is None

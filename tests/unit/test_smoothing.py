@@ -22,9 +22,10 @@ AT_TARGET_M, AT_TARGET_RAD = 1e-8, 1e-7
 # Errors of the trapezium rule over one tick of a motion whose jerk is bounded.
 STEP_ATOL_M, STEP_ATOL_RAD = 2e-7, 1e-6
 SPEED_ATOL = np.array([2e-4] * 3 + [1e-3] * 3)
+SLOWEST, REACH_M = 0.1, 0.15
 
 offsets = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
-targets = st.tuples(offsets, offsets).map(lambda pair: (0.15 * pair[0], 0.6 * pair[1]))
+targets = st.tuples(offsets, offsets).map(lambda pair: (REACH_M * pair[0], 0.6 * pair[1]))
 orders = st.lists(st.tuples(st.integers(1, 90), st.none() | targets), min_size=1, max_size=12)
 
 
@@ -37,7 +38,8 @@ def ordered(motion: Smoother, order: tuple[np.ndarray, np.ndarray] | None) -> No
         motion.brake()
         return
     here = motion.motion.pose
-    motion.target(Pose(START.position_m + order[0], exp3(order[1]) @ here.rotation))
+    speed = SLOWEST + (1 - SLOWEST) * abs(order[0][0]) / REACH_M
+    motion.target(Pose(START.position_m + order[0], exp3(order[1]) @ here.rotation), speed)
 
 
 def check_tick(before: Motion, now: Motion) -> None:
@@ -186,6 +188,24 @@ def test_it_stands_still_until_it_is_told_to_move() -> None:
     assert motion.at_rest
     np.testing.assert_array_equal(now.twist, np.zeros(6))
     np.testing.assert_array_equal(now.pose.position_m, START.position_m)
+
+
+def test_who_is_given_less_speed_in_motion_slows_down_to_it_and_keeps_to_it() -> None:
+    motion, share = smoother(), 0.2
+    far = Pose(START.position_m + [0.3, 0.0, 0.0], START.rotation)
+    motion.target(far)
+    for _ in range(80):
+        motion.tick()
+    assert motion.motion.twist[0] > 2 * share * LIMITS.translation[0]
+    motion.target(far, share)
+    speeds: list[float] = []
+    for _ in range(150):
+        before = motion.motion
+        check_tick(before, motion.tick())
+        speeds.append(motion.motion.twist[0])
+    slow = share * LIMITS.translation[0]
+    assert speeds[-1] == pytest.approx(slow, abs=STILL)
+    assert motion.failures == 0
 
 
 def test_reset_forgets_all_motion() -> None:

@@ -30,6 +30,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
+from vla_zenoh.control.slowdown import Slowdown
 from vla_zenoh.control.so3 import Pose, between, exp3, log3, norm3, orthonormal
 from vla_zenoh.profile import Composition
 from vla_zenoh.types import FloatArray
@@ -73,14 +74,14 @@ class Aggregator:
             mixed = waypoints[0].pose
             for older, plan, waypoint in zip(plans, plans[1:], waypoints[1:], strict=False):
                 mixed = between(mixed, waypoint.pose, self._weight(older, plan, now_ns))
-            return Goal(mixed, waypoints[-1].width_m)
+            return Goal(mixed, waypoints[-1].width_m, slowdown=_slowest(waypoints))
         same = len(waypoints) == len(self._waypoints) and all(
             ours is theirs for ours, theirs in zip(waypoints, self._waypoints, strict=True)
         )
         if self._mean is None or not same:
             self._waypoints = waypoints
             pose = mean_pose([goal.pose for goal in waypoints], self._weights[: len(waypoints)])
-            self._mean = Goal(pose, waypoints[-1].width_m)
+            self._mean = Goal(pose, waypoints[-1].width_m, slowdown=_slowest(waypoints))
         return self._mean
 
     def _blended(self, timeline: GoalTimeline, now_ns: int) -> list[Plan]:
@@ -99,6 +100,12 @@ class Aggregator:
             return 1.0
         s = max(now_ns - plan.arrival_ns, 0) / window_ns
         return s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
+
+
+def _slowest(goals: Sequence[Goal]) -> Slowdown | None:
+    """What slows the mix of `goals`: it lies between them."""
+    found = [goal.slowdown for goal in goals if goal.slowdown is not None]
+    return min(found, key=lambda each: each.share, default=None)
 
 
 def mean_pose(poses: Sequence[Pose], weights: FloatArray) -> Pose:

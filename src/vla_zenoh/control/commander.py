@@ -136,6 +136,11 @@ class Commander:
         return self._mover.streaming
 
     @property
+    def speed(self) -> float:
+        """Share of the speed limits that the arm has now; less than 1 near a bound."""
+        return self._mover.speed
+
+    @property
     def smoothing_failures(self) -> int:
         """Times Ruckig found no way and the arm was braked instead."""
         return self._mover.failures

@@ -29,6 +29,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from vla_zenoh.control.limits import into_workspace
+from vla_zenoh.control.slowdown import Slowdown
 from vla_zenoh.control.so3 import Pose, between, orthonormal
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import Cause, FloatArray
@@ -45,11 +46,13 @@ class Goal:
         pose: of the TCP.
         width_m: of the gripper.
         joints_rad: (n,) a joint solution of the pose, where one was looked for.
+        slowdown: why the arm goes there slower than at full speed.
     """
 
     pose: Pose
     width_m: float
     joints_rad: FloatArray | None = None
+    slowdown: Slowdown | None = None
 
 
 @dataclass(slots=True)

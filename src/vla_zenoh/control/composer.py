@@ -8,6 +8,7 @@ from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
 from vla_zenoh.control.limits import LimitHit, bound_step
 from vla_zenoh.control.ports import Outputs
 from vla_zenoh.control.reach import Shadow
+from vla_zenoh.control.slowdown import Slowdown
 from vla_zenoh.errors import RecordError
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import REFUSE_FACTOR, Profile
@@ -57,16 +58,18 @@ class Composer:
                         hit.limit,
                     )
             joints_rad: FloatArray | None = None
+            slower: Slowdown | None = None
             if self._reach is not None and (len(goals) < BOUND_AHEAD or self._refusing):
                 pose, cut = self._reach.bound(before.pose, pose, action.dt_s, before.joints_rad)
                 acted = [*acted, *cut]
-                joints_rad = self._reach.joints_rad
+                joints_rad, slower = self._reach.joints_rad, self._reach.slowdown
             if acted and self._refusing:
                 return Refusal(
                     acted[0].name, "out of bounds, and the profile says refuse", *acted[0][1:3]
                 )
             hits += acted
-            before = Goal(pose, before.width_m if width_m is None else width_m, joints_rad)
+            width_m = before.width_m if width_m is None else width_m
+            before = Goal(pose, width_m, joints_rad, slower)
             goals.append(before)
         out.shortened(hits)
         plan = Plan(
@@ -97,7 +100,7 @@ class Composer:
             pose, cut = self._reach.bound(
                 before.pose, asked.pose, plan.dt_ns / 1e9, before.joints_rad
             )
-            goal = Goal(pose, asked.width_m, self._reach.joints_rad)
+            goal = Goal(pose, asked.width_m, self._reach.joints_rad, self._reach.slowdown)
             if cut:
                 plan.shift_rest(due, goal, self._limits)
                 out.shortened(cut)

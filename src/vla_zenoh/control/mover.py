@@ -12,6 +12,7 @@ from vla_zenoh.control.joint_stage import JointStage
 from vla_zenoh.control.limits import leash
 from vla_zenoh.control.ports import Outputs
 from vla_zenoh.control.reach import Shadow
+from vla_zenoh.control.slowdown import Slowdown
 from vla_zenoh.control.smoothing import Motion, Smoother, motion_limits
 from vla_zenoh.control.so3 import Pose, held_pose, pose_of, quat_from_rotation
 from vla_zenoh.control.states import OBEYING, State
@@ -60,6 +61,9 @@ class Mover:
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
         self.streaming = False
+        self.speed = 1.0
+        """Share of the speed limits that the arm has to its goal."""
+        self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
@@ -100,6 +104,7 @@ class Mover:
             now_ns: time of this tick.
             blocked: the arm is far from its controller's reference.
         """
+        self._slowed_by.clear()
         if self._reach is not None and joint is not None:
             self._reach.reset(self._reach.kinematics.joints_of(joint))
         actual, start = pose_of(measured), held_pose(measured)
@@ -189,17 +194,26 @@ class Mover:
             if hits:
                 goal = self._shorten(plans, goal, pose, now_ns)
                 out.tell("warning", "limit", hits[0].name, "leash", hits[0].value, hits[0].limit)
-            smoother.target(goal.pose)
+            self._slow_down(goal.slowdown, out)
+            smoother.target(goal.pose, self.speed)
             self.goal = goal
             self.gripper.want(goal.width_m)
         return timeline.plan.cause
+
+    def _slow_down(self, slower: Slowdown | None, out: Outputs) -> None:
+        """Take over the speed of a goal; tell each reason once in every activation."""
+        if slower is not None and slower.name not in self._slowed_by:
+            self._slowed_by.add(slower.name)
+            where = f" at {slower.where}" if slower.where else ""
+            out.tell("info", "limit", slower.name, f"slower{where}", slower.value, slower.limit)
+        self.speed = 1.0 if slower is None else slower.share
 
     def _shorten(self, plans: Sequence[Plan], goal: Goal, pose: Pose, now_ns: int) -> Goal:
         """Move all that is ahead by what the leash cut off, or the cut way would come back.
 
         What is moved lies between goals that were bounded.
         """
-        cut = Goal(pose, goal.width_m)
+        cut = Goal(pose, goal.width_m, slowdown=goal.slowdown)
         if len(plans) == 1:
             plans[0].shift_rest(plans[0].index_at(now_ns), cut, self._limits)
             return cut

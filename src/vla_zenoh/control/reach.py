@@ -28,6 +28,7 @@ from vla_zenoh.control.collision import TABLE, CollisionModel
 from vla_zenoh.control.ik import Approach, IkSettings, InverseKinematics, pose_error
 from vla_zenoh.control.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.slowdown import Slowdown, slowdown
 from vla_zenoh.control.so3 import Pose, exp3, orthonormal
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types import FloatArray
@@ -53,9 +54,10 @@ class ReachLimits:
 
     Args:
         joint_margin_rad: kept from both ends of every joint's range.
-        singularity_slow: smallest singular value of the Jacobian below which steps get shorter.
+        singularity_slow: smallest singular value of the Jacobian below which the arm gets slower
+            and steps shorter.
         singularity_stop: it gets no smaller than this.
-        collision_slow_m: distance of the arm to itself below which steps get shorter.
+        collision_slow_m: distance of the arm to itself below which likewise.
         collision_stop_m: it comes no nearer; also the arm, without its hand, to the table.
         table_z_m: height of the table in the base frame; None: there is none.
         table_slow_m: likewise for hand and fingers, which have work to do there.
@@ -66,7 +68,7 @@ class ReachLimits:
     """
 
     joint_margin_rad: float = 0.05
-    singularity_slow: float = 0.025
+    singularity_slow: float = 0.05
     singularity_stop: float = 0.015
     collision_slow_m: float = 0.05
     collision_stop_m: float = 0.02
@@ -186,6 +188,8 @@ class Shadow:
             self._solver.posture_rad = joints.copy()
         pose, jacobian = self.kinematics.pose_and_jacobian(joints)
         self._here = _Stand(pose, joints, 0.0, self._barriers(joints, jacobian))
+        self.slowdown: Slowdown | None = None
+        """Why the step bounded last is to be taken slower than at full speed."""
 
     @property
     def joints_rad(self) -> FloatArray:
@@ -233,7 +237,7 @@ class Shadow:
         start = self._stand_at(before, start_rad)
         end, hits = self._try(start, asked, dt_s)
         if not hits:
-            self._here = end
+            self._settle(start, end)
             return asked, []
         step = pose_error(asked, before)
         best, low, high = start, 0.0, 1.0
@@ -254,8 +258,14 @@ class Shadow:
                     high, hits = fraction, found
                 else:
                     best, low = end, fraction
-        self._here = best
+        self._settle(start, best)
         return (best.pose if low > 0.0 else before), list(hits)
+
+    def _settle(self, start: _Stand, end: _Stand) -> None:
+        self._here = end
+        self.slowdown = slowdown(
+            start.barriers, end.barriers, self._stop, self._slow, self._names, self._where
+        )
 
     def _guess(self, start: _Stand, end: _Stand, hits: Sequence[LimitHit]) -> float:
         """Where to begin to look for the feasible part, from how the whole step failed."""

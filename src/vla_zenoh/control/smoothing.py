@@ -82,7 +82,7 @@ class Smoother:
         self._otg = Ruckig(AXES, dt_s)
         self._input = InputParameter(AXES)
         self._output = OutputParameter(AXES)
-        self._input.max_velocity = self._box(limits, 0)
+        self._full_speed = self._box(limits, 0)
         self._input.max_acceleration = self._box(limits, 1)
         self._input.max_jerk = self._box(limits, 2)
         self.failures = 0
@@ -97,6 +97,7 @@ class Smoother:
         self._anchor = orthonormal(pose.rotation)
         zeros = [0.0] * AXES
         self._otg.reset()
+        self._input.max_velocity = self._full_speed
         self._input.control_interface = ControlInterface.Position
         self._input.synchronization = Synchronization.Phase
         self._input.current_position = [*pose.position_m.tolist(), 0.0, 0.0, 0.0]
@@ -112,9 +113,15 @@ class Smoother:
             np.zeros(6),
         )
 
-    def target(self, pose: Pose) -> None:
-        """Head for `pose` from the present state, without a step in velocity or acceleration."""
+    def target(self, pose: Pose, speed: float = 1.0) -> None:
+        """Head for `pose` from the present state, without a step in velocity or acceleration.
+
+        Args:
+            pose: where to.
+            speed: share of the velocity limits; who is faster slows down within the other limits.
+        """
         self._anchor_here()
+        self._input.max_velocity = [speed * limit for limit in self._full_speed]
         self.braking = False
         self._input.control_interface = ControlInterface.Position
         self._input.synchronization = Synchronization.Phase

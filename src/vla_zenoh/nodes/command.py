@@ -325,6 +325,7 @@ class CommandNode:
                 "policy_done": mind.policy_done,
                 "at_rest": mind.at_rest,
                 "streaming": mind.streaming,
+                "speed_share": round(mind.speed, 3),
                 "tracking_mm": round(mind.tracking_m * 1e3, 3),
                 "tracking_mrad": round(mind.tracking_rad * 1e3, 3),
                 "tick_us": self._cost_us.spread(),

@@ -158,9 +158,10 @@ class ReachLimits(Section):
 
     Args:
         joint_margin_rad: kept from both ends of every joint's range.
-        singularity_slow: smallest singular value of the Jacobian below which steps get shorter.
+        singularity_slow: smallest singular value of the Jacobian below which the arm gets slower
+            and steps shorter.
         singularity_stop: it gets no smaller than this.
-        collision_slow_m: distance of the arm to itself below which steps get shorter.
+        collision_slow_m: distance of the arm to itself below which likewise.
         collision_stop_m: it comes no nearer; also the arm, without its hand, to the table.
         table_z_m: height of the table in the base frame; null: there is none.
         table_slow_m: likewise for hand and fingers, which have work to do there.
@@ -168,7 +169,7 @@ class ReachLimits(Section):
     """
 
     joint_margin_rad: float = Field(default=0.05, ge=0, le=0.5)
-    singularity_slow: float = Field(default=0.025, ge=0, le=0.5)
+    singularity_slow: float = Field(default=0.05, ge=0, le=0.5)
     singularity_stop: float = Field(default=0.015, ge=0, le=0.5)
     collision_slow_m: float = Field(default=0.05, ge=0, le=0.3)
     collision_stop_m: float = Field(default=0.02, ge=0, le=0.3)
@@ -259,6 +260,8 @@ class Timing(Section):
         command_timeout_s: pose stream silent for this long: the robot side brakes by itself.
         max_observation_age_s: a chunk made from an older observation is refused.
         max_clock_step_s: the wall clock jumped by more: brake, and activation is needed again.
+        max_clock_offset_s: another host's clock may differ by this much, which is then reckoned
+            with; beyond it activation is refused.
     """
 
     command_hz: float = Field(default=250.0, ge=50, le=1000)
@@ -268,6 +271,7 @@ class Timing(Section):
     command_timeout_s: float = Field(default=0.1, ge=0.01, le=1)
     max_observation_age_s: float = Field(default=1.0, gt=0, le=10)
     max_clock_step_s: float = Field(default=0.05, gt=0, le=1)
+    max_clock_offset_s: float = Field(default=0.1, gt=0, le=1)
 
     @model_validator(mode="after")
     def _patience_outlasts_the_rate(self) -> Timing:
