@@ -26,7 +26,7 @@ SELECTORS = (
     "all_events",
     "all_alive",
 )
-NO_KEYS = ("short", "of", "all_seen_of")
+NO_KEYS = ("short", "of", "on", "all_seen_of")
 """Methods that give something else than one key."""
 GOOD_CHUNKS = st.from_regex(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,20}", fullmatch=True)
 
