@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from typing import Any
 
 import numpy as np
@@ -61,27 +61,27 @@ def run_in_lockstep(
         profile: of a robot that is commanded by poses.
         trials: prompts.
         conditions: each prompt under each of these.
-        stop: set by Ctrl-C; rows not begun are left out.
+        stop: set by Ctrl-C; rows not ended are left out.
         done: called with every row as it ends, in whatever order.
         processes: at once; None: one a core.
 
     """
-    jobs = [(trial, each) for each in conditions for trial in trials]
-    with ProcessPoolExecutor(
-        processes or os.cpu_count() or 1,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=die_with_parent,
-    ) as pool:
-        futures = [pool.submit(lockstep_row, profile, trial, each) for trial, each in jobs]
-        left: set[Future[Row]] = set(futures)
-        while left:
-            ended, left = wait(left, timeout=LOOK_S, return_when=FIRST_COMPLETED)
-            for future in ended:
-                done(future.result())
-            if stop.is_set():
-                pool.shutdown(wait=True, cancel_futures=True)
-                left.clear()
-    yield from (future.result() for future in futures if future.done() and not future.cancelled())
+    jobs = [(profile, trial, each) for each in conditions for trial in trials]
+    context = multiprocessing.get_context("spawn")
+    # Leaving the block ends the processes, in the middle of a row if need be.
+    with context.Pool(processes or os.cpu_count() or 1, initializer=_begin) as pool:
+        results = [pool.apply_async(lockstep_row, job) for job in jobs]
+        left = list(results)
+        while left and not stop.wait(LOOK_S):
+            for result in [result for result in left if result.ready()]:
+                left.remove(result)
+                done(result.get())
+        yield from (result.get() for result in results if result not in left)
+
+
+def _begin() -> None:
+    die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends us
 
 
 def lockstep_row(profile: Profile, trial: Trial, conditions: Conditions) -> Row:
