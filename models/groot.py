@@ -65,7 +65,6 @@ class Groot:
             if not name.startswith(prefix):
                 raise SpecError(f"map: {name!r} must begin with {prefix!r}")
         self.spec = self._layout.spec
-        self._context: zmq.Context[Any] | None = None
         self._socket: zmq.Socket[Any] | None = None
         self._backoff = Backoff()
         self._begins = True
@@ -119,8 +118,7 @@ class Groot:
 
     # -- the socket ---------------------------------------------------------------------------
     def _connect(self) -> None:
-        self._context = self._context or zmq.Context()
-        socket = self._socket = self._context.socket(zmq.REQ)
+        socket = self._socket = zmq.Context.instance().socket(zmq.REQ)
         milliseconds = int(self._timeout_s * 1000)
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.SNDTIMEO, milliseconds)
@@ -141,9 +139,13 @@ class Groot:
         self._backoff.succeeded()
 
     def _drop(self) -> None:
-        socket, self._socket = self._socket, None
+        self.close()
         self._begins = True
         self._backoff.failed(time.monotonic())
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        socket, self._socket = self._socket, None
         if socket is not None:
             with suppress(zmq.ZMQError):
                 socket.close()

@@ -14,7 +14,7 @@ import socket
 import struct
 import time
 import uuid
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -73,6 +73,7 @@ class OpenPi:
         self.spec = self._layout.spec
         self._forward: Forward | None = None
         self._connection: ClientConnection | None = None
+        self._until_closed = ExitStack()
         self._backoff = Backoff()
         self._begins, self._session = True, ""
 
@@ -130,16 +131,18 @@ class OpenPi:
         if self._connection is not None:
             if self._connection.state is State.OPEN:
                 return self._connection
-            self._connection = None  # closed while nothing was asked: a server may do that
-        connection = self._connection = connect(
-            self._url,
-            compression=None,
-            max_size=openpi.MAX_BYTES,
-            additional_headers=self._headers,
-            proxy=None,
-            open_timeout=self._timeout_s,
-            close_timeout=CLOSE_S,
-            ping_interval=None,  # a server that thinks does not answer pings
+            self.close()  # it was closed while nothing was asked: a server may do that
+        connection = self._connection = self._until_closed.enter_context(
+            connect(
+                self._url,
+                compression=None,
+                max_size=openpi.MAX_BYTES,
+                additional_headers=self._headers,
+                proxy=None,
+                open_timeout=self._timeout_s,
+                close_timeout=CLOSE_S,
+                ping_interval=None,  # a server that thinks does not answer pings
+            )
         )
         # A stopped server reads nothing, and sending would wait for it without end.
         seconds = struct.pack("ll", int(self._timeout_s), int(self._timeout_s % 1 * 1e6))
@@ -151,12 +154,16 @@ class OpenPi:
         return connection
 
     def _drop(self) -> None:
-        connection, self._connection = self._connection, None
+        self.close()
         self._begins = True
         self._backoff.failed(time.monotonic())
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        connection, self._connection = self._connection, None
         if connection is not None:
             # Not the polite way, which waits for a server that may be stopped.
             with suppress(OSError):
                 connection.socket.shutdown(socket.SHUT_RDWR)
             with suppress(OSError, WebSocketException):
-                connection.close()
+                self._until_closed.close()

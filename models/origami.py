@@ -127,7 +127,7 @@ class Origami:
                     break
                 return origami.read_answer(payload, operation, request_id)
         except zenoh.ZError as error:
-            self._close()
+            self.close()
             raise PeerError("peer_gone", f"no router at {self._url}: {error}") from error
         if time.monotonic() - asked_s < 0.5 * self._timeout_s:
             raise PeerError("peer_gone", f"nobody behind {self._url} answers {operation}")
@@ -153,7 +153,8 @@ class Origami:
             self._session = zenoh.open(config)
         return self._session
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Let go of the session."""
         import zenoh
 
         session, self._session = self._session, None

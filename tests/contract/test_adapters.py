@@ -1,0 +1,328 @@
+"""The adapters against servers that speak as published, each a process of its own."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from peer_rig import KINDS, Server, free_port, served
+
+from vla_zenoh.errors import PeerError, SpecError, WorkerError
+from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.policy import Observation, Policy, check_steps, example_observation
+from vla_zenoh.profile import SessionProfile, load_profile
+from vla_zenoh.types import JointState
+
+STEP_M, ATOL_M = 0.01, 1e-6
+FK_ATOL_M = 1e-4
+TIMEOUT_S = 1.0
+LATE_S = 0.6
+"""What a busy machine may add to a time-out."""
+PATIENCE_S = 8.0
+BACK_OFF_S = 2.0
+UP_RAD = 0.01
+ADAPTERS = ("openpi", "groot", "openvla_rest", "origami")
+
+
+def in_full(*names: str, quick: str) -> list[Any]:
+    """All of them with the slow tests, `quick` always."""
+    return [pytest.param(n, marks=() if n == quick else pytest.mark.slow) for n in names]
+
+
+@contextmanager
+def made(model: str, settings: Mapping[str, str]) -> Iterator[Policy]:
+    policy = make_policy(find_model(model), settings)
+    getattr(policy, "load", lambda: None)()
+    try:
+        yield policy
+    finally:
+        getattr(policy, "close", lambda: None)()
+
+
+@contextmanager
+def asked(name: str, **options: str) -> Iterator[tuple[Server, Policy]]:
+    """A server and the adapter that asks it; for a policy behind a router, that too."""
+    port = free_port()
+    router = None
+    if KINDS[name].model == "origami":
+        where = (f"tcp/127.0.0.1:{port}",)
+        router = open_session(SessionProfile(listen=where, connect=where), mode="router")
+    try:
+        with (
+            served(name, port) as server,
+            made(server.kind.model, {**server.settings, **options}) as policy,
+        ):
+            yield server, policy
+    finally:
+        if router is not None:
+            router.close()
+
+
+def seen(policy: Policy, prompt: str) -> Observation:
+    found = example_observation(policy.spec, prompt=prompt)
+    if found.joint is None:
+        return found
+    robot = load_profile("panda_sim").robot
+    none = np.zeros(7)
+    return replace(found, joint=JointState(robot.arm_joints, robot.home_rad, none, none))
+
+
+def answer(policy: Policy, prompt: str, patience_s: float = PATIENCE_S) -> np.ndarray[Any, Any]:
+    """Checked steps, asked for again and again while the server is not there."""
+    give_up_s = time.monotonic() + patience_s
+    while True:
+        try:
+            return check_steps(policy.spec.action, policy.infer(seen(policy, prompt)).steps)
+        except PeerError as error:
+            if error.reason not in ("peer_gone", "peer_timeout") or time.monotonic() > give_up_s:
+                raise
+        time.sleep(0.02)
+
+
+def refusal(policy: Policy, prompt: str) -> PeerError:
+    """How the next question that reaches the server is refused, and that it takes no time."""
+    give_up_s = time.monotonic() + PATIENCE_S
+    while True:
+        began_s = time.monotonic()
+        with pytest.raises(PeerError) as raised:
+            policy.infer(seen(policy, prompt))
+        assert time.monotonic() - began_s < 2 * TIMEOUT_S + LATE_S
+        if "tried again" not in str(raised.value) or time.monotonic() > give_up_s:
+            return raised.value
+        time.sleep(0.02)
+
+
+def height_m(policy: Policy, steps: np.ndarray[Any, Any]) -> float:
+    """How far the first step goes up: joints lead to poses, told apart from home."""
+    if policy.spec.action.kind == "delta":
+        return float(steps[0, 2])
+    still = answer(policy, "hold")
+    return float(steps[0, 2] - still[0, 2])
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_an_adapter_and_its_server_understand_each_other_and_recover_from_every_fault(
+    name: str,
+) -> None:
+    with asked(name) as (_, policy):
+        up, down, still = (answer(policy, prompt) for prompt in ("up", "down", "hold"))
+        if policy.spec.action.kind == "delta":
+            assert height_m(policy, up) == pytest.approx(STEP_M, abs=ATOL_M)
+            assert height_m(policy, down) == pytest.approx(-STEP_M, abs=ATOL_M)
+            assert np.abs(still[:, :6]).max() < ATOL_M
+            assert (up[:, 6] == 1.0).all()
+            assert policy.spec.action.gripper_open_is_high
+        else:
+            # The second joint turned back by UP_RAD moves the hand on a circle about it.
+            assert height_m(policy, up) == pytest.approx(-height_m(policy, down), abs=FK_ATOL_M)
+            assert height_m(policy, up) > 0.2 * UP_RAD
+        for fault, reason in (
+            ("nan", "peer_reply"),
+            ("short", "peer_reply"),
+            ("raise", "peer_error"),
+        ):
+            assert refusal(policy, f"up {fault}").reason == reason, fault
+            np.testing.assert_allclose(answer(policy, "up"), up, atol=ATOL_M)
+
+
+@pytest.mark.parametrize("name", in_full(*ADAPTERS, "groot_n15", quick="groot"))
+def test_a_late_answer_is_never_taken_for_that_of_the_next_question(name: str) -> None:
+    with asked(name, timeout_s="0.4") as (_, policy):
+        up = answer(policy, "up")
+        with pytest.raises(PeerError) as raised:
+            policy.infer(seen(policy, "down slow"))
+        assert raised.value.reason == "peer_timeout"
+        # The answer to that one arrives while these are asked.
+        give_up_s = time.monotonic() + 2.5
+        while time.monotonic() < give_up_s:
+            try:
+                got = policy.infer(seen(policy, "up")).steps
+            except PeerError:
+                time.sleep(0.02)
+                continue
+            np.testing.assert_allclose(np.asarray(got), up, atol=ATOL_M)
+            time.sleep(0.05)
+        np.testing.assert_allclose(answer(policy, "up"), up, atol=ATOL_M)
+
+
+@pytest.mark.parametrize("name", in_full(*ADAPTERS, quick=""))
+def test_a_server_killed_and_started_again_is_found(name: str) -> None:
+    with asked(name) as (server, policy):
+        answer(policy, "up")
+        server.kill()
+        error = refusal(policy, "up")
+        assert error.reason in ("peer_gone", "peer_timeout")
+        server.start()
+        answer(policy, "up")
+
+
+@pytest.mark.parametrize("name", in_full(*ADAPTERS, quick="openpi"))
+def test_a_stopped_server_takes_no_more_than_the_time_out(name: str) -> None:
+    with asked(name) as (server, policy):
+        answer(policy, "up")
+        server.signal(signal.SIGSTOP)
+        try:
+            reasons = [refusal(policy, "up").reason for _ in range(2)]
+        finally:
+            server.signal(signal.SIGCONT)
+        assert "peer_timeout" in reasons
+        assert set(reasons) <= {"peer_timeout", "peer_gone"}
+        answer(policy, "up")
+
+
+@pytest.mark.parametrize("name", ADAPTERS)
+def test_without_a_server_the_answer_is_that_nobody_is_there(name: str) -> None:
+    kind = KINDS[name]
+    with made(kind.model, kind.settings(free_port())) as policy:
+        for _ in range(3):
+            assert refusal(policy, "up").reason == "peer_gone"
+
+
+@pytest.mark.parametrize("name", ["openpi", "groot", "openvla_rest"])
+def test_a_port_that_accepts_and_says_nothing_takes_no_more_than_the_time_out(name: str) -> None:
+    kind = KINDS[name]
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        settings = {**kind.settings(mute.getsockname()[1]), "timeout_s": "0.3"}
+        with made(kind.model, settings) as policy:
+            began_s = time.monotonic()
+            assert refusal(policy, "up").reason in ("peer_timeout", "peer_gone")
+            assert time.monotonic() - began_s < 0.6 + LATE_S
+
+
+def test_a_server_that_gives_a_byte_now_and_then_takes_no_more_than_the_time_out() -> None:
+    kind = KINDS["openvla_rest"]
+    ends = threading.Event()
+
+    def drip(listener: socket.socket) -> None:
+        connection, _ = listener.accept()
+        with connection:
+            head = b"HTTP/1.1 200 OK\r\nContent-Length: 1000\r\n\r\n"
+            for byte in head + b"[" * 1000:
+                if ends.wait(0.01):
+                    return
+                try:
+                    connection.send(bytes([byte]))
+                except OSError:
+                    return
+
+    with socket.create_server(("127.0.0.1", 0)) as slow:
+        thread = threading.Thread(target=drip, args=(slow,))
+        thread.start()
+        settings = {**kind.settings(slow.getsockname()[1]), "timeout_s": "0.3"}
+        policy = make_policy(find_model(kind.model), settings)
+        began_s = time.monotonic()
+        error = refusal(policy, "up")
+        took_s = time.monotonic() - began_s
+        ends.set()
+        thread.join(5)
+    assert error.reason == "peer_timeout"
+    assert took_s < 0.3 + LATE_S
+
+
+def test_a_connection_that_the_server_closed_while_idle_is_made_again_without_a_refusal() -> None:
+    with asked("openpi") as (server, policy):
+        answer(policy, "up")
+        server.kill()
+        server.start()
+        time.sleep(0.1)
+        answer(policy, "up", patience_s=0.0)
+
+
+def test_groots_pickles_are_refused() -> None:
+    with served("groot") as server:
+        server.kill()
+        server.kind = replace(server.kind, variant="pickle")
+        server.start()
+        with made("groot", server.settings) as policy:
+            assert "pickles, which run code" in str(refusal(policy, "up"))
+
+
+def test_an_answer_with_another_questions_number_is_refused() -> None:
+    port = free_port()
+    where = (f"tcp/127.0.0.1:{port}",)
+    with (
+        open_session(SessionProfile(listen=where, connect=where), mode="router"),
+        served("origami", port) as server,
+        made("origami", server.settings) as policy,
+    ):
+        server.kill()
+        server.kind = replace(server.kind, variant="other")
+        server.start()
+        until_s = time.monotonic() + PATIENCE_S
+        while (error := refusal(policy, "up")).reason == "peer_gone":
+            assert time.monotonic() < until_s
+        assert "request_id of the answer is 'another'" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "named"),
+    [
+        ("vllm", {"columns": "0:8"}, "column 7 is wanted"),
+        ("groot", {"map": "video.image=, video.top=camera:front"}, "wants video image"),
+        ("groot", {"keys": "x,y,z,roll,pitch,yaw,grip"}, "gives no action grip"),
+        ("groot_n15", {"map": "state.x="}, "wants state x"),
+        ("origami", {"action": "joint_delta"}, "action=joint_delta is set"),
+    ],
+)
+def test_what_the_server_says_of_itself_is_held_against_the_options(
+    name: str, options: dict[str, str], named: str
+) -> None:
+    kind = KINDS[name]
+    given = kind.options.get("map", "")
+    if "map" in options:
+        options = {**options, "map": f"{given}, {options['map']}"}
+    with asked(name, **options) as (_, policy):
+        error = refusal(policy, "up")
+        while error.reason == "peer_gone":
+            error = refusal(policy, "up")
+        assert error.reason == "peer_mismatch"
+        assert named in str(error)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "named"),
+    [
+        ("openpi", {"url": "http://127.0.0.1:1"}, "ws://HOST:PORT"),
+        ("openpi", {"dialect": "latin"}, "auto, openpi, vllm"),
+        ("openpi", {"timeout_s": "0"}, "0.01 to 60"),
+        ("openpi", {"sise": "224x224"}, "no option 'sise'"),
+        ("groot", {"version": "n1"}, "n1.5, n1.6"),
+        ("groot", {"map": "image=camera:front"}, "must begin with 'video.'"),
+        ("groot", {"action": "joint_delta"}, "joints are not read"),
+        ("openvla_rest", {"url": "ftp://x"}, "http://HOST:PORT"),
+        ("openvla_rest", {"encoded": "perhaps"}, "true, false"),
+        ("origami", {"session_id": ""}, "session_id is empty"),
+    ],
+)
+def test_an_option_that_cannot_be_is_refused_before_anything_runs(
+    name: str, options: dict[str, str], named: str
+) -> None:
+    with pytest.raises(WorkerError, match=named) as raised:
+        make_policy(find_model(name), options)
+    assert isinstance(raised.value.__cause__, SpecError)
+
+
+def test_a_servers_statistics_are_part_of_the_spec() -> None:
+    policy = make_policy(find_model("openvla_rest"), {"unnorm_key": "bridge_orig"})
+    assert policy.spec.action.normalisation == "bridge_orig"
+
+
+def test_origamis_adapter_closes_nothing_of_others() -> None:
+    """Its session is its own: that of the worker beside it lives on when the router is lost."""
+    with asked("origami") as (server, policy):
+        answer(policy, "up")
+        own = policy._session  # pyright: ignore
+        assert isinstance(own, zenoh.Session)
+        server.kill()
+        refusal(policy, "up")
+        assert not own.is_closed()

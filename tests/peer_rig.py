@@ -1,0 +1,161 @@
+"""Servers of other systems as processes of their own, and the adapters that ask them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from camera_rig import free_endpoint, until
+
+PEERS = Path(__file__).parent / "peers"
+START_S = 20.0
+_PLAIN = {"rotation": "rpy", "clip": "", "position_scale_m": "1", "rotation_scale_rad": "1"}
+_SMALL = {"size": "64x64", "dt_s": "0.1", "horizon": "4", "timeout_s": "1"}
+_NO_WRIST = {
+    "openpi": "observation/wrist_image=",
+    "groot": "video.wrist_image=",
+    "oft": "wrist_image=",
+    "origami": "observation/image/wrist_right=blank:224x224",
+}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A server of `tests/peers` and the options of the adapter that fits it.
+
+    Args:
+        model: the adapter.
+        script: the server.
+        url: with PORT in it.
+        options: of the adapter.
+        variant: of the server.
+    """
+
+    model: str
+    script: str
+    url: str
+    options: Mapping[str, str]
+    variant: str = ""
+
+    def settings(self, port: int) -> dict[str, str]:
+        return {"url": self.url.replace("PORT", str(port)), **self.options}
+
+
+_OPENPI = {**_PLAIN, **_SMALL, "map": _NO_WRIST["openpi"], "gripper_open": "high"}
+_GROOT = {**_PLAIN, **_SMALL, "map": _NO_WRIST["groot"]}
+KINDS: Mapping[str, Kind] = {
+    "openpi": Kind(
+        "openpi", "openpi_server.py", "ws://127.0.0.1:PORT", {**_OPENPI, "gripper_threshold": "0.5"}
+    ),
+    "vllm": Kind(
+        "openpi",
+        "openpi_server.py",
+        "ws://127.0.0.1:PORT/v1/realtime/robot/openpi",
+        {**_OPENPI, "gripper_threshold": "0.5"},
+        "vllm",
+    ),
+    "groot": Kind("groot", "groot_server.py", "tcp://127.0.0.1:PORT", _GROOT),
+    "groot_n15": Kind(
+        "groot", "groot_server.py", "tcp://127.0.0.1:PORT", {**_GROOT, "version": "n1.5"}, "n1.5"
+    ),
+    "openvla_rest": Kind(
+        "openvla_rest", "openvla_server.py", "http://127.0.0.1:PORT", {**_SMALL, "horizon": "1"}
+    ),
+    "openvla_text": Kind(
+        "openvla_rest",
+        "openvla_server.py",
+        "http://127.0.0.1:PORT/act",
+        {**_SMALL, "encoded": "true"},
+        "text",
+    ),
+    "oft": Kind(
+        "openvla_rest",
+        "openvla_server.py",
+        "http://127.0.0.1:PORT",
+        {**_PLAIN, **_SMALL, "preset": "oft_libero", "map": _NO_WRIST["oft"]},
+        "oft",
+    ),
+    "origami": Kind(
+        "origami",
+        "origami_server.py",
+        "tcp/127.0.0.1:PORT",
+        {"map": _NO_WRIST["origami"], "dt_s": "0.1", "timeout_s": "1"},
+    ),
+}
+"""All of them move in metres and radians, so that a test knows how far; one camera."""
+
+
+@dataclass
+class Server:
+    """A process that can be killed, stopped and started again on its port."""
+
+    kind: Kind
+    port: int
+    python: str = sys.executable
+    process: subprocess.Popen[bytes] | None = None
+    listens: bool = True
+    _all: list[subprocess.Popen[bytes]] = field(default_factory=list)
+
+    @property
+    def settings(self) -> dict[str, str]:
+        return self.kind.settings(self.port)
+
+    def start(self, *, wait: bool = True) -> None:
+        script = str(PEERS / self.kind.script)
+        told = ["--port", str(self.port), f"--variant={self.kind.variant}"]
+        self.process = subprocess.Popen([self.python, script, *told])
+        self._all.append(self.process)
+        if wait and self.listens:
+            until(f"{self.kind.script} listens", self._answers, START_S)
+
+    def _answers(self) -> bool:
+        assert self.process is not None
+        assert self.process.poll() is None, f"{self.kind.script} has ended"
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", self.port)) == 0
+
+    def signal(self, number: int) -> None:
+        assert self.process is not None
+        os.kill(self.process.pid, number)
+
+    def kill(self) -> None:
+        self.signal(signal.SIGKILL)
+        assert self.process is not None
+        self.process.wait(5)
+
+    def end(self) -> None:
+        for process in self._all:
+            if process.poll() is None:
+                process.kill()
+            process.wait(5)
+
+
+def free_port() -> int:
+    return int(free_endpoint().rpartition(":")[2])
+
+
+@contextmanager
+def served(name: str, port: int | None = None, **changes: Any) -> Iterator[Server]:
+    """The server of one of `KINDS`.
+
+    Args:
+        name: of the kind.
+        port: to listen on, or that of a router; None: any.
+        changes: fields of the `Server`.
+    """
+    kind = KINDS[name]
+    # A policy behind a router listens nowhere itself.
+    server = Server(kind, port or free_port(), listens=kind.model != "origami", **changes)
+    try:
+        server.start()
+        yield server
+    finally:
+        server.end()
