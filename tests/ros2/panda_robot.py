@@ -63,9 +63,10 @@ CAMERAS = {
 }
 BASE = "panda_link0"
 
-FOLLOW_1_S = 50.0
-"""How stiffly the desired pose is followed: 20 mm away it begins with 50 m/s^2 at most, and 0.4 m/s
-is never passed on the way."""
+FOLLOW_1_S = 30.0
+"""How stiffly the desired pose is followed: in motion the arm is two time constants behind it."""
+MAX_ACCELERATION = np.array([10.0, 10.0, 10.0, 30.0, 30.0, 30.0])
+"""m/s^2 and rad/s^2: what the motors can do is not exceeded by a pose some way off."""
 CATCH_UP_NS = 50_000_000
 PRIORITY = 40
 
@@ -91,7 +92,8 @@ class Follower:
         away = np.concatenate(
             (self._goal_m - self._position_m, pin.log3(self._goal_rotation @ self._rotation.T))
         )
-        acceleration = w * w * away - 2 * w * self._twist
+        wanted = w * w * away - 2 * w * self._twist
+        acceleration = np.clip(wanted, -MAX_ACCELERATION, MAX_ACCELERATION)
         self._twist = self._twist + acceleration * dt_s
         self._position_m = self._position_m + self._twist[:3] * dt_s
         self._rotation = pin.exp3(self._twist[3:] * dt_s) @ self._rotation

@@ -111,11 +111,16 @@ class People:
     def _answer(self, service: Service, request: Request) -> None:
         try:
             asked = self._messages.decode(request_of(service.type), request.payload)
-            said, success = self._do[service.name](asked), True
         except CodecError as error:
             self._refuse(error.reason, f"{service.name}: {error}", service.name)
             request.drop(str(error))
             return
+        # An error in place of an answer never reaches a ROS client: it would wait for ever.
+        try:
+            said, success = self._do[service.name](asked), True
+        except CodecError as error:
+            self._refuse(error.reason, f"{service.name}: {error}", service.name)
+            said, success = str(error), False
         except (SessionError, zenoh.ZError) as error:
             said, success = str(error), False
         response = self._messages.new(response_of(service.type), success=success, message=said)
