@@ -115,8 +115,14 @@ def _task_spans(run: Run) -> list[tuple[int, int, str]]:
                 out.append((since_ns, entry.heard_ns, worker))
             since_ns, worker = entry.heard_ns, now
     if worker:
-        out.append((since_ns, run.ended_ns + 1, worker))
+        out.append((since_ns, _last_ns(run) + 1, worker))
     return out
+
+
+def _last_ns(run: Run) -> int:
+    """When robot and models were last heard: a recorder may listen on after them."""
+    streams = (run.tasks, run.chunks, run.commands, run.joint_commands, run.poses)
+    return max((stream[-1].heard_ns for stream in streams if stream), default=run.ended_ns)
 
 
 def _requests(
@@ -340,5 +346,5 @@ def _prompt_spans(run: Run) -> list[tuple[int, int, str]]:
                 out.append((since_ns, entry.heard_ns, now))
             since_ns, now = entry.heard_ns, said
     if now is not None:
-        out.append((since_ns, run.ended_ns + 1, now))
+        out.append((since_ns, _last_ns(run) + 1, now))
     return out
