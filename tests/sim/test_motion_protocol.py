@@ -1,0 +1,54 @@
+"""The motion protocol in lockstep: a row of figures that hold."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from vla_zenoh.bench.motion import PROTOCOL, Conditions
+from vla_zenoh.nodes.bench_motion_lockstep import lockstep_row, run_in_lockstep
+from vla_zenoh.profile import load_profile, override
+
+NAMES = {trial.name: trial for trial in PROTOCOL}
+SLOW_MODEL = {"delay_ms": 140.0, "jitter": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("prompt", "conditions"),
+    [
+        ("close gripper", Conditions(10.0)),
+        pytest.param("go up", Conditions(5.0, 8, **SLOW_MODEL), marks=pytest.mark.slow),
+        pytest.param("yaw right", Conditions(1.0, 50, **SLOW_MODEL), marks=pytest.mark.slow),
+        pytest.param("roll left", Conditions(2.0), marks=pytest.mark.slow),
+    ],
+)
+def test_a_prompt_is_carried_out_exactly_within_limits(prompt: str, conditions: Conditions) -> None:
+    row = lockstep_row(load_profile("panda_sim"), NAMES[prompt], conditions)
+    assert row["ok"], row["faults"]
+    assert row["steps_done"] >= 50
+    assert row["seam_jerk_over_limit"] <= 1.001
+
+
+def test_a_prompt_that_cannot_be_carried_out_is_a_row_that_says_why() -> None:
+    late = override(load_profile("panda_sim"), {"timing": {"max_observation_age_s": 0.01}})
+    row = lockstep_row(late, NAMES["go up"], Conditions(10.0))
+    assert not row["ok"]
+    assert "did not end" in row["faults"][0]
+
+
+@pytest.mark.slow
+def test_rows_come_in_the_order_they_were_asked_for() -> None:
+    rows = run_in_lockstep(
+        load_profile("panda_sim"),
+        [NAMES["open gripper"], NAMES["close gripper"]],
+        [Conditions(10.0), Conditions(5.0)],
+        threading.Event(),
+        lambda _: None,
+    )
+    assert [(row["prompt"], row["rate_hz"]) for row in rows] == [
+        ("open gripper", 10.0),
+        ("close gripper", 10.0),
+        ("open gripper", 5.0),
+        ("close gripper", 5.0),
+    ]
