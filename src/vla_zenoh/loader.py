@@ -126,11 +126,14 @@ def import_model(model: ModelFile) -> ModuleType:
     return module
 
 
-def make_policy(model: ModelFile, options: Mapping[str, str] | None = None) -> Policy:
+def make_policy(
+    model: ModelFile, options: Mapping[str, str] | None = None, *, profile: str | None = None
+) -> Policy:
     """Import the file and make its model, without loading weights.
 
     The model is the one class in the file that has ``infer``; where there are several, the name
-    ``MODEL`` says which. `options` are given to its constructor by name, as text.
+    ``MODEL`` says which. `options` are given to its constructor by name, as text; one that takes a
+    `profile` is given the name or path of the robot's, where the options have none.
 
     Raises:
         WorkerError: the file does not import, has no such class, or refuses the options.
@@ -140,8 +143,11 @@ def make_policy(model: ModelFile, options: Mapping[str, str] | None = None) -> P
     if not callable(maker):
         raise WorkerError(f"{model.path}: MODEL must be a class, it is a {type(maker).__name__}")
     name = getattr(maker, "__name__", "MODEL")
+    chosen = dict(options or {})
+    if profile is not None and "profile" in _parameters(maker):
+        chosen.setdefault("profile", profile)
     try:
-        policy: Any = maker(**(options or {}))
+        policy: Any = maker(**chosen)
     except (Exception, SystemExit) as error:
         raise WorkerError(
             f"{model.path}: {name} cannot be made: {error} (options it takes: {_accepted(maker)})"
@@ -161,10 +167,14 @@ def make_policy(model: ModelFile, options: Mapping[str, str] | None = None) -> P
 
 
 def _accepted(maker: Callable[..., Any]) -> str:
+    return ", ".join(_parameters(maker)) or "none"
+
+
+def _parameters(maker: Callable[..., Any]) -> list[str]:
     try:
-        return ", ".join(inspect.signature(maker).parameters) or "none"
-    except (TypeError, ValueError):
-        return "unknown"
+        return list(inspect.signature(maker).parameters)
+    except (TypeError, ValueError):  # written in C, without a signature
+        return []
 
 
 def _only_model(module: Any, path: Path) -> type:

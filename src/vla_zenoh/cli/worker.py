@@ -52,7 +52,7 @@ def worker(
     chosen = model_options(options or [])
     # Comes back only where this environment has what the model's header asks for.
     run_in_own_environment(found, python)
-    policy = make_policy(found, chosen)
+    policy = make_policy(found, chosen, profile=profile)
     form = _image_form(loaded, host) if images == "auto" else images
     run_node(
         loaded,
