@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from vla_zenoh.cli.bench_codec import codec
 from vla_zenoh.cli.bench_command import command
 from vla_zenoh.cli.bench_motion import motion
 from vla_zenoh.cli.bench_openvla import openvla
@@ -18,6 +19,7 @@ bench_app = typer.Typer(help="Measure this computer.", no_args_is_help=True)
 
 
 bench_app.command("motion")(motion)
+bench_app.command("codec")(codec)
 bench_app.command("command")(command)
 bench_app.command("task")(task)
 bench_app.command("openvla")(openvla)

@@ -1,0 +1,74 @@
+"""vla-zenoh bench codec."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from vla_zenoh.cli.output import console
+
+BUDGET_S = 0.3
+"""Time for one figure, at most `MAX_TURNS` turns."""
+MIN_TURNS, MAX_TURNS = 5, 2000
+
+
+def codec(
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the result to this file.")
+    ] = None,
+) -> None:
+    """Measure encoding and decoding, ours and ROS 2's, in microseconds.
+
+    Of ROS 2 beside cyclonedds and pycdr2, where they are installed.
+    """
+    from rich.table import Table
+
+    from vla_zenoh.bench.codec import cases
+    from vla_zenoh.bench.other_cdr import MODULES
+
+    rows: list[dict[str, Any]] = []
+    for case in cases():
+        us = {"encode": _median_us(case.encode), "decode": _median_us(case.decode)}
+        for library, (encode, decode) in case.others.items():
+            us |= {
+                f"{library} encode": _median_us(encode),
+                f"{library} decode": _median_us(decode),
+            }
+        rows.append({"name": case.name, "bytes": case.payload_bytes, "us": us})
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps(rows, indent=2) + "\n", "utf-8")
+    table = Table(title="microseconds to encode / decode, median")
+    table.add_column("what", no_wrap=True)
+    table.add_column("bytes", justify="right")
+    columns = ("ours", *MODULES)
+    for name in columns:
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(row["name"], str(row["bytes"]), *(_pair(row["us"], c) for c in columns))
+    console().print(table)
+
+
+def _pair(us: dict[str, float], who: str) -> str:
+    before = "" if who == "ours" else f"{who} "
+    if f"{before}encode" not in us:
+        return ""
+    return f"{us[f'{before}encode']:.1f} / {us[f'{before}decode']:.1f}"
+
+
+def _median_us(function: Callable[[], Any]) -> float:
+    taken_ns: list[int] = []
+    give_up = time.perf_counter() + BUDGET_S
+    while len(taken_ns) < MIN_TURNS or (
+        len(taken_ns) < MAX_TURNS and time.perf_counter() < give_up
+    ):
+        began_ns = time.perf_counter_ns()
+        function()
+        taken_ns.append(time.perf_counter_ns() - began_ns)
+    return statistics.median(taken_ns) / 1e3
