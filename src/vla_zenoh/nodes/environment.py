@@ -22,12 +22,13 @@ from vla_zenoh.nodes.orphan import die_with_parent
 INSIDE_VARIABLE = "VLA_ZENOH_WORKER_ENVIRONMENT"
 
 
-def run_in_own_environment(model: ModelFile, python: str | None) -> None:
+def run_in_own_environment(model: ModelFile, python: str | None, more: Sequence[str] = ()) -> None:
     """Replace this process by one in the right environment; returns where this one is right.
 
     Args:
         model: the file.
         python: interpreter of a prepared environment, which must have this package.
+        more: packages that the command needs beside the model's own.
 
     Raises:
         WorkerError: another environment is needed and cannot be made.
@@ -48,7 +49,7 @@ def run_in_own_environment(model: ModelFile, python: str | None) -> None:
         if shutil.which(python) is None:
             raise WorkerError(f"--python {python!r} is not an interpreter")
         os.execvpe(python, [python, *arguments], environment)
-    command = environment_command(model)
+    command = environment_command(model, more)
     # Not on stdout, where `vla-zenoh check --json` writes its result.
     said = f"preparing an environment for {model.name}: {', '.join(model.dependencies)}"
     print(said, file=sys.stderr, flush=True)
