@@ -203,6 +203,37 @@ def test_what_a_model_sees_is_shown_with_its_prompt_raw_output_and_steps(
         assert len(list(out.glob("*/*.json"))) == 2
 
 
+def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
+    chain: Chain, tmp_path: Path
+) -> None:
+    model = tmp_path / "riser.py"
+    model.write_text(OWN_MODEL)
+    with worker(chain, str(model)):
+        infers = "the riser infers"
+        chain.until(infers, lambda: chain.state("worker-riser") == "inferring", READY_PATIENCE_S)
+        chain.move()
+        words = ("compare", "scripted", "riser", "--seconds", "2", "--tolerance", "0.2", "--json")
+        said = command_line(*words, profile=chain.profile_file)
+        assert said.returncode == 0, said.stderr
+        found = json.loads(said.stdout)
+        assert found["pairs"] >= 5
+        assert abs(found["cosine"]) == pytest.approx(1.0)
+        assert found["mean"][0] == pytest.approx(0.0, abs=1e-6)
+        assert found["gripper"] is None
+        # The shadow's deltas are on their key like those of the one that is obeyed.
+        said = command_line(
+            "echo", "delta/*", "--seconds", "2", "--json", profile=chain.profile_file
+        )
+        keys = {json.loads(line)["key"].rsplit("/", 1)[-1] for line in said.stdout.splitlines()}
+        assert keys == {"scripted", "riser"}
+
+
+def test_a_worker_that_is_not_there_cannot_be_compared(chain: Chain) -> None:
+    said = command_line("compare", "scripted", "ghost", profile=chain.profile_file)
+    assert said.returncode == 1
+    assert "worker 'ghost' tells no spec; is it alive?" in said.stderr
+
+
 def test_who_shows_nothing_is_named(chain: Chain) -> None:
     said = command_line("seen", "ghost", "--json", profile=chain.profile_file)
     assert said.returncode == 1

@@ -1,0 +1,89 @@
+"""Hears two workers over a live run: their chunks, their specs, and where the arm was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeVar
+
+import zenoh
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
+from vla_zenoh.control.disagreement import StandingHistory
+from vla_zenoh.errors import CodecError, NodeError
+from vla_zenoh.keys import Keys
+from vla_zenoh.nodes.slots import Arrival, Inbox
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.types import ActionChunk, GripperState, Header, PoseState
+
+SPEC_PATIENCE_S = 2.0
+MAX_STATES, MAX_CHUNKS = 4096, 1024
+
+Record = TypeVar("Record")
+
+
+class CompareListener:
+    """See the module; `poll` often.
+
+    Args:
+        session: open session.
+        keys: of the robot.
+        workers: the two names.
+
+    Raises:
+        NodeError: a worker has published no spec.
+    """
+
+    def __init__(self, session: zenoh.Session, keys: Keys, workers: tuple[str, str]) -> None:
+        self.specs = {worker: _spec(session, keys, worker) for worker in workers}
+        self.chunks: dict[str, list[ActionChunk]] = {worker: [] for worker in workers}
+        self.standing = StandingHistory()
+        self._deltas = {worker: Inbox(MAX_CHUNKS) for worker in workers}
+        self._poses, self._grippers = Inbox(MAX_STATES), Inbox(MAX_STATES)
+        listening = [
+            *((keys.delta(worker), self._deltas[worker]) for worker in workers),
+            (keys.state_pose, self._poses),
+            (keys.state_gripper, self._grippers),
+        ]
+        self._subscribers = [
+            session.declare_subscriber(key, zenoh.handlers.Callback(inbox, indirect=False))
+            for key, inbox in listening
+        ]
+
+    def poll(self) -> None:
+        """Take in what came since the last call."""
+        for kind, inbox in ((PoseState, self._poses), (GripperState, self._grippers)):
+            for header, state in _read(kind, inbox.take_all()):
+                self.standing.add(header.stamp_wall_ns, state)
+        for worker, inbox in self._deltas.items():
+            for _, chunk in _read(ActionChunk, inbox.take_all()):
+                # A worker that was started anew may have another spec; what it said before and
+                # now cannot be read together.
+                if chunk.spec_hash == self.specs[worker].hash:
+                    self.chunks[worker].append(chunk)
+
+    def close(self) -> None:
+        """Stop listening."""
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+
+
+def _spec(session: zenoh.Session, keys: Keys, worker: str) -> ModelSpec:
+    for reply in session.get(keys.spec(worker), timeout=SPEC_PATIENCE_S):
+        if reply.ok is not None:
+            try:
+                return records.decode(ModelSpec, reply.ok.payload.to_bytes())
+            except CodecError as error:
+                raise NodeError(f"the spec of worker {worker!r} cannot be read: {error}") from error
+    raise NodeError(f"worker {worker!r} tells no spec; is it alive? (`vla-zenoh status`)")
+
+
+def _read(kind: type[Record], arrivals: Sequence[Arrival]) -> Iterator[tuple[Header, Record]]:
+    for arrival in arrivals:
+        attachment: Any = arrival.sample.attachment
+        try:
+            header = header_codec.decode(attachment.to_bytes() if attachment else None)
+            record = records.decode(kind, arrival.sample.payload.to_bytes())
+        except CodecError:
+            continue  # the nodes count and tell what strangers write
+        yield header, record
