@@ -77,6 +77,10 @@ class Keys:
         """A plain JPEG file, encoding image/jpeg; written while someone listens."""
         return self._at("camera", chunk(camera, "camera name"), "jpeg")
 
+    def camera_fitted(self, camera: str, form: str) -> str:
+        """A JPEG as a model wants it, made where the camera is; see `vla_zenoh.observe.form_of`."""
+        return self._at("camera", chunk(camera, "camera name"), "fitted", chunk(form, "form"))
+
     @property
     def state_joint(self) -> str:
         """`JointState`."""
@@ -206,17 +210,14 @@ class Keys:
         return self._at("**")
 
     @property
-    def without_raw_pictures(self) -> tuple[str, ...]:
-        """The same without ``camera/*/raw``: listening to those makes cameras send 1 MB a picture.
+    def without_pictures(self) -> tuple[str, ...]:
+        """The same without pictures; two-part keys that are added later are among them, too."""
+        return (self._at("*"), self._at("*", "*"))
 
-        Two-part keys that are added later are among them, too.
-        """
-        return (
-            self._at("*"),
-            self._at("*", "*"),
-            self._at("camera", "*", "jpeg"),
-            self._at("seen", "*", "*"),
-        )
+    @property
+    def without_raw_pictures(self) -> tuple[str, ...]:
+        """The same with JPEG alone: who listens to raw pictures makes cameras send 1 MB each."""
+        return (*self.without_pictures, self._at("camera", "*", "jpeg"), self._at("seen", "*", "*"))
 
     @property
     def all_deltas(self) -> str:

@@ -124,6 +124,13 @@ def _oldest(entries: Sequence[Stamped[Any]]) -> Stamped[Any] | None:
     return min(entries, key=lambda entry: entry.header.stamp_wall_ns, default=None)
 
 
+def form_of(spec: CameraSpec) -> str | None:
+    """Name of the size and resize rule a model wants; None: any size will do."""
+    if spec.width is None or spec.height is None or spec.resize == "none":
+        return None
+    return f"{spec.width}x{spec.height}-{spec.resize}"
+
+
 def prepare(image: Image, spec: CameraSpec) -> NDArray[np.uint8]:
     """A picture in the size and channel order the model declared.
 

@@ -13,6 +13,7 @@ from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.control.so3 import distance, pose_of
 from vla_zenoh.errors import SpecError, VlaZenohError
+from vla_zenoh.offset import Offset
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped
@@ -40,6 +41,9 @@ class Surroundings:
         worker_complaints: worker -> why it cannot infer, where it said so.
         camera_ages_s: camera -> age of its newest picture, as its node says.
         camera_nodes: camera -> the node that serves it.
+        host: the computer of the command node.
+        hosts: node -> its computer, as it says.
+        clocks: node -> its clock minus that of the command node, where it was measured.
     """
 
     alive: frozenset[str] = frozenset()
@@ -49,6 +53,9 @@ class Surroundings:
     worker_complaints: Mapping[str, str] = field(default_factory=dict)
     camera_ages_s: Mapping[str, float] = field(default_factory=dict)
     camera_nodes: Mapping[str, str] = field(default_factory=dict)
+    host: str = ""
+    hosts: Mapping[str, str] = field(default_factory=dict)
+    clocks: Mapping[str, Offset] = field(default_factory=dict)
 
 
 def reasons_not_to_activate(
@@ -82,6 +89,7 @@ def reasons_not_to_activate(
         *_spec(profile, worker, around, rate_hz),
         *_chunk(profile, worker, around, chunk, now_ns, rate_hz),
         *_cameras(profile, worker, around),
+        *_clocks(profile, worker, around),
     ]
 
 
@@ -256,4 +264,29 @@ def _cameras(profile: Profile, worker: str, around: Surroundings) -> list[str]:
             reasons.append(f"no living node serves camera {camera!r}")
         elif age_s > CAMERA_PATIENCE_S:
             reasons.append(f"camera {camera!r} has sent no picture for {age_s:.1f} s")
+    return reasons
+
+
+def _clocks(profile: Profile, worker: str, around: Surroundings) -> list[str]:
+    """Clocks that are off by more than can be reckoned with, or of other hosts and not known."""
+    spec = around.specs.get(worker)
+    cameras = spec.observation.cameras if spec is not None else ()
+    nodes = [around.robot_node, worker_node(worker)]
+    nodes += [
+        around.camera_nodes[one.camera] for one in cameras if one.camera in around.camera_nodes
+    ]
+    bound_s, reasons = profile.timing.max_clock_offset_s, []
+    for node in dict.fromkeys(nodes):
+        found = around.clocks.get(node)
+        if found is not None and abs(found.offset_s) - found.uncertainty_s > bound_s:
+            reasons.append(
+                f"the clock of node {node!r} is {found.offset_s:+.3f} s off this one's "
+                f"(+-{found.uncertainty_s:.4f} s), at most {bound_s:g} s is allowed "
+                "(timing.max_clock_offset_s); synchronise the clocks of both hosts (chrony or ptp)"
+            )
+        elif found is None and around.hosts.get(node, around.host) != around.host:
+            reasons.append(
+                f"the clock of node {node!r} on {around.hosts[node]} is not known: it has not "
+                "answered yet"
+            )
     return reasons

@@ -16,12 +16,14 @@ from vla_zenoh.nodes.camera_sources.rtsp import without_password
 from vla_zenoh.nodes.camera_sources.sim import SimCameras
 from vla_zenoh.nodes.camera_sources.source import STALL_S
 from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.slots import Arrival, Latest
+from vla_zenoh.nodes.slots import Arrival, Latest, Mailbox
 from vla_zenoh.nodes.speaker import Speaker
+from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Event, SceneState, Stamped
 
 TICK_S = 0.05
+SPECS_A_TICK = 8
 GOODBYE_S = 0.3
 """Threads get this long to end; one that hangs in a driver is left behind."""
 
@@ -66,6 +68,9 @@ class CameraNode:
             for camera, settings in chosen.items()
             if not settings.source.startswith(SIM)
         ]
+        self._specs: Mailbox | None = None
+        if any(settings.fit_for_workers for settings in chosen.values()):
+            self._specs = self.node.listen(self.node.keys.all_specs, Mailbox(SPECS_A_TICK))
         views = [
             (settings.source.removeprefix(SIM), self._outlets[camera])
             for camera, settings in chosen.items()
@@ -83,6 +88,7 @@ class CameraNode:
         try:
             while not stop.wait(TICK_S):
                 self._watch()
+                self._hear_models()
         finally:
             self._halt.set()
             give_up = time.monotonic() + GOODBYE_S
@@ -109,6 +115,16 @@ class CameraNode:
     def _read_scene(self, arrival: Arrival) -> Stamped[SceneState] | None:
         with self._voice:
             return self.node.read(SceneState, arrival, self._scene_speaker)
+
+    def _hear_models(self) -> None:
+        """Serve the sizes that models want, where the profile says so."""
+        for arrival in self._specs.take_all() if self._specs is not None else ():
+            with self._voice:
+                stamped = self.node.read(ModelSpec, arrival)
+            for wanted in stamped.record.observation.cameras if stamped is not None else ():
+                outlet = self._outlets.get(wanted.camera)
+                if outlet is not None and outlet.profile.fit_for_workers:
+                    outlet.fit_for(wanted)
 
     # -- status -------------------------------------------------------------------------------
     def _watch(self) -> None:

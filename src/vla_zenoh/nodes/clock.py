@@ -26,6 +26,11 @@ class Clock:
         """Nanoseconds since the Unix epoch."""
         return time.monotonic_ns() + self._offset_ns
 
+    @property
+    def offset_ns(self) -> int:
+        """Wall time minus time of the monotonic clock."""
+        return self._offset_ns
+
     def wall_at(self, mono_ns: int) -> int:
         """The same for a time of the monotonic clock."""
         return mono_ns + self._offset_ns

@@ -17,10 +17,13 @@ from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind
+from vla_zenoh.nodes import offsets
 from vla_zenoh.nodes.clock import Clock
+from vla_zenoh.nodes.offsets import Clocks
 from vla_zenoh.nodes.session import QOS
 from vla_zenoh.nodes.slots import Arrival, Inbox, Latest, Mailbox
 from vla_zenoh.nodes.speaker import Speaker
+from vla_zenoh.nodes.traffic import Traffic
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Event, Header, NodeStatus, Stamped
 
@@ -43,6 +46,7 @@ class Stream:
         self._source, self._clock = source, clock
         self.key = key
         self.seq = 0
+        self.sent_bytes = 0
 
     @property
     def wanted(self) -> bool:
@@ -66,6 +70,7 @@ class Stream:
         payload = record if isinstance(record, bytes) else records.encode(record)
         self._publisher.put(payload, attachment=header_codec.encode(header), encoding=encoding)
         self.seq += 1
+        self.sent_bytes += len(payload)
         return header
 
 
@@ -89,11 +94,18 @@ class Node:
         self.counters: Counter[str] = Counter()
         self.started_wall_ns = time.time_ns()
         self._declared: list[Any] = []
+        self._streams: list[Stream] = []
+        self.traffic = Traffic(session)
         self._last_event: dict[tuple[str, str, str], float] = {}
         self._held_events: Counter[tuple[str, str, str]] = Counter()
         self._last_status = 0.0
         self._last_state = ""
         self._refuse_a_second_one()
+        self.clocks = Clocks(
+            session, self.keys, self.clock, name, profile.timing.max_clock_offset_s
+        )
+        own_clock = self.keys.clock(name)
+        self.answer(own_clock, lambda query: offsets.answer(self.clock, own_clock, query))
         self._token = session.liveliness().declare_token(self.keys.alive(name))
         self._status = self.stream(self.keys.status(name), Kind.NEWS)
         self._events = self.stream(self.keys.event(name), Kind.NEWS)
@@ -109,7 +121,9 @@ class Node:
     # -- writing ------------------------------------------------------------------------------
     def stream(self, key: str, kind: Kind) -> Stream:
         """A writer for `key`."""
-        return Stream(self.session, key, kind, self.source, self.clock)
+        made = Stream(self.session, key, kind, self.source, self.clock)
+        self._streams.append(made)
+        return made
 
     def tell(self, event: Event) -> None:
         """Write an event; a flood of the same is thinned out and counted."""
@@ -157,6 +171,7 @@ class Node:
         now: bool = False,
     ) -> None:
         """Write status when it is time, when `state` changed, or `now`."""
+        self.clocks.tick()
         clock = time.monotonic()
         if not now and state == self._last_state and clock - self._last_status < STATUS_PERIOD_S:
             return
@@ -172,12 +187,33 @@ class Node:
                 rates_hz or {},
                 latency_ms or {},
                 dict(self.counters),
-                detail or {},
+                {**(detail or {}), "clocks": self._clocks_in_words(), "net": self._net()},
             )
         )
 
+    def _net(self) -> dict[str, Any]:
+        found = self.traffic.detail(self._streams)
+        short = self.keys.short
+        return {
+            what: {short(key): value for key, value in said.items()}
+            if isinstance(said, Mapping)
+            else said
+            for what, said in found.items()
+        }
+
+    def _clocks_in_words(self) -> dict[str, dict[str, float]]:
+        return {
+            node: {
+                "offset_ms": round(found.offset_s * 1e3, 3),
+                "uncertainty_ms": round(found.uncertainty_s * 1e3, 3),
+                "round_trip_ms": round(found.round_trip_s * 1e3, 3),
+            }
+            for node, found in self.clocks.known().items()
+        }
+
     def report_due(self, state: str) -> bool:
         """Whether `report` would write now: lets a fast loop skip collecting what to report."""
+        self.clocks.tick()
         due = time.monotonic() - self._last_status >= STATUS_PERIOD_S
         return due or state != self._last_state
 
@@ -223,6 +259,8 @@ class Node:
     ) -> Stamped[Record] | None:
         """Decode a stream sample; a refusal is counted and told, and None is returned.
 
+        Its stamps are put on this node's clock, see `vla_zenoh.nodes.offsets`.
+
         Args:
             kind: the record.
             arrival: the sample.
@@ -240,6 +278,8 @@ class Node:
             return None
         if speaker is not None:
             speaker.heard(header, arrival.mono_ns)
+        self.traffic.heard(str(sample.key_expr), header, arrival.nth)
+        header, record = self.clocks.here(header, record)
         return Stamped(header, record, self.wall_of(arrival))
 
     @staticmethod

@@ -16,10 +16,17 @@ import zenoh
 
 
 class Arrival(NamedTuple):
-    """A sample and when it arrived, on the monotonic clock."""
+    """A sample and when it arrived, on the monotonic clock.
+
+    Args:
+        sample: as Zenoh gave it.
+        mono_ns: when.
+        nth: how many had arrived in its slot by then, itself included; 0 where nobody counts.
+    """
 
     sample: zenoh.Sample
     mono_ns: int
+    nth: int = 0
 
 
 class Latest:
@@ -33,8 +40,8 @@ class Latest:
 
     def __call__(self, sample: zenoh.Sample) -> None:
         with self._changed:
-            self._arrival = Arrival(sample, time.monotonic_ns())
             self._count += 1
+            self._arrival = Arrival(sample, time.monotonic_ns(), self._count)
             self._changed.notify_all()
 
     @property
@@ -62,12 +69,14 @@ class Inbox:
     def __init__(self, size: int) -> None:
         self._arrivals: deque[Arrival] = deque(maxlen=size)
         self._size = size
+        self._count = 0
         self.dropped = 0
 
     def __call__(self, sample: zenoh.Sample) -> None:
+        self._count += 1
         if len(self._arrivals) == self._size:
             self.dropped += 1
-        self._arrivals.append(Arrival(sample, time.monotonic_ns()))
+        self._arrivals.append(Arrival(sample, time.monotonic_ns(), self._count))
 
     def take_all(self) -> list[Arrival]:
         """Everything that arrived, oldest first."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import socket
 import threading
+import time
 from typing import Any
 
 from vla_zenoh import keys as key_names
@@ -14,6 +16,7 @@ from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import NodeStatus, Stamped
 
 MAX_WORKERS = 32
+CLOCKS_PERIOD_S = 0.25
 STATUSES_A_TICK, SPECS_A_TICK = 8, 4
 """What is more was not sent by any node of ours: each says something twice a second."""
 
@@ -31,6 +34,8 @@ class Neighbours:
         self._voices: dict[str, str] = {}
         self._complaints: dict[str, str] = {}
         self._cameras: dict[str, tuple[str, float, int]] = {}
+        self._hosts: dict[str, str] = {}
+        self._next_clocks_s = 0.0
         self._statuses = node.listen(node.keys.all_status, Mailbox(STATUSES_A_TICK))
         self._new_specs = node.listen(node.keys.all_specs, Mailbox(SPECS_A_TICK))
         node.on_alive(self._on_alive)
@@ -42,6 +47,7 @@ class Neighbours:
             self._changed = True
             if not alive:
                 self._voices.pop(name, None)
+                self._hosts.pop(name, None)
             if not alive and name.startswith("worker-"):
                 worker = name.removeprefix("worker-")
                 self._specs.pop(worker, None)
@@ -59,6 +65,7 @@ class Neighbours:
             if stamped is not None:
                 worker = key_names.last(str(arrival.sample.key_expr))
                 self._take_spec(worker, stamped.record, stamped.header.source)
+        self._follow_clocks()
         with self._lock:
             if not self._changed:
                 return None
@@ -74,7 +81,20 @@ class Neighbours:
                     for camera, (_, age_s, heard_ns) in self._cameras.items()
                 },
                 {camera: node for camera, (node, _, _) in self._cameras.items()},
+                socket.gethostname(),
+                dict(self._hosts),
+                self._node.clocks.known(),
             )
+
+    def _follow_clocks(self) -> None:
+        """Measure the clocks of all nodes, and look at them now and then."""
+        if time.monotonic() < self._next_clocks_s:
+            return
+        self._next_clocks_s = time.monotonic() + CLOCKS_PERIOD_S
+        with self._lock:
+            for name in self._alive:
+                self._node.clocks.follow(name)
+            self._changed = True
 
     def owner(self, worker: str) -> str | None:
         """The source that speaks for a worker: who published its spec."""
@@ -106,6 +126,7 @@ class Neighbours:
 
     def _take_status(self, status: NodeStatus, now_ns: int) -> None:
         with self._lock:
+            self._hosts[status.node] = status.host
             if status.node.startswith("worker-"):
                 complaint = status.detail.get("complaint", "")
                 worker = status.node.removeprefix("worker-")

@@ -23,8 +23,8 @@ from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.seen import SeenOutlet
 from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
 from vla_zenoh.nodes.speaker import Speaker
-from vla_zenoh.observe import History, NotYet, assemble
-from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps
+from vla_zenoh.observe import History, NotYet, assemble, form_of
+from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
@@ -90,9 +90,15 @@ class WorkerNode:
         )
         self._task_slot = node.listen(keys.task, Latest())
         self._jpeg = images == "jpeg"
-        key_of = keys.camera_jpeg if self._jpeg else keys.camera_raw
+
+        def key_of(camera: CameraSpec) -> str:
+            settings, form = profile.cameras.get(camera.camera), form_of(camera)
+            if self._jpeg and settings is not None and settings.fit_for_workers and form:
+                return keys.camera_fitted(camera.camera, form)
+            return (keys.camera_jpeg if self._jpeg else keys.camera_raw)(camera.camera)
+
         self._image_slots = {
-            camera.camera: node.listen(key_of(camera.camera), Latest())
+            camera.camera: node.listen(key_of(camera), Latest())
             for camera in self.spec.observation.cameras
         }
         self._state_slots = {
@@ -219,6 +225,8 @@ class WorkerNode:
             self.node.refuse(error.reason, f"camera {camera}: {error}")
             return None
         self._speakers[camera].heard(header, arrival.mono_ns)
+        self.node.traffic.heard(str(sample.key_expr), header, arrival.nth)
+        header, image = self.node.clocks.here(header, image)
         return Stamped(header, image, self.node.wall_of(arrival))
 
     def _observe(self, due_s: float) -> Observation | None:

@@ -70,6 +70,8 @@ def _cameras(profile: Profile) -> Iterator[Fault]:
         place = ("cameras", name, "source")
         if camera.source.startswith("ros2:") and profile.ros2 is None:
             yield place, f"is {camera.source!r}, which needs a section ros2"
+        if camera.source.startswith("ros2:") and camera.fit_for_workers:
+            yield ("cameras", name, "fit_for_workers"), "cannot be done for a camera of ROS 2"
         if camera.source.startswith("sim:") and profile.robot.driver != "sim":
             yield (
                 place,

@@ -315,7 +315,11 @@ class CameraProfile(Section):
         width: pixels published.
         height: likewise.
         rate_hz: pictures per second, at most.
-        jpeg_quality: of the jpeg key, 1 to 100.
+        jpeg_quality: of pictures as JPEG, which is how they travel between hosts, 1 to 100.
+        jpeg_rate_hz: of those at most; null: as many as there are.
+        jpeg_width: wider ones are made smaller for the jpeg key; null: as they are.
+        fit_for_workers: a worker on another host gets them in the very size of its spec, made
+            where the camera is. Of the sources all but ``ros2:`` can.
         loop: a file starts again at its end.
     """
 
@@ -324,6 +328,9 @@ class CameraProfile(Section):
     height: int = Field(default=480, ge=16, le=8192)
     rate_hz: float = Field(default=30.0, gt=0, le=240)
     jpeg_quality: int = Field(default=90, ge=1, le=100)
+    jpeg_rate_hz: float | None = Field(default=None, gt=0, le=240)
+    jpeg_width: int | None = Field(default=None, ge=16, le=8192)
+    fit_for_workers: bool = False
     loop: bool = True
 
 

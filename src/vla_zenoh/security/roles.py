@@ -81,7 +81,9 @@ TABLE = (
     # Pictures show people: whoever may only look on does not see them.
     _stream("camera_raw", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
     _stream("camera_jpeg", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
+    _stream("camera_fitted", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
     _stream("seen", {WORKER}, {OPERATOR}),
+    _stream("seen_record", {WORKER}, {OPERATOR}),
     _stream("state_joint", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
     _stream("state_pose", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
     _stream("state_gripper", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
@@ -102,7 +104,7 @@ TABLE = (
     Row(
         "spec",
         put=frozenset({WORKER}),
-        subscribe=frozenset({COMMAND, OPERATOR, VIEWER}),
+        subscribe=frozenset({CAMERA, COMMAND, OPERATOR, VIEWER}),
         answer=frozenset({WORKER}),
         ask=frozenset({COMMAND, OPERATOR, VIEWER}),
     ),
@@ -119,7 +121,7 @@ TABLE = (
     Row("sim_step", answer=frozenset({ROBOT}), ask=frozenset({OPERATOR})),
 )
 
-NO_KEYS = ("everything", "short", "group", "on")
+NO_KEYS = ("everything", "short", "whole", "group", "on")
 """Members of `Keys` that give text and no key of their own."""
 OWN = frozenset({Act.PUT, Act.ANSWER, Act.ANNOUNCE})
 """What a node does only in its own name."""
@@ -163,6 +165,8 @@ def _choices(parameter: str, identity: Identity, act: Act) -> tuple[str, ...]:
         return (identity.node,)
     if parameter == "worker":
         return (identity.worker,) if identity.worker else ()
+    if parameter == "form":
+        return ("*",)
     if parameter == "camera":  # a worker shows what it saw of any camera
         return ("*",) if identity.role is Role.WORKER else identity.cameras
     return ()

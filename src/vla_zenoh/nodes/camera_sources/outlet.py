@@ -18,10 +18,14 @@ from vla_zenoh.nodes.camera_sources.pace import Pace
 from vla_zenoh.nodes.camera_sources.picture import fit, to_rgb
 from vla_zenoh.nodes.camera_sources.source import Pixels
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
-from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.node import Node, Stream
+from vla_zenoh.observe import form_of, prepare
+from vla_zenoh.policy import CameraSpec
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Event, Image
 
+MAX_FORMS = 8
+"""Sizes in which pictures are made for models; those of more models are served as JPEG."""
 WAITING, OK, LOST, ENDED = "waiting", "ok", "lost", "ended"
 _SOURCE_LIMIT = 200
 
@@ -53,6 +57,10 @@ class Outlet:
         self._shown, self._clock, self._tell = shown[:_SOURCE_LIMIT], node.clock, tell
         self._raw = node.stream(node.keys.camera_raw(name), Kind.FRAME)
         self._jpeg = node.stream(node.keys.camera_jpeg(name), Kind.FRAME)
+        self._fitted: dict[str, tuple[CameraSpec, Stream]] = {}
+        self._stream_of = node.stream
+        self._keys = node.keys
+        self._jpeg_pace = None if profile.jpeg_rate_hz is None else Pace(profile.jpeg_rate_hz)
         self._seq = 0
         self._newest_mono_ns: int | None = None
         self._sizes: set[tuple[int, ...]] = set()
@@ -111,7 +119,17 @@ class Outlet:
     @property
     def wanted(self) -> bool:
         """Somebody listens."""
-        return self._raw.wanted or self._jpeg.wanted
+        fitted = any(stream.wanted for _, stream in self._fitted.values())
+        return self._raw.wanted or self._jpeg.wanted or fitted
+
+    def fit_for(self, spec: CameraSpec) -> None:
+        """From now on serve pictures as this model wants them, while it listens."""
+        form = form_of(spec)
+        if form is None or form in self._fitted or len(self._fitted) >= MAX_FORMS:
+            return
+        stream = self._stream_of(self._keys.camera_fitted(self.name, form), Kind.FRAME)
+        # Replaced whole: the thread that draws reads it meanwhile.
+        self._fitted = {**self._fitted, form: (spec.model_copy(update={"colour": "rgb"}), stream)}
 
     def put(self, picture: Pixels, mono_ns: int) -> None:
         """Write what OpenCV gave, captured at `mono_ns`, in the profile's size.
@@ -128,7 +146,11 @@ class Outlet:
     def put_rgb(self, rgb: NDArray[np.uint8], mono_ns: int, stamp_wall_ns: int) -> None:
         """Write a finished picture, in each form that somebody listens to."""
         raw, jpeg = self._raw.wanted, self._jpeg.wanted
-        if not (raw or jpeg):
+        fitted = [pair for pair in self._fitted.values() if pair[1].wanted]
+        thinned = self._jpeg_pace is not None
+        if (jpeg or fitted) and self._jpeg_pace is not None and not self._jpeg_pace.due(mono_ns):
+            jpeg, fitted = False, []
+        if not (raw or jpeg or fitted):
             return
         image = Image(rgb)
         if raw:
@@ -137,15 +159,33 @@ class Outlet:
                 encode_raw(image), stamp_wall_ns=stamp_wall_ns, seq=self._seq, encoding=schema
             )
         if jpeg:
-            self._jpeg.put(
-                encode_jpeg(image, self.profile.jpeg_quality),
-                stamp_wall_ns=stamp_wall_ns,
-                seq=self._seq,
-                encoding=zenoh.Encoding.IMAGE_JPEG,
-            )
+            self._put_jpeg(self._jpeg, self._narrowed(image), stamp_wall_ns, own_seq=thinned)
+        for spec, stream in fitted:
+            self._put_jpeg(stream, Image(prepare(image, spec)), stamp_wall_ns, own_seq=True)
         self._seq += 1
         with self._lock:
             self._latency_ms.add((time.monotonic_ns() - mono_ns) / 1e6)
+
+    def _put_jpeg(self, stream: Stream, image: Image, stamp_wall_ns: int, *, own_seq: bool) -> None:
+        stream.put(
+            encode_jpeg(image, self.profile.jpeg_quality),
+            stamp_wall_ns=stamp_wall_ns,
+            seq=None if own_seq else self._seq,
+            encoding=zenoh.Encoding.IMAGE_JPEG,
+        )
+
+    def _narrowed(self, image: Image) -> Image:
+        height, width = image.rgb.shape[:2]
+        widest = self.profile.jpeg_width
+        if widest is None or width <= widest:
+            return image
+        smaller = CameraSpec(
+            camera=self.name,
+            width=widest,
+            height=max(8, round(height * widest / width)),
+            resize="stretch",
+        )
+        return Image(prepare(image, smaller))
 
     def _count_size(self, size: tuple[int, ...]) -> None:
         self.counts["resized"] += 1

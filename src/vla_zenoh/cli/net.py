@@ -1,0 +1,214 @@
+"""vla-zenoh net."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from vla_zenoh.cli.options import DEFAULT_PROFILE, ConnectOption, JsonOption, ProfileOption, client
+from vla_zenoh.cli.output import console, fail, print_json, printable
+from vla_zenoh.nodes.client import Client
+from vla_zenoh.nodes.clock import Clock
+from vla_zenoh.nodes.offsets import Clocks
+from vla_zenoh.types import NodeStatus
+
+HERE = "this computer"
+POLL_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Two hosts, as the first one sees the second.
+
+    Args:
+        seen_from: a host.
+        host: the other one.
+        by: node that measured, on the first.
+        of: node that was asked, on the second.
+        round_trip_ms: there and back, through the router.
+        offset_ms: the second clock minus the first.
+        uncertainty_ms: of that.
+        links: of the measuring node, to its router.
+    """
+
+    seen_from: str
+    host: str
+    by: str
+    of: str
+    round_trip_ms: float
+    offset_ms: float
+    uncertainty_ms: float
+    links: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """What one node writes on one key.
+
+    Args:
+        key: short.
+        node: who.
+        host: where.
+        rate_hz: records a second.
+        bytes_s: bytes a second, once, however many listen.
+        lost: listener -> records that never reached it.
+    """
+
+    key: str
+    node: str
+    host: str
+    rate_hz: float
+    bytes_s: float
+    lost: dict[str, int]
+
+
+def net(
+    profile: ProfileOption = DEFAULT_PROFILE,
+    connect: ConnectOption = None,
+    seconds: Annotated[
+        float, typer.Option("--seconds", "-s", min=1.0, help="How long to listen.")
+    ] = 3.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Show every pair of hosts: link, round trip, clock offset; and what each key costs."""
+    with client(profile, connect) as robot:
+        clocks = Clocks(
+            robot.session,
+            robot.keys,
+            Clock(),
+            HERE,
+            robot.profile.timing.max_clock_offset_s,
+        )
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            for node in tuple(robot.alive):
+                clocks.follow(node)
+            clocks.tick()
+            time.sleep(POLL_S)
+        statuses = {name: found for name, (found, _, alive) in robot.snapshot().items() if alive}
+        own_links = tuple(sorted(str(link.dst) for link in robot.session.info.links()))
+        pairs = _pairs(statuses, _own(clocks, statuses, own_links))
+        lines = _lines(statuses)
+    bound_ms = robot.profile.timing.max_clock_offset_s * 1e3
+    if as_json:
+        print_json({"hosts": pairs, "keys": lines, "max_clock_offset_ms": bound_ms})
+    else:
+        _print(robot, pairs, lines, bound_ms)
+    if not statuses:
+        fail(f"no node of robot {robot.keys.robot!r} says anything")
+
+
+def _own(clocks: Clocks, statuses: dict[str, NodeStatus], links: tuple[str, ...]) -> list[Pair]:
+    """Each host as seen from here."""
+    return [
+        Pair(
+            HERE,
+            statuses[node].host,
+            "net",
+            node,
+            round(found.round_trip_s * 1e3, 3),
+            round(found.offset_s * 1e3, 3),
+            round(found.uncertainty_s * 1e3, 3),
+            links,
+        )
+        for node, found in clocks.known().items()
+        if node in statuses
+    ]
+
+
+def _pairs(statuses: dict[str, NodeStatus], own: list[Pair]) -> list[Pair]:
+    """The best measurement of each pair of hosts."""
+    best: dict[tuple[str, str], Pair] = {}
+    for pair in [*own, *_told(statuses)]:
+        hosts = (pair.seen_from, pair.host)
+        if hosts not in best or pair.uncertainty_ms < best[hosts].uncertainty_ms:
+            best[hosts] = pair
+    return [best[hosts] for hosts in sorted(best)]
+
+
+def _told(statuses: dict[str, NodeStatus]) -> list[Pair]:
+    """What nodes say of nodes on other hosts."""
+    out: list[Pair] = []
+    for name, status in statuses.items():
+        for other, found in _map(status.detail.get("clocks")).items():
+            there = statuses.get(other)
+            numbers = [
+                _number(_map(found).get(what))
+                for what in ("round_trip_ms", "offset_ms", "uncertainty_ms")
+            ]
+            if there is not None and there.host != status.host and None not in numbers:
+                round_trip_ms, offset_ms, uncertainty_ms = (n or 0.0 for n in numbers)
+                links = _map(status.detail.get("net")).get("links") or ()
+                out.append(
+                    Pair(
+                        status.host,
+                        there.host,
+                        name,
+                        other,
+                        round_trip_ms,
+                        offset_ms,
+                        uncertainty_ms,
+                        tuple(map(str, links)),
+                    )
+                )
+    return out
+
+
+def _lines(statuses: dict[str, NodeStatus]) -> list[Line]:
+    lost: dict[str, dict[str, int]] = {}
+    for name, status in statuses.items():
+        for key, count in _map(_map(status.detail.get("net")).get("lost")).items():
+            lost.setdefault(key, {})[name] = int(_number(count) or 0)
+    out: list[Line] = []
+    for name, status in statuses.items():
+        for key, rates in _map(_map(status.detail.get("net")).get("sent")).items():
+            if isinstance(rates, (list, tuple)) and len(rates) == 2:
+                rate_hz, bytes_s = (_number(rate) or 0.0 for rate in rates)
+                line = Line(key, name, status.host, rate_hz, bytes_s, lost.get(key, {}))
+                out.append(line)
+    return sorted(out, key=lambda line: -line.bytes_s)
+
+
+def _map(value: Any) -> dict[str, Any]:
+    return dict(value) if isinstance(value, dict) else {}
+
+
+def _number(value: Any) -> float | None:
+    fine = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return float(value) if fine else None
+
+
+def _print(robot: Client, pairs: list[Pair], lines: list[Line], bound_ms: float) -> None:
+    hosts = Table(header_style="bold", title=f"robot {robot.keys.robot}", title_justify="left")
+    for column in ("from", "to", "round trip", "clock is ahead by", "link", "measured by"):
+        hosts.add_column(column, overflow="fold")
+    for pair in pairs:
+        wrong = abs(pair.offset_ms) - pair.uncertainty_ms > bound_ms
+        hosts.add_row(
+            printable(pair.seen_from),
+            printable(pair.host),
+            f"{pair.round_trip_ms:.2f} ms",
+            f"[{'bold red' if wrong else 'white'}]"
+            f"{pair.offset_ms:+.2f} +- {pair.uncertainty_ms:.2f} ms[/]",
+            printable(", ".join(pair.links)),
+            f"{pair.by} of {pair.of}",
+        )
+    keys = Table(header_style="bold")
+    for column in ("key", "node", "host", "rate", "kbit/s", "lost on the way to"):
+        keys.add_column(column, overflow="fold")
+    for line in lines:
+        lost = ", ".join(f"{node} {count}" for node, count in sorted(line.lost.items()))
+        keys.add_row(
+            printable(line.key),
+            printable(line.node),
+            printable(line.host),
+            f"{line.rate_hz:.1f} Hz",
+            f"{line.bytes_s * 8e-3:,.1f}",
+            f"[yellow]{printable(lost)}[/]" if lost else "",
+        )
+    console().print(hosts)
+    console().print(keys)

@@ -1,0 +1,168 @@
+"""Clocks of other nodes: asks them over Zenoh, and puts their stamps on our own clock.
+
+A node asks those whose streams it reads, and whom it was told of. It never waits for an answer.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import zenoh
+
+from vla_zenoh.codec import message
+from vla_zenoh.errors import CodecError
+from vla_zenoh.keys import Keys, Kind
+from vla_zenoh.nodes.clock import Clock
+from vla_zenoh.nodes.session import QOS
+from vla_zenoh.offset import Exchange, Offset, OffsetFilter
+from vla_zenoh.types import ActionChunk, Header
+
+ASK_PERIOD_S = 1.0
+FIRST_ASKS, FIRST_PERIOD_S = 8, 0.1
+"""The first so many questions follow each other quickly: one of them will be undisturbed."""
+PATIENCE_S = 2.0
+FORGET_S = 30.0
+"""Who has not answered for so long has no clock we know of."""
+MAX_PEERS = 64
+_STAMPS_OF_A_CHUNK = (
+    "observation_stamp_ns",
+    "valid_until_ns",
+    "observed_ns",
+    "inference_start_ns",
+    "inference_end_ns",
+)
+
+Record = TypeVar("Record")
+
+
+@dataclass(slots=True)
+class _Peer:
+    filter: OffsetFilter
+    asks: int = 0
+    next_ask_s: float = 0.0
+    answered_s: float = -1e9
+
+
+class Clocks:
+    """See the module.
+
+    Args:
+        session: open session.
+        keys: of the robot.
+        clock: our own.
+        name: our own node's, whose clock needs no asking.
+        bound_s: a clock that is off by more is wrong, and its stamps stay as they are.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, keys: Keys, clock: Clock, name: str, bound_s: float
+    ) -> None:
+        self._session, self._keys, self._clock, self._name = session, keys, clock, name
+        self._bound_s = bound_s
+        self._lock = threading.Lock()
+        self._peers: dict[str, _Peer] = {}
+        self._next_look_s = 0.0
+
+    # -- asking -------------------------------------------------------------------------------
+    def follow(self, node: str) -> None:
+        """From now on know the clock of `node`."""
+        if node != self._name and node not in self._peers and len(self._peers) < MAX_PEERS:
+            with self._lock:
+                self._peers[node] = _Peer(OffsetFilter(self._bound_s))
+            self._next_look_s = 0.0
+
+    def tick(self) -> None:
+        """Ask whoever is due. Cheap; call it from the loop that owns the node."""
+        now_s = time.monotonic()
+        if now_s < self._next_look_s:
+            return
+        self._next_look_s = now_s + FIRST_PERIOD_S / 2
+        for node, peer in list(self._peers.items()):
+            if now_s >= peer.next_ask_s:
+                peer.asks += 1
+                peer.next_ask_s = now_s + (
+                    FIRST_PERIOD_S if peer.asks <= FIRST_ASKS else ASK_PERIOD_S
+                )
+                self._ask(node, peer)
+
+    def _ask(self, node: str, peer: _Peer) -> None:
+        asked_ns = time.monotonic_ns()
+
+        def take(reply: zenoh.Reply) -> None:
+            got_ns = time.monotonic_ns()
+            if reply.ok is None:
+                return
+            try:
+                heard_ns, said_ns = decode_stamps(reply.ok.payload.to_bytes())
+            except CodecError:
+                return  # whoever answers that has no clock we could use
+            with self._lock:
+                if peer.filter.add(Exchange(asked_ns, heard_ns, said_ns, got_ns)):
+                    peer.answered_s = time.monotonic()
+
+        self._session.get(
+            self._keys.clock(node),
+            zenoh.handlers.Callback(take, indirect=False),
+            timeout=PATIENCE_S,
+            **QOS[Kind.CONTROL],
+        )
+
+    # -- knowing ------------------------------------------------------------------------------
+    def known(self) -> dict[str, Offset]:
+        """Node -> its clock minus ours, of those that answered lately."""
+        now_ns, now_s = time.monotonic_ns(), time.monotonic()
+        with self._lock:
+            found = {
+                node: peer.filter.offset(self._clock.offset_ns, now_ns)
+                for node, peer in self._peers.items()
+                if now_s - peer.answered_s < FORGET_S
+            }
+        return {node: offset for node, offset in found.items() if offset is not None}
+
+    def here(self, header: Header, record: Record) -> tuple[Header, Record]:
+        """Header and record with their stamps on our own clock."""
+        node = header.source.partition("#")[0]
+        ahead_ns = self._ahead_ns(node)
+        if not ahead_ns:
+            return header, record
+        header = replace(header, stamp_wall_ns=header.stamp_wall_ns - ahead_ns)
+        if isinstance(record, ActionChunk):
+            changes: Mapping[str, Any] = {
+                name: getattr(record, name) - ahead_ns for name in _STAMPS_OF_A_CHUNK
+            }
+            record = replace(record, **changes)
+        return header, record
+
+    def _ahead_ns(self, node: str) -> int:
+        peer = self._peers.get(node)
+        if peer is None:
+            self.follow(node)
+            return 0
+        with self._lock:
+            return peer.filter.applied_ns(self._clock.offset_ns, time.monotonic_ns())
+
+
+def answer(clock: Clock, key: str, query: zenoh.Query) -> None:
+    """Tell when the question was heard, and when it is answered."""
+    heard_ns = clock.wall_ns()
+    reply = {"heard_ns": heard_ns, "said_ns": clock.wall_ns()}
+    query.reply(key, message.pack(reply), **QOS[Kind.CONTROL])
+
+
+def decode_stamps(payload: bytes) -> tuple[int, int]:
+    """When a question was heard and answered, on the other one's wall clock, ns.
+
+    Raises:
+        CodecError: it says something else.
+    """
+    found = message.unpack(payload)
+    heard, said = (
+        (found.get("heard_ns"), found.get("said_ns")) if isinstance(found, dict) else (None, None)
+    )
+    if type(heard) is not int or type(said) is not int:
+        raise CodecError("shape", "a clock answers with heard_ns and said_ns")
+    return heard, said

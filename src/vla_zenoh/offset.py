@@ -1,0 +1,123 @@
+"""How far another host's clock is ahead of ours, from the four stamps of NTP. Pure.
+
+One exchange gives the offset up to half the time it was under way (RFC 5905, section 8): what was
+spent on the way there and what on the way back cannot be told apart. So of the last exchanges the
+quickest counts, and half its round trip is the uncertainty: a bound, no guess.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+WINDOW = 8
+"""Exchanges of which the quickest is taken, as in NTP's clock filter."""
+DRIFT = 50e-6
+"""Two clocks of ordinary computers run apart by this much, s per s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """One question and its answer, in ns.
+
+    Args:
+        asked: on our monotonic clock.
+        heard: when the other one heard it, on its wall clock.
+        said: when it answered, on its wall clock.
+        got: when the answer came, on our monotonic clock.
+    """
+
+    asked: int
+    heard: int
+    said: int
+    got: int
+
+    @property
+    def round_trip_ns(self) -> int:
+        """Time under way, without what the other one took to answer."""
+        return (self.got - self.asked) - (self.said - self.heard)
+
+    @property
+    def ahead_ns(self) -> int:
+        """The other one's wall clock minus our monotonic clock."""
+        return ((self.heard - self.asked) + (self.said - self.got)) // 2
+
+
+@dataclass(frozen=True, slots=True)
+class Offset:
+    """The other one's wall clock minus ours.
+
+    Args:
+        offset_s: positive: the other clock is ahead.
+        uncertainty_s: the truth is not further away than this.
+        round_trip_s: of the newest exchange.
+    """
+
+    offset_s: float
+    uncertainty_s: float
+    round_trip_s: float
+
+
+class OffsetFilter:
+    """Makes one offset of many exchanges, and a steady one to translate stamps by.
+
+    Args:
+        bound_s: a clock that is off by more is wrong, and its stamps are not translated.
+    """
+
+    def __init__(self, bound_s: float) -> None:
+        self._bound_ns = int(bound_s * 1e9)
+        self._window: deque[Exchange] = deque(maxlen=WINDOW)
+        self._best: Exchange | None = None
+        self._applied_ns = 0
+
+    def add(self, exchange: Exchange) -> bool:
+        """Take one exchange; False: it cannot be, and is left out."""
+        if exchange.round_trip_ns < 0 or exchange.said < exchange.heard:
+            return False
+        if self._best is not None and self._differ(self._best, exchange):
+            self._window.clear()  # one of the clocks was set
+        self._window.append(exchange)
+        self._best = min(self._window, key=lambda one: self._uncertainty_ns(one, exchange.got))
+        return True
+
+    def offset(self, wall_minus_mono_ns: int, now_mono_ns: int) -> Offset | None:
+        """What is known now; None before the first exchange.
+
+        Args:
+            wall_minus_mono_ns: our own wall clock minus our monotonic one, now.
+            now_mono_ns: on our monotonic clock.
+        """
+        best = self._best
+        if best is None:
+            return None
+        return Offset(
+            (best.ahead_ns - wall_minus_mono_ns) / 1e9,
+            self._uncertainty_ns(best, now_mono_ns) / 1e9,
+            self._window[-1].round_trip_ns / 1e9,
+        )
+
+    def applied_ns(self, wall_minus_mono_ns: int, now_mono_ns: int) -> int:
+        """What to take off the other one's stamps to have them on our clock.
+
+        It changes only when it is certain to be wrong, so that stamps do not tremble with every
+        exchange; and it is zero for a clock that is beyond the bound.
+        """
+        best = self._best
+        if best is None:
+            return 0
+        offset_ns = best.ahead_ns - wall_minus_mono_ns
+        if abs(offset_ns) > self._bound_ns:
+            self._applied_ns = 0
+        elif abs(offset_ns - self._applied_ns) > self._uncertainty_ns(best, now_mono_ns):
+            self._applied_ns = offset_ns
+        return self._applied_ns
+
+    @staticmethod
+    def _uncertainty_ns(exchange: Exchange, now_mono_ns: int) -> int:
+        age_ns = max(now_mono_ns - exchange.got, 0)
+        return exchange.round_trip_ns // 2 + int(age_ns * DRIFT) + 1
+
+    def _differ(self, one: Exchange, other: Exchange) -> bool:
+        apart_ns = abs(one.ahead_ns - other.ahead_ns)
+        return apart_ns > self._uncertainty_ns(one, other.got) + other.round_trip_ns // 2 + 1

@@ -1,0 +1,81 @@
+"""Run on a host of the lab: drive the arm as an operator does, and say how far it went.
+
+drive.py PROFILE DIRECTION COUNT
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+import numpy as np
+from camera_rig import until
+from chain import READY_PATIENCE_S, Recorder
+
+from vla_zenoh.errors import SessionError
+from vla_zenoh.nodes.client import Client
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.profile import load_profile
+
+STILL_M_S = 0.005
+EARLY = "refused.activate_refused"
+"""While nodes are still starting."""
+
+
+def main(name: str, direction: str, count: int) -> None:
+    profile = load_profile(name)
+    with open_session(profile.session, wait_s=READY_PATIENCE_S) as session:
+        client = Client(profile, session).follow()
+        recorder = Recorder(session, profile.keys)
+        reasons = [""]
+
+        def activated() -> bool:
+            try:
+                return client.activate().active
+            except SessionError as error:
+                reasons.append(str(error))
+                return False
+
+        client.wait_for(lambda: client.status("command"), READY_PATIENCE_S)
+        client.set_prompt("hold")
+        try:
+            until("an active arm", activated, READY_PATIENCE_S)
+        except AssertionError as error:
+            raise AssertionError(f"{error}: {reasons[-1]}") from error
+        state = until("a pose", recorder.newest_state)
+        assert state.reference_position_m is not None
+        start_m = np.array(state.reference_position_m)
+        client.set_prompt(f"HARD: go {direction} x{count}")
+
+        def done() -> bool:
+            command, now = client.status("command"), recorder.newest_state()
+            assert now is not None
+            still = float(np.abs(now.twist[:3]).max()) < STILL_M_S
+            return bool(command and command.detail.get("policy_done") and still)
+
+        until("the motion", done, 10.0 + 2.0 * count)
+        time.sleep(0.5)
+        end = until("a pose", recorder.newest_state)
+        client.deactivate()
+        camera = client.status("camera")
+        refused = {
+            node: {
+                k: v for k, v in status.counters.items() if k.startswith("refused.") and k != EARLY
+            }
+            for node, (status, _, _) in client.snapshot().items()
+        }
+        print(
+            json.dumps(
+                {
+                    "way_m": (np.array(end.reference_position_m) - start_m).tolist(),
+                    "jpeg": camera.counters.get("front.jpeg", 0) if camera else 0,
+                    "raw": camera.counters.get("front.raw", 0) if camera else 0,
+                    "refused": {node: found for node, found in refused.items() if found},
+                }
+            )
+        )
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], int(sys.argv[3]))

@@ -1,0 +1,196 @@
+"""Hosts that are network namespaces of this machine, joined by a switch that nothing else is on.
+
+Each host has a name and an address of its own, its own loopback and its own /dev/shm, so that
+nothing but the network joins them. `Lab.shape` makes a host's link slow or lossy (tc netem).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+NETWORK = "10.213.0."
+"""Exists inside the namespaces only."""
+COMMAND_PATIENCE_S = 10.0
+END_S = 6.0
+SWITCH = "switch"
+OWN_NAME = ("unshare", "--uts", "sh", "-c")
+
+
+def why_not() -> str:
+    """Why there can be no namespaces here, empty when there can."""
+    if sys.platform != "linux":
+        return "network namespaces are Linux's"
+    if os.geteuid() != 0:
+        return "only root may make network namespaces"
+    if shutil.which("ip") is None:
+        return "the program ip (package iproute2) is not there"
+    made = subprocess.run(
+        ["unshare", "--net", "--mount", "true"], capture_output=True, check=False, timeout=10
+    )
+    return "" if made.returncode == 0 else f"namespaces are not permitted: {made.stderr.decode()}"
+
+
+needs_namespaces = pytest.mark.skipif(bool(why_not()), reason=why_not() or "-")
+
+
+def _ip(*words: str, check: bool = True) -> str:
+    done = subprocess.run(
+        ["ip", *words], capture_output=True, text=True, timeout=COMMAND_PATIENCE_S, check=False
+    )
+    assert done.returncode == 0 or not check, f"ip {' '.join(words)}: {done.stderr}"
+    return done.stdout
+
+
+@dataclass
+class Host:
+    """One host of the lab."""
+
+    name: str
+    namespace: str
+    address: str
+    device: str
+    processes: list[subprocess.Popen[str]] = field(default_factory=list)
+
+    def words(self, *words: str) -> list[str]:
+        """A command line that runs `words` on this host."""
+        inside = f'mount -t tmpfs tmpfs /dev/shm && hostname {self.name} && exec "$@"'
+        return ["ip", "netns", "exec", self.namespace, *OWN_NAME, inside, "sh", *words]
+
+    def start(self, *words: str, output: Path | None = None) -> subprocess.Popen[str]:
+        """Start a process here; the lab ends it at last."""
+        with open(output or os.devnull, "w") as target:
+            process = subprocess.Popen(
+                self.words(*words),
+                stdin=subprocess.DEVNULL,
+                stdout=target,
+                stderr=subprocess.STDOUT,
+                text=True,
+                start_new_session=True,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            )
+        self.processes.append(process)
+        return process
+
+    def run(self, *words: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+        """Run a command here to its end."""
+        return subprocess.run(
+            self.words(*words),
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+            env={
+                **os.environ,
+                "PYTHONPATH": os.pathsep.join(sys.path),
+                "COLUMNS": "200",
+                "NO_COLOR": "1",
+            },
+        )
+
+    def ask(self, program: Path, *arguments: str, timeout_s: float = 60.0) -> Any:
+        """Run a Python program here that prints JSON on its last line; returns that."""
+        done = self.run(sys.executable, str(program), *arguments, timeout_s=timeout_s)
+        assert done.returncode == 0, f"{program.name} {arguments}: {done.stdout}\n{done.stderr}"
+        return json.loads(done.stdout.strip().splitlines()[-1])
+
+    def end(self, process: subprocess.Popen[str], number: int = signal.SIGINT) -> int:
+        """End a process of this host, as Ctrl-C would."""
+        if process.poll() is None:
+            os.killpg(process.pid, number)
+        try:
+            return process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            return process.wait(END_S)
+
+
+class Lab:
+    """See the module.
+
+    Args:
+        names: of the hosts; the first has the address ``.1``, and so on.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._mark = f"vz{os.getpid() % 100000}"
+        self.hosts = {
+            name: Host(name, f"{self._mark}-{name}", f"{NETWORK}{at}", f"vz{at}")
+            for at, name in enumerate(names, start=1)
+        }
+        self._switch = f"{self._mark}-{SWITCH}"
+
+    def __getitem__(self, name: str) -> Host:
+        return self.hosts[name]
+
+    def build(self) -> None:
+        """Make namespaces, cables and addresses."""
+        _ip("netns", "add", self._switch)
+        _ip("-n", self._switch, "link", "add", "bridge0", "type", "bridge")
+        _ip("-n", self._switch, "link", "set", "bridge0", "up")
+        for host in self.hosts.values():
+            space, port = host.namespace, f"p{host.device}"
+            _ip("netns", "add", space)
+            _ip("-n", space, "link", "set", "lo", "up")
+            _ip(
+                *("-n", self._switch, "link", "add", port, "type", "veth"),
+                *("peer", "name", host.device, "netns", space),
+            )
+            _ip("-n", self._switch, "link", "set", port, "master", "bridge0", "up")
+            _ip("-n", space, "addr", "add", f"{host.address}/24", "dev", host.device)
+            _ip("-n", space, "link", "set", host.device, "up")
+
+    def remove(self) -> None:
+        """End what still runs, and take everything down."""
+        for host in self.hosts.values():
+            for process in host.processes:
+                if process.poll() is None:
+                    host.end(process, signal.SIGKILL)
+        for space in (*(host.namespace for host in self.hosts.values()), self._switch):
+            _ip("netns", "del", space, check=False)
+
+    def shape(self, name: str, *netem: str) -> None:
+        """Make a host's link bad both ways, as ``"delay", "20ms", "5ms", "loss", "1%"``."""
+        host = self.hosts[name]
+        for space, device in (
+            (host.namespace, host.device),
+            (self._switch, f"p{host.device}"),
+        ):
+            words = ["tc", "-n", space, "qdisc", "replace", "dev", device, "root"]
+            rule = ["netem", *netem] if netem else ["pfifo"]
+            subprocess.run([*words, *rule], check=True, timeout=COMMAND_PATIENCE_S)
+
+    def cut(self, name: str, *, cable: bool = True) -> None:
+        """Pull a host's cable, or with ``cable=False`` plug it in again."""
+        host = self.hosts[name]
+        _ip("-n", self._switch, "link", "set", f"p{host.device}", "down" if cable else "up")
+
+
+@contextmanager
+def lab(*names: str) -> Iterator[Lab]:
+    """Hosts of these names while the block lasts."""
+    made = Lab(names)
+    try:
+        made.build()
+        yield made
+    finally:
+        made.remove()
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """A folder for certificates and profiles."""
+    with tempfile.TemporaryDirectory(prefix="vla-zenoh-lab-") as folder:
+        yield Path(folder)

@@ -1,0 +1,245 @@
+"""Three hosts with certificates move the arm; whoever has none of these, or too little, does not.
+
+Real namespaces, a real router with mutual TLS and access control, a real session for each attempt;
+each result is looked at from the attacker's side and from the robot's.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from netns.lab import Lab, lab, needs_namespaces, scratch
+
+from vla_zenoh.nodes.session import config
+from vla_zenoh.profile import load_profile, override
+from vla_zenoh.security.identity import Identity, Role
+from vla_zenoh.security.store import Store
+
+pytestmark = [pytest.mark.netns, pytest.mark.slow, needs_namespaces, pytest.mark.timeout(240)]
+
+HERE = Path(__file__).parent
+PORT = 7447
+STEPS, STEP_M, TOLERANCE_M = 10, 0.01, 0.001
+STILL_M = 0.001
+"""An arm that nobody moves stays within this."""
+WATCH_S = 7.0
+MARK = "stranger"
+PLAIN = f"""\
+extends: panda_sim_two_hosts
+cameras:
+  front: {{source: "sim:front", width: 160, height: 120, rate_hz: 20}}
+  wrist: null
+session:
+  listen: [tcp/127.0.0.1:{PORT}]
+  connect: [tcp/127.0.0.1:{PORT}]
+hosts:
+  robot: {{nodes: [router, sim, camera, command]}}
+  gpu: {{nodes: [worker], connect: ["tcp/127.0.0.1:{PORT}"]}}
+"""
+
+
+@dataclass
+class Site:
+    """The lab at work.
+
+    Args:
+        hosts: the namespaces.
+        folder: everything's.
+        store: of the authority, which no host has.
+    """
+
+    hosts: Lab
+    folder: Path
+    store: Store
+
+    def profile(self, host: str) -> Path:
+        return self.folder / host / "lab.yaml"
+
+    def equip(self, host: str) -> Path:
+        """Give a host what a person would copy there: its own certificates and the profile."""
+        folder = self.folder / host
+        shutil.copytree(self.store.folder / host, folder / "certificates" / host)
+        text = (self.folder / "plain_secure.yaml").read_text()
+        text = text.replace(str(self.store.folder), str(folder / "certificates"))
+        text = text.replace("extends: plain", f"extends: {self.folder / 'plain.yaml'}")
+        self.profile(host).write_text(text)
+        return self.profile(host)
+
+
+@pytest.fixture(scope="module")
+def site() -> Iterator[Site]:
+    with scratch() as folder, lab("robot", "gpu", "desk", "strange") as hosts:
+        (folder / "plain.yaml").write_text(PLAIN)
+        made = Site(hosts, folder, Store(folder / "authority"))
+
+        def secure(*words: str) -> None:
+            done = hosts["desk"].run(sys.executable, "-m", "vla_zenoh", "secure", *words)
+            assert done.returncode == 0, done.stdout + done.stderr
+
+        secured = str(folder / "plain_secure.yaml")
+        place = f"robot={hosts['robot'].address}"
+        secure(
+            *("init", "--profile", str(folder / "plain.yaml"), "--output", secured),
+            *("--folder", str(made.store.folder), "--at", place),
+        )
+        secure("add", "desk", "--role", "operator", "--profile", secured)
+        secure("add", "wall", "--role", "viewer", "--profile", secured)
+        for host in ("robot", "gpu", "desk"):
+            made.equip(host)
+        for host in ("robot", "gpu"):
+            words = (sys.executable, "-m", "vla_zenoh", "up", str(made.profile(host)))
+            hosts[host].start(*words, "--host", host, output=folder / f"{host}.log")
+        yield made
+
+
+def test_three_hosts_with_certificates_carry_out_the_motion(site: Site) -> None:
+    try:
+        found = site.hosts["desk"].ask(
+            HERE / "drive.py", str(site.profile("desk")), "up", str(STEPS), timeout_s=120.0
+        )
+    except AssertionError as error:
+        logs = [f"{h}:\n{(site.folder / f'{h}.log').read_text()[-3000:]}" for h in ("robot", "gpu")]
+        raise AssertionError("\n".join([str(error), *logs])) from None
+    assert found["way_m"] == pytest.approx([0.0, 0.0, STEPS * STEP_M], abs=TOLERANCE_M)
+    assert found["jpeg"] > 0  # pictures crossed the network as JPEG ...
+    assert found["raw"] == 0  # ... and none as pixels
+    assert found["refused"] == {}
+
+
+def plain_tcp(site: Site) -> dict[str, Any]:
+    profile = load_profile("panda_sim")
+    return config(profile.session, connect=(f"tcp/{site.hosts['robot'].address}:{PORT}",))
+
+
+def with_files(site: Site, store: Store, host: str, node: str) -> dict[str, Any]:
+    """The configuration that shows this certificate."""
+    lab_profile = load_profile(str(site.folder / "plain_secure.yaml"))
+    changes = {"session": {"security": {"folder": str(store.folder), "host": host}}}
+    return config(override(lab_profile, changes).session, identity=node)
+
+
+def no_certificate(site: Site) -> dict[str, Any]:
+    found = with_files(site, site.store, "wall", "viewer")
+    tls = found["transport"]["link"]["tls"]
+    tls["enable_mtls"] = False
+    del tls["connect_private_key"], tls["connect_certificate"]
+    return found
+
+
+def another_authority(site: Site) -> dict[str, Any]:
+    """An operator, says a certificate that somebody else's lab made."""
+    other, now = Store(site.folder / "other"), dt.datetime.now(dt.UTC)
+    other.make_authority("vla-zenoh lab", now)
+    other.add([Identity(Role.OPERATOR, "operator", "desk")], now)
+    found = with_files(site, other, "desk", "operator")
+    # It knows the lab's own authority, so that nothing on its side refuses the router.
+    found["transport"]["link"]["tls"]["root_ca_certificate"] = str(site.store.folder / "ca.pem")
+    return found
+
+
+def expired(site: Site) -> dict[str, Any]:
+    """An operator of this lab, until two days ago."""
+    old, now = Store(site.folder / "old"), dt.datetime.now(dt.UTC)
+    for name in ("ca.pem", "ca.key"):
+        old.folder.mkdir(exist_ok=True)
+        shutil.copy(site.store.folder / name, old.folder / name)
+    long_ago = now - dt.timedelta(days=4)
+    old.add([Identity(Role.OPERATOR, "operator", "desk")], long_ago, days=2)
+    return with_files(site, old, "desk", "operator")
+
+
+def unknown_name(site: Site) -> dict[str, Any]:
+    """A certificate of this lab about somebody whom the profile does not name."""
+    more, now = Store(site.folder / "more"), dt.datetime.now(dt.UTC)
+    for name in ("ca.pem", "ca.key"):
+        more.folder.mkdir(exist_ok=True)
+        shutil.copy(site.store.folder / name, more.folder / name)
+    more.add([Identity(Role.OPERATOR, "operator", "attic")], now)
+    return with_files(site, more, "attic", "operator")
+
+
+def viewer(site: Site) -> dict[str, Any]:
+    return with_files(site, site.store, "wall", "viewer")
+
+
+def camera(site: Site) -> dict[str, Any]:
+    """The camera's own certificate, in the hands of a thief."""
+    return with_files(site, site.store, "robot", "camera")
+
+
+def worker(site: Site) -> dict[str, Any]:
+    """A worker's certificate, in the hands of a thief."""
+    return with_files(site, site.store, "gpu", "worker-scripted")
+
+
+def attack(site: Site, settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What the attacker got, and what the robot's host saw of it."""
+    file = site.folder / "attack.json"
+    file.write_text(json.dumps(settings))
+    seen = site.folder / "watch.log"
+    watching = site.hosts["robot"].start(
+        *(sys.executable, str(HERE / "watch.py"), str(site.profile("robot"))),
+        *(str(WATCH_S), MARK),
+        output=seen,
+    )
+    got = site.hosts["strange"].ask(HERE / "attack.py", str(file), "panda", "other")
+    assert watching.wait(60.0) == 0, seen.read_text()
+    return got, json.loads(seen.read_text().strip().splitlines()[-1])
+
+
+def nothing_came_of_it(seen: dict[str, Any]) -> None:
+    assert seen["marked"] == {}
+    assert seen["moved_m"] < STILL_M
+    assert not seen["active"]
+    assert seen["worker"] == "scripted"
+    assert MARK not in seen["prompt"]
+    assert seen["alive"] == ["camera", "command", "router", "sim", "worker-scripted"]
+
+
+@pytest.mark.parametrize(
+    "who", [plain_tcp, no_certificate, another_authority, expired], ids=lambda who: who.__name__
+)
+def test_a_host_without_a_good_certificate_gets_no_session(
+    site: Site, who: Callable[[Site], dict[str, Any]]
+) -> None:
+    got, seen = attack(site, who(site))
+    assert not got["opened"], got
+    nothing_came_of_it(seen)
+
+
+def test_a_name_that_the_profile_does_not_know_hears_nothing_and_is_not_heard(site: Site) -> None:
+    got, seen = attack(site, unknown_name(site))
+    assert got["heard"] == {}
+    assert got["answers"] == got["alive"] == 0
+    nothing_came_of_it(seen)
+
+
+def test_a_viewer_sees_states_but_no_picture_and_moves_nothing(site: Site) -> None:
+    got, seen = attack(site, viewer(site))
+    assert got["opened"]
+    assert got["heard"]["state/pose"] > 0
+    assert not any(key.startswith(("camera/", "seen/", "sim/scene")) for key in got["heard"])
+    assert got["answers"] > 0
+    nothing_came_of_it(seen)
+
+
+def test_a_stolen_camera_reads_no_other_picture_and_moves_nothing(site: Site) -> None:
+    got, seen = attack(site, camera(site))
+    assert got["opened"]
+    assert got["heard"] == {}
+    nothing_came_of_it(seen)
+
+
+def test_a_stolen_worker_speaks_for_no_other_worker_and_moves_nothing(site: Site) -> None:
+    got, seen = attack(site, worker(site))
+    assert got["opened"]
+    assert not any(key.startswith("command/") for key in got["heard"])
+    nothing_came_of_it(seen)

@@ -1,0 +1,108 @@
+"""Offsets of clocks: never wrong by more than they say, and steady."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vla_zenoh.offset import Exchange, OffsetFilter
+
+MS = 1_000_000
+WALL_MINUS_MONO_NS = 1_700_000_000 * 10**9
+BOUND_S = 0.1
+
+
+def exchange(at_ns: int, offset_ns: int, there_ns: int, back_ns: int, took_ns: int = 0) -> Exchange:
+    """With a clock that is `offset_ns` ahead of ours, ours being WALL_MINUS_MONO_NS + monotonic."""
+    heard = at_ns + there_ns + WALL_MINUS_MONO_NS + offset_ns
+    return Exchange(at_ns, heard, heard + took_ns, at_ns + there_ns + took_ns + back_ns)
+
+
+ways = st.tuples(st.integers(0, 200 * MS), st.integers(0, 200 * MS), st.integers(0, 50 * MS))
+
+
+@given(st.integers(-90 * MS, 90 * MS), st.lists(ways, min_size=1, max_size=30))
+def test_the_truth_is_never_further_away_than_the_uncertainty(
+    offset_ns: int, delays: list[tuple[int, int, int]]
+) -> None:
+    found, now_ns = OffsetFilter(BOUND_S), 0
+    for there_ns, back_ns, took_ns in delays:
+        one = exchange(now_ns, offset_ns, there_ns, back_ns, took_ns)
+        assert found.add(one)
+        now_ns = one.got + MS
+        said = found.offset(WALL_MINUS_MONO_NS, now_ns)
+        assert said is not None
+        assert abs(said.offset_s - offset_ns / 1e9) <= said.uncertainty_s + 1e-9
+        applied_ns = found.applied_ns(WALL_MINUS_MONO_NS, now_ns)
+        worst_ns = (said.uncertainty_s * 2) * 1e9 + 2
+        assert applied_ns == 0 or abs(applied_ns - offset_ns) <= worst_ns
+
+
+def test_the_quickest_exchange_counts() -> None:
+    found = OffsetFilter(BOUND_S)
+    for delay_ms in (80, 2, 60):
+        found.add(exchange(0, 30 * MS, delay_ms * MS, 0))
+    said = found.offset(WALL_MINUS_MONO_NS, 80 * MS)
+    assert said is not None
+    assert said.uncertainty_s == pytest.approx(0.001, abs=1e-5)
+    assert said.offset_s == pytest.approx(0.031, abs=1e-5)
+    assert said.round_trip_s == pytest.approx(0.060)
+
+
+def test_stamps_do_not_tremble_with_every_exchange() -> None:
+    found, seen = OffsetFilter(BOUND_S), set()
+    for second in range(60):
+        jitter_ns = (second * 7919) % 200_000
+        found.add(exchange(second * 10**9, 20 * MS, 300_000 + jitter_ns, 400_000))
+        seen.add(found.applied_ns(WALL_MINUS_MONO_NS, second * 10**9 + MS))
+    assert len(seen) == 1
+    assert abs(seen.pop() - 20 * MS) < MS
+
+
+def test_a_clock_near_ours_is_left_as_it_is() -> None:
+    found = OffsetFilter(BOUND_S)
+    found.add(exchange(0, 100_000, 200_000, 200_000))
+    assert found.applied_ns(WALL_MINUS_MONO_NS, MS) == 0
+
+
+def test_a_clock_beyond_the_bound_is_not_translated() -> None:
+    found = OffsetFilter(BOUND_S)
+    found.add(exchange(0, 2000 * MS, MS, MS))
+    assert found.applied_ns(WALL_MINUS_MONO_NS, 3 * MS) == 0
+    said = found.offset(WALL_MINUS_MONO_NS, 3 * MS)
+    assert said is not None
+    assert said.offset_s == pytest.approx(2.0, abs=0.002)
+
+
+def test_a_clock_that_is_set_is_noticed_at_the_next_exchange() -> None:
+    found = OffsetFilter(BOUND_S)
+    for second in range(5):
+        found.add(exchange(second * 10**9, 0, MS // 10, MS // 10))
+    found.add(exchange(6 * 10**9, 50 * MS, MS, MS))
+    assert found.applied_ns(WALL_MINUS_MONO_NS, 6 * 10**9 + 3 * MS) == 50 * MS
+
+
+def test_our_own_clock_that_is_set_needs_no_new_exchange() -> None:
+    found = OffsetFilter(BOUND_S)
+    found.add(exchange(0, 0, MS, MS))
+    later = found.offset(WALL_MINUS_MONO_NS + 30 * MS, 3 * MS)
+    assert later is not None
+    assert later.offset_s == pytest.approx(-0.03, abs=1e-6)
+
+
+def test_what_cannot_be_is_left_out() -> None:
+    found = OffsetFilter(BOUND_S)
+    assert not found.add(Exchange(10 * MS, WALL_MINUS_MONO_NS, WALL_MINUS_MONO_NS - 1, 11 * MS))
+    assert not found.add(Exchange(0, 0, 10 * MS, MS))
+    assert found.offset(WALL_MINUS_MONO_NS, 0) is None
+
+
+def test_an_old_measurement_is_worth_less() -> None:
+    found = OffsetFilter(BOUND_S)
+    found.add(exchange(0, 0, MS, MS))
+    young = found.offset(WALL_MINUS_MONO_NS, 2 * MS)
+    old = found.offset(WALL_MINUS_MONO_NS, 100 * 10**9)
+    assert young is not None
+    assert old is not None
+    assert old.uncertainty_s > young.uncertainty_s + 0.004
