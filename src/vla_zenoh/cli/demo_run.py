@@ -23,14 +23,22 @@ from vla_zenoh.demo.tables import write_chunks, write_commands, write_poses
 from vla_zenoh.demo.video import write_video
 from vla_zenoh.errors import SessionError
 from vla_zenoh.loader import find_model, make_policy
-from vla_zenoh.nodes.demo import DemoResult, DemoRun, first_commands
+from vla_zenoh.nodes.demo import DemoResult, DemoRun
 from vla_zenoh.nodes.launch import Host
+from vla_zenoh.nodes.listener import Listener
 from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
-from vla_zenoh.nodes.recording import Recorder
+from vla_zenoh.nodes.recorder import Recorder
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile, override, to_yaml
+from vla_zenoh.recording.run import Run, load_run, pictures
 
 MAX_LOG_LINES = 20
+RECORDING = "run.mcap"
+HOLD = "hold"
+KEPT = 400
+"""States that the demo itself looks back on."""
+PICTURE_NS = 60_000_000
+"""Pictures of the video lie at least this far apart: twice as many as it shows."""
 
 
 def run_demo(
@@ -55,9 +63,10 @@ def run_demo(
         f"watch it from another terminal: vla-zenoh status --connect {loaded.session.connect[0]}",
         style="dim",
     )
-    result, recorder = _run(loaded, segments, rate, seconds, folder, stop, screen)
-    summary = _summary(loaded, rate, result, recorder)
-    _write_folder(folder, loaded, summary, result, recorder, screen)
+    result = _run(loaded, segments, rate, seconds, folder, stop, screen)
+    run = load_run(folder / RECORDING)
+    summary = _summary(loaded, rate, result, run)
+    _write_folder(folder, loaded, summary, run, screen)
     if json_file is not None:
         json_file.parent.mkdir(parents=True, exist_ok=True)
         json_file.write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
@@ -95,7 +104,7 @@ def _run(
     folder: Path,
     stop: threading.Event,
     screen: Console,
-) -> tuple[DemoResult, Recorder]:
+) -> DemoResult:
     lines: list[str] = []
     with (
         (folder / "nodes.log").open("w", encoding="utf-8") as log_file,
@@ -125,32 +134,44 @@ def _run(
         try:
             with host as running:
                 assert running.session is not None and running.client is not None
-                camera = (
-                    "front" if "front" in profile.cameras else next(iter(profile.cameras), None)
-                )
-                recorder = Recorder(running.session, profile.keys, profile.task.worker, camera)
+                recorder = Recorder(
+                    profile, running.session, folder / RECORDING, expressions=_recorded(profile)
+                ).start()
+                listener = Listener(running.session, profile.keys, profile.task.worker, keep=KEPT)
 
                 def watch() -> None:
                     if not running.supervisor.watch():
                         stop.set()
 
-                run = DemoRun(running.client, recorder, stop, watch, progress)
-                result = run.run(segments, rate_hz, seconds)
-                recorder.close()
+                run = DemoRun(running.client, listener, stop, watch, progress)
+                try:
+                    result = run.run(segments, rate_hz, seconds)
+                finally:
+                    listener.close()
+                    recorder.close()
         except Exception:
             screen.print("\n".join(lines[-MAX_LOG_LINES:]), style="dim", markup=False)
             raise
         for index, task in enumerate(tasks):
             if index < len(result.outcomes):
                 bars.update(task, completed=segments[index].steps)
-    return result, recorder
+    return result
 
 
-def _summary(
-    profile: Profile, rate_hz: float, result: DemoResult, recorder: Recorder
-) -> dict[str, Any]:
+def _camera(profile: Profile) -> str | None:
+    return "front" if "front" in profile.cameras else next(iter(profile.cameras), None)
+
+
+def _recorded(profile: Profile) -> tuple[str, ...]:
+    """Everything, and the pictures of one camera: each more takes its share of the processor."""
+    camera = _camera(profile)
+    keys = profile.keys
+    return (*keys.without_pictures, *([keys.camera_jpeg(camera)] if camera else []))
+
+
+def _summary(profile: Profile, rate_hz: float, result: DemoResult, run: Run) -> dict[str, Any]:
     outcomes = [outcome.to_dict() for outcome in result.outcomes]
-    commands = recorder.recording.commands or recorder.recording.joint_commands
+    commands = run.commands or run.joint_commands
     refusals: dict[str, int] = {}
     for status in result.statuses.values():
         for name, count in status.counters.items():
@@ -165,10 +186,10 @@ def _summary(
         **{key: only[key] for key in ("prompt", "steps", "steps_done", "asked", "reached") if only},
         "drift_mm": max((o["drift_mm"] for o in outcomes), default=None),
         "rotation_drift_rad": max((o["rotation_drift_rad"] for o in outcomes), default=None),
-        "latency_ms": latencies(first_commands(recorder)),
+        "latency_ms": latencies(run.first_commands()),
         "rates_hz": {
             "command": _rate(commands),
-            "state": _rate(recorder.recording.poses),
+            "state": _rate(run.poses),
             "chunks": result.statuses[f"worker-{profile.task.worker}"].rates_hz.get("chunks", 0.0)
             if f"worker-{profile.task.worker}" in result.statuses
             else 0.0,
@@ -192,44 +213,47 @@ def _counter(result: DemoResult, node: str, name: str) -> int:
 
 
 def _write_folder(
-    folder: Path,
-    profile: Profile,
-    summary: dict[str, Any],
-    result: DemoResult,
-    recorder: Recorder,
-    screen: Console,
+    folder: Path, profile: Profile, summary: dict[str, Any], run: Run, screen: Console
 ) -> None:
-    heard = recorder.recording
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
     (folder / "profile.yaml").write_text(to_yaml(profile), "utf-8")
-    write_commands(folder / "commands.csv", heard.commands)
-    write_poses(folder / "poses.csv", heard.poses)
+    write_commands(folder / "commands.csv", run.commands)
+    write_poses(folder / "poses.csv", run.poses)
     spec = make_policy(find_model(profile.task.worker)).spec
-    obeyed = {cause.chunk_seq for cause, _ in first_commands(recorder)}
-    chunks = [entry.record.steps for entry in heard.chunks if entry.header.seq in obeyed]
+    worker = profile.task.worker
+    first = run.first_commands()
+    obeyed = {cause.chunk_seq for cause, _ in first if cause.worker == worker}
+    chunks = [
+        entry.record.steps
+        for entry in run.chunks
+        if entry.record.worker == worker and entry.header.seq in obeyed
+    ]
     write_chunks(folder / "chunks.npz", spec, chunks)
+    marks = [(at_ns, prompt) for at_ns, prompt in run.prompts() if prompt != HOLD]
     with Progress(
         TextColumn("{task.description:<24}"), BarColumn(), TimeElapsedColumn(), console=screen
     ) as bars:
         plotting = bars.add_task("drawing plot.png", total=1)
-        plot_run(
-            folder / "plot.png",
-            profile,
-            heard.poses,
-            heard.commands,
-            heard.marks,
-            first_commands(recorder),
-        )
+        plot_run(folder / "plot.png", profile, run.poses, run.commands, marks, first)
         bars.update(plotting, completed=1)
-        filming = bars.add_task("writing front.mp4", total=max(1, len(heard.frames)))
-        frames = write_video(
+        frames = _frames(run, _camera(profile))
+        filming = bars.add_task("writing front.mp4", total=max(1, len(frames)))
+        written = write_video(
             folder / "front.mp4",
-            heard.frames,
-            heard.marks,
+            frames,
+            marks,
             lambda done, total: bars.update(filming, completed=done, total=total),
         )
-        if not frames:
+        if not written:
             bars.update(filming, description="no pictures, no video", completed=1, total=1)
+
+
+def _frames(run: Run, camera: str | None) -> list[tuple[int, bytes]]:
+    frames: list[tuple[int, bytes]] = []
+    for picture in pictures(run.file, camera) if camera is not None else ():
+        if not frames or picture.heard_ns - frames[-1][0] >= PICTURE_NS:
+            frames.append((picture.heard_ns, picture.jpeg))
+    return frames
 
 
 def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
@@ -264,7 +288,8 @@ def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
     refused = ", ".join(f"{reason} {count}" for reason, count in summary["refusals"].items())
     screen.print(f"rates: {rates}; refusals: {refused or 'none'}")
     screen.print(
-        f"run folder: {folder} (summary.json, commands.csv, poses.csv, plot.png, front.mp4)"
+        f"run folder: {folder} (run.mcap, summary.json, commands.csv, poses.csv, plot.png, "
+        "front.mp4)"
     )
     if result.interrupted:
         screen.print("[yellow]interrupted; the arm was braked[/]")

@@ -12,7 +12,7 @@ from vla_zenoh.nodes.bench_process import cpu_s
 from vla_zenoh.nodes.command import SPREAD_S
 from vla_zenoh.nodes.demo import DemoRun, Interrupted
 from vla_zenoh.nodes.launch import Host
-from vla_zenoh.nodes.recording import Recorder
+from vla_zenoh.nodes.listener import Listener
 from vla_zenoh.profile import Profile, override
 
 PROMPT = "HARD: go up within 0.2"
@@ -49,11 +49,11 @@ def measure_command(
             if not host.supervisor.watch():
                 raise NodeError("a node dies again and again")
 
-        recorder = Recorder(host.session, profile.keys, profile.task.worker, camera=None)
-        run = DemoRun(client, recorder, stop, watch, lambda *_: None)
+        listener = Listener(host.session, profile.keys, profile.task.worker)
+        run = DemoRun(client, listener, stop, watch, lambda *_: None)
         run.wait_until_ready()
         run.activate(RATE_HZ)
-        recorder.close()  # what it hears costs time that is not the command node's
+        listener.close()  # what it hears costs time that is not the command node's
         client.set_prompt(PROMPT)
         if stop.wait(STATUS_S):
             raise Interrupted

@@ -22,9 +22,10 @@ from vla_zenoh.bench.motion import (
 from vla_zenoh.control.so3 import pose_of
 from vla_zenoh.demo.segments import make_segment
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.demo import DemoRun, first_commands
+from vla_zenoh.nodes.demo import DemoRun
 from vla_zenoh.nodes.launch import Host
-from vla_zenoh.nodes.recording import Recorder, Recording
+from vla_zenoh.nodes.listener import Listener, Streams
+from vla_zenoh.recording.run import first_commands
 
 RESET_PATIENCE_S = 3.0
 HOME_TOLERANCE_M = 0.002
@@ -36,7 +37,7 @@ def run_in_real_time(
     conditions: Sequence[Conditions],
     stop: threading.Event,
     progress: Callable[[Trial, Conditions, int], None],
-) -> Iterator[tuple[dict[str, Any], Recording]]:
+) -> Iterator[tuple[dict[str, Any], Streams]]:
     """One row after the other, with what was recorded for it.
 
     Args:
@@ -59,16 +60,16 @@ def run_in_real_time(
 
     for each in conditions:
         for trial in trials:
-            recorder = Recorder(host.session, profile.keys, profile.task.worker, camera=None)
+            listener = Listener(host.session, profile.keys, profile.task.worker)
             run = DemoRun(
                 host.client,
-                recorder,
+                listener,
                 stop,
                 watch,
                 lambda _, done, trial=trial, each=each: progress(trial, each, done),
             )
             run.wait_until_ready()
-            _go_home(host, recorder)
+            _go_home(host, listener)
             run.activate(PREPARATION_HZ)
             try:
                 if trial.preparation:
@@ -80,17 +81,17 @@ def run_in_real_time(
                 outcome = run.carry_out(0, trial.segment, each.rate_hz)
             except NodeError as error:
                 # The arm stands, as it should; the other prompts can still be measured.
-                yield failed_row(trial, each, str(error)), recorder.close()
+                yield failed_row(trial, each, str(error)), listener.close()
                 continue
             finally:
                 host.client.deactivate()
-            recording = recorder.close()
-            first = first_commands(recorder)
+            recording = listener.close()
+            first = first_commands(recording.commands or recording.joint_commands)
             stream = stream_of(recording, first, since_ns, profile.timing.state_hz)
             yield make_row(trial, each, profile, outcome, stream), recording
 
 
-def _go_home(host: Host, recorder: Recorder) -> None:
+def _go_home(host: Host, listener: Listener) -> None:
     """Put the simulated arm back; the command node is inactive."""
     assert host.client is not None
     client = host.client
@@ -108,7 +109,7 @@ def _resets(host: Host) -> int:
 
 
 def stream_of(
-    recording: Recording, first: Sequence[tuple[Any, int]], since_ns: int, state_hz: float
+    recording: Streams, first: Sequence[tuple[Any, int]], since_ns: int, state_hz: float
 ) -> Stream:
     """The commanded motion since `since_ns`, as arrays."""
     commands = [entry for entry in recording.commands if entry.header.stamp_wall_ns >= since_ns]

@@ -16,8 +16,8 @@ from vla_zenoh.demo.analysis import Outcome, Standing, judge
 from vla_zenoh.demo.segments import Segment
 from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.recording import Recorder
-from vla_zenoh.types import Cause, NodeStatus
+from vla_zenoh.nodes.listener import Listener
+from vla_zenoh.types import NodeStatus
 
 READY_PATIENCE_S = 40.0
 ACTIVATE_PATIENCE_S = 15.0
@@ -53,7 +53,7 @@ class DemoRun:
 
     Args:
         client: hears the nodes.
-        recorder: hears the streams.
+        listener: hears the streams.
         stop: set by Ctrl-C.
         watch: called often; raises when the nodes cannot be kept alive.
         progress: called with (segment index, steps carried out).
@@ -62,12 +62,12 @@ class DemoRun:
     def __init__(
         self,
         client: Client,
-        recorder: Recorder,
+        listener: Listener,
         stop: threading.Event,
         watch: Callable[[], None],
         progress: Callable[[int, int], None],
     ) -> None:
-        self._client, self._recorder, self._stop = client, recorder, stop
+        self._client, self._listener, self._stop = client, listener, stop
         self._watch, self._progress = watch, progress
         self._well_since_s = 0.0
 
@@ -101,7 +101,7 @@ class DemoRun:
     def _ready(self) -> bool:
         """Everybody has been well for long enough that the command node has heard it too."""
         worker = self._client.status(worker_node(self._client.profile.task.worker))
-        heard = self._recorder.recording
+        heard = self._listener.streams
         well = bool(
             worker is not None
             and worker.state == "inferring"
@@ -143,7 +143,7 @@ class DemoRun:
             Interrupted: Ctrl-C.
         """
         before = self._standing()
-        self._recorder.recording.mark(segment.prompt)
+        self._listener.streams.mark(segment.prompt)
         began = time.monotonic()
         if seconds is None:
             task = self._client.set_prompt(segment.prompt_with_count)
@@ -160,7 +160,7 @@ class DemoRun:
         if seconds is not None:
             self._client.set_prompt("hold")
             self._wait(self._at_rest, SLACK_S, "the arm does not come to rest")
-            steps_done = self._steps_heard(task.episode)
+            steps_done = self._listener.steps_carried_out(task.episode)
             segment = replace(segment, steps=steps_done)
         self._pause(SETTLE_S)
         duration_s = time.monotonic() - began - SETTLE_S
@@ -186,15 +186,6 @@ class DemoRun:
         detail = self._command()
         return int(detail.get("accepted_steps", 0)) if detail.get("episode") == episode else 0
 
-    def _steps_heard(self, episode: int) -> int:
-        """Steps of the chunks of `episode` that a pose command named as its cause."""
-        obeyed = {cause.chunk_seq for cause, _ in first_commands(self._recorder)}
-        return sum(
-            len(entry.record.steps)
-            for entry in self._recorder.recording.chunks
-            if entry.record.episode == episode and entry.header.seq in obeyed
-        )
-
     def _finished(self, episode: int, steps: int, index: int) -> bool:
         detail = self._command()
         if detail.get("episode") != episode:
@@ -203,7 +194,7 @@ class DemoRun:
         return bool(detail.get("policy_done")) and self._at_rest()
 
     def _at_rest(self) -> bool:
-        heard = self._recorder.recording
+        heard = self._listener.streams
         if not heard.grippers or heard.grippers[-1].record.moving:
             return False
         if heard.joint_commands:
@@ -218,7 +209,7 @@ class DemoRun:
     def _standing(self) -> Standing:
         """Mean measured pose of the next moments."""
         self._wait(self._at_rest_measured, SLACK_S, "the arm does not come to rest")
-        heard = self._recorder.recording
+        heard = self._listener.streams
         # Decoding may lag behind on a busy computer: what was heard before now does not count.
         until_ns = time.time_ns() + STAND_WINDOW_NS
         self._wait(
@@ -235,7 +226,7 @@ class DemoRun:
         return Standing(Pose(position, rotation), heard.grippers[-1].record.width_m)
 
     def _at_rest_measured(self) -> bool:
-        pose = self._recorder.recording.newest_pose()
+        pose = self._listener.streams.newest_pose()
         return pose is not None and float(np.abs(pose.twist).max()) < 1e-3
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
@@ -261,16 +252,3 @@ class DemoRun:
             word = found.detail.get("complaint") or found.detail.get("why") or ""
             said.append(f"{name} is {found.state}" + (f" ({word})" if word else ""))
         return "; ".join(said) or "no node says anything"
-
-
-def first_commands(recorder: Recorder) -> list[tuple[Cause, int]]:
-    """For each chunk the first pose command that carries it out, and when it was heard."""
-    out: list[tuple[Cause, int]] = []
-    last: tuple[str, int] | None = None
-    heard = recorder.recording
-    for entry in heard.commands or heard.joint_commands:
-        cause = entry.record.cause
-        if cause is not None and (cause.worker, cause.chunk_seq) != last:
-            last = (cause.worker, cause.chunk_seq)
-            out.append((cause, entry.heard_ns))
-    return out

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -113,14 +113,19 @@ class Run:
 
     def first_commands(self) -> list[tuple[Cause, int]]:
         """For each chunk the first command that carries it out, and when it was heard."""
-        out: list[tuple[Cause, int]] = []
-        newest: tuple[str, int] | None = None
-        for entry in self.commands or self.joint_commands:
-            cause = entry.record.cause
-            if cause is not None and (cause.worker, cause.chunk_seq) != newest:
-                newest = (cause.worker, cause.chunk_seq)
-                out.append((cause, entry.heard_ns))
-        return out
+        return first_commands(self.commands or self.joint_commands)
+
+
+def first_commands(commands: Sequence[Heard]) -> list[tuple[Cause, int]]:
+    """For each chunk the first of `commands` that carries it out, and when it was heard."""
+    out: list[tuple[Cause, int]] = []
+    newest: tuple[str, int] | None = None
+    for entry in commands:
+        cause = entry.record.cause
+        if cause is not None and (cause.worker, cause.chunk_seq) != newest:
+            newest = (cause.worker, cause.chunk_seq)
+            out.append((cause, entry.heard_ns))
+    return out
 
 
 def load_run(path: Path) -> Run:

@@ -1,4 +1,4 @@
-"""What a run looked like from outside: everything heard on the keys, with times of arrival."""
+"""What a run looks like from outside while it goes on: streams in memory, with times of arrival."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import zenoh
 
@@ -14,10 +14,10 @@ from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Keys
+from vla_zenoh.recording.run import Heard
 from vla_zenoh.types import (
     ActionChunk,
     GripperState,
-    Header,
     JointCommand,
     JointState,
     PoseCommand,
@@ -27,18 +27,9 @@ from vla_zenoh.types import (
 Record = TypeVar("Record")
 
 
-@dataclass(frozen=True, slots=True)
-class Heard:
-    """A record, its header, and when it was heard (wall clock here)."""
-
-    header: Header
-    record: Any
-    heard_ns: int
-
-
 @dataclass(slots=True)
-class Recording:
-    """All of a run, in memory; a minute is some 40 MB."""
+class Streams:
+    """What was heard; without a bound a minute is some 40 MB."""
 
     poses: list[Heard] = field(default_factory=list)
     joints: list[Heard] = field(default_factory=list)
@@ -46,7 +37,6 @@ class Recording:
     commands: list[Heard] = field(default_factory=list)
     joint_commands: list[Heard] = field(default_factory=list)
     chunks: list[Heard] = field(default_factory=list)
-    frames: list[tuple[int, bytes]] = field(default_factory=list)
     marks: list[tuple[int, str]] = field(default_factory=list)
 
     def mark(self, prompt: str) -> None:
@@ -58,31 +48,27 @@ class Recording:
         return self.poses[-1].record if self.poses else None
 
 
-class Recorder:
-    """Fills a `Recording` from the keys of one robot while the context lasts.
+class Listener:
+    """Fills `Streams` from the keys of one robot until `close`.
 
     Args:
         session: open session.
         keys: of the robot.
-        worker: whose chunks to record.
-        camera: whose JPEG pictures to record, None: no video.
-        frames_hz: at most so many pictures a second.
+        worker: whose chunks to hear.
+        keep: how many of each kind are kept at least; None: all.
     """
 
     def __init__(
-        self,
-        session: zenoh.Session,
-        keys: Keys,
-        worker: str,
-        camera: str | None,
-        frames_hz: float = 15.0,
+        self, session: zenoh.Session, keys: Keys, worker: str, *, keep: int | None = None
     ) -> None:
-        self.recording = Recording()
-        self._frame_ns = int(0.9e9 / frames_hz)
-        self._queue: list[tuple[str, bytes, bytes | None, int]] = []
+        self.streams = Streams()
+        self._keep = keep
+        self._steps: dict[int, tuple[int, int]] = {}  # chunk -> episode, steps
+        self._named: set[int] = set()  # chunks that a command named
+        self._worker = worker
+        self._queue: list[tuple[str, str, bytes, bytes | None, int]] = []
         self._ready = threading.Condition()
         self._closed = False
-        self._last_frame_ns = 0
         named = {
             "poses": keys.state_pose,
             "joints": keys.state_joint,
@@ -97,17 +83,20 @@ class Recorder:
             )
             for name, key in named.items()
         ]
-        if camera is not None:
-            handler = zenoh.handlers.Callback(self._take_frame, indirect=False)
-            self._subscribers.append(session.declare_subscriber(keys.camera_jpeg(camera), handler))
         self._thread = threading.Thread(target=self._decode_all, daemon=True)
         self._thread.start()
+
+    def steps_carried_out(self, episode: int) -> int:
+        """Steps of the chunks of `episode` that a command named as its cause."""
+        steps = (self._steps.get(chunk, (-1, 0)) for chunk in list(self._named))
+        return sum(count for of, count in steps if of == episode)
 
     def _into(self, name: str) -> Callable[[zenoh.Sample], None]:
         def take(sample: zenoh.Sample) -> None:
             attachment = sample.attachment
             entry = (
                 name,
+                str(sample.key_expr),
                 sample.payload.to_bytes(),
                 attachment.to_bytes() if attachment is not None else None,
                 time.time_ns(),
@@ -116,12 +105,6 @@ class Recorder:
                 self._queue.append(entry)
 
         return take
-
-    def _take_frame(self, sample: zenoh.Sample) -> None:
-        now_ns = time.time_ns()
-        if now_ns - self._last_frame_ns >= self._frame_ns:
-            self._last_frame_ns = now_ns
-            self.recording.frames.append((now_ns, sample.payload.to_bytes()))
 
     def _decode_all(self) -> None:
         kinds = {
@@ -136,21 +119,34 @@ class Recorder:
             time.sleep(0.05)
             with self._ready:
                 queue, self._queue = self._queue, []
-            for name, payload, attachment, heard_ns in queue:
+            for name, key, payload, attachment, heard_ns in queue:
                 try:
                     heard = Heard(
                         header_codec.decode(attachment),
                         records.decode(kinds[name], payload),
                         heard_ns,
+                        key,
                     )
                 except CodecError:
                     continue  # the nodes themselves count and tell what they refuse
-                getattr(self.recording, name).append(heard)
+                self._take(getattr(self.streams, name), heard)
 
-    def close(self) -> Recording:
-        """Stop listening; the recording is complete afterwards."""
+    def _take(self, stream: list[Heard], heard: Heard) -> None:
+        record = heard.record
+        if isinstance(record, ActionChunk):
+            self._steps[heard.header.seq] = (record.episode, len(record.steps))
+        elif isinstance(record, (PoseCommand, JointCommand)):
+            cause = record.cause
+            if cause is not None and cause.worker == self._worker:
+                self._named.add(cause.chunk_seq)
+        stream.append(heard)
+        if self._keep is not None and len(stream) > 2 * self._keep:
+            del stream[: -self._keep]
+
+    def close(self) -> Streams:
+        """Stop listening; the streams are complete afterwards."""
         for subscriber in self._subscribers:
             subscriber.undeclare()
         self._closed = True
         self._thread.join(10.0)
-        return self.recording
+        return self.streams
