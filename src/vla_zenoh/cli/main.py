@@ -29,6 +29,7 @@ from vla_zenoh.cli import (
     router,
     secure,
     seen,
+    serve,
     set_prompt,
     sim,
     status,
@@ -114,6 +115,7 @@ for panel, name, function in (
 
 app.add_typer(bench.bench_app, name="bench", rich_help_panel=LOOK)
 app.add_typer(profile.profile_app, name="profile", rich_help_panel=LOOK)
+app.add_typer(serve.serve_app, name="serve", rich_help_panel=RUN)
 app.add_typer(secure.secure_app, name="secure", rich_help_panel=RUN)
 
 

@@ -1,0 +1,75 @@
+"""vla-zenoh serve openpi."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from typing import Annotated
+
+import typer
+
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    ProfileOption,
+    effective_profile,
+    model_options,
+)
+from vla_zenoh.cli.output import console
+from vla_zenoh.interop.offer import make_offer
+from vla_zenoh.interop.openpi import PORT
+from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.nodes.environment import run_in_own_environment
+from vla_zenoh.nodes.process import stop_on_signals
+
+WEBSOCKETS = "websockets>=15"
+
+serve_app = typer.Typer(help="Serve a model to other systems.", no_args_is_help=True)
+
+
+@serve_app.callback()
+def _group() -> None:
+    """Serve a model to other systems."""
+
+
+@serve_app.command("openpi")
+def openpi(
+    worker: Annotated[str, typer.Option("--worker", "-w", help="Name of a model, or its file.")],
+    profile: ProfileOption = DEFAULT_PROFILE,
+    options: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Option of the model as name=value; may be repeated."),
+    ] = None,
+    names: Annotated[
+        str, typer.Option("--map", help="Other names, as observation/image=camera:front,...")
+    ] = "",
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = PORT,
+    api_key: Annotated[
+        str, typer.Option(envvar="VLA_ZENOH_API_KEY", help="What clients have to bring.")
+    ] = "",
+    python: Annotated[
+        str | None, typer.Option("--python", help="Interpreter of a prepared environment.")
+    ] = None,
+) -> None:
+    """Answer openpi's clients with a model of ours; whoever asks drives the robot."""
+    robot = effective_profile(profile).robot
+    found = find_model(worker)
+    chosen = model_options(options or [])
+    run_in_own_environment(found, python, (WEBSOCKETS,))
+    from vla_zenoh.nodes.openpi_server import OpenPiServer
+
+    policy = make_policy(found, chosen, profile=profile)
+    offer = make_offer(policy.spec, names, robot.arm_joints, robot.gripper.max_width_m)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    getattr(policy, "load", lambda: None)()
+    stop = stop_on_signals()
+    server = OpenPiServer(policy, offer, host, port, api_key=api_key)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    console().print(f"{found.name} for openpi's clients at ws://{host}:{server.port}")
+    for name, what in offer.described().items():
+        console().print(f"  {name}: {what}", highlight=False)
+    stop.wait()
+    server.stop()
+    # A model's library may leave threads behind that would keep the process.
+    os._exit(0)

@@ -1,0 +1,122 @@
+"""Serves one of our models to openpi's clients, over WebSocket, without any Zenoh.
+
+One client at a time: a model remembers what it was shown, so a second one is told to come later. A
+new connection and a new prompt begin an episode.
+"""
+
+from __future__ import annotations
+
+import hmac
+import logging
+import threading
+import time
+from http import HTTPStatus
+from typing import Any
+
+from vla_zenoh.errors import MissingExtraError, PeerError, SpecError
+from vla_zenoh.interop import openpi
+from vla_zenoh.interop.offer import Offer
+from vla_zenoh.policy import ActionSteps, Policy, check_steps
+
+try:
+    from websockets.datastructures import Headers
+    from websockets.exceptions import ConnectionClosed
+    from websockets.http11 import Request, Response
+    from websockets.sync.server import Server, ServerConnection, serve
+except ImportError as error:
+    raise MissingExtraError(error.name or "websockets", "serve") from error
+
+INTERNAL_ERROR, TRY_AGAIN_LATER = 1011, 1013
+MAX_ERROR = 1000
+
+
+class OpenPiServer:
+    """See the module.
+
+    Args:
+        policy: a model that is loaded.
+        offer: its names.
+        host: address to listen on.
+        port: likewise; 0: any.
+        api_key: what clients have to bring, empty: nothing.
+    """
+
+    def __init__(
+        self, policy: Policy, offer: Offer, host: str, port: int, *, api_key: str = ""
+    ) -> None:
+        self._policy, self._offer, self._key = policy, offer, api_key
+        self._busy = threading.Lock()
+        self._seq = 0
+        self._log = logging.getLogger("vla_zenoh.openpi")
+        self._server: Server = serve(
+            self._handle,
+            host,
+            port,
+            compression=None,
+            max_size=openpi.MAX_BYTES,
+            process_request=self._admit,
+        )
+        self.port: int = self._server.socket.getsockname()[1]
+
+    def serve_forever(self) -> None:
+        """Answer until `stop`."""
+        self._server.serve_forever()
+
+    def stop(self) -> None:
+        """Let nobody in any more."""
+        self._server.shutdown()
+
+    # -- connections --------------------------------------------------------------------------
+    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        if request.path == openpi.HEALTH_PATH:
+            return connection.respond(HTTPStatus.OK, "OK\n")
+        if self._key and not _has_key(request.headers, self._key):
+            return connection.respond(HTTPStatus.UNAUTHORIZED, "wrong or no API key\n")
+        if self._busy.locked():
+            return connection.respond(
+                HTTPStatus.SERVICE_UNAVAILABLE, "another client is connected\n"
+            )
+        return None
+
+    def _handle(self, connection: ServerConnection) -> None:
+        if not self._busy.acquire(blocking=False):
+            connection.close(TRY_AGAIN_LATER, "another client is connected")
+            return
+        try:
+            self._serve(connection)
+        except ConnectionClosed:
+            pass
+        finally:
+            self._busy.release()
+
+    def _serve(self, connection: ServerConnection) -> None:
+        connection.send(openpi.metadata(self._policy.spec.action, self._offer.described()))
+        prompt: str | None = None
+        previous_ms: float | None = None
+        while True:
+            frame = connection.recv()
+            began_s = time.monotonic()
+            try:
+                self._seq += 1
+                given = openpi.read_observation(frame)
+                observation = self._offer.observe(given, time.time_ns(), self._seq)
+                if observation.prompt != prompt:
+                    prompt = observation.prompt
+                    getattr(self._policy, "reset", lambda: None)()
+                result: Any = self._policy.infer(observation)
+                steps = result.steps if isinstance(result, ActionSteps) else result
+                actions = check_steps(self._policy.spec.action, steps)
+            except Exception as error:  # the client is told, as openpi tells it, and may come again
+                told = error if isinstance(error, (PeerError, SpecError)) else repr(error)
+                self._log.warning("a question was refused: %s", told)
+                connection.send(f"{type(error).__name__}: {error}"[:MAX_ERROR])
+                connection.close(INTERNAL_ERROR, "the reason is in the frame before")
+                return
+            infer_ms = (time.monotonic() - began_s) * 1e3
+            connection.send(openpi.answer(actions, infer_ms, previous_ms))
+            previous_ms = (time.monotonic() - began_s) * 1e3
+
+
+def _has_key(headers: Headers, key: str) -> bool:
+    given = headers.get("Authorization", "")
+    return hmac.compare_digest(given.encode(), f"Api-Key {key}".encode())
