@@ -95,6 +95,7 @@ def test_a_worker_writes_its_own_keys_only(lab: Profile) -> None:
     assert may(lab, "worker-scripted@gpu", Act.PUT) == {
         "delta/scripted",
         "spec/scripted",
+        "seen/scripted",
         "seen/scripted/*",
         "status/worker-scripted",
         "event/worker-scripted",
@@ -105,6 +106,7 @@ def test_a_camera_host_writes_its_own_cameras_only(lab: Profile) -> None:
     assert may(lab, "camera-eyes@eyes", Act.PUT) == {
         "camera/front/raw",
         "camera/front/jpeg",
+        "camera/front/fitted/*",
         "status/camera-eyes",
         "event/camera-eyes",
     }

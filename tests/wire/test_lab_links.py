@@ -1,0 +1,249 @@
+"""Between hosts: clocks that differ, links of their own for commands, pictures made smaller."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import zenoh
+from camera_rig import await_match, camera_rig, free_endpoint, grey, until
+
+from vla_zenoh.codec.image import decode_jpeg
+from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
+from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.rehearsal import rehearse
+from vla_zenoh.nodes.session import QOS, open_session
+from vla_zenoh.nodes.slots import Latest
+from vla_zenoh.observe import form_of, prepare
+from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
+from vla_zenoh.profile import Profile, load_profile, override
+from vla_zenoh.profile.schema import CameraProfile
+from vla_zenoh.security.roles import Act
+from vla_zenoh.security.rules import access_control
+from vla_zenoh.types import Image, Stamped, Task
+
+AHEAD_NS = 60_000_000
+"""How far the other clock is ahead in these tests; within the bound of the profile."""
+OFFSET_TOLERANCE_S = 0.005
+STAMP_TOLERANCE_S = 0.02
+JPEG_TOLERANCE = 8  # of 255
+
+
+@contextmanager
+def two_nodes() -> Iterator[tuple[Node, Node]]:
+    """The command node and a robot's, each with a session of its own."""
+    endpoint = free_endpoint()
+    profile = override(
+        load_profile("panda_sim"), {"session": {"listen": [endpoint], "connect": [endpoint]}}
+    )
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as here,
+        open_session(profile.session) as there,
+    ):
+        near, far = Node("command", profile, here), Node("sim", profile, there)
+        yield near, far
+        near.close()
+        far.close()
+
+
+def set_ahead(node: Node, by_ns: int) -> None:
+    """Its clock, as another host's would be."""
+    node.clock._offset_ns += by_ns
+
+
+def asked(node: Node, other: str) -> Any:
+    def known() -> Any:
+        node.clocks.tick()
+        return node.clocks.known().get(other)
+
+    node.clocks.follow(other)
+    return until(f"the clock of {other}", known)
+
+
+def test_a_clock_that_is_ahead_is_measured_within_its_uncertainty() -> None:
+    with two_nodes() as (near, far):
+        set_ahead(far, AHEAD_NS)
+        time.sleep(0.1)
+        found = asked(near, "sim")
+        assert abs(found.offset_s - AHEAD_NS / 1e9) <= found.uncertainty_s
+        back = asked(far, "command")
+        assert abs(back.offset_s + AHEAD_NS / 1e9) <= back.uncertainty_s
+        assert found.uncertainty_s < OFFSET_TOLERANCE_S * 10
+
+
+def test_stamps_of_another_host_are_read_on_the_own_clock() -> None:
+    with two_nodes() as (near, far):
+        set_ahead(far, AHEAD_NS)
+        slot = near.listen(near.keys.task, Latest())
+        asked(near, "sim")
+        out = far.stream(far.keys.task, Kind.ORDER)
+        until("a listener", lambda: out.wanted)
+
+        def exchange() -> Stamped[Task] | None:
+            out.put(Task("hold", "scripted", 5.0, False, 0))
+            assert slot.wait(1.0)
+            arrival = slot.take()
+            assert arrival is not None
+            near.clocks.tick()
+            stamped = near.read(Task, arrival)
+            assert stamped is not None
+            late_s = (stamped.received_ns - stamped.header.stamp_wall_ns) / 1e9
+            return stamped if abs(late_s) < STAMP_TOLERANCE_S else None
+
+        assert until("a stamp on our clock", exchange)
+
+
+def test_a_clock_beyond_the_bound_is_told_and_its_stamps_stay() -> None:
+    with two_nodes() as (near, far):
+        set_ahead(far, 2_000_000_000)
+        found = asked(near, "sim")
+        around = Surroundings(frozenset({"sim"}), clocks=near.clocks.known())
+        reasons = reasons_not_to_activate(
+            near.profile, "scripted", "hold", around, None, None, None, time.time_ns()
+        )
+        said = [reason for reason in reasons if "clock of node 'sim'" in reason]
+        assert len(said) == 1
+        assert "at most 0.1 s is allowed (timing.max_clock_offset_s)" in said[0]
+        assert found.offset_s == pytest.approx(2.0, abs=OFFSET_TOLERANCE_S * 10)
+
+
+def test_commands_and_pictures_travel_on_links_of_their_own() -> None:
+    endpoint = free_endpoint()
+    profile = override(
+        load_profile("panda_sim"),
+        {"session": {"listen": [endpoint], "connect": [endpoint], "separate_links": True}},
+    )
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as writer,
+        open_session(profile.session) as reader,
+    ):
+        links = sorted(link.priorities for link in writer.info.links())
+        assert links == [(0, 3), (4, 7)]
+        heard: dict[str, int] = {}
+
+        def take(sample: zenoh.Sample) -> None:
+            heard[str(sample.priority)] = heard.get(str(sample.priority), 0) + 1
+
+        subscriber = reader.declare_subscriber(
+            profile.keys.everything, zenoh.handlers.Callback(take, indirect=False)
+        )
+        await_match(writer, profile.keys.command_pose)
+        for kind in Kind:
+            writer.put(profile.keys.command_pose, b"x", **QOS[kind])
+        until("one of each kind", lambda: sum(heard.values()) == len(Kind))
+        subscriber.undeclare()
+
+
+def chart(folder: Path) -> Path:
+    """A picture with something in it: dark left, light right."""
+    picture = np.concatenate([grey(40, 320, 480), grey(200, 320, 480)], axis=1)
+    assert cv2.imwrite(str(folder / "chart.png"), picture)
+    return folder
+
+
+def test_jpeg_between_hosts_is_thinned_and_narrowed_as_the_profile_says(tmp_path: Path) -> None:
+    camera = CameraProfile(
+        source=f"file:{chart(tmp_path)}", rate_hz=50, jpeg_rate_hz=10, jpeg_width=160
+    )
+    with camera_rig({"front": camera}) as rig:
+        raws, _raw = rig.listen(rig.profile.keys.camera_raw("front"))
+        jpegs, _jpeg = rig.listen(rig.profile.keys.camera_jpeg("front"))
+        until("pictures of both", lambda: len(jpegs) >= 10 and len(raws) >= 40)
+        stamps = [frame.header.stamp_wall_ns for frame in jpegs]
+        rate_hz = (len(stamps) - 1) / ((stamps[-1] - stamps[0]) / 1e9)
+        assert rate_hz == pytest.approx(10.0, rel=0.2)
+        assert decode_jpeg(jpegs[-1].payload).rgb.shape == (120, 160, 3)
+        numbers = [frame.header.seq for frame in jpegs]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
+def test_a_model_on_another_host_gets_pictures_in_its_own_size(tmp_path: Path) -> None:
+    wanted = CameraSpec(camera="front", width=224, height=224, resize="pad", colour="bgr")
+    spec = ModelSpec(
+        name="far",
+        observation=ObservationSpec(cameras=(wanted,)),
+        action=ActionSpec(horizon=1, dt_s=0.2, frame="tcp", rotation="rpy", gripper="none"),
+    )
+    camera = CameraProfile(source=f"file:{chart(tmp_path)}", rate_hz=50, fit_for_workers=True)
+    with camera_rig({"front": camera}) as rig:
+        form = form_of(wanted)
+        assert form == "224x224-pad"
+        whole, _whole = rig.listen(rig.profile.keys.camera_jpeg("front"))
+        fitted, _fitted = rig.listen(rig.profile.keys.camera_fitted("front", form))
+        node = Node("worker-far", rig.profile, rig.watcher)
+        out = node.stream(node.keys.spec("far"), Kind.NEWS)
+        until("the camera node", lambda: out.wanted)
+        out.put(spec)
+        until("fitted pictures", lambda: len(fitted) > 5 and len(whole) > 5)
+        node.close()
+        image = decode_jpeg(fitted[-1].payload)
+        assert image.rgb.shape == (224, 224, 3)
+        # What the worker makes of it is what it would have made of the whole picture.
+        from_whole = prepare(decode_jpeg(whole[-1].payload), wanted)
+        from_fitted = prepare(Image(image.rgb), wanted)
+        assert np.median(np.abs(from_whole.astype(int) - from_fitted)) < JPEG_TOLERANCE
+        assert len(fitted[-1].payload) < len(whole[-1].payload)
+
+
+@pytest.fixture(scope="module")
+def lab() -> Profile:
+    return override(
+        load_profile("panda_sim"),
+        {
+            "session": {
+                "listen": ["tls/127.0.0.1:7447"],
+                "connect": ["tls/127.0.0.1:7447"],
+                "security": {"people": {"wall": "viewer"}},
+            },
+            "cameras": {"wrist": None},
+        },
+    )
+
+
+def test_every_role_does_its_part_and_nothing_else_with_real_sessions(lab: Profile) -> None:
+    verdicts = rehearse(lab)
+    assert {one.identity.node for one in verdicts} == {
+        "sim",
+        "camera",
+        "command",
+        "worker-scripted",
+        "operator",
+        "viewer",
+    }
+    for one in verdicts:
+        assert one.faults == ()
+        assert one.must > 0
+        assert one.must_not > 0
+
+
+def test_a_missing_rule_and_one_too_much_are_named(lab: Profile) -> None:
+    rules: dict[str, Any] = access_control([lab])
+    told = "vla/panda:worker-scripted@here:egress:declare_subscriber"
+    for rule in rules["rules"]:
+        if rule["id"] == told:
+            rule["key_exprs"] = ["vla/panda/nothing"]
+        if rule["id"].startswith("vla/panda:viewer@wall:") and rule["messages"][0] in (
+            "declare_subscriber",
+            "put",
+        ):
+            rule["key_exprs"].append(lab.keys.camera_jpeg("front"))
+    faults = {one.identity.node: one.faults for one in rehearse(lab, rules)}
+    key = lab.keys.delta("scripted")
+    assert (
+        f"worker-scripted@here cannot {Act.PUT.value} {key}: no rule allows egress "
+        f"declare_subscriber {key}"
+    ) in faults["worker-scripted"]
+    assert faults["viewer"] == (
+        f"viewer@wall can subscribe {lab.keys.camera_jpeg('front')} and must not: rule "
+        "'vla/panda:viewer@wall:ingress:declare_subscriber' allows it",
+    )
+    assert faults["sim"] == faults["command"] == ()
