@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chain import command_line
+from peer_rig import KINDS, free_port, served
 
 from vla_zenoh.check import fit, plausible
 from vla_zenoh.check.examine import Examination, Report
@@ -141,6 +142,57 @@ def test_inference_longer_than_a_period_is_named(asked_hz: float) -> None:
 def test_every_finding_has_a_meaning() -> None:
     told = {name for name, _ in ERRORS.values()} | set(WARNINGS.values())
     assert told <= set(MEANINGS)
+
+
+# -- what is shipped ------------------------------------------------------------------------------
+
+
+def passes(model: str, **options: str) -> Report:
+    report = Examination(
+        make_policy(find_model(model), options),
+        model,
+        CheckBench(PATIENCE_S),
+        profile=load_profile("panda_sim"),
+        runs=RUNS,
+    ).run()
+    assert report.ok, report.findings
+    assert report.runs >= RUNS
+    return report
+
+
+def test_scripted_keeps_its_contract_and_is_blind() -> None:
+    report = passes("scripted")
+    assert names(report, "warning") == {"ignores_pictures"}
+    assert report.depends_on == {"pictures": False, "prompt": True}
+
+
+def test_replay_keeps_its_contract(tmp_path: Path) -> None:
+    steps = np.full((3, 4, 7), 0.01, np.float32)
+    recorded = json.dumps(spec(gripper="absolute_m").to_dict())
+    np.savez(tmp_path / "chunks.npz", spec=recorded, steps=steps, length=np.array([4, 2, 3]))
+    passes("replay", file=str(tmp_path / "chunks.npz"))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "openpi",
+        pytest.param("groot", marks=pytest.mark.slow),
+        pytest.param("openvla_rest", marks=pytest.mark.slow),
+    ],
+)
+def test_an_adapter_keeps_its_contract_with_its_server(name: str) -> None:
+    with served(name) as server:
+        passes(server.kind.model, **server.settings)
+
+
+def test_an_adapter_without_its_server_is_said_to_fail_at_loading_or_inference() -> None:
+    settings = KINDS["openpi"].settings(free_port())
+    report = Examination(
+        make_policy(find_model("openpi"), settings), "openpi", CheckBench(PATIENCE_S), runs=3
+    ).run()
+    assert names(report, "error") <= {"load_failed", "inference_failed"}
+    assert not report.ok
 
 
 # -- spec and profile -----------------------------------------------------------------------------

@@ -159,6 +159,11 @@ class Examination:
         report = self.report
         try:
             self._run()
+            close = getattr(self._policy, "close", None)
+            if callable(close):
+                self._bench.call(close)
+        except Failed as failed:
+            report.findings.append(error("close_failed", str(failed)))
         except Hung as hung:
             report.findings.append(error("hangs", str(hung)))
         report.findings = distinct(report.findings)

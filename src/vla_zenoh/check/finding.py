@@ -10,11 +10,12 @@ Level = Literal["error", "warning", "note"]
 MEANINGS: Mapping[str, str] = {
     "cannot_be_made": "the file does not import, or its class refuses its options",
     "load_failed": "load() raised",
-    "hangs": "load(), reset() or infer() did not come back in time",
+    "hangs": "a call of the model did not come back in time",
     "spec_changed": "the spec is another one after load() than before",
     "normalisation": "the spec's normalisation is not among the keys the weights came with",
     "reset_failed": "reset() raised",
     "inference_failed": "infer() raised",
+    "close_failed": "close() raised",
     "horizon": "more steps than the spec declares, or none",
     "shape": "steps of another width than the spec declares",
     "dtype": "steps that are not numbers",

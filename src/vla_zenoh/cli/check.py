@@ -90,7 +90,7 @@ def _examine(
     patience_s: float,
 ) -> Report:
     try:
-        policy = make_policy(found, options)
+        policy = make_policy(found, options, profile=profile.name if profile else None)
     except WorkerError as fault:
         return Report(worker, findings=[error("cannot_be_made", str(fault))])
     return Examination(
