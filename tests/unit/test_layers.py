@@ -23,6 +23,7 @@ FORBIDDEN = {
     "bench": PURE - {"asyncio"},  # openpi's server is one of asyncio
     "check": PURE,
     "codec": PURE,
+    "lockstep": PURE,
     "types": PURE,
     "control": PURE,
     "evaluation": PURE,

@@ -1,21 +1,12 @@
-"""The whole loop in one thread on a virtual clock: robot, cameras, worker, command node.
-
-The same `Commander`, `ArmGuard` and `assemble` as in the nodes, and every record goes through
-the codec as on the wire; only sessions, threads and waiting are left out. A run is reproducible to
-the bit and as fast as the computer: for tests, for making data, for measuring what latency does.
-
-Faults are put in from outside: `Lockstep.tamper` stands on the wire and may drop, delay, repeat or
-change every message; `Lockstep.set_clock` sets the wall clock of one node; `Lockstep.alive` names
-the nodes that others believe alive.
-"""
+"""The loop itself: who hears what when."""
 
 from __future__ import annotations
 
 import heapq
 import random
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -26,18 +17,17 @@ from vla_zenoh.codec import records
 from vla_zenoh.control.arm_guard import Measured, make_arm_guard
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.joint_impedance import JointReference
-from vla_zenoh.control.names import worker_node
 from vla_zenoh.control.preflight import Surroundings
 from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.so3 import Pose
 from vla_zenoh.errors import CodecError
-from vla_zenoh.observe import History, NotYet, assemble
-from vla_zenoh.policy import ActionSteps, Policy, check_steps
+from vla_zenoh.lockstep.records import Delays, Message, Tamper, Trace
+from vla_zenoh.lockstep.worker import LockstepWorker
+from vla_zenoh.policy import Policy
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
     Event,
-    FloatArray,
     GripperCommand,
     GripperState,
     Header,
@@ -58,76 +48,10 @@ TICK_NS = 1_000_000
 START_NS = 1_700_000_000_000_000_000
 """The virtual wall clock begins here; any time that is not zero will do."""
 SIM, CAMERA, COMMAND = "sim", "camera", "command"
-STATE_KINDS: dict[str, type[Any]] = {
-    "joint": JointState,
-    "pose": PoseState,
-    "gripper": GripperState,
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Delays:
-    """What takes how long.
-
-    Args:
-        inference_s: from observation to chunk.
-        jitter: share by which an inference varies, either way.
-        camera_s: from capture to the worker.
-        camera_hz: pictures per second.
-        wire_s: everything else on its way.
-    """
-
-    inference_s: float = 0.0
-    jitter: float = 0.0
-    camera_s: float = 0.0
-    camera_hz: float = 30.0
-    wire_s: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Message:
-    """One record on the wire.
-
-    Args:
-        kind: class of the record.
-        header: what its writer says of it.
-        payload: the record as bytes.
-        arrival_ns: virtual time at which it arrives.
-    """
-
-    kind: type[Any]
-    header: Header
-    payload: bytes
-    arrival_ns: int
-
-
-Tamper = Callable[[Message], Iterable[Message]]
-"""What arrives in place of a message: nothing, itself, several, others."""
-
-
-@dataclass(slots=True)
-class Trace:
-    """What was commanded and where the TCP was, one entry per command tick.
-
-    Args:
-        time_ns: (n,) virtual wall clock.
-        commands: the pose commands; None where nothing was streamed.
-        joints: likewise the joint commands.
-        position_m: measured TCP, (3,) each.
-        rotation: measured TCP, (3, 3) each.
-        width_m: measured opening.
-    """
-
-    time_ns: list[int] = field(default_factory=list)
-    commands: list[PoseCommand | None] = field(default_factory=list)
-    joints: list[JointCommand | None] = field(default_factory=list)
-    position_m: list[FloatArray] = field(default_factory=list)
-    rotation: list[FloatArray] = field(default_factory=list)
-    width_m: list[float] = field(default_factory=list)
 
 
 class Lockstep:
-    """See the module. Settings are put with `put`; time goes on with `run` and `run_until`.
+    """See the package. Settings are put with `put`; time goes on with `run` and `run_until`.
 
     Args:
         profile: limits, timing, cameras.
@@ -166,7 +90,7 @@ class Lockstep:
         self.guard_refused: Counter[str] = Counter()
         policies = {profile.task.worker: policy, **(others or {})}
         self.workers = {
-            name: _Worker(profile, name, each, self.delays, random.Random(seed + index))
+            name: LockstepWorker(profile, name, each, self.delays, random.Random(seed + index))
             for index, (name, each) in enumerate(policies.items())
         }
         self.alive = {SIM, CAMERA, COMMAND, *(w.source for w in self.workers.values())}
@@ -376,89 +300,6 @@ class Lockstep:
     def _take_gripper_command(self, command: Stamped[GripperCommand]) -> None:
         order = command.record
         self.world.set_gripper(order.width_m, order.speed_m_s, order.force_n)
-
-
-class _Worker:
-    """A worker on the virtual clock: one inference at a time, at the task's rate."""
-
-    def __init__(
-        self, profile: Profile, name: str, policy: Policy, delays: Delays, jitter: random.Random
-    ) -> None:
-        self.name = name
-        self.source = worker_node(name)
-        self.policy, self.spec = policy, policy.spec
-        self.task: Task | None = None
-        self._patience_ns = int(profile.timing.max_observation_age_s * 1e9)
-        self._delays, self._jitter = delays, jitter
-        self._images: dict[str, Stamped[Image]] = {}
-        self._states = {part: History() for part in self.spec.observation.state}
-        self._not_before_ns = self._due_ns = 0
-        load = getattr(policy, "load", None)
-        if callable(load):
-            load()
-
-    def take_task(self, task: Stamped[Task]) -> None:
-        """The task, as the command node published it."""
-        known, self.task = self.task, task.record
-        if known is None or known.episode != self.task.episode:
-            self._not_before_ns = task.header.stamp_wall_ns
-            reset = getattr(self.policy, "reset", None)
-            if callable(reset):
-                reset()
-
-    def take_state(self, state: Stamped[Any]) -> None:
-        """A state; kept if the model asked for it."""
-        for part, history in self._states.items():
-            if isinstance(state.record, STATE_KINDS[part]):
-                history.add(state)
-
-    def take_picture(self, camera: str, picture: Stamped[Image]) -> None:
-        """The newest picture of a camera."""
-        self._images[camera] = picture
-
-    def turn(self, now_ns: int, wall_ns: int) -> ActionChunk | None:
-        """Begin an inference if it is time and there is something to see.
-
-        Args:
-            now_ns: virtual time.
-            wall_ns: this worker's wall clock, in which a chunk is dated.
-        """
-        if self.task is None or now_ns < self._due_ns or wall_ns < self._not_before_ns:
-            return None
-        observation = assemble(
-            self.spec,
-            self.task,
-            self._images,
-            self._states,
-            not_before_ns=self._not_before_ns,
-            now_ns=wall_ns,
-        )
-        if isinstance(observation, NotYet):
-            return None
-        result = self.policy.infer(observation)
-        answer = result if isinstance(result, ActionSteps) else ActionSteps(result)
-        steps = check_steps(self.spec.action, answer.steps)
-        share = 1.0 + self._delays.jitter * self._jitter.uniform(-1.0, 1.0)
-        duration_ns = round(self._delays.inference_s * share * 1e9)
-        # One inference at a time, and a period that was missed is not made up for.
-        period_ns = round(1e9 / observation.rate_hz)
-        self._due_ns = max(self._due_ns + period_ns, now_ns + duration_ns)
-        self._not_before_ns = wall_ns + duration_ns
-        return ActionChunk(
-            worker=self.name,
-            spec_hash=self.spec.hash,
-            episode=observation.task.episode,
-            observation_stamp_ns=observation.stamp_wall_ns,
-            observation_seq=observation.seq,
-            valid_until_ns=observation.stamp_wall_ns
-            + int(len(steps) * self.spec.action.dt_s * 1e9)
-            + self._patience_ns,
-            steps=steps,
-            observed_ns=wall_ns,
-            inference_start_ns=wall_ns,
-            inference_end_ns=wall_ns + duration_ns,
-            done=answer.done,
-        )
 
 
 def _gray(camera: str) -> Image:
