@@ -225,6 +225,7 @@ def test_every_role_does_its_part_and_nothing_else_with_real_sessions(lab: Profi
         assert one.must_not > 0
 
 
+@pytest.mark.slow
 def test_a_missing_rule_and_one_too_much_are_named(lab: Profile) -> None:
     rules: dict[str, Any] = access_control([lab])
     told = "vla/panda:worker-scripted@here:egress:declare_subscriber"

@@ -150,7 +150,7 @@ def answer(clock: Clock, key: str, query: zenoh.Query) -> None:
     """Tell when the question was heard, and when it is answered."""
     heard_ns = clock.wall_ns()
     reply = {"heard_ns": heard_ns, "said_ns": clock.wall_ns()}
-    query.reply(key, message.pack(reply), **QOS[Kind.CONTROL])
+    query.reply(key, message.pack(reply))
 
 
 def decode_stamps(payload: bytes) -> tuple[int, int]:
