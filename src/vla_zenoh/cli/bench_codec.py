@@ -44,9 +44,9 @@ def codec(
     if json_file is not None:
         json_file.parent.mkdir(parents=True, exist_ok=True)
         json_file.write_text(json.dumps(rows, indent=2) + "\n", "utf-8")
-    table = Table(title="microseconds to encode / decode, median")
-    table.add_column("what", no_wrap=True)
-    table.add_column("bytes", justify="right")
+    table = Table(title="microseconds (or ms) to encode / decode, median")
+    table.add_column("what")
+    table.add_column("bytes", justify="right", no_wrap=True)
     columns = ("ours", *MODULES)
     for name in columns:
         table.add_column(name, justify="right", no_wrap=True)
@@ -59,7 +59,11 @@ def _pair(us: dict[str, float], who: str) -> str:
     before = "" if who == "ours" else f"{who} "
     if f"{before}encode" not in us:
         return ""
-    return f"{us[f'{before}encode']:.1f} / {us[f'{before}decode']:.1f}"
+    return f"{_shown(us[f'{before}encode'])} / {_shown(us[f'{before}decode'])}"
+
+
+def _shown(us: float) -> str:
+    return f"{us:.1f}" if us < 1000 else f"{us / 1000:.1f} ms"
 
 
 def _median_us(function: Callable[[], Any]) -> float:

@@ -1,0 +1,157 @@
+"""The node ``ros2`` between a robot that speaks a bridge's wire form and somebody who watches."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import zenoh
+from camera_rig import PATIENCE_S, free_endpoint, until
+from ros2_peer import KinematicPanda, Ros2Peer
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
+from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.clock import Clock
+from vla_zenoh.nodes.node import Stream
+from vla_zenoh.nodes.ros2.node import Ros2Node
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.types import Event, GripperState, Header, JointState, NodeStatus, PoseState
+
+CAMERA = "/camera/realsense2_camera/color/image_raw"
+WIDTH, HEIGHT = 64, 48
+PROFILE = """\
+extends: panda_ros2
+cameras:
+  front: {{source: "ros2:{camera}", width: {width}, height: {height}, rate_hz: 60}}
+  wrist: null
+timing: {{command_timeout_s: 0.3, state_timeout_s: 0.5}}
+session: {{listen: [{endpoint}], connect: [{endpoint}]}}
+ros2:
+  bridge: {bridge}
+  cameras: {{wrist: null}}
+{more}"""
+
+
+def write_profile(folder: Path, bridge: str = "ros2dds", more: str = "") -> Path:
+    """A profile of a ROS 2 Panda with one small camera, on an address of its own.
+
+    `more` is YAML that goes on in the section ros2.
+    """
+    path = folder / "ros2.yaml"
+    path.write_text(
+        PROFILE.format(
+            bridge=bridge,
+            endpoint=free_endpoint(),
+            camera=CAMERA,
+            width=WIDTH,
+            height=HEIGHT,
+            more=more,
+        )
+    )
+    return path
+
+
+@dataclass
+class Ros2Rig:
+    """What a test holds."""
+
+    profile: Profile
+    node: Ros2Node
+    session: zenoh.Session
+    peer: Ros2Peer
+    robot: KinematicPanda
+    states: dict[type, list[tuple[Header, Any]]] = field(default_factory=dict)
+    statuses: list[NodeStatus] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+
+    def newest(self, kind: type) -> Any:
+        return until(f"a {kind.__name__}", lambda: self.states[kind][-1:])[0][1]
+
+    def wait(self, what: str, ask: Callable[[], Any], timeout_s: float = PATIENCE_S) -> Any:
+        try:
+            return until(what, ask, timeout_s)
+        except AssertionError as error:
+            story = [f"{event.what}: {event.why}" for event in self.events[-12:]]
+            status = self.statuses[-1] if self.statuses else None
+            raise AssertionError(f"{error}\nevents: {story}\nstatus: {status}") from None
+
+    def counted(self, name: str) -> int:
+        return self.statuses[-1].counters.get(name, 0) if self.statuses else 0
+
+    def detail(self, name: str) -> Any:
+        return self.statuses[-1].detail.get(name) if self.statuses else None
+
+    def happened(self, what: str) -> list[Event]:
+        return [event for event in self.events if event.what == what]
+
+    def stream(self, key: str, source: str = "command#1") -> Stream:
+        """A writer of commands; waits until the node hears it."""
+        stream = Stream(self.session, key, Kind.CONTROL, source, Clock())
+        until(f"the node listens to {key}", lambda: stream.wanted)
+        return stream
+
+
+@contextmanager
+def ros2_rig(folder: Path, bridge: str = "ros2dds", more: str = "") -> Iterator[Ros2Rig]:
+    """The node, in a thread, and a kinematic Panda on the other side."""
+    profile = load_profile(str(write_profile(folder, bridge, more)))
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as theirs,
+        open_session(profile.session) as ours,
+        open_session(profile.session) as watcher,
+    ):
+        peer = Ros2Peer(theirs, bridge)
+        node = Ros2Node(profile, ours)
+        robot = KinematicPanda(peer)
+        rig = Ros2Rig(profile, node, watcher, peer, robot)
+        keys = profile.keys
+        subscribers = [
+            _keep(watcher, key, kind, rig.states.setdefault(kind, []))
+            for key, kind in (
+                (keys.state_joint, JointState),
+                (keys.state_pose, PoseState),
+                (keys.state_gripper, GripperState),
+            )
+        ]
+        subscribers.append(_listen(watcher, keys.status("ros2"), NodeStatus, rig.statuses.append))
+        subscribers.append(_listen(watcher, keys.event("ros2"), Event, rig.events.append))
+        stop = threading.Event()
+        thread = threading.Thread(target=node.run, args=(stop,))
+        thread.start()
+        try:
+            yield rig
+        finally:
+            stop.set()
+            thread.join(5.0)
+            robot.close()
+            peer.close()
+            for subscriber in subscribers:
+                subscriber.undeclare()
+            assert not thread.is_alive(), "the node does not end"
+
+
+def _keep(
+    session: zenoh.Session, key: str, kind: type, heard: list[tuple[Header, Any]]
+) -> zenoh.Subscriber[Any]:
+    def keep(sample: zenoh.Sample) -> None:
+        assert sample.attachment is not None
+        header = header_codec.decode(sample.attachment.to_bytes())
+        heard.append((header, records.decode(kind, sample.payload.to_bytes())))
+
+    return session.declare_subscriber(key, zenoh.handlers.Callback(keep, indirect=False))
+
+
+def _listen(
+    session: zenoh.Session, key: str, kind: type, take: Callable[[Any], None]
+) -> zenoh.Subscriber[Any]:
+    def keep(sample: zenoh.Sample) -> None:
+        take(records.decode(kind, sample.payload.to_bytes()))
+
+    return session.declare_subscriber(key, zenoh.handlers.Callback(keep, indirect=False))

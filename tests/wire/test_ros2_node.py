@@ -1,0 +1,432 @@
+"""The node ``ros2`` on a real bus; its robot has the wire form of a bridge, or of rmw_zenoh."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from panda_arm import ARM_JOINTS, HOME_RAD, panda
+from ros2_rig import CAMERA, HEIGHT, WIDTH, Ros2Rig, ros2_rig
+
+from vla_zenoh.codec.image import decode_raw
+from vla_zenoh.control.so3 import quat_from_rotation
+from vla_zenoh.nodes.node import Stream
+from vla_zenoh.types import GripperCommand, GripperState, JointState, PoseCommand, PoseState
+
+POSITION_TOLERANCE_M = 1e-6
+PERIOD_S = 0.004
+SPEED_M_S = 0.05
+SILENCE_S = 0.3
+"""timing.command_timeout_s of the rig's profile."""
+MOVE = "/panda_gripper/move/_action"
+GOAL = "multi_mode_control_msgs/msg/CartesianImpedanceGoal"
+BRIDGES = ("ros2dds", "rmw_zenoh")
+
+
+@pytest.fixture(scope="module", params=BRIDGES)
+def shared_rig(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Ros2Rig]:
+    with ros2_rig(tmp_path_factory.mktemp("ros2"), request.param) as rig:
+        rig.newest(JointState)
+        yield rig
+
+
+@pytest.fixture
+def rig(shared_rig: Ros2Rig) -> Iterator[Ros2Rig]:
+    """The module's robot, well and at home."""
+    robot = shared_rig.robot
+    yield shared_rig
+    robot.silent = robot.frozen = False
+    robot.alter = lambda fields: None
+    robot.clock_ns = 0
+
+
+# -- state ----------------------------------------------------------------------------------------
+def test_joint_states_become_our_states_with_the_robots_own_stamps(rig: Ros2Rig) -> None:
+    joints: JointState = rig.newest(JointState)
+    assert joints.names == ARM_JOINTS
+    pose: PoseState = rig.newest(PoseState)
+    rig.wait("a gripper state", lambda: rig.states[GripperState])
+    assert rig.newest(GripperState).width_m == pytest.approx(rig.robot.width_m)
+    expected = panda().forward(rig.robot.joints_rad).position_m
+    assert np.abs(pose.position_m - expected).max() < POSITION_TOLERANCE_M
+    stamps: list[int] = []
+    rig.robot.alter = lambda fields: stamps.append(
+        fields["header"].stamp.sec * 10**9 + fields["header"].stamp.nanosec
+    )
+    since = len(rig.states[JointState])
+    rig.wait("ten states", lambda: len(rig.states[JointState]) > since + 10)
+    heard = {kind: [h for h, _ in rig.states[kind]] for kind in (JointState, PoseState)}
+    assert {h.stamp_wall_ns for h in heard[JointState][since + 2 :]} <= set(stamps)
+    poses = {(h.stamp_wall_ns, h.seq) for h in heard[PoseState]}
+    assert {(h.stamp_wall_ns, h.seq) for h in heard[JointState][:-1]} <= poses
+
+
+@pytest.mark.parametrize(
+    ("field", "index", "value", "reason"),
+    [
+        ("position", 2, np.nan, "invalid"),
+        ("velocity", 0, np.inf, "invalid"),
+    ],
+)
+def test_what_is_not_finite_is_refused_and_no_state_comes_of_it(
+    rig: Ros2Rig, field: str, index: int, value: float, reason: str
+) -> None:
+    before = rig.counted(f"refused.{reason}")
+
+    def spoil(fields: dict[str, Any]) -> None:
+        fields[field][index] = value
+
+    rig.robot.alter = spoil
+    rig.wait("it is refused", lambda: rig.counted(f"refused.{reason}") > before)
+    since = len(rig.states[PoseState])
+    rig.wait("the node says so", lambda: rig.statuses[-1].state == "silent")
+    assert len(rig.states[PoseState]) == since
+
+
+def test_a_robot_that_repeats_itself_is_frozen(rig: Ros2Rig) -> None:
+    before = rig.counted("refused.frozen")
+    rig.robot.frozen = True
+    rig.wait("it is refused", lambda: rig.counted("refused.frozen") > before)
+    rig.wait("the node says so", lambda: rig.statuses[-1].state == "silent")
+
+
+def test_a_robot_that_falls_silent_and_comes_back_is_told(rig: Ros2Rig) -> None:
+    rig.wait("it runs", lambda: rig.statuses[-1].state == "running")
+    rig.events.clear()
+    rig.robot.silent = True
+    rig.wait("silence", lambda: rig.happened("running->silent"))
+    rig.robot.silent = False
+    rig.wait("voice", lambda: rig.happened("silent->running"))
+
+
+def test_bytes_that_are_no_message_are_counted(rig: Ros2Rig) -> None:
+    before = rig.counted("refused.malformed")
+    for payload in (b"", b"\x00\x01\x00\x00\xff\xff\xff\xff", bytes(100)):
+        rig.peer.put_bytes("/joint_states", "sensor_msgs/msg/JointState", payload)
+    rig.wait("they are refused", lambda: rig.counted("refused.malformed") >= before + 3)
+    assert rig.statuses[-1].state == "running"
+
+
+# -- pictures -------------------------------------------------------------------------------------
+def image(rig: Ros2Rig, stamp_ns: int, encoding: str = "bgr8", value: int = 7) -> Any:
+    pixels = np.full((HEIGHT, WIDTH, 3), (value, 0, 0), np.uint8)
+    return rig.peer.message(
+        "sensor_msgs/msg/Image",
+        header=rig.peer.header(stamp_ns),
+        height=HEIGHT,
+        width=WIDTH,
+        encoding=encoding,
+        step=3 * WIDTH,
+        data=pixels.ravel(),
+    )
+
+
+def test_pictures_come_with_their_stamp_and_depth_is_refused(rig: Ros2Rig) -> None:
+    heard: list[tuple[int, np.ndarray[Any, Any]]] = []
+
+    def keep(sample: zenoh.Sample) -> None:
+        from vla_zenoh.codec import header as header_codec
+
+        assert sample.attachment is not None
+        header = header_codec.decode(sample.attachment.to_bytes())
+        schema = str(sample.encoding).partition(";")[2]
+        heard.append((header.stamp_wall_ns, decode_raw(sample.payload.to_bytes(), schema).rgb))
+
+    key = rig.profile.keys.camera_raw("front")
+    subscriber = rig.session.declare_subscriber(key, zenoh.handlers.Callback(keep, indirect=False))
+    sent: set[int] = set()
+
+    def send() -> bool:
+        stamp_ns = time.time_ns()
+        sent.add(stamp_ns)
+        rig.peer.put(CAMERA, image(rig, stamp_ns))
+        time.sleep(0.02)
+        return len(heard) > 3
+
+    rig.wait("pictures", send)
+    stamp_ns, rgb = heard[-1]
+    assert stamp_ns in sent
+    assert (rgb == (0, 0, 7)).all(), "blue came first"
+    before = rig.counted("refused.encoding")
+
+    def send_depth() -> bool:
+        rig.peer.put(CAMERA, image(rig, time.time_ns(), "16UC1"))
+        time.sleep(0.02)
+        return rig.counted("refused.encoding") > before
+
+    rig.wait("depth is refused", send_depth)
+    rig.wait("the camera is lost", lambda: rig.detail("cameras")["front"]["state"] == "lost")
+    assert "distances" in rig.detail("cameras")["front"]["why"]
+    subscriber.undeclare()
+
+
+# -- commands -------------------------------------------------------------------------------------
+class Commander:
+    """A command stream upwards at `SPEED_M_S`, from where the robot is."""
+
+    def __init__(self, rig: Ros2Rig) -> None:
+        self._stream: Stream = rig.stream(rig.profile.keys.command_pose, f"command#{id(self)}")
+        held: PoseState = rig.newest(PoseState)
+        self._quat_xyzw = held.quat_xyzw
+        at_m = held.reference_position_m
+        self._at_m = np.array(held.position_m if at_m is None else at_m)
+        self.moving = True
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.wait(PERIOD_S):
+            speed_m_s = SPEED_M_S if self.moving else 0.0
+            self._at_m[2] += speed_m_s * PERIOD_S
+            self.put(self._at_m, speed_m_s)
+
+    def put(self, at_m: Any, speed_m_s: float = 0.0) -> None:
+        twist = np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
+        quat = self._quat_xyzw
+        self._stream.put(PoseCommand(at_m, quat, twist, np.zeros(6), at_m, quat, "active"))
+
+    def end(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+def test_a_stream_that_falls_silent_is_braked_and_then_nothing_more_is_sent(rig: Ros2Rig) -> None:
+    goals = rig.robot.goals
+    rig.events.clear()
+    commander = Commander(rig)
+    since = len(goals)
+    rig.wait("goals arrive", lambda: len(goals) > since + 50)
+    goal = goals[-1]
+    assert goal.q_n.tolist() == pytest.approx(HOME_RAD.tolist())
+    commander.end()
+    rig.wait("it brakes", lambda: rig.happened("running->braking"))
+    rig.wait("it stands", lambda: rig.happened("braking->running"))
+    time.sleep(0.1)
+    count = len(goals)
+    time.sleep(2 * SILENCE_S)
+    assert len(goals) == count, "the controller holds what it was sent last"
+    heights_m = np.array([goal.pose.position.z for goal in goals[since:]])
+    steps_m = np.diff(heights_m)
+    assert steps_m.min() > -1e-6, "it never goes back"
+    assert np.abs(np.diff(steps_m)).max() < 0.005, "and never jumps"
+    held: PoseState = rig.newest(PoseState)
+    assert held.reference_position_m is not None
+    assert held.reference_position_m[2] == pytest.approx(heights_m[-1])
+    assert rig.detail("held")
+
+
+def test_a_stream_that_begins_elsewhere_is_refused(rig: Ros2Rig) -> None:
+    sent, before = len(rig.robot.goals), rig.counted("refused.pose_jump")
+    commander = Commander(rig)
+    commander.end()
+    rig.wait("silence", lambda: not rig.detail("following"))
+    sent = len(rig.robot.goals)
+    pose = panda().forward(rig.robot.joints_rad)
+    stream = rig.stream(rig.profile.keys.command_pose, "stranger#1")
+    away = pose.position_m + (0, 0, 0.05)
+    quat = quat_from_rotation(pose.rotation)
+    order = PoseCommand(away, quat, np.zeros(6), np.zeros(6), away, quat, "active")
+
+    def shout() -> bool:
+        stream.put(order)
+        time.sleep(0.05)
+        return rig.counted("refused.pose_jump") > before
+
+    rig.wait("it is refused", shout)
+    assert len(rig.robot.goals) == sent
+
+
+# -- gripper --------------------------------------------------------------------------------------
+def test_the_newest_gripper_goal_wins_and_never_two_run_at_once(rig: Ros2Rig) -> None:
+    peer, running, most = rig.peer, set[bytes](), [0]
+    widths: list[float] = []
+    cancelled: dict[bytes, threading.Event] = {}
+
+    def accept(asked: Any) -> Any:
+        identity = bytes(asked.goal_id.uuid)
+        cancelled[identity] = threading.Event()
+        running.add(identity)
+        most[0] = max(most[0], len(running))
+        widths.append(asked.goal.width)
+        return peer.message("franka_msgs/action/Move_SendGoal_Response", accepted=True)
+
+    def finish(asked: Any) -> Any:
+        identity = bytes(asked.goal_id.uuid)
+        interrupted = cancelled[identity].wait(0.6)
+        running.discard(identity)
+        return peer.message(
+            "franka_msgs/action/Move_GetResult_Response",
+            status=5 if interrupted else 4,
+            result=peer.message("franka_msgs/action/Move_Result", success=not interrupted),
+        )
+
+    def cancel(asked: Any) -> Any:
+        cancelled[bytes(asked.goal_info.goal_id.uuid)].set()
+        return peer.message("action_msgs/srv/CancelGoal_Response")
+
+    peer.serve(f"{MOVE}/send_goal", "franka_msgs/action/Move_SendGoal", accept)
+    peer.serve(f"{MOVE}/get_result", "franka_msgs/action/Move_GetResult", finish)
+    peer.serve(f"{MOVE}/cancel_goal", "action_msgs/srv/CancelGoal", cancel)
+    stream = rig.stream(rig.profile.keys.command_gripper)
+    time.sleep(0.3)  # the services are declared on their way
+    stream.put(GripperCommand(0.01, 0.1, 20.0))
+    rig.wait("the first goal", lambda: widths)
+    rig.wait("the gripper moves", lambda: rig.newest(GripperState).moving)
+    for width_m in (0.02, 0.03, 0.04):
+        stream.put(GripperCommand(width_m, 0.1, 20.0))
+    rig.wait("the newest goal", lambda: widths[-1] == 0.04)
+    rig.wait("it is done", lambda: not running and not rig.newest(GripperState).moving)
+    assert most[0] == 1
+    assert widths[0] == 0.01
+    assert len(widths) <= 3, "wishes that were overtaken are not sent"
+    assert rig.counted("ros2.gripper_cancelled") >= 1
+
+
+# -- the ROS graph --------------------------------------------------------------------------------
+def test_our_ends_are_seen_in_the_ros_graph(rig: Ros2Rig) -> None:
+    ros2 = rig.profile.ros2
+    assert ros2 is not None
+    rmw = ros2.bridge == "rmw_zenoh"
+    selector = "@ros2_lv/0/**" if rmw else "@/*/@ros2_lv/**"
+    tokens = [
+        str(reply.ok.key_expr)
+        for reply in rig.session.liveliness().get(selector, timeout=2.0)
+        if reply.ok is not None
+    ]
+    roles = ("MP", "MS", "SS", "SC", "AC", "NN")
+    seen = {role: [t for t in tokens if f"/{role}/" in t] for role in roles}
+    assert any("desired_pose" in token for token in seen["MP"])
+    assert any("joint_states" in token for token in seen["MS"])
+    assert any("image_raw" in token for token in seen["MS"])
+    for service in ("set_active", "stop", "reset", "set_prompt", "set_request"):
+        assert any(service in token for token in seen["SS"]), service
+    if rmw:
+        assert any("vla_panda" in token for token in seen["NN"])
+        assert len([t for t in seen["SC"] if "_action" in t]) == 3
+    else:
+        assert any("panda_gripper§move" in token for token in seen["AC"])
+    assert len(set(tokens)) == len(tokens)
+
+
+def test_the_status_of_all_nodes_is_a_diagnostic_array(rig: Ros2Rig) -> None:
+    heard: list[Any] = []
+    rig.peer.on("/vla/status", "diagnostic_msgs/msg/DiagnosticArray", heard.append)
+    rig.wait("an array", lambda: heard and heard[-1].status)
+    assert "vla-zenoh/panda: ros2" in [entry.name for entry in heard[-1].status]
+
+
+def test_a_service_without_a_command_node_says_what_is_missing(rig: Ros2Rig) -> None:
+    answer = rig.peer.call("/vla/set_prompt", "vla_msgs/srv/SetPrompt", prompt="go up")
+    assert answer is not None
+    assert not answer.success
+    assert "no command node" in answer.message
+    refused = rig.peer.call("/vla/set_prompt", "vla_msgs/srv/SetPrompt", prompt="a\x07b")
+    assert not refused.success
+    assert "control characters" in refused.message
+
+
+def test_a_prompt_on_a_topic_becomes_our_prompt(rig: Ros2Rig) -> None:
+    heard: list[str] = []
+    subscriber = rig.session.declare_subscriber(
+        rig.profile.keys.prompt,
+        zenoh.handlers.Callback(lambda s: heard.append(s.payload.to_string()), indirect=False),
+    )
+
+    def say() -> bool:
+        rig.peer.put("/vla/prompt", rig.peer.message("std_msgs/msg/String", data="go up"))
+        time.sleep(0.05)
+        return bool(heard)
+
+    rig.wait("the prompt", say)
+    assert heard[0] == "go up"
+    subscriber.undeclare()
+
+
+# -- other robots ---------------------------------------------------------------------------------
+def test_a_robots_clock_that_differs_is_measured_and_told(tmp_path: Path) -> None:
+    with ros2_rig(tmp_path) as rig:
+        rig.robot.clock_ns = -2_500_000_000
+        rig.wait("it is told", lambda: rig.happened("robot_clock"))
+        rig.wait("a figure", lambda: (rig.detail("robot_clock_behind_s") or 0) > 2.4)
+        assert rig.detail("robot_clock_behind_s") == pytest.approx(2.5, abs=0.2)
+        header, _ = rig.states[JointState][-1]
+        assert time.time_ns() - header.stamp_wall_ns > 2.4e9, "stamps are kept"
+
+
+TF = """\
+  tcp: tf
+  wrench: {topic: /wrench}
+  gripper: {topic: /width, type: std_msgs/msg/Float64, per_finger: true}
+  pose_command: {topic: /target, type: geometry_msgs/msg/PoseStamped, frame: base}
+"""
+
+
+def test_the_tcp_may_come_from_tf_and_the_gripper_take_widths(tmp_path: Path) -> None:
+    with ros2_rig(tmp_path, more=TF) as rig:
+        peer = rig.peer
+        rig.wait("it is told", lambda: rig.counted("refused.no_transform"))
+        assert not rig.states[PoseState]
+        shift = peer.message("geometry_msgs/msg/Vector3", x=0.5, z=0.25)
+        turn = peer.message("geometry_msgs/msg/Quaternion", w=1.0)
+        way = peer.message("geometry_msgs/msg/Transform", translation=shift, rotation=turn)
+        force = peer.message("geometry_msgs/msg/Vector3", z=-9.0)
+        wrench = peer.message("geometry_msgs/msg/Wrench", force=force)
+
+        def send() -> bool:
+            now_ns = time.time_ns()
+            entry = peer.message(
+                "geometry_msgs/msg/TransformStamped",
+                header=peer.header(now_ns, "panda_link0"),
+                child_frame_id="panda_hand_tcp",
+                transform=way,
+            )
+            peer.put("/tf", peer.message("tf2_msgs/msg/TFMessage", transforms=[entry]))
+            for frame in ("panda_link0", "somewhere"):
+                stamped = peer.message(
+                    "geometry_msgs/msg/WrenchStamped",
+                    header=peer.header(now_ns, frame),
+                    wrench=wrench,
+                )
+                peer.put("/wrench", stamped)
+            time.sleep(0.01)
+            return bool(rig.states[PoseState]) and rig.newest(PoseState).wrench is not None
+
+        rig.wait("a pose with a wrench", send)
+        pose: PoseState = rig.newest(PoseState)
+        assert pose.position_m.tolist() == [0.5, 0.0, 0.25]
+        assert pose.wrench is not None
+        assert pose.wrench.tolist() == [0, 0, -9, 0, 0, 0]
+        rig.wait("the other frame is refused", lambda: rig.counted("refused.frame"))
+        widths: list[float] = []
+        peer.on("/width", "std_msgs/msg/Float64", lambda message: widths.append(message.data))
+        stream = rig.stream(rig.profile.keys.command_gripper)
+
+        def ask() -> bool:
+            stream.put(GripperCommand(0.06, 0.1, 10.0))
+            time.sleep(0.05)
+            return bool(widths)
+
+        rig.wait("a width", ask)
+        assert widths[0] == 0.03
+        targets: list[Any] = []
+        peer.on("/target", "geometry_msgs/msg/PoseStamped", targets.append)
+        poses = rig.stream(rig.profile.keys.command_pose)
+
+        def order() -> bool:
+            send()
+            at, quat = pose.position_m, pose.quat_xyzw
+            poses.put(PoseCommand(at, quat, np.zeros(6), np.zeros(6), at, quat, "active"))
+            return bool(targets)
+
+        rig.wait("a target", order)
+        assert targets[0].header.frame_id == "base"
+        assert targets[0].pose.position.x == 0.5
