@@ -41,6 +41,7 @@ STILL_M_S = 0.005
 """A measured arm that is slower than this stands: the impedance controller still settles."""
 WIDTH, HEIGHT, CAMERA_HZ = 160, 120, 20
 LOW_M, HIGH_M = 0.30, 0.55
+UNKNOWN = np.full(3, np.nan)
 
 FloatArray = NDArray[np.float64]
 
@@ -202,7 +203,12 @@ class Recorder:
             np.array([header.stamp_wall_ns for header, _ in found], np.int64),
             np.array([state.position_m for _, state in found]).reshape(-1, 3),
             np.array([state.twist for _, state in found]).reshape(-1, 6),
-            np.array([state.reference_position_m for _, state in found]).reshape(-1, 3),
+            np.array(
+                [
+                    UNKNOWN if state.reference_position_m is None else state.reference_position_m
+                    for _, state in found
+                ]
+            ).reshape(-1, 3),
             np.array([header.source for header, _ in found]),
         )
 

@@ -30,6 +30,10 @@ class Hold:
         """A command was sent."""
         self._sent_ns, self._settled = now_ns, None
 
+    def lose(self) -> None:
+        """Nobody knows what became of the last commands: the robot is not heard."""
+        self._sent_ns = self._settled = None
+
     def look(self, measured: Pose, now_ns: int) -> bool:
         """Whether `held` still; call it while nothing is sent."""
         if self._sent_ns is None or now_ns - self._sent_ns < SETTLE_NS:
@@ -38,5 +42,5 @@ class Hold:
             self._settled = measured
         apart_m, apart_rad = distance(self._settled, measured)
         if apart_m > MOVED_M or apart_rad > MOVED_RAD:
-            self._sent_ns = self._settled = None
+            self.lose()
         return self.held

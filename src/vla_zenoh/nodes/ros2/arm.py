@@ -302,6 +302,8 @@ class Arm:
             self._send(reference, now_ns)
         elif self._tcp is not None:
             self._hold.look(self._tcp, now_ns)
+        if self.state == "silent":  # a bridge that is gone drops what is sent, and says nothing
+            self._hold.lose()
 
     def _send(self, reference: Reference | JointReference, now_ns: int) -> None:
         command: Any
