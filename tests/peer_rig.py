@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pytest
 from camera_rig import free_endpoint, until
 
 PEERS = Path(__file__).parent / "peers"
 START_S = 20.0
+ENVIRONMENT_S = 300
+# openpi-client does not name typing-extensions, which it imports.
+OPENPI_CLIENT = ("openpi-client==0.1.2", "typing-extensions")
+JSON_NUMPY = ("json-numpy==2.1.1",)
 _PLAIN = {"rotation": "rpy", "clip": "", "position_scale_m": "1", "rotation_scale_rad": "1"}
 _SMALL = {"size": "64x64", "dt_s": "0.1", "horizon": "4", "timeout_s": "1"}
 _NO_WRIST = {
@@ -136,6 +145,31 @@ class Server:
             if process.poll() is None:
                 process.kill()
             process.wait(5)
+
+
+@cache
+def python_with(*packages: str) -> str:
+    """An interpreter of an environment with these packages and nothing of ours.
+
+    Skips the test where it cannot be had.
+    """
+    beside = Path(sys.executable).parent / "uv"
+    uv = str(beside) if beside.is_file() else shutil.which("uv")
+    if uv is None:
+        pytest.skip("there is no uv")
+    folder = tempfile.mkdtemp(prefix="vla-zenoh-peer-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    python = str(Path(folder) / "bin" / "python")
+    for command in (
+        [uv, "venv", "--quiet", "--clear", "--python", "3.11", folder],
+        [uv, "pip", "install", "--quiet", "--python", python, *packages],
+    ):
+        made = subprocess.run(
+            command, capture_output=True, text=True, check=False, timeout=ENVIRONMENT_S
+        )
+        if made.returncode != 0:
+            pytest.skip(f"no environment with {', '.join(packages)}: {made.stderr[-300:]}")
+    return python
 
 
 def free_port() -> int:

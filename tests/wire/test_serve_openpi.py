@@ -1,0 +1,226 @@
+"""Our models for openpi's clients: the command as a process, asked over real WebSockets."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from camera_rig import until
+from peer_rig import OPENPI_CLIENT, free_port, python_with
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from vla_zenoh.errors import PeerError, SpecError
+from vla_zenoh.interop import openpi
+from vla_zenoh.interop.offer import make_offer
+from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.policy import ModelSpec, example_observation
+from vla_zenoh.profile import load_profile
+
+START_S, WAIT_S = 30.0, 10.0
+STEP_M, ATOL_M = 0.01, 1e-6
+KEY = "a key"
+WITH_OPENPI = """\
+import json, sys
+import numpy as np
+from openpi_client.websocket_client_policy import WebsocketClientPolicy
+from openpi_client.action_chunk_broker import ActionChunkBroker
+client = WebsocketClientPolicy("127.0.0.1", int(sys.argv[1]))
+asked = {
+    "observation/front": np.zeros((480, 640, 3), np.uint8),
+    "observation/pose": np.array([0.4, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]),
+    "observation/gripper": np.array([0.05]),
+    "prompt": "HARD: go up",
+}
+broker = ActionChunkBroker(client, 1)
+steps = [broker.infer(asked)["actions"].tolist() for _ in range(2)]
+try:
+    client.infer({"prompt": "HARD: go up"})
+    said = ""
+except RuntimeError as error:
+    said = str(error)
+print(json.dumps([client.get_server_metadata()["action_dim"], steps, said]))
+"""
+
+
+@contextmanager
+def serving(*more: str) -> Iterator[int]:
+    """The command, until the block ends; gives its port."""
+    port = free_port()
+    command = [sys.executable, "-m", "vla_zenoh", "serve", "openpi", "--port", str(port), *more]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert "for openpi's clients" in process.stdout.readline()
+            yield port
+            process.send_signal(signal.SIGINT)
+            assert process.wait(WAIT_S) == 0
+        finally:
+            if process.poll() is None:
+                process.kill()
+
+
+@contextmanager
+def connected(port: int, key: str = "") -> Iterator[tuple[ClientConnection, dict[str, Any]]]:
+    headers = {"Authorization": f"Api-Key {key}"} if key else None
+    url = f"ws://127.0.0.1:{port}"
+    with connect(url, compression=None, proxy=None, additional_headers=headers) as connection:
+        yield connection, openpi.read_metadata(connection.recv(WAIT_S))
+
+
+def question(prompt: str = "HARD: go up", **changes: Any) -> bytes:
+    fields = {
+        "observation/front": np.zeros((48, 64, 3), np.uint8),
+        "observation/pose": np.array([0.4, 0, 0.3, 1, 0, 0, 0]),
+        "observation/gripper": np.array([0.05], np.float32),
+        "prompt": prompt,
+        **changes,
+    }
+    return openpi.request({name: value for name, value in fields.items() if value is not None})
+
+
+def health(port: int) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=WAIT_S)
+    connection.request("GET", "/healthz")
+    response = connection.getresponse()
+    try:
+        return response.status, response.read()
+    finally:
+        connection.close()
+
+
+def test_a_client_learns_what_is_served_gets_actions_and_is_told_what_is_wrong() -> None:
+    with serving("--worker", "scripted", "--api-key", KEY) as port:
+        assert health(port) == (200, b"OK\n")
+        with connected(port, KEY) as (connection, said):
+            assert said["action_dim"] == 7
+            assert said["vla_zenoh_action"]["gripper"] == "delta_m"
+            assert set(said["observation"]) == set(msgpack.unpackb(question()))
+            for _ in range(2):
+                connection.send(question())
+                answer = openpi.read_answer(connection.recv(WAIT_S))
+                np.testing.assert_allclose(
+                    answer["actions"], [[0, 0, STEP_M, 0, 0, 0, 0]], atol=ATOL_M
+                )
+            assert {"infer_ms", "prev_total_ms"} <= set(answer["server_timing"])
+            # One at a time, and only with the key; health is for everybody.
+            with pytest.raises(InvalidStatus, match="503"), connected(port, KEY):
+                pass
+            with pytest.raises(InvalidStatus, match="401"), connected(port, "another"):
+                pass
+            assert health(port)[0] == 200
+            connection.send(question(prompt="dance"))
+            told = connection.recv(WAIT_S)
+            assert isinstance(told, str)
+            assert "does not know the prompt 'dance'" in told
+            with pytest.raises(ConnectionClosed):
+                connection.recv(WAIT_S)
+
+        # The place is free again at once, and every other slip is named too.
+        for wrong, named in (
+            (question(**{"observation/pose": None}), "lacks observation/pose"),
+            (question(**{"observation/pose": np.zeros(3)}), "wanted (7,)"),
+            (question(**{"observation/pose": np.zeros(7)}), "quaternion"),
+            (question(**{"observation/front": np.zeros((4, 4), np.uint8)}), "front"),
+            (question(**{"observation/gripper": "wide"}), "gripper"),
+            (b"\xc1", "cannot be read"),
+        ):
+            until("the place is free", partial(_asks, port, wrong, named), START_S)
+
+
+def _asks(port: int, frame: bytes, named: str) -> bool:
+    try:
+        with connected(port, KEY) as (connection, _):
+            connection.send(frame)
+            told = connection.recv(WAIT_S)
+    except InvalidStatus:
+        return False
+    assert isinstance(told, str)
+    assert named in told, told
+    return True
+
+
+def test_our_own_adapter_drives_our_own_server() -> None:
+    with serving("--worker", "scripted") as port:
+        settings = {"url": f"ws://127.0.0.1:{port}", "preset": "own", "gripper": "delta_m"}
+        policy = make_policy(find_model("openpi"), settings)
+        try:
+            seen = example_observation(policy.spec, prompt="HARD: go up")
+            steps = np.asarray(policy.infer(seen).steps)
+            np.testing.assert_allclose(steps, [[0, 0, STEP_M, 0, 0, 0, 0]], atol=ATOL_M)
+        finally:
+            policy.close()  # pyright: ignore[reportAttributeAccessIssue]
+        other = make_policy(find_model("openpi"), {**settings, "gripper": "absolute_m"})
+        with pytest.raises(PeerError, match="its gripper is 'delta_m', 'absolute_m' is set"):
+            other.infer(seen)
+
+
+@pytest.mark.slow
+def test_openpis_own_client_is_served(tmp_path: Path) -> None:
+    python = python_with(*OPENPI_CLIENT)
+    with serving("--worker", "scripted") as port:
+        done = subprocess.run(
+            [python, "-c", WITH_OPENPI, str(port)],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            check=False,
+            timeout=60,
+        )
+    assert done.returncode == 0, done.stderr
+    dim, steps, said = json.loads(done.stdout)
+    assert dim == 7
+    np.testing.assert_allclose(steps, [[0, 0, STEP_M, 0, 0, 0, 0]] * 2, atol=ATOL_M)
+    assert "Error in inference server" in said
+    assert "the observation lacks observation/front" in said
+
+
+# -- names ----------------------------------------------------------------------------------------
+def spec() -> ModelSpec:
+    return make_policy(find_model("scripted")).spec
+
+
+def offer(names: str = "") -> Any:
+    robot = load_profile("panda_sim").robot
+    return make_offer(spec(), names, robot.arm_joints, robot.gripper.max_width_m)
+
+
+def test_the_names_of_an_offer_can_be_those_of_liberos_clients() -> None:
+    names = "observation/image=camera:front, observation/state=position+rotvec+fingers_m"
+    given = {
+        "observation/image": np.zeros((256, 256, 3), np.uint8),
+        "observation/state": np.array([0.4, 0, 0.3, np.pi, 0, 0, 0.03, -0.03]),
+        "prompt": "go",
+        "more": 1,
+    }
+    seen = offer(names).observe(given, 5, 1)
+    assert seen.pose.position_m.tolist() == [0.4, 0.0, 0.3]
+    assert abs(seen.pose.quat_xyzw[0]) == pytest.approx(1.0)
+    assert seen.gripper.width_m == pytest.approx(0.06)
+    assert seen.images["front"].shape == (256, 256, 3)
+    assert (seen.prompt, seen.task.active, seen.stamp_wall_ns) == ("go", True, 5)
+
+
+@pytest.mark.parametrize(
+    ("names", "why"),
+    [
+        ("a=camera:back", "the model has no camera back"),
+        ("a=x+y+z", "the whole pose"),
+        ("a=position", "the whole pose"),
+        ("a=blank:4x4", "blank is for what is sent"),
+    ],
+)
+def test_names_that_do_not_say_enough_are_refused(names: str, why: str) -> None:
+    with pytest.raises(SpecError, match=why):
+        offer(names)
