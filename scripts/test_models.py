@@ -25,6 +25,8 @@ from vla_zenoh.nodes.environment import environment_command
 ROOT = Path(__file__).resolve().parent.parent
 TESTS = ROOT / "tests" / "models"
 TOOLS = ["pytest>=8.2", "pytest-timeout>=2.3"]
+STUCK_S = 280
+"""To import torch and start a robot takes longer than the other tests may."""
 NOTHING_RAN = 5
 """pytest's exit status when no test was selected."""
 
@@ -61,7 +63,8 @@ def run_tests(
     """Verdict and reason of a run of pytest."""
     # Folders above have fixtures that need the simulator.
     inside = ["--confcutdir", str(TESTS)] if len(python) > 1 else []
-    command = [*python, "-m", "pytest", "-q", "-m", "models", *inside, *what, *options]
+    patience = ["-o", f"faulthandler_timeout={STUCK_S}"]
+    command = [*python, "-m", "pytest", "-q", "-m", "models", *patience, *inside, *what, *options]
     status = subprocess.run(command, cwd=ROOT, env=environ, check=False).returncode
     if status == NOTHING_RAN:
         return "skipped", "no test was selected"

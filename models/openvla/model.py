@@ -130,16 +130,6 @@ class OpenVLA:
         )
         self.network: Any = None
         self._tokenizer: Any = None
-        self._details: dict[str, Any] = {}
-
-    @property
-    def last_details(self) -> Mapping[str, Any]:
-        """Of the last `infer`: ``prompt``, ``ids``, ``tokens``, ``normalised``, ``picture``.
-
-        The text and its tokens as the model read them, the action's tokens, their numbers in
-        [-1, 1], and the (224, 224, 3) picture before it is normalised. Empty before the first one.
-        """
-        return self._details
 
     def load(self) -> None:
         """Read the weights and try them once.
@@ -220,17 +210,16 @@ class OpenVLA:
         picture = trained_form(observation.images[self._camera], crop=self._crop)
         ids = self.ids(observation.prompt)
         tokens = self.network.act(ids, self._pixels(picture), AXES)
-        self._details = {
-            "prompt": prompt_text(self._template, observation.prompt),
-            "ids": ids,
-            "tokens": tokens,
-            "picture": picture,
-        }
         normalised = self.bins.decode(tokens)
-        self._details["normalised"] = normalised.tolist()
         step = self._range.expand(normalised)
         step[-1] = np.clip(step[-1], 0.0, 1.0)
-        return ActionSteps(step[None])
+        raw = {
+            "prompt": prompt_text(self._template, observation.prompt),
+            "prompt_tokens": ids,
+            "action_tokens": tokens,
+            "normalised": normalised.tolist(),
+        }
+        return ActionSteps(step[None], raw=raw, pictures={self._camera: picture})
 
 
 def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -72,6 +72,13 @@ def looking(policy: Any, picture: Picture, prompt: str = "put the red brick in t
     return replace(seen, images={"front": picture})
 
 
+def answered(policy: Any, picture: Picture, prompt: str = "lift it") -> dict[str, Any]:
+    """What the model says of one inference, with the picture it was shown."""
+    answer = policy.infer(looking(policy, picture, prompt))
+    assert answer.raw is not None
+    return {**answer.raw, "picture": answer.pictures["front"]}
+
+
 def embedded(parts: Parts, picture: Picture, ids: Sequence[int]) -> Any:
     """What Llama reads, computed from whole forward passes and a hook before the last block."""
     bytes_ = torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255
@@ -121,17 +128,15 @@ def recomputed(parts: Parts, embeddings: Any) -> list[int]:
 def test_tokens_are_those_of_the_published_algorithm(
     policy: Any, reference: Parts, seed: int
 ) -> None:
-    policy.infer(looking(policy, mosaic(seed)))
-    details = policy.last_details
+    details = answered(policy, mosaic(seed))
     with torch.inference_mode():
-        embeddings = embedded(reference, details["picture"], details["ids"])
-    assert details["tokens"] == generated(reference, embeddings)
-    assert details["tokens"] == recomputed(reference, embeddings)
+        embeddings = embedded(reference, details["picture"], details["prompt_tokens"])
+    assert details["action_tokens"] == generated(reference, embeddings)
+    assert details["action_tokens"] == recomputed(reference, embeddings)
 
 
 def test_what_the_model_reads_is_the_prompt_of_the_training(policy: Any) -> None:
-    policy.infer(looking(policy, mosaic(0), prompt="Push the Blue brick"))
-    ids = policy.last_details["ids"]
+    ids = answered(policy, mosaic(0), "Push the Blue brick")["prompt_tokens"]
     assert (ids[0], ids[-1], ids.count(29871)) == (1, 29871, ids.count(29871))
     text = tiny_openvla.tokenizer().decode(ids[1:-1])
     assert text.strip() == "In: What action should the robot take to push the blue brick?\nOut:"
@@ -141,7 +146,7 @@ def test_an_action_is_the_tokens_in_the_units_of_the_data(policy: Any) -> None:
     answer = policy.infer(looking(policy, mosaic(1)))
     step = check_steps(policy.spec.action, answer.steps)[0]
     edges = np.linspace(-1, 1, 256)
-    for axis, token in enumerate(policy.last_details["tokens"]):
+    for axis, token in enumerate(answer.raw["action_tokens"]):
         index = min(max(32000 - token - 1, 0), 254)
         number = (edges[index] + edges[index + 1]) / 2
         low, high = BRIDGE["q01"][axis], BRIDGE["q99"][axis]
@@ -161,11 +166,7 @@ def test_every_picture_gives_another_action(policy: Any) -> None:
 
 def test_another_prompt_gives_another_action(policy: Any) -> None:
     prompts = ("lift the red brick", "push the blue brick away", "open the gripper")
-    seen = {
-        tuple(policy.last_details["tokens"])
-        for prompt in prompts
-        if policy.infer(looking(policy, mosaic(3), prompt))
-    }
+    seen = {tuple(answered(policy, mosaic(3), prompt)["action_tokens"]) for prompt in prompts}
     assert len(seen) == len(prompts)
 
 
@@ -177,12 +178,11 @@ def test_the_same_picture_gives_the_same_action(policy: Any) -> None:
 def test_the_first_version_with_one_encoder_and_its_own_prompt(tmp_path: Path) -> None:
     parts = tiny_openvla.write(tmp_path / "v1", Parts(fused=False)).in_float()
     policy = loaded(tmp_path / "v1")
-    policy.infer(looking(policy, mosaic(4)))
-    details = policy.last_details
+    details = answered(policy, mosaic(4))
     assert details["prompt"].startswith("A chat between a curious user")
     with torch.inference_mode():
-        embeddings = embedded(parts, details["picture"], details["ids"])
-    assert details["tokens"] == generated(parts, embeddings)
+        embeddings = embedded(parts, details["picture"], details["prompt_tokens"])
+    assert details["action_tokens"] == generated(parts, embeddings)
 
 
 def test_bfloat16_computes_in_bfloat16(folder: Path) -> None:
@@ -195,8 +195,8 @@ def test_bfloat16_computes_in_bfloat16(folder: Path) -> None:
 @pytest.mark.parametrize("kind", ["int8", "nf4"])
 def test_quantised_layers_answer_nearly_alike_with_less_memory(folder: Path, kind: str) -> None:
     whole, small = loaded(folder), loaded(folder, quantise=kind)
-    whole.infer(looking(whole, mosaic(5)))
-    ids, picture = whole.last_details["ids"], whole.last_details["picture"]
+    details = answered(whole, mosaic(5))
+    ids, picture = details["prompt_tokens"], details["picture"]
     logits, memory = [], []
     for policy in (whole, small):
         network: Any = policy.network
@@ -270,7 +270,7 @@ def test_an_adapter_is_added_as_peft_adds_it(folder: Path, tmp_path: Path) -> No
         torch.testing.assert_close(ours[name], tensor, rtol=1e-5, atol=1e-6)
     changed = [name for name, t in plain.network.state_dict().items() if not t.equal(ours[name])]
     assert len(changed) == 2 * 3 + 3 + 3 + 1 + 2
-    policy.infer(looking(policy, mosaic(6)))
+    details = answered(policy, mosaic(6))
     with torch.inference_mode():
-        embeddings = embedded(parts, policy.last_details["picture"], policy.last_details["ids"])
-    assert policy.last_details["tokens"] == generated(parts, embeddings)
+        embeddings = embedded(parts, details["picture"], details["prompt_tokens"])
+    assert details["action_tokens"] == generated(parts, embeddings)

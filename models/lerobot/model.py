@@ -1,0 +1,240 @@
+# /// script
+# requires-python = ">=3.12,<3.14"
+# dependencies = ["lerobot[pi,smolvla]==0.6.1", "numpy>=1.26", "safetensors==0.8.0"]
+# ///
+"""Any policy that LeRobot saved (ACT, SmolVLA, pi0, ...), run by LeRobot itself.
+
+A policy directory does not say what its numbers mean, so the options do, and what they say is
+checked against the sizes in its config. Weights are read from safetensors; nothing is unpickled.
+
+    vla-zenoh worker lerobot --set checkpoint=DIR --set dt_s=0.1 --set kind=delta \\
+        --set rotation=rpy --set gripper=open_fraction --set state=position,rpy,gripper_m
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from vla_zenoh_model_lerobot.mapping import (
+    ACTION,
+    PIPELINES,
+    STATE,
+    STATE_PARTS,
+    WEIGHTS,
+    WITHOUT_WORDS,
+    device_step,
+    features,
+    horizon,
+    number,
+    one_by_one,
+    pictures,
+    read_config,
+    state_numbers,
+    state_parts,
+)
+
+from vla_zenoh.errors import SpecError, WorkerError
+from vla_zenoh.policy import (
+    ActionSpec,
+    ActionSteps,
+    CameraSpec,
+    Frame,
+    GripperMeaning,
+    ModelSpec,
+    MotionKind,
+    Observation,
+    ObservationSpec,
+    Resize,
+    Rotation,
+)
+
+
+class LeRobot:
+    """See the module.
+
+    Args:
+        checkpoint: directory with ``config.json``, ``model.safetensors`` and the two pipelines.
+        kind: an action is a ``delta`` or an ``absolute`` pose of the TCP.
+        rotation: form of its rotation: ``rpy``, ``rotvec`` or ``quaternion``.
+        gripper: meaning of its last number, see `vla_zenoh.policy.ActionSpec`.
+        dt_s: duration of a step: 1 / fps of the data.
+        frame: axes of a delta, ``base`` or ``tcp``.
+        open_is_high: ``yes``: a large gripper number means open.
+        scale_m: metres of one unit of position.
+        state: what the numbers of ``observation.state`` are, in order, of `STATE_PARTS`.
+        cameras: ``camera=feature`` where the names differ, separated by commas; a feature without
+            one takes the camera of its own last name.
+        resize: how a picture of another size becomes the one of the config.
+        max_width_m: of the gripper, for ``gripper_open`` and ``gripper_closed``.
+        steps: of each chunk that are sent; by default as many as the policy was made to carry out.
+        device: as torch names it; ``auto``: a GPU where there is one.
+    """
+
+    def __init__(
+        self,
+        checkpoint: str = "",
+        kind: str = "",
+        rotation: str = "",
+        gripper: str = "",
+        dt_s: str = "",
+        frame: str = "base",
+        open_is_high: str = "yes",
+        scale_m: str = "1",
+        state: str = "",
+        cameras: str = "",
+        resize: str = "none",
+        max_width_m: str = "0.08",
+        steps: str = "",
+        device: str = "auto",
+    ) -> None:
+        if not checkpoint:
+            raise WorkerError("it needs a policy: --set checkpoint=DIRECTORY")
+        self._folder = Path(checkpoint).expanduser()
+        config = read_config(self._folder)
+        for name, value, allowed in (
+            ("kind", kind, get_args(MotionKind)),
+            ("rotation", rotation, get_args(Rotation)),
+            ("gripper", gripper, get_args(GripperMeaning)),
+            ("frame", frame, get_args(Frame)),
+            ("resize", resize, get_args(Resize)),
+            ("open_is_high", open_is_high, ("yes", "no")),
+        ):
+            if value not in allowed:
+                raise WorkerError(
+                    f"{name} is {value!r}; say what the data meant with --set {name}= one of: "
+                    f"{', '.join(allowed)}"
+                )
+        if not dt_s:
+            raise WorkerError("how long is a step? Say --set dt_s=SECONDS, which is 1 / fps")
+        inputs = features(self._folder, config, "input_features")
+        self._pictures = pictures(inputs, cameras)
+        self._state = state_parts(inputs, state)
+        self._max_width_m = number("max_width_m", max_width_m)
+        self._one_by_one = one_by_one(config)
+        most = 1 if self._one_by_one else horizon(config, steps)
+        self._device = device
+        self.spec = ModelSpec(
+            name="lerobot",
+            observation=ObservationSpec(
+                cameras=tuple(
+                    CameraSpec(
+                        camera=camera,
+                        height=shape[1],
+                        width=shape[2],
+                        resize=resize,
+                    )
+                    for camera, (_, shape) in self._pictures.items()
+                ),
+                state=tuple(dict.fromkeys(STATE_PARTS[name][0] for name in self._state)),
+                prompt=config["type"] not in WITHOUT_WORDS,
+            ),
+            action=ActionSpec(
+                horizon=most,
+                dt_s=number("dt_s", dt_s),
+                kind=kind,
+                frame=frame,
+                rotation=rotation,
+                position_scale_m=number("scale_m", scale_m),
+                gripper=gripper,
+                gripper_open_is_high=open_is_high == "yes",
+            ),
+        )
+        self._check_action(config)
+        self.policy: Any = None
+        self._before: Any = None
+        self._after: Any = None
+
+    def _check_action(self, config: Mapping[str, Any]) -> None:
+        shape = features(self._folder, config, "output_features").get(ACTION)
+        wanted = self.spec.action.dimension
+        if shape != (wanted,):
+            raise WorkerError(
+                f"{self._folder}: its actions have shape {shape}; position, "
+                f"{self.spec.action.rotation} and gripper {self.spec.action.gripper!r} are "
+                f"({wanted},). A policy whose actions are joint angles cannot be carried out here"
+            )
+
+    def load(self) -> None:
+        """Read weights and pipelines.
+
+        Raises:
+            WorkerError: they are missing, damaged or not of this LeRobot.
+        """
+        import torch
+        from lerobot.configs import PreTrainedConfig
+        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+        device = self._device
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        overrides = {
+            name: {"device_processor": {"device": device}} if has_device else {}
+            for name, has_device in ((file, device_step(self._folder / file)) for file in PIPELINES)
+        }
+        if not (self._folder / WEIGHTS).is_file():
+            raise WorkerError(f"{self._folder} holds no {WEIGHTS}; other formats are pickles")
+        try:
+            torch.zeros(1, device=device)
+            config = PreTrainedConfig.from_pretrained(self._folder, local_files_only=True)
+            config.device = device
+            # All weights are in the directory: none are fetched to be overwritten.
+            if hasattr(config, "pretrained_backbone_weights"):
+                config.pretrained_backbone_weights = None
+            self.policy = get_policy_class(config.type).from_pretrained(
+                self._folder, config=config, strict=True
+            )
+            self._before, self._after = make_pre_post_processors(
+                config,
+                pretrained_path=str(self._folder),
+                preprocessor_overrides=overrides[PIPELINES[0]],
+                postprocessor_overrides=overrides[PIPELINES[1]],
+            )
+        except Exception as error:  # LeRobot raises whatever its libraries do
+            raise WorkerError(
+                f"LeRobot cannot load {self._folder}: {type(error).__name__}: {str(error)[:500]}"
+            ) from error
+        bad = [n for n, w in self.policy.named_parameters() if not torch.isfinite(w).all()]
+        if bad:
+            raise WorkerError(f"weight {bad[0]} in {self._folder} holds NaN or infinity")
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was seen and planned in the last episode."""
+        for part in (self.policy, self._before, self._after):
+            if part is not None:
+                part.reset()
+
+    def infer(self, observation: Observation) -> ActionSteps:
+        """The next chunk by LeRobot's own pipelines and policy.
+
+        Raises:
+            SpecError: the policy answers with something else than its config says.
+        """
+        import torch
+        from lerobot.policies.utils import prepare_observation_for_inference
+
+        given: dict[str, Any] = {
+            feature: np.ascontiguousarray(observation.images[camera])
+            for camera, (feature, _) in self._pictures.items()
+        }
+        if self._state:
+            given[STATE] = state_numbers(self._state, observation, self._max_width_m)
+        with torch.inference_mode():
+            device = torch.device(self.policy.config.device)
+            batch = self._before(
+                prepare_observation_for_inference(given, device, observation.prompt)
+            )
+            if self._one_by_one:
+                wanted = self.policy.select_action(batch)[:, None]
+            else:
+                chunk = self.policy.predict_action_chunk(batch)
+                if chunk.ndim != 3:
+                    raise SpecError(f"the policy's chunk has shape {tuple(chunk.shape)}")
+                wanted = chunk[:, : self.spec.action.horizon]
+            # Step by step, as LeRobot does: some pipelines know no chunks.
+            steps = torch.cat([self._after(step) for step in wanted.unbind(1)])
+        raw = {"normalised": wanted[0].float().cpu().tolist()}
+        return ActionSteps(steps.float().cpu().numpy(), raw=raw)

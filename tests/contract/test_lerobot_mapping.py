@@ -1,0 +1,166 @@
+"""What a LeRobot directory declares, against what the options say it means; no LeRobot needed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, example, given
+from hypothesis import strategies as st
+
+from vla_zenoh.control.so3 import exp3, rotation_from_quat, rotation_from_rpy
+from vla_zenoh.errors import WorkerError
+from vla_zenoh.loader import find_model, import_model, make_policy
+from vla_zenoh.policy import Policy, example_observation
+
+import_model(find_model("lerobot"))
+from vla_zenoh_model_lerobot import mapping  # noqa: E402
+
+ATOL = 1e-6
+"""Of rotation matrices; extrinsic angles lose digits near a pitch of 90 degrees."""
+CONFIG: dict[str, Any] = {
+    "type": "act",
+    "n_obs_steps": 1,
+    "chunk_size": 100,
+    "n_action_steps": 50,
+    "input_features": {
+        "observation.images.front": {"type": "VISUAL", "shape": [3, 480, 640]},
+        "observation.images.gripper_cam": {"type": "VISUAL", "shape": [3, 480, 640]},
+        "observation.state": {"type": "STATE", "shape": [8]},
+    },
+    "output_features": {"action": {"type": "ACTION", "shape": [7]}},
+}
+MEANING = {
+    "kind": "delta",
+    "rotation": "rpy",
+    "gripper": "open_fraction",
+    "dt_s": "0.05",
+    "state": "joints,gripper_m",
+    "cameras": "wrist=observation.images.gripper_cam",
+}
+
+
+def make(folder: Path, config: Mapping[str, Any] = CONFIG, **options: str) -> Policy:
+    (folder / "config.json").write_text(json.dumps(config))
+    return make_policy(find_model("lerobot"), {"checkpoint": str(folder), **MEANING, **options})
+
+
+def test_the_spec_says_what_the_options_say(tmp_path: Path) -> None:
+    spec = make(tmp_path, frame="tcp", open_is_high="no", scale_m="0.001").spec
+    assert [camera.camera for camera in spec.observation.cameras] == ["front", "wrist"]
+    assert {(c.width, c.height, c.resize) for c in spec.observation.cameras} == {(640, 480, "none")}
+    assert spec.observation.state == ("joint", "gripper")
+    assert not spec.observation.prompt
+    assert (spec.action.horizon, spec.action.dt_s) == (50, 0.05)
+    assert (spec.action.frame, spec.action.gripper_open_is_high) == ("tcp", False)
+    assert spec.action.position_scale_m == 0.001
+
+
+def test_a_policy_that_reads_words_asks_for_a_prompt(tmp_path: Path) -> None:
+    assert make(tmp_path, {**CONFIG, "type": "smolvla"}).spec.observation.prompt
+
+
+@pytest.mark.parametrize("change", [{"n_obs_steps": 2}, {"temporal_ensemble_coeff": 0.01}])
+def test_a_policy_that_plans_by_itself_gives_one_step(
+    tmp_path: Path, change: dict[str, Any]
+) -> None:
+    assert make(tmp_path, {**CONFIG, **change}).spec.action.horizon == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"kind": ""}, r"kind is ''; .* one of: delta, absolute"),
+        ({"rotation": "euler"}, r"rotation is 'euler'; .* rpy, rotvec, quaternion"),
+        ({"gripper": ""}, r"gripper is ''; .* open_fraction"),
+        ({"resize": "squash"}, r"resize is 'squash'"),
+        ({"dt_s": ""}, r"how long is a step"),
+        ({"dt_s": "fast"}, r"dt_s is 'fast'"),
+        ({"state": ""}, r"has shape \(8,\), --set state= makes \(0,\)"),
+        ({"state": "joints"}, r"has shape \(8,\), --set state=joints makes \(7,\)"),
+        ({"state": "joints,grip"}, r"state names 'grip'; there are: joints \(7\)"),
+        ({"cameras": "wrist=observation.images.hand"}, r"which the policy does not know; its"),
+        ({"cameras": "front=observation.images.gripper_cam"}, r"two pictures .* 'front'"),
+        ({"steps": "101"}, r"steps is 101; the policy's chunks have 100"),
+        ({"steps": "many"}, r"steps is 'many'"),
+        ({"rotation": "quaternion"}, r"actions have shape \(7,\); .* are \(8,\)"),
+        ({"gripper": "none"}, r"actions have shape \(7,\); .* are \(6,\)"),
+    ],
+)
+def test_an_option_that_does_not_fit_is_named(
+    tmp_path: Path, options: dict[str, str], match: str
+) -> None:
+    with pytest.raises(WorkerError, match=match):
+        make(tmp_path, **options)
+
+
+def test_joint_actions_are_refused_with_the_reason(tmp_path: Path) -> None:
+    joints = {**CONFIG, "output_features": {"action": {"type": "ACTION", "shape": [14]}}}
+    with pytest.raises(WorkerError, match="joint angles cannot be carried out here"):
+        make(tmp_path, joints)
+
+
+@pytest.mark.parametrize(
+    ("config", "match"),
+    [
+        ({"model_type": "llama"}, "has no type; it is not a LeRobot policy"),
+        ({**CONFIG, "use_peft": True}, "is an adapter"),
+        ({**CONFIG, "type": "groot"}, "runs code from a model hub"),
+        ({**CONFIG, "input_features": ["front"]}, "not of LeRobot's form"),
+        (
+            {
+                **CONFIG,
+                "input_features": {
+                    **CONFIG["input_features"],
+                    "observation.environment_state": {"type": "ENV", "shape": [4]},
+                },
+            },
+            "needs observation.environment_state, which no robot here can tell",
+        ),
+    ],
+)
+def test_a_directory_that_cannot_be_run_is_refused(
+    tmp_path: Path, config: dict[str, Any], match: str
+) -> None:
+    with pytest.raises(WorkerError, match=match):
+        make(tmp_path, config)
+
+
+def test_a_directory_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(WorkerError, match="is not a folder"):
+        make_policy(find_model("lerobot"), {"checkpoint": str(tmp_path / "nowhere")})
+    with pytest.raises(WorkerError, match=r"--set checkpoint=DIRECTORY"):
+        make_policy(find_model("lerobot"))
+
+
+QUATERNIONS = st.lists(st.floats(-1, 1), min_size=4, max_size=4)
+
+
+@given(QUATERNIONS)
+@example([1.0, 0.0, 1.0, 0.0])
+@example([0.0, 1.0, 0.0, 1.0])
+@example([0.1, 1.0, 0.1, 1.0 + 1e-9])
+@example([0.3, -1.0, 0.3, 1.0])
+def test_all_forms_of_a_rotation_are_the_same_rotation(numbers: list[float]) -> None:
+    length = float(np.linalg.norm(numbers))
+    assume(length > 0.1)
+    unit = [value / length for value in numbers]
+    wanted = rotation_from_quat(np.array(unit))
+    np.testing.assert_allclose(rotation_from_quat(np.array(mapping.quaternion(unit))), wanted)
+    np.testing.assert_allclose(exp3(np.array(mapping.rotvec(unit))), wanted, atol=ATOL)
+    np.testing.assert_allclose(rotation_from_rpy(np.array(mapping.rpy(unit))), wanted, atol=ATOL)
+
+
+def test_the_state_is_put_together_in_the_order_that_was_told(tmp_path: Path) -> None:
+    spec = make(tmp_path, state="joints,gripper_open").spec
+    seen = example_observation(spec)
+    numbers = mapping.state_numbers(["gripper_closed", "gripper_m", "joints"], seen, 0.1)
+    assert seen.gripper is not None
+    width_m = seen.gripper.width_m
+    np.testing.assert_allclose(numbers[:2], [1 - width_m / 0.1, width_m], rtol=1e-6)
+    assert numbers.dtype == np.float32
+    assert len(numbers) == 9

@@ -1,0 +1,201 @@
+"""The LeRobot worker gives what LeRobot itself gives, and names what does not fit."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("lerobot", reason="needs LeRobot's environment: make test-models")
+import tiny_act
+import torch
+from lerobot.common.control_utils import predict_action
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.policies.factory import make_pre_post_processors
+from safetensors.torch import load_file, save_file
+
+from vla_zenoh.errors import WorkerError
+from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.policy import check_steps, example_observation
+from vla_zenoh.types import GripperState, PoseState
+
+pytestmark = pytest.mark.models
+
+ATOL = 1e-6
+"""Metres and radians, of float32."""
+MEANING = {
+    "kind": "delta",
+    "rotation": "rpy",
+    "gripper": "open_fraction",
+    "dt_s": "0.1",
+    "state": "position,rotvec,gripper_m",
+}
+STATE = [0.4, 0.1, 0.3, 0.0, 0.0, np.pi / 2, 0.05]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("lerobot") / "act"
+    tiny_act.write(folder)
+    return folder
+
+
+@pytest.fixture
+def folder(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "act"))
+
+
+def make(folder: Path, **options: str) -> Any:
+    given = {"checkpoint": str(folder), "device": "cpu", **MEANING, **options}
+    return make_policy(find_model("lerobot"), given)
+
+
+def loaded(folder: Path, **options: str) -> Any:
+    policy = make(folder, **options)
+    policy.load()
+    return policy
+
+
+def looking(policy: Any, seed: int) -> Any:
+    shape = (tiny_act.HEIGHT, tiny_act.WIDTH, 3)
+    picture = np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+    half = np.sqrt(0.5)
+    return replace(
+        example_observation(policy.spec),
+        images={"front": picture},
+        pose=PoseState(np.array(STATE[:3]), np.array([0, 0, half, half]), np.zeros(6)),
+        gripper=GripperState(width_m=STATE[6], moving=False, holding=False),
+    )
+
+
+def lerobots_own(folder: Path, seen: Any, count: int) -> np.ndarray:
+    """(count, D) actions by LeRobot's own loading, `predict_action` and queue."""
+    config = PreTrainedConfig.from_pretrained(folder)
+    assert isinstance(config, ACTConfig)
+    config.pretrained_backbone_weights = None
+    policy = ACTPolicy.from_pretrained(folder, config=config)
+    before, after = make_pre_post_processors(policy.config, pretrained_path=str(folder))
+    given = {
+        "observation.images.front": seen.images["front"],
+        "observation.state": np.array(STATE, np.float32),
+    }
+    steps = [
+        predict_action(given, policy, torch.device("cpu"), before, after, use_amp=False)
+        for _ in range(count)
+    ]
+    return torch.cat(steps).numpy()
+
+
+@pytest.fixture(autouse=True)
+def no_download(monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot by itself would fetch weights that those of the directory then replace."""
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("a download")
+
+    monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", refuse)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_chunk_is_what_lerobots_own_queue_gives(whole: Path, seed: int) -> None:
+    policy = loaded(whole)
+    seen = looking(policy, seed)
+    steps = check_steps(policy.spec.action, policy.infer(seen).steps)
+    assert steps.shape == (tiny_act.STEPS, tiny_act.ACTION_SIZE)
+    np.testing.assert_allclose(steps, lerobots_own(whole, seen, tiny_act.STEPS), atol=ATOL)
+
+
+def test_the_whole_chunk_can_be_had(whole: Path) -> None:
+    policy = loaded(whole, steps=str(tiny_act.CHUNK))
+    seen = looking(policy, 0)
+    steps = np.asarray(policy.infer(seen).steps)
+    assert policy.spec.action.horizon == tiny_act.CHUNK
+    first = lerobots_own(whole, seen, tiny_act.STEPS)
+    np.testing.assert_allclose(steps[: tiny_act.STEPS], first, atol=ATOL)
+
+
+def test_actions_are_in_the_units_of_the_data(whole: Path) -> None:
+    policy = loaded(whole)
+    answer = policy.infer(looking(policy, 0))
+    scale = tiny_act.STATISTICS["action"]
+    raw = np.asarray(answer.raw["normalised"])
+    wanted = raw * scale["std"].numpy() + scale["mean"].numpy()
+    np.testing.assert_allclose(np.asarray(answer.steps), wanted, atol=1e-5)
+
+
+def test_picture_and_state_both_matter(whole: Path) -> None:
+    policy = loaded(whole)
+    seen = looking(policy, 0)
+    other = replace(seen, gripper=GripperState(width_m=0.0, moving=False, holding=False))
+    first, second, third = (
+        np.asarray(policy.infer(each).steps) for each in (seen, looking(policy, 1), other)
+    )
+    assert np.abs(first - second).max() > 1e-5
+    assert np.abs(first - third).max() > 1e-5
+
+
+def test_a_policy_that_averages_chunks_is_asked_step_by_step(tmp_path: Path) -> None:
+    tiny_act.write(tmp_path / "act", temporal_ensemble_coeff=0.01, n_action_steps=1)
+    policy = loaded(tmp_path / "act")
+    assert policy.spec.action.horizon == 1
+    seen = looking(policy, 4)
+    steps = np.concatenate([np.asarray(policy.infer(seen).steps) for _ in range(5)])
+    np.testing.assert_allclose(steps, lerobots_own(tmp_path / "act", seen, 5), atol=ATOL)
+    policy.reset()
+    np.testing.assert_allclose(np.asarray(policy.infer(seen).steps), steps[:1], atol=ATOL)
+
+
+def test_missing_weights_are_not_made_up(folder: Path) -> None:
+    content = load_file(folder / "model.safetensors")
+    del content["model.action_head.bias"]
+    save_file(content, folder / "model.safetensors")
+    with pytest.raises(WorkerError, match=r"(?s)LeRobot cannot load .*model.action_head.bias"):
+        loaded(folder)
+
+
+def test_weights_that_are_not_numbers_are_named(folder: Path) -> None:
+    content = load_file(folder / "model.safetensors")
+    content["model.action_head.bias"][0] = float("inf")
+    save_file(content, folder / "model.safetensors")
+    with pytest.raises(WorkerError, match=r"model.action_head.bias .* holds NaN or infinity"):
+        loaded(folder)
+
+
+def test_a_file_that_was_cut_off_is_an_error(folder: Path) -> None:
+    content = (folder / "model.safetensors").read_bytes()
+    (folder / "model.safetensors").write_bytes(content[:1000])
+    with pytest.raises(WorkerError, match=r"LeRobot cannot load .*Safetensor"):
+        loaded(folder)
+
+
+def test_pickled_weights_are_not_read(folder: Path) -> None:
+    (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
+    with pytest.raises(WorkerError, match=r"holds no model.safetensors; other formats are pickles"):
+        loaded(folder)
+
+
+def test_a_device_that_is_not_there_is_an_error(whole: Path) -> None:
+    with pytest.raises(WorkerError, match="LeRobot cannot load"):
+        loaded(whole, device="cuda:99")
+
+
+def test_a_pipeline_that_names_code_is_refused(folder: Path) -> None:
+    file = folder / "policy_preprocessor.json"
+    content = json.loads(file.read_text())
+    content["steps"].append({"class": "os.system", "config": {}})
+    file.write_text(json.dumps(content))
+    with pytest.raises(WorkerError, match=r"'os.system' is not one of LeRobot's own"):
+        loaded(folder)
+
+
+def test_a_policy_without_pipelines_says_how_to_get_them(folder: Path) -> None:
+    (folder / "policy_postprocessor.json").unlink()
+    with pytest.raises(WorkerError, match=r"holds no policy_postprocessor.json; .*migrate_policy"):
+        loaded(folder)
