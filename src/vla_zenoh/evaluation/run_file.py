@@ -242,8 +242,9 @@ def _seams(out: Evaluation, commands: Sequence[Heard]) -> None:
             goal = after.goal_position_m - before.goal_position_m
             goal_mm.append(float(np.linalg.norm(goal)) * 1e3)
             # What acceleration explains is no step.
-            expected = before.twist[:3] + before.acceleration[:3] * apart_s
-            velocity_mm_s.append(float(np.linalg.norm(after.twist[:3] - expected)) * 1e3)
+            gained = (before.acceleration[:3] + after.acceleration[:3]) / 2 * apart_s
+            step = after.twist[:3] - before.twist[:3] - gained
+            velocity_mm_s.append(float(np.linalg.norm(step)) * 1e3)
     out.jerk = np.array(jerk)
     out.seam_goal_mm, out.seam_velocity_mm_s = np.array(goal_mm), np.array(velocity_mm_s)
 

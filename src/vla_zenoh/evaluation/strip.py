@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from vla_zenoh.errors import CodecError, SpecError
 from vla_zenoh.evaluation.result import View
 from vla_zenoh.observe import prepare
 from vla_zenoh.policy import CameraSpec
-from vla_zenoh.recording.run import Picture, Run, pictures
+from vla_zenoh.recording.run import Picture, Run, pictures, seen_pictures
 from vla_zenoh.types import ActionChunk, Image
 
 HEIGHT_PX = 150
@@ -23,31 +23,39 @@ QUALITY = 80
 def views_of(run: Run, chunks: Sequence[ActionChunk], count: int) -> list[View]:
     """For each camera `count` pictures, evenly over the run.
 
-    With chunks they are the pictures that chunks were made of; where the model asks for another
-    size, what it was given stands beside them.
+    With chunks they are the pictures that chunks were made of. What the model was given of them
+    stands beside: as it was recorded, else as its spec says where it asks for another size.
     """
     stamps = [chunk.observation_stamp_ns for chunk in chunks]
     if not stamps:
         stamps = [int(ns) for ns in np.linspace(run.began_ns, run.ended_ns, 2 * count + 1)[1::2]]
     elif len(stamps) > count:
         stamps = [stamps[int(i)] for i in np.linspace(0, len(stamps) - 1, count)]
-    specs = {chunk.spec_hash for chunk in chunks}
-    asked = {
-        camera.camera: camera
-        for name in specs & run.specs.keys()
-        for camera in run.specs[name].observation.cameras
-    }
     out: list[View] = []
     for camera in sorted(run.picture_counts):
-        for found in _nearest(run, camera, stamps):
-            out += _views(run, camera, found, asked.get(camera))
+        taken = _nearest(pictures(run.file, camera), stamps)
+        asked = _asked(run, chunks, camera)
+        given = {}
+        for worker in dict.fromkeys(chunk.worker for chunk in chunks):
+            seen = seen_pictures(run.file, worker, camera)
+            given |= {picture.stamp_ns: picture for picture in _nearest(seen, stamps)}
+        for picture in taken:
+            out += _views(run, camera, picture, given.get(picture.stamp_ns), asked)
     return out
 
 
-def _nearest(run: Run, camera: str, stamps: Sequence[int]) -> list[Picture]:
+def _asked(run: Run, chunks: Sequence[ActionChunk], camera: str) -> CameraSpec | None:
+    """What the models' specs say of a camera."""
+    hashes = dict.fromkeys(chunk.spec_hash for chunk in chunks)
+    specs = [run.specs[name] for name in hashes if name in run.specs]
+    cameras = (each for spec in specs for each in spec.observation.cameras)
+    return next((each for each in cameras if each.camera == camera), None)
+
+
+def _nearest(found: Iterable[Picture], stamps: Sequence[int]) -> list[Picture]:
     """For each stamp the picture that was taken nearest to it, in one pass over the file."""
     best: list[Picture | None] = [None] * len(stamps)
-    for picture in pictures(run.file, camera):
+    for picture in found:
         for index, stamp_ns in enumerate(stamps):
             known = best[index]
             distance = abs(picture.stamp_ns - stamp_ns)
@@ -56,19 +64,21 @@ def _nearest(run: Run, camera: str, stamps: Sequence[int]) -> list[Picture]:
     return [picture for picture in best if picture is not None]
 
 
-def _views(run: Run, camera: str, found: Picture, asked: CameraSpec | None) -> list[View]:
+def _views(
+    run: Run, camera: str, taken: Picture, given: Picture | None, asked: CameraSpec | None
+) -> list[View]:
     try:
-        image = image_codec.decode_jpeg(found.jpeg)
-    except CodecError:
-        return []  # told when the run was read
-    t_s = (found.stamp_ns - run.began_ns) / 1e9
-    out = [View(t_s, camera, _small(image.rgb))]
-    if asked is not None and asked.width is not None:
-        try:
-            given = prepare(image, asked.model_copy(update={"colour": "rgb"}))
-        except SpecError:
-            return out
-        out.append(View(t_s, camera, _small(given), model=True))
+        image = image_codec.decode_jpeg(taken.jpeg)
+        t_s = (taken.stamp_ns - run.began_ns) / 1e9
+        out = [View(t_s, camera, _small(image.rgb))]
+        if given is not None:
+            seen = image_codec.decode_jpeg(given.jpeg).rgb
+            out.append(View(t_s, camera, _small(seen), model=True))
+        elif asked is not None and asked.width is not None:
+            seen = prepare(image, asked.model_copy(update={"colour": "rgb"}))
+            out.append(View(t_s, camera, _small(seen), model=True))
+    except (CodecError, SpecError):
+        return []  # no picture that can be shown
     return out
 
 

@@ -31,11 +31,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vla_zenoh.policy import ModelSpec
-from vla_zenoh.types import ActionChunk, Cause, ObjectPoses
+from vla_zenoh.types import ActionChunk, Cause, ObjectPoses, Seen
 
 PACKAGE = "vla_zenoh_msgs"
 HEADER = "std_msgs/Header header"
-_SHAPED = {(ActionChunk, "steps"), (ObjectPoses, "position_m"), (ObjectPoses, "quat_xyzw")}
+_SHAPED = {
+    (ActionChunk, "steps"),
+    (Seen, "steps"),
+    (ObjectPoses, "position_m"),
+    (ObjectPoses, "quat_xyzw"),
+}
 _PLAIN = {bool: "bool", int: "int64", float: "float64", str: "string"}
 _NO_INTEGER = -(2**63)
 

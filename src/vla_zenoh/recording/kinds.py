@@ -17,6 +17,7 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
     SceneState,
+    Seen,
     Task,
 )
 
@@ -34,6 +35,7 @@ RECORDS: tuple[type, ...] = (
     Event,
     SceneState,
     ObjectPoses,
+    Seen,
 )
 """Every record that has a key."""
 
@@ -67,6 +69,7 @@ class Kinds:
             (self._keys.spec, ModelSpec),
             (self._keys.status, NodeStatus),
             (self._keys.event, Event),
+            (self._keys.seen_record, Seen),
         )
         name = last(key)
         try:

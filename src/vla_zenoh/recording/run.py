@@ -26,6 +26,7 @@ from vla_zenoh.types import (
     ObjectPoses,
     PoseCommand,
     PoseState,
+    Seen,
     Task,
 )
 
@@ -76,6 +77,7 @@ class Run:
     tasks: list[Heard] = field(default_factory=list)
     events: list[Heard] = field(default_factory=list)
     objects: list[Heard] = field(default_factory=list)
+    seen: list[Heard] = field(default_factory=list)
     specs: dict[str, ModelSpec] = field(default_factory=dict)
     """By hash."""
     statuses: dict[str, NodeStatus] = field(default_factory=dict)
@@ -148,6 +150,7 @@ def load_run(path: Path) -> Run:
         Task: run.tasks,
         Event: run.events,
         ObjectPoses: run.objects,
+        Seen: run.seen,
     }
     for entry in file.entries(_of_interest(keys)):
         run.began_ns = run.began_ns or entry.heard_ns
@@ -175,13 +178,15 @@ def load_run(path: Path) -> Run:
 
 
 def _of_interest(keys: Keys) -> Callable[[str], bool]:
-    """Everything of the robot but raw pictures, and what models saw of them."""
+    """Everything of the robot but raw pictures, and those that models saw."""
 
     def wanted(key: str) -> bool:
         group = keys.group(key)
         if group == "camera":
             return key == keys.camera_jpeg(_camera(keys, key))
-        return group not in ("", "seen")
+        if group == "seen":
+            return key == keys.seen_record(last(key))
+        return bool(group)
 
     return wanted
 
@@ -204,7 +209,15 @@ def _keep(run: Run, lists: dict[type, list[Heard]], heard: Heard) -> None:
 
 def pictures(file: RunFile, camera: str) -> Iterator[Picture]:
     """Every JPEG of a camera, oldest first, one in memory at a time."""
-    key = file.keys.camera_jpeg(camera)
+    return _jpegs(file, file.keys.camera_jpeg(camera))
+
+
+def seen_pictures(file: RunFile, worker: str, camera: str) -> Iterator[Picture]:
+    """What a model was given of a camera; `seq` is its chunk's, the stamp the observation's."""
+    return _jpegs(file, file.keys.seen(worker, camera))
+
+
+def _jpegs(file: RunFile, key: str) -> Iterator[Picture]:
     for entry in file.entries(lambda each: each == key):
         if entry.header is not None and entry.encoding == JPEG:
             stamp_ns, seq = entry.header.stamp_wall_ns, entry.header.seq
