@@ -32,8 +32,8 @@ SHAPES = {
     "observation/state/joint_torque": (65,),
     "observation/tactile": (60,),
 }
-UP_RAD = np.array([0.0, -0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
-"""A step of the second joint backwards lifts the hand by about 4 mm."""
+UP_RAD = np.array([0.0, -0.03, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""A step of the second joint backwards lifts the hand by about 12 mm."""
 
 
 def out(value: Any) -> Any:

@@ -188,3 +188,17 @@ def test_a_folder_may_have_files_beside_its_model(tmp_path: Path) -> None:
     )
     module = import_model(find_model(str(folder)))
     assert module.Model().infer(None) == 42
+
+
+def test_a_model_that_takes_a_profile_is_given_the_workers(write) -> None:
+    text = MODEL.replace('size: str = "1"', 'profile="none", size: str = "1"')
+    text = text.replace("self.size =", "self.profile = profile\n        self.size =")
+    model = find_model(write(text))
+    assert make_policy(model).profile == "none"  # pyright: ignore
+    assert make_policy(model, profile="lab.yaml").profile == "lab.yaml"  # pyright: ignore
+    chosen = make_policy(model, {"profile": "mine"}, profile="lab.yaml")
+    assert chosen.profile == "mine"  # pyright: ignore
+
+
+def test_a_model_that_takes_no_profile_is_not_given_one(write) -> None:
+    assert make_policy(find_model(write(MODEL)), profile="lab.yaml").spec.name == "still"
