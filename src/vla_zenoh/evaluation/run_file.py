@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from vla_zenoh.evaluation.result import Evaluation, Trace
 from vla_zenoh.evaluation.segments import segment
 from vla_zenoh.evaluation.strip import views_of
 from vla_zenoh.recording.run import Heard, Run, load_run
-from vla_zenoh.types import Cause, FloatArray, NodeStatus
+from vla_zenoh.types import Cause, FloatArray, NodeStatus, Task
 
 GAP_S = 0.05
 """A stream that says nothing for longer was interrupted: nothing is derived across the gap."""
@@ -63,32 +63,41 @@ def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) ->
         out.problems.append(f"the recorder dropped {dropped} samples")
     obeyed = _obeyed_chunks(run)
     causes = run.first_commands()
-    until_ns = run.ended_ns + 1
+    until_ns = _last_ns(run) + 1
     if first is not None:
         if len(obeyed) < first:
             out.problems.append(f"it has {len(obeyed)} chunks, fewer than the {first} asked for")
         elif len(obeyed) > first:
-            until_ns = obeyed[first].heard_ns
+            until_ns = obeyed[first].header.stamp_wall_ns
         obeyed = obeyed[:first]
         wanted = {(entry.record.worker, entry.header.seq) for entry in obeyed}
         causes = [each for each in causes if (each[0].worker, each[0].chunk_seq) in wanted]
     _requests(out, obeyed, causes, zero_ns)
     measured, commanded = _measured(run, zero_ns, until_ns), _commanded(run, zero_ns, until_ns)
     _motion(out, measured, commanded, run)
-    _seams(out, [entry for entry in run.commands if entry.heard_ns < until_ns])
-    _joint_jerk(out, [entry for entry in run.joint_commands if entry.heard_ns < until_ns])
+    _seams(out, _until(run.commands, until_ns))
+    _joint_jerk(out, _until(run.joint_commands, until_ns))
     active = _active(run, until_ns, zero_ns)
     _idle(out, active, measured)
     out.refusals = _counted(run.first_statuses, run.statuses, "refused.")
     out.skipped = _counted(run.first_statuses, run.statuses, "skipped.")
-    grippers = [entry for entry in run.grippers if entry.heard_ns < until_ns]
+    grippers = _until(run.grippers, until_ns)
     out.width_m = np.array([entry.record.width_m for entry in grippers])
     out.width_t_s = np.array([(e.header.stamp_wall_ns - zero_ns) / 1e9 for e in grippers])
-    out.gripper_orders = sum(entry.heard_ns < until_ns for entry in run.gripper_commands)
+    out.gripper_orders = len(_until(run.gripper_commands, until_ns))
     _segments(out, run, causes, measured, until_ns)
     if pictures:
         out.views = views_of(run, [entry.record for entry in obeyed], pictures)
     return out
+
+
+def _until(stream: Sequence[Heard], until_ns: int) -> list[Heard]:
+    """What is stamped before a time.
+
+    Stamps of the writers say what belongs together, not when something reached the recorder: so a
+    replayed run is cut as the original is.
+    """
+    return [entry for entry in stream if entry.header.stamp_wall_ns < until_ns]
 
 
 # -- requests -------------------------------------------------------------------------------------
@@ -98,31 +107,43 @@ def _obeyed_chunks(run: Run) -> list[Heard]:
     starts = [since_ns for since_ns, _, _ in spans]
     out: list[Heard] = []
     for entry in run.chunks:
-        at = bisect_right(starts, entry.heard_ns) - 1
-        if at >= 0 and entry.heard_ns < spans[at][1] and entry.record.worker == spans[at][2]:
+        stamp_ns = entry.header.stamp_wall_ns
+        at = bisect_right(starts, stamp_ns) - 1
+        if at >= 0 and stamp_ns < spans[at][1] and entry.record.worker == spans[at][2]:
             out.append(entry)
     return out
 
 
 def _task_spans(run: Run) -> list[tuple[int, int, str]]:
     """(since ns, until ns, worker) of each time in which the arm obeyed one worker."""
+    return _spans(run, lambda task: task.worker)
+
+
+def _prompt_spans(run: Run) -> list[tuple[int, int, str]]:
+    """The same for prompts."""
+    return _spans(run, lambda task: task.prompt)
+
+
+def _spans(run: Run, of: Callable[[Task], str]) -> list[tuple[int, int, str]]:
     out: list[tuple[int, int, str]] = []
-    since_ns, worker = 0, ""
+    since_ns, now = 0, None
     for entry in run.tasks:
-        now = entry.record.worker if entry.record.active else ""
-        if now != worker:
-            if worker:
-                out.append((since_ns, entry.heard_ns, worker))
-            since_ns, worker = entry.heard_ns, now
-    if worker:
-        out.append((since_ns, _last_ns(run) + 1, worker))
+        said = of(entry.record) if entry.record.active else None
+        if said != now:
+            stamp_ns = entry.header.stamp_wall_ns
+            if now is not None:
+                out.append((since_ns, stamp_ns, now))
+            since_ns, now = stamp_ns, said
+    if now is not None:
+        out.append((since_ns, _last_ns(run) + 1, now))
     return out
 
 
 def _last_ns(run: Run) -> int:
-    """When robot and models were last heard: a recorder may listen on after them."""
+    """The last stamp of robot and models: a recorder may listen on after them."""
     streams = (run.tasks, run.chunks, run.commands, run.joint_commands, run.poses)
-    return max((stream[-1].heard_ns for stream in streams if stream), default=run.ended_ns)
+    stamps = (stream[-1].header.stamp_wall_ns for stream in streams if stream)
+    return max(stamps, default=run.ended_ns)
 
 
 def _requests(
@@ -135,7 +156,8 @@ def _requests(
     carried_out = {(cause.worker, cause.chunk_seq) for cause, _ in causes}
     out.succeeded = sum((entry.record.worker, entry.header.seq) in carried_out for entry in obeyed)
     if obeyed:
-        out.seconds = (obeyed[-1].heard_ns - obeyed[0].heard_ns) / 1e9
+        first, last = obeyed[0].header, obeyed[-1].header
+        out.seconds = (last.stamp_wall_ns - first.stamp_wall_ns) / 1e9
     stages = {
         "end_to_end": [heard - cause.observation_stamp_ns for cause, heard in causes],
         "outbound": [c.observed_ns - c.observation_stamp_ns for c, _ in causes],
@@ -165,8 +187,7 @@ def _measured(run: Run, zero_ns: int, until_ns: int) -> Motion:
     return _stream(
         (
             (e.header.stamp_wall_ns, e.record.position_m, e.record.quat_xyzw, e.record.twist)
-            for e in run.poses
-            if e.heard_ns < until_ns
+            for e in _until(run.poses, until_ns)
         ),
         zero_ns,
     )
@@ -178,12 +199,11 @@ def _commanded(run: Run, zero_ns: int, until_ns: int) -> Motion:
         return _stream(
             (
                 (e.header.stamp_wall_ns, e.record.position_m, e.record.quat_xyzw, e.record.twist)
-                for e in run.commands
-                if e.heard_ns < until_ns
+                for e in _until(run.commands, until_ns)
             ),
             zero_ns,
         )
-    held = (e for e in run.poses if e.record.reference_position_m is not None)
+    poses = _until(run.poses, until_ns)
     return _stream(
         (
             (
@@ -192,8 +212,8 @@ def _commanded(run: Run, zero_ns: int, until_ns: int) -> Motion:
                 e.record.reference_quat_xyzw,
                 e.record.twist,
             )
-            for e in held
-            if e.heard_ns < until_ns
+            for e in poses
+            if e.record.reference_position_m is not None
         ),
         zero_ns,
     )
@@ -321,7 +341,9 @@ def _segments(
         out.marks.append((since_s, prompt))
         part = measured.part(since_s, until_s)
         carried_out = sum(
-            steps.get(_chunk(cause), 1) for cause, heard in causes if since_ns <= heard < end_ns
+            steps.get(_chunk(cause), 1)
+            for cause, _ in causes
+            if since_ns <= cause.received_ns < end_ns
         )
         low, high = np.searchsorted(out.width_t_s, (since_s, until_s))
         out.segments.append(
@@ -334,18 +356,3 @@ def _segments(
                 out.width_m[low:high],
             )
         )
-
-
-def _prompt_spans(run: Run) -> list[tuple[int, int, str]]:
-    out: list[tuple[int, int, str]] = []
-    since_ns, now = 0, None
-    for entry in run.tasks:
-        task = entry.record
-        said = task.prompt if task.active else None
-        if said != now:
-            if now is not None:
-                out.append((since_ns, entry.heard_ns, now))
-            since_ns, now = entry.heard_ns, said
-    if now is not None:
-        out.append((since_ns, _last_ns(run) + 1, now))
-    return out

@@ -123,7 +123,10 @@ class Recorder:
     def _ask_settings(self) -> None:
         """Settings are put once and kept by the command node: those in force stand at the top."""
         keys = self.node.keys
+        wanted = [zenoh.KeyExpr(expression) for expression in self._expressions]
         for key in (keys.prompt, keys.worker, keys.rate, keys.active):
+            if not any(expression.includes(zenoh.KeyExpr(key)) for expression in wanted):
+                continue
             for reply in self.node.session.get(key, timeout=ANSWER_S):
                 if reply.ok is not None:
                     self._put(key, reply.ok.payload.to_bytes(), TEXT, None)

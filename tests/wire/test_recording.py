@@ -1,0 +1,404 @@
+"""A robot's keys into a file and back onto keys, with real nodes and processes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from camera_rig import free_endpoint, until
+from chain import READY_PATIENCE_S, Chain, command_line, running_chain
+from rosbags.rosbag2 import Reader
+
+from vla_zenoh.codec import records
+from vla_zenoh.errors import NodeError
+from vla_zenoh.evaluation.result import Evaluation
+from vla_zenoh.evaluation.run_file import evaluate_run
+from vla_zenoh.keys import Keys, Kind
+from vla_zenoh.nodes.node import Stream
+from vla_zenoh.nodes.recorder import Recorder
+from vla_zenoh.nodes.replay import CAMERAS, Replay
+from vla_zenoh.profile import Profile, override
+from vla_zenoh.recording.reader import open_recording
+from vla_zenoh.recording.run import Run, load_run, pictures
+from vla_zenoh.types import Event, NodeStatus
+
+STEPS, STEP_M = 8, 0.01
+REACHED_M = 0.002
+RELATIVE = 1e-6  # stamps are floats of seconds since another beginning
+FILE_LIMIT_BYTES = 400_000
+PATIENCE_S = 30.0
+
+
+@pytest.fixture(scope="module")
+def run_file(shared_chain: Chain, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A robot that goes up, recorded from before its activation until after it."""
+    chain, path = shared_chain, tmp_path_factory.mktemp("recording") / "up.mcap"
+    chain.settle()
+    with recording(chain, path):
+        chain.client.set_prompt(f"HARD: go up x{STEPS}")
+        chain.client.activate()
+        chain.until("the steps are done", lambda: bool(chain.detail("policy_done")), PATIENCE_S)
+        chain.wait_still()
+        chain.client.deactivate()
+        chain.client.set_prompt("hold")
+    return path
+
+
+@contextmanager
+def recording(chain: Chain, path: Path, profile: Profile | None = None) -> Iterator[Recorder]:
+    recorder = Recorder(profile or chain.profile, chain.session, path).start()
+    try:
+        yield recorder
+    finally:
+        recorder.close()
+
+
+def ghost_of(chain: Chain, name: str = "ghost") -> Profile:
+    return override(chain.profile, {"robot": {"name": name}})
+
+
+def test_the_file_holds_everything_that_was_said(run_file: Path, shared_chain: Chain) -> None:
+    run = load_run(run_file)
+    assert run.problems == []
+    assert run.file.ended == {"dropped": {}}
+    streams = (run.poses, run.joints, run.grippers, run.commands, run.chunks, run.tasks)
+    assert all(len(stream) > 5 for stream in (*streams, run.seen))
+    assert run.picture_counts["front"] > 5
+    said = [(setting.name, setting.text) for setting in run.settings]
+    assert said[0] == ("prompt", "hold"), "the setting in force before the recording began"
+    for setting in (("prompt", f"HARD: go up x{STEPS}"), ("active", "true"), ("active", "false")):
+        assert setting in said
+    assert {"camera", "command", "sim", "worker-scripted"} <= run.statuses.keys()
+    assert any(heard.record.kind == "transition" for heard in run.events)
+    (spec,) = run.specs.values()
+    assert spec.name == "scripted"
+    assert shared_chain.profile.session.connect[0] in run.file.profile_yaml
+
+
+def test_every_sample_is_there_once_and_in_order(run_file: Path) -> None:
+    last_ns = 0
+    seqs: dict[tuple[str, str], int] = {}
+    for entry in open_recording(run_file).entries():
+        assert entry.heard_ns >= last_ns
+        last_ns = entry.heard_ns
+        if entry.header is not None and "state" in entry.key:
+            source = (entry.key, entry.header.source)
+            assert entry.header.seq == seqs.get(source, entry.header.seq - 1) + 1
+            seqs[source] = entry.header.seq
+    assert len(seqs) == 3
+
+
+def test_rosbags_finds_the_standard_messages(run_file: Path) -> None:
+    with Reader(run_file) as bag:
+        types = {c.topic: (c.msgtype, c.msgcount) for c in bag.connections}
+    expected = {
+        "/vla/panda/camera/front/jpeg": "sensor_msgs/msg/CompressedImage",
+        "/vla/panda/state/joint": "sensor_msgs/msg/JointState",
+        "/vla/panda/state/pose": "geometry_msgs/msg/PoseStamped",
+        "/vla/panda/command/pose": "geometry_msgs/msg/PoseStamped",
+        "/vla/panda/prompt": "std_msgs/msg/String",
+    }
+    for topic, name in expected.items():
+        assert types[topic][0] == name
+        assert types[topic][1] > 0
+
+
+def test_its_evaluation_tells_what_the_arm_did(run_file: Path) -> None:
+    found = evaluate_run(run_file, pictures=3)
+    segment = next(s for s in found.segments if s.prompt == f"HARD: go up x{STEPS}")
+    assert segment.asked_m == pytest.approx(STEPS * STEP_M)
+    assert segment.along_m == pytest.approx(STEPS * STEP_M, abs=REACHED_M)
+    assert found.command_path_m == pytest.approx(STEPS * STEP_M, abs=REACHED_M)
+    assert found.success_rate == 1.0
+    assert found.requests >= STEPS
+    assert set(found.latency()) == {
+        "end_to_end",
+        "outbound",
+        "inference",
+        "inbound",
+        "worker_to_command",
+        "command_to_pose",
+    }
+    whole, parts = found.stages_ms["end_to_end"], ("outbound", "inference", "inbound")
+    np.testing.assert_allclose(whole, sum(found.stages_ms[p] for p in parts), atol=1.0)
+    assert found.problems == []
+    seen = [view for view in found.views if view.model]
+    assert len(found.views) == 3 + len(seen)
+
+
+def test_the_first_requests_alone_can_be_evaluated(run_file: Path) -> None:
+    found = evaluate_run(run_file, 3)
+    assert found.requests == 3
+    assert len(found.stages_ms["end_to_end"]) <= 3
+    assert found.path_m is not None
+    assert found.path_m < evaluate_run(run_file).path_m  # pyright: ignore
+
+
+# -- replay ---------------------------------------------------------------------------------------
+def moved_equally(one: Run, other: Run, kind: str) -> None:
+    """Every record of the one is in the other, later by one and the same time."""
+    a, b = getattr(one, kind), getattr(other, kind)
+    assert [entry.header.seq for entry in a] == [entry.header.seq for entry in b]
+    shifts = {y.header.stamp_wall_ns - x.header.stamp_wall_ns for x, y in zip(a, b, strict=True)}
+    assert len(shifts) == 1
+
+
+ARRIVAL = {"end_to_end", "inbound", "command_to_pose"}
+"""Stages that end when the recorder heard a command: those are the replay's own."""
+
+
+def assert_same(one: Evaluation, other: Evaluation) -> None:
+    """All figures but those of arrival times at the recorder."""
+    a, b = one.row(), other.row()
+    for name, value in a.items():
+        if name.startswith("e2e_") or name == "record_id":
+            continue
+        if isinstance(value, float):
+            assert math.isclose(value, b[name], rel_tol=RELATIVE, abs_tol=1e-9), name
+        else:
+            assert value == b[name], name
+    for stage, values in one.stages_ms.items():
+        assert len(values) == len(other.stages_ms[stage])
+        if stage not in ARRIVAL:
+            np.testing.assert_array_equal(values, other.stages_ms[stage])
+    assert [s.prompt for s in one.segments] == [s.prompt for s in other.segments]
+
+
+def test_a_replayed_run_evaluates_as_the_original(
+    run_file: Path, chain: Chain, tmp_path: Path
+) -> None:
+    ghost, again = ghost_of(chain), tmp_path / "again.mcap"
+    with recording(chain, again, ghost):
+        done = command_line(
+            "replay", str(run_file), "--as", "ghost", "--json", profile=chain.profile_file
+        )
+        assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["failure"] == ""
+    assert set(result["interval_error_ms"]) == {"p50", "p95", "max"}
+    one, other = load_run(run_file), load_run(again)
+    assert other.keys == Keys("ghost")
+    for kind in ("poses", "joints", "grippers", "commands", "chunks", "tasks", "seen"):
+        moved_equally(one, other, kind)
+    jpegs = [[p.jpeg for p in pictures(run.file, "front")] for run in (one, other)]
+    assert jpegs[0] == jpegs[1]
+    assert_same(evaluate_run(run_file), evaluate_run(again))
+
+
+def test_a_worker_infers_on_a_replayed_run(run_file: Path, chain: Chain, tmp_path: Path) -> None:
+    profile = tmp_path / "ghost.yaml"
+    profile.write_text(f"extends: {chain.profile_file}\nrobot: {{name: ghost}}\n")
+    statuses: list[NodeStatus] = []
+    subscriber = chain.session.declare_subscriber(
+        Keys("ghost").status("worker-scripted"),
+        lambda s: statuses.append(records.decode(NodeStatus, s.payload.to_bytes())),
+    )
+    only = [word for part in ("cameras", "state", "task") for word in ("--only", part)]
+    words = ("replay", str(run_file), "--as", "ghost", "--loop", *only)
+    with process("worker", "scripted", profile=profile), process(*words, profile=profile):
+        until(
+            "the worker infers",
+            lambda: any(status.state == "inferring" for status in statuses),
+            READY_PATIENCE_S,
+        )
+    subscriber.undeclare()
+
+
+@contextmanager
+def process(*words: str, profile: Path, **more: Any) -> Iterator[subprocess.Popen[str]]:
+    child = subprocess.Popen(
+        [sys.executable, "-m", "vla_zenoh", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "VLA_ZENOH_PROFILE": str(profile), "NO_COLOR": "1", "COLUMNS": "200"},
+        **more,
+    )
+    try:
+        yield child
+    finally:
+        child.terminate()
+        child.communicate(timeout=15)
+
+
+def test_a_replay_onto_a_live_robot_is_refused(run_file: Path, chain: Chain) -> None:
+    done = command_line("replay", str(run_file), profile=chain.profile_file)
+    assert done.returncode == 1
+    assert "robot 'panda' lives (command, sim)" in done.stderr
+    assert "--as NAME" in done.stderr
+
+
+def test_pictures_beside_a_live_camera_are_left_out(run_file: Path, chain: Chain) -> None:
+    done = command_line("replay", str(run_file), "--only", "cameras", profile=chain.profile_file)
+    assert done.returncode == 1
+    assert "of node camera, which is alive itself" in done.stderr
+
+
+def test_a_replay_ends_when_a_robot_comes_to_life(run_file: Path, chain: Chain) -> None:
+    ghost = ghost_of(chain, "sleeper")
+    replay = Replay(ghost, chain.session, open_recording(run_file), loop=True)
+    found: list[Any] = []
+    thread = threading.Thread(target=lambda: found.append(replay.run(threading.Event())))
+    thread.start()
+    time.sleep(1.0)
+    token = chain.session.liveliness().declare_token(ghost.keys.alive("command"))
+    thread.join(PATIENCE_S)
+    token.undeclare()
+    assert "robot 'sleeper' lives (command)" in found[0].failure
+
+
+def test_only_pictures_may_be_replayed_beside_a_live_robot(run_file: Path, chain: Chain) -> None:
+    ghost = ghost_of(chain, "blind")
+    token = chain.session.liveliness().declare_token(ghost.keys.alive("command"))
+    file = open_recording(run_file)
+    with pytest.raises(NodeError, match=r"robot 'blind' lives \(command\)"):
+        Replay(ghost, chain.session, file, groups={CAMERAS, "state"})
+    replayed = Replay(ghost, chain.session, file, groups={CAMERAS}, speed=8).run(threading.Event())
+    token.undeclare()
+    assert set(replayed.samples) == {Keys("blind").camera_jpeg("front")}
+    assert replayed.failure == ""
+
+
+# -- what goes wrong ------------------------------------------------------------------------------
+def test_what_the_queue_cannot_take_is_counted_and_said(chain: Chain, tmp_path: Path) -> None:
+    ghost, path = ghost_of(chain, "fast"), tmp_path / "a.mcap"
+    recorder = Recorder(ghost, chain.session, path, queue_bytes=100).start()
+    key = ghost.keys.event("camera")
+    stream = Stream(chain.session, key, Kind.ORDER, "camera#1", recorder.node.clock)
+    small = Event("info", "notice", "x")
+    for event in (small, Event("info", "notice", "x", "y" * 200), small):
+        stream.put(event)
+        time.sleep(0.4)
+    recorded = recorder.close()
+    # What it says of itself is larger than this queue, and is missing as well.
+    assert recorded.dropped[key] == 1
+    run = load_run(path)
+    assert run.file.ended == {"dropped": dict(recorded.dropped)}
+    assert [len(heard.record.why) for heard in run.events if "camera" in heard.key] == [0, 0]
+    assert f"the recorder dropped {recorded.dropped.total()} samples" in evaluate_run(path).problems
+
+
+def test_a_recorder_that_is_killed_leaves_a_readable_file(chain: Chain, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with process("record", "--out", str(path), profile=chain.profile_file) as child:
+        until(
+            "something is recorded",
+            lambda: path.exists() and path.stat().st_size > 50_000,
+            READY_PATIENCE_S,
+        )
+        child.send_signal(signal.SIGKILL)
+        child.wait(10)
+    run = load_run(path)
+    assert run.file.damage == ""
+    assert len(run.poses) > 10
+    with Reader(path) as bag:
+        assert sum(1 for _ in bag.messages()) > len(run.poses)
+    assert evaluate_run(path).problems == ["its recorder was ended before it could finish the file"]
+
+
+def test_a_full_disk_ends_the_recording_and_spares_the_file(chain: Chain, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_LIMIT_BYTES, FILE_LIMIT_BYTES))
+
+    with process(
+        "record", "--out", str(path), profile=chain.profile_file, preexec_fn=limit
+    ) as child:
+        output, _ = child.communicate(timeout=60)
+    assert child.returncode == 1
+    assert "File too large; what was recorded until then is whole" in " ".join(output.split())
+    run = load_run(path)
+    assert run.file.damage == ""
+    assert len(run.poses) > 10
+
+
+def test_the_recorder_says_how_it_goes(chain: Chain, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    done = command_line(
+        "record",
+        "--out",
+        str(path),
+        "--seconds",
+        "2",
+        "--keys",
+        "state/*",
+        "--keys",
+        "status/recorder",
+        "--json",
+        profile=chain.profile_file,
+    )
+    assert done.returncode == 0, done.stderr
+    result: dict[str, Any] = json.loads(done.stdout)
+    assert (result["dropped"], result["failure"]) == ({}, "")
+    assert result["size_bytes"] == path.stat().st_size
+    status = load_run(path).statuses["recorder"]
+    assert status.state == "recording"
+    assert status.counters["dropped"] == 0
+    assert set(result["samples"]) == {
+        *(chain.profile.keys.whole(f"state/{part}") for part in ("joint", "pose", "gripper")),
+        chain.profile.keys.status("recorder"),
+    }
+
+
+# -- a minute of a whole lab ----------------------------------------------------------------------
+LAB = """\
+extends: panda_sim
+task: {{prompt: hold, rate_hz: 5, worker: scripted}}
+session:
+  listen: [{endpoint}]
+  connect: [{endpoint}]
+"""
+LAB_S = 60.0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_a_minute_of_two_cameras_is_recorded_whole_and_replayed(tmp_path: Path) -> None:
+    lab, first, again = (tmp_path / name for name in ("lab.yaml", "first.mcap", "again.mcap"))
+    lab.write_text(LAB.format(endpoint=free_endpoint()))
+    words = ("record", "--out", str(first), "--seconds", f"{LAB_S:g}", "--json")
+    with running_chain(tmp_path, profile_file=lab) as chain:
+        chain.activate_when_ready()
+        results: list[Any] = []
+        thread = threading.Thread(
+            target=lambda: results.append(command_line(*words, profile=lab, timeout_s=2 * LAB_S))
+        )
+        thread.start()
+        time.sleep(8.0)
+        for prompt in ("go up", "yaw left", "go down", "yaw right"):
+            chain.client.set_prompt(f"HARD: {prompt} x20", timeout_s=10.0)
+            time.sleep(8.0)
+        chain.client.deactivate()
+        thread.join()
+        with recording(chain, again, ghost_of(chain)):
+            done = command_line(
+                *("replay", str(first), "--as", "ghost", "--json"),
+                profile=lab,
+                timeout_s=2 * LAB_S,
+            )
+    recorded, replayed = json.loads(results[0].stdout), json.loads(done.stdout)
+    print(
+        f"\nrecorded {recorded['bytes_per_s'] / 1e3:.0f} kB/s at {recorded['cpu_share']:.1%} of "
+        f"a core, {sum(recorded['samples'].values())} samples, dropped {recorded['dropped']}; "
+        f"replayed, time between samples off by {replayed['interval_error_ms']} ms"
+    )
+    assert recorded["dropped"] == {}
+    run = load_run(first)
+    for camera in ("front", "wrist"):
+        taken = [picture.seq for picture in pictures(run.file, camera)]
+        assert taken == list(range(taken[0], taken[0] + len(taken))), "a picture is missing"
+    assert_same(evaluate_run(first), evaluate_run(again))
