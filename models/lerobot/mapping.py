@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.policy import Observation
+from vla_zenoh.state_vector import read_state
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
@@ -22,22 +18,6 @@ WITHOUT_WORDS = frozenset({"act", "diffusion", "tdmpc", "vqbet"})
 """Policies that read no prompt."""
 REMOTE_CODE = frozenset({"gaussian_actor", "groot", "pi0_fast"})
 """LeRobot runs code from a model hub for these."""
-
-UPRIGHT = 1e-7
-"""Cosine of a pitch so near to 90 degrees that roll and yaw turn about the same axis."""
-
-STATE_PARTS: Mapping[str, tuple[str, int]] = {
-    "joints": ("joint", 7),
-    "joint_velocities": ("joint", 7),
-    "position": ("pose", 3),
-    "rpy": ("pose", 3),
-    "rotvec": ("pose", 3),
-    "quaternion": ("pose", 4),
-    "gripper_m": ("gripper", 1),
-    "gripper_open": ("gripper", 1),
-    "gripper_closed": ("gripper", 1),
-}
-"""What ``observation.state`` can be made of: part of the robot's state, and how many numbers."""
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -116,35 +96,24 @@ def pictures(
     return out
 
 
-def state_parts(features: Mapping[str, tuple[int, ...]], told: str) -> list[str]:
-    """Names of `STATE_PARTS` that make ``observation.state``, in order.
+def state_parts(features: Mapping[str, tuple[int, ...]], told: str) -> tuple[str, ...]:
+    """Parts that make ``observation.state``, in order, see `vla_zenoh.state_vector`.
 
     Args:
         features: of the policy.
-        told: the names, separated by commas.
+        told: the parts, joined by +.
 
     Raises:
-        WorkerError: their numbers are not as many as the policy's, or it wants something else.
+        WorkerError: the policy wants something else than pictures and a flat state.
+        SpecError: their numbers are not as many as the policy's.
     """
     other = sorted(name for name in features if name != STATE and not name.startswith(PICTURE))
     if other:
         raise WorkerError(f"the policy needs {', '.join(other)}, which no robot here can tell")
-    known = ", ".join(f"{name} ({size})" for name, (_, size) in STATE_PARTS.items())
-    names = [name.strip() for name in told.split(",") if name.strip()]
-    strange = [name for name in names if name not in STATE_PARTS]
-    if strange:
-        raise WorkerError(f"state names {strange[0]!r}; there are: {known}")
-    if STATE not in features:
-        if names:
-            raise WorkerError(f"the policy has no {STATE}; leave --set state= out")
-        return []
-    size = sum(STATE_PARTS[name][1] for name in names)
-    if features[STATE] != (size,):
-        raise WorkerError(
-            f"{STATE} has shape {features[STATE]}, --set state={told} makes ({size},); "
-            f"name its parts in order: {known}"
-        )
-    return names
+    shape = features.get(STATE, (0,))
+    if len(shape) != 1:
+        raise WorkerError(f"{STATE} has shape {shape}; wanted one row of numbers")
+    return read_state(told, shape[0])
 
 
 def one_by_one(config: Mapping[str, Any]) -> bool:
@@ -179,65 +148,6 @@ def number(name: str, given: str) -> float:
         return float(given)
     except ValueError as error:
         raise WorkerError(f"{name} is {given!r}; wanted a number") from error
-
-
-def state_numbers(
-    names: Sequence[str], observation: Observation, max_width_m: float
-) -> NDArray[np.float32]:
-    """(N,) ``observation.state``.
-
-    Positions in m, angles in rad, quaternions x, y, z, w with w >= 0, rpy extrinsic x, y, z.
-
-    Args:
-        names: of `STATE_PARTS`, in order.
-        observation: has the parts that these need.
-        max_width_m: of the open gripper.
-    """
-    joint, pose, gripper = observation.joint, observation.pose, observation.gripper
-    out: list[float] = []
-    for name in names:
-        if joint is not None and name in ("joints", "joint_velocities"):
-            out += list(joint.position_rad if name == "joints" else joint.velocity_rad_s)
-        elif pose is not None and name == "position":
-            out += list(pose.position_m)
-        elif pose is not None and name in ROTATION_FORMS:
-            out += ROTATION_FORMS[name](pose.quat_xyzw)
-        elif gripper is not None:
-            share = gripper.width_m / max_width_m
-            out.append({"gripper_m": gripper.width_m, "gripper_open": share}.get(name, 1 - share))
-    return np.asarray(out, np.float32)
-
-
-def quaternion(quat_xyzw: Sequence[float]) -> list[float]:
-    """The same rotation with w >= 0."""
-    sign = -1.0 if quat_xyzw[3] < 0 else 1.0
-    return [sign * float(value) for value in quat_xyzw]
-
-
-def rotvec(quat_xyzw: Sequence[float]) -> list[float]:
-    """Axis times angle in rad, angle within [0, pi]."""
-    x, y, z, w = quaternion(quat_xyzw)
-    sine = math.sqrt(x * x + y * y + z * z)
-    factor = 2 * math.atan2(sine, w) / sine if sine > 0 else 2.0
-    return [factor * x, factor * y, factor * z]
-
-
-def rpy(quat_xyzw: Sequence[float]) -> list[float]:
-    """Roll, pitch, yaw in rad: turns about the fixed x, y, z, one after the other."""
-    x, y, z, w = quaternion(quat_xyzw)
-    ahead, aside = 1 - 2 * (y * y + z * z), 2 * (w * z + x * y)
-    sine, cosine = 2 * (w * y - z * x), math.hypot(ahead, aside)
-    pitch = math.atan2(sine, cosine)
-    if cosine < UPRIGHT:  # only the sum, or difference, of the other two is known
-        return [0.0, pitch, math.copysign(2.0, -sine) * math.atan2(x, w)]
-    return [
-        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        pitch,
-        math.atan2(aside, ahead),
-    ]
-
-
-ROTATION_FORMS = {"quaternion": quaternion, "rotvec": rotvec, "rpy": rpy}
 
 
 def device_step(pipeline: Path) -> bool:

@@ -8,7 +8,7 @@ A policy directory does not say what its numbers mean, so the options do, and wh
 checked against the sizes in its config. Weights are read from safetensors; nothing is unpickled.
 
     vla-zenoh worker lerobot --set checkpoint=DIR --set dt_s=0.1 --set kind=delta \\
-        --set rotation=rpy --set gripper=open_fraction --set state=position,rpy,gripper_m
+        --set rotation=rpy --set gripper=open_fraction --set state=position+rpy+gripper_m
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from vla_zenoh_model_lerobot.mapping import (
     ACTION,
     PIPELINES,
     STATE,
-    STATE_PARTS,
     WEIGHTS,
     WITHOUT_WORDS,
     device_step,
@@ -32,7 +31,6 @@ from vla_zenoh_model_lerobot.mapping import (
     one_by_one,
     pictures,
     read_config,
-    state_numbers,
     state_parts,
 )
 
@@ -50,6 +48,7 @@ from vla_zenoh.policy import (
     Resize,
     Rotation,
 )
+from vla_zenoh.state_vector import parts_of, state_vector
 
 
 class LeRobot:
@@ -64,7 +63,7 @@ class LeRobot:
         frame: axes of a delta, ``base`` or ``tcp``.
         open_is_high: ``yes``: a large gripper number means open.
         scale_m: metres of one unit of position.
-        state: what the numbers of ``observation.state`` are, in order, of `STATE_PARTS`.
+        state: what the numbers of ``observation.state`` are, in order, see `state_vector`.
         cameras: ``camera=feature`` where the names differ, separated by commas; a feature without
             one takes the camera of its own last name.
         resize: how a picture of another size becomes the one of the config.
@@ -128,7 +127,7 @@ class LeRobot:
                     )
                     for camera, (_, shape) in self._pictures.items()
                 ),
-                state=tuple(dict.fromkeys(STATE_PARTS[name][0] for name in self._state)),
+                state=parts_of(self._state),
                 prompt=config["type"] not in WITHOUT_WORDS,
             ),
             action=ActionSpec(
@@ -221,7 +220,7 @@ class LeRobot:
             for camera, (feature, _) in self._pictures.items()
         }
         if self._state:
-            given[STATE] = state_numbers(self._state, observation, self._max_width_m)
+            given[STATE] = state_vector(self._state, observation, self._max_width_m)
         with torch.inference_mode():
             device = torch.device(self.policy.config.device)
             batch = self._before(

@@ -35,7 +35,7 @@ MEANING = {
     "rotation": "rpy",
     "gripper": "open_fraction",
     "dt_s": "0.1",
-    "state": "position,rotvec,gripper_m",
+    "state": "position+rotvec+gripper_m",
 }
 STATE = [0.4, 0.1, 0.3, 0.0, 0.0, np.pi / 2, 0.05]
 
