@@ -54,7 +54,11 @@ def main(name: str, direction: str, count: int) -> None:
             still = float(np.abs(now.twist[:3]).max()) < STILL_M_S
             return bool(command and command.detail.get("policy_done") and still)
 
-        until("the motion", done, 10.0 + 2.0 * count)
+        try:
+            until("the motion", done, 10.0 + 2.0 * count)
+        except AssertionError as error:
+            news = [f"{node} {event.what}: {event.why}" for node, _, event in client.events]
+            raise AssertionError("\n".join([str(error), str(client.task), *news[-20:]])) from error
         time.sleep(0.5)
         end = until("a pose", recorder.newest_state)
         client.deactivate()

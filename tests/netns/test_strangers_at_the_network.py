@@ -11,12 +11,11 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pytest
-from netns.lab import Lab, lab, needs_namespaces, scratch
+from netns.lab import needs_namespaces
+from netns.site import HERE, Site, secured_site
 
 from vla_zenoh.nodes.session import config
 from vla_zenoh.profile import load_profile, override
@@ -25,7 +24,6 @@ from vla_zenoh.security.store import Store
 
 pytestmark = [pytest.mark.netns, pytest.mark.slow, needs_namespaces, pytest.mark.timeout(240)]
 
-HERE = Path(__file__).parent
 PORT = 7447
 STEPS, STEP_M, TOLERANCE_M = 10, 0.01, 0.001
 STILL_M = 0.001
@@ -46,68 +44,18 @@ hosts:
 """
 
 
-@dataclass
-class Site:
-    """The lab at work.
-
-    Args:
-        hosts: the namespaces.
-        folder: everything's.
-        store: of the authority, which no host has.
-    """
-
-    hosts: Lab
-    folder: Path
-    store: Store
-
-    def profile(self, host: str) -> Path:
-        return self.folder / host / "lab.yaml"
-
-    def equip(self, host: str) -> Path:
-        """Give a host what a person would copy there: its own certificates and the profile."""
-        folder = self.folder / host
-        shutil.copytree(self.store.folder / host, folder / "certificates" / host)
-        text = (self.folder / "plain_secure.yaml").read_text()
-        text = text.replace(str(self.store.folder), str(folder / "certificates"))
-        text = text.replace("extends: plain", f"extends: {self.folder / 'plain.yaml'}")
-        self.profile(host).write_text(text)
-        return self.profile(host)
-
-
 @pytest.fixture(scope="module")
 def site() -> Iterator[Site]:
-    with scratch() as folder, lab("robot", "gpu", "desk", "strange") as hosts:
-        (folder / "plain.yaml").write_text(PLAIN)
-        made = Site(hosts, folder, Store(folder / "authority"))
-
-        def secure(*words: str) -> None:
-            done = hosts["desk"].run(sys.executable, "-m", "vla_zenoh", "secure", *words)
-            assert done.returncode == 0, done.stdout + done.stderr
-
-        secured = str(folder / "plain_secure.yaml")
-        place = f"robot={hosts['robot'].address}"
-        secure(
-            *("init", "--profile", str(folder / "plain.yaml"), "--output", secured),
-            *("--folder", str(made.store.folder), "--at", place),
-        )
-        secure("add", "desk", "--role", "operator", "--profile", secured)
-        secure("add", "wall", "--role", "viewer", "--profile", secured)
-        for host in ("robot", "gpu", "desk"):
-            made.equip(host)
-        for host in ("robot", "gpu"):
-            words = (sys.executable, "-m", "vla_zenoh", "up", str(made.profile(host)))
-            hosts[host].start(*words, "--host", host, output=folder / f"{host}.log")
+    with secured_site(PLAIN, ("robot", "gpu", "desk", "strange"), ("robot",)) as made:
+        made.add("desk", "operator")
+        made.add("wall", "viewer")
+        made.equip("robot", "gpu", "desk")
+        made.up("robot", "gpu")
         yield made
 
 
 def test_three_hosts_with_certificates_carry_out_the_motion(site: Site) -> None:
-    try:
-        found = site.hosts["desk"].ask(
-            HERE / "drive.py", str(site.profile("desk")), "up", str(STEPS), timeout_s=120.0
-        )
-    except AssertionError as error:
-        logs = [f"{h}:\n{(site.folder / f'{h}.log').read_text()[-3000:]}" for h in ("robot", "gpu")]
-        raise AssertionError("\n".join([str(error), *logs])) from None
+    found = site.drive("desk", "up", STEPS)
     assert found["way_m"] == pytest.approx([0.0, 0.0, STEPS * STEP_M], abs=TOLERANCE_M)
     assert found["jpeg"] > 0  # pictures crossed the network as JPEG ...
     assert found["raw"] == 0  # ... and none as pixels

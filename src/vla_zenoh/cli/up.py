@@ -46,7 +46,7 @@ def up(
         log(node, sentence, "bold")
 
     with Host(loaded, host, log=log, tell=tell) as running:
-        where = ", ".join(loaded.session.connect)
+        where = ", ".join(running.profile.session.connect)
         tell("up", f"profile {loaded.name}, host {running.host}, router at {where}")
         tell("up", "look: vla-zenoh status; drive: vla-zenoh prompt/activate; end: Ctrl-C")
         running.serve(stop)

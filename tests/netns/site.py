@@ -1,0 +1,102 @@
+"""A lab with certificates on hosts that are namespaces, made by the commands a person would use."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from netns.lab import Lab, lab, scratch
+
+from vla_zenoh.security.store import Store
+
+HERE = Path(__file__).parent
+DRIVE_S = 120.0
+LINES_SHOWN = 3000
+
+
+@dataclass
+class Site:
+    """The lab.
+
+    Args:
+        hosts: the namespaces.
+        folder: everything's.
+        store: of the authority, which no host has.
+    """
+
+    hosts: Lab
+    folder: Path
+    store: Store
+
+    @property
+    def secured(self) -> Path:
+        return self.folder / "plain_secure.yaml"
+
+    def profile(self, host: str) -> Path:
+        return self.folder / host / "lab.yaml"
+
+    def vla(self, host: str, *words: str, timeout_s: float = 60.0) -> str:
+        """Run ``vla-zenoh`` on a host; returns its output."""
+        done = self.hosts[host].run(sys.executable, "-m", "vla_zenoh", *words, timeout_s=timeout_s)
+        assert done.returncode == 0, f"{words}: {done.stdout}{done.stderr}"
+        return done.stdout
+
+    def add(self, host: str, role: str) -> None:
+        """Give people at a computer a role."""
+        anywhere = next(iter(self.hosts.hosts))
+        words = ("secure", "add", host, "--role", role, "--profile", str(self.secured))
+        self.vla(anywhere, *words)
+
+    def equip(self, *hosts: str) -> None:
+        """Give hosts what a person would copy there: their own certificates and the profile."""
+        for host in hosts:
+            folder = self.folder / host
+            shutil.copytree(self.store.folder / host, folder / "certificates" / host)
+            text = self.secured.read_text()
+            text = text.replace(str(self.store.folder), str(folder / "certificates"))
+            text = text.replace("extends: plain", f"extends: {self.folder / 'plain.yaml'}")
+            self.profile(host).write_text(text)
+
+    def up(self, *hosts: str) -> None:
+        """Start what belongs on these hosts."""
+        for host in hosts:
+            words = (sys.executable, "-m", "vla_zenoh", "up", str(self.profile(host)))
+            self.hosts[host].start(*words, "--host", host, output=self.folder / f"{host}.log")
+
+    def drive(self, host: str, direction: str, count: int) -> Any:
+        """Drive the arm from a host; what came of it."""
+        words = (str(self.profile(host)), direction, str(count))
+        try:
+            return self.hosts[host].ask(HERE / "drive.py", *words, timeout_s=DRIVE_S)
+        except AssertionError as error:
+            logs = [
+                f"{path.stem}:\n{path.read_text()[-LINES_SHOWN:]}"
+                for path in sorted(self.folder.glob("*.log"))
+            ]
+            raise AssertionError("\n".join([str(error), *logs])) from None
+
+
+@contextmanager
+def secured_site(plain: str, hosts: Sequence[str], routers: Sequence[str]) -> Iterator[Site]:
+    """A lab whose profile is `plain`, with certificates, nothing started yet.
+
+    Args:
+        plain: the profile, all of it on loopback.
+        hosts: of the network.
+        routers: those that run one.
+    """
+    with scratch() as folder, lab(*hosts) as made:
+        (folder / "plain.yaml").write_text(plain)
+        site = Site(made, folder, Store(folder / "authority"))
+        places = [word for host in routers for word in ("--at", f"{host}={made[host].address}")]
+        site.vla(
+            hosts[0],
+            *("secure", "init", "--profile", str(folder / "plain.yaml")),
+            *("--output", str(site.secured), "--folder", str(site.store.folder), *places),
+        )
+        yield site
