@@ -251,6 +251,8 @@ class Policy(Protocol):
     ``normalisation_keys``, where a model has it, names the statistics its weights came with:
     `ActionSpec.normalisation` must be one of them.
     ``example_prompts`` likewise names prompts it knows, the first of which makes it move.
+    ``takes_committed = True``: it is called as ``infer(observation, committed=...)`` and told what
+    of its last chunk is under way, see `vla_zenoh.committed`.
     """
 
     @property

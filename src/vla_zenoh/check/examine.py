@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from vla_zenoh.check import fit, plausible
 from vla_zenoh.check.examples import MAX_WIDTH_M, PROMPTS, Look, Maker, looks, noise
 from vla_zenoh.check.finding import Finding, distinct, error, note, warning
+from vla_zenoh.committed import Continuation
 from vla_zenoh.errors import SpecError
-from vla_zenoh.policy import ActionSteps, ModelSpec, Policy, check_steps
+from vla_zenoh.policy import ModelSpec, Policy, check_steps
 from vla_zenoh.profile import Limits, Profile, Timing
 
 DEFAULT_RUNS = 100
@@ -149,7 +150,7 @@ class Examination:
         named = prompts or getattr(policy, "example_prompts", None)
         self._looks = looks(tuple(named) if named else PROMPTS)
         self._runs, self._budget_s = runs, budget_s
-        self._maker = Maker(policy.spec, profile)
+        self._maker, self._continuation = Maker(policy.spec, profile), Continuation(policy)
         self._answers: list[tuple[Look, Steps]] = []
         self._took_ms: list[float] = []
         self.report = Report(worker, policy.spec)
@@ -302,6 +303,7 @@ class Examination:
         return self._infer(look, again=True)
 
     def _reset(self) -> None:
+        self._continuation = Continuation(self._policy)
         reset = getattr(self._policy, "reset", None)
         if not callable(reset):
             return
@@ -319,21 +321,23 @@ class Examination:
             findings.append(error("picture_size", str(fault)))
             return None
         try:
-            answer, took_s = self._bench.call(lambda: self._policy.infer(observation))
+            answer, took_s = self._bench.call(lambda: self._continuation.infer(observation))
         except Failed as failed:
             refused = look.strange and isinstance(failed.error, SpecError)
             if not refused:
                 findings.append(error("inference_failed", f"{look.name}: {failed}"))
             return None
         self._took_ms.append(took_s * 1e3)
-        given = answer.steps if isinstance(answer, ActionSteps) else answer
         try:
-            steps = check_steps(action, given)
+            steps = check_steps(action, answer.steps)
         except SpecError as fault:
             findings.append(error(fault.reason, f"{look.name}: {fault}"))
             return None
         findings += plausible.findings(action, steps, self._limits, self._width_m)
         self._answers.append((look, steps))
+        # So that one that takes what is under way is given some at the next look.
+        arrival_ns = observation.stamp_wall_ns + round(took_s * 1e9)
+        self._continuation.published(observation, steps, arrival_ns, obeyed=look.active)
         return steps
 
     def _in_budget(self) -> bool:

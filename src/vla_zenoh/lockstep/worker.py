@@ -5,10 +5,11 @@ from __future__ import annotations
 import random
 from typing import Any
 
+from vla_zenoh.committed import Continuation
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.lockstep.records import Delays
 from vla_zenoh.observe import History, NotYet, assemble
-from vla_zenoh.policy import ActionSteps, Policy, check_steps
+from vla_zenoh.policy import Policy, check_steps
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
@@ -36,6 +37,7 @@ class LockstepWorker:
         self.name = name
         self.source = worker_node(name)
         self.policy, self.spec = policy, policy.spec
+        self._continuation = Continuation(policy)
         self.task: Task | None = None
         self._patience_ns = int(profile.timing.max_observation_age_s * 1e9)
         self._delays, self._jitter = delays, jitter
@@ -84,8 +86,7 @@ class LockstepWorker:
         )
         if isinstance(observation, NotYet):
             return None
-        result = self.policy.infer(observation)
-        answer = result if isinstance(result, ActionSteps) else ActionSteps(result)
+        answer = self._continuation.infer(observation)
         steps = check_steps(self.spec.action, answer.steps)
         share = 1.0 + self._delays.jitter * self._jitter.uniform(-1.0, 1.0)
         duration_ns = round(self._delays.inference_s * share * 1e9)
@@ -93,6 +94,8 @@ class LockstepWorker:
         period_ns = round(1e9 / observation.rate_hz)
         self._due_ns = max(self._due_ns + period_ns, now_ns + duration_ns)
         self._not_before_ns = wall_ns + duration_ns
+        obeyed = self.task.active and self.task.worker == self.name
+        self._continuation.published(observation, steps, self._not_before_ns, obeyed=obeyed)
         return ActionChunk(
             worker=self.name,
             spec_hash=self.spec.hash,

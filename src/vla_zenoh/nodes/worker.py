@@ -15,6 +15,7 @@ import zenoh
 
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
+from vla_zenoh.committed import Continuation
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import CodecError, PeerError, SpecError
 from vla_zenoh.keys import Kind
@@ -24,7 +25,7 @@ from vla_zenoh.nodes.seen import SeenOutlet
 from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
 from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.observe import History, NotYet, assemble, form_of
-from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps
+from vla_zenoh.policy import CameraSpec, Observation, Policy, check_steps
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
@@ -80,6 +81,7 @@ class WorkerNode:
         self._delay_s = delay_s
         node = self.node = Node(worker_node(name), profile, session)
         self.policy, self.name, self.spec = policy, name, policy.spec
+        self._continuation = Continuation(policy)
         keys = node.keys
         self._chunk_out = node.stream(keys.delta(name), Kind.ORDER)
         self._spec_out = node.stream(keys.spec(name), Kind.NEWS)
@@ -268,8 +270,7 @@ class WorkerNode:
         observed_ns = self.node.clock.wall_ns()
         start_ns = self.node.clock.wall_ns()
         try:
-            result = self.policy.infer(observation)
-            answer = result if isinstance(result, ActionSteps) else ActionSteps(result)
+            answer = self._continuation.infer(observation)
             steps, done = check_steps(self.spec.action, answer.steps), bool(answer.done)
         except SpecError as error:
             return self._failed("contract", str(error))
@@ -300,6 +301,8 @@ class WorkerNode:
         )
         self._not_before_ns = header.stamp_wall_ns
         self._rate.tick()
+        obeyed = observation.task.active and observation.task.worker == self.name
+        self._continuation.published(observation, steps, header.stamp_wall_ns, obeyed=obeyed)
         self._seen.show(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
         return True
 
