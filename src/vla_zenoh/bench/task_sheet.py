@@ -22,10 +22,15 @@ Picture = NDArray[np.uint8]
 
 def failure_sheet(ended: Sequence[Ended]) -> bytes | None:
     """A JPEG file with the first failures that have pictures; None where there is none."""
-    failed = [e for e in ended if not e.success and e.pictures is not None][:MAX_TILES]
-    if not failed:
+    return sheet([each for each in ended if not each.success])
+
+
+def sheet(ended: Sequence[Ended]) -> bytes | None:
+    """A JPEG file with the first outcomes that have pictures; None where there is none."""
+    shown = [each for each in ended if each.pictures is not None][:MAX_TILES]
+    if not shown:
         return None
-    tiles = [_tile(each) for each in failed]
+    tiles = [_tile(each) for each in shown]
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % min(COLUMNS, len(tiles)))
     columns = min(COLUMNS, len(tiles))
     rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
@@ -41,7 +46,7 @@ def _tile(ended: Ended) -> Picture:
                 decode_jpeg(jpeg).rgb, (TILE_WIDTH, TILE_HEIGHT), interpolation=cv2.INTER_AREA
             )
             tile[:TILE_HEIGHT, index * TILE_WIDTH : (index + 1) * TILE_WIDTH] = small
-    said = f"{ended.episode.seed}: {ended.failure}, {ended.time_s:.1f} s"
+    said = f"{ended.episode.seed}: {ended.failure or 'done'}, {ended.time_s:.1f} s"
     # OpenCV's letters are ASCII.
     prompt = ended.prompt.encode("ascii", "replace").decode()
     for row, line in enumerate([said, *textwrap.wrap(prompt, LETTERS)[:2]]):
@@ -51,7 +56,7 @@ def _tile(ended: Ended) -> Picture:
             (6, TILE_HEIGHT + 18 + 16 * row),
             cv2.FONT_HERSHEY_SIMPLEX,
             0.38,
-            (180, 0, 0) if row == 0 else (0, 0, 0),
+            (180, 0, 0) if row == 0 and not ended.success else (0, 0, 0),
             1,
             cv2.LINE_AA,
         )

@@ -6,6 +6,8 @@ import json
 import socket
 import threading
 import time
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,7 @@ from vla_zenoh.nodes.recorder import Recorder
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile, override, to_yaml
 from vla_zenoh.recording.run import Run, load_run, pictures
+from vla_zenoh.types import NodeStatus
 
 MAX_LOG_LINES = 20
 RECORDING = "run.mcap"
@@ -135,7 +138,7 @@ def _run(
             with host as running:
                 assert running.session is not None and running.client is not None
                 recorder = Recorder(
-                    profile, running.session, folder / RECORDING, expressions=_recorded(profile)
+                    profile, running.session, folder / RECORDING, expressions=recorded(profile)
                 ).start()
                 listener = Listener(running.session, profile.keys, profile.task.worker, keep=KEPT)
 
@@ -162,7 +165,7 @@ def _camera(profile: Profile) -> str | None:
     return "front" if "front" in profile.cameras else next(iter(profile.cameras), None)
 
 
-def _recorded(profile: Profile) -> tuple[str, ...]:
+def recorded(profile: Profile) -> tuple[str, ...]:
     """Everything, and the pictures of one camera: each more takes its share of the processor."""
     camera = _camera(profile)
     keys = profile.keys
@@ -172,12 +175,6 @@ def _recorded(profile: Profile) -> tuple[str, ...]:
 def _summary(profile: Profile, rate_hz: float, result: DemoResult, run: Run) -> dict[str, Any]:
     outcomes = [outcome.to_dict() for outcome in result.outcomes]
     commands = run.commands or run.joint_commands
-    refusals: dict[str, int] = {}
-    for status in result.statuses.values():
-        for name, count in status.counters.items():
-            if name.startswith("refused."):
-                key = name.removeprefix("refused.")
-                refusals[key] = refusals.get(key, 0) + count
     only = outcomes[0] if len(outcomes) == 1 else {}
     return {
         "ok": bool(outcomes) and not result.interrupted and all(o["ok"] for o in outcomes),
@@ -195,9 +192,19 @@ def _summary(profile: Profile, rate_hz: float, result: DemoResult, run: Run) -> 
             else 0.0,
         },
         "missed_ticks": _counter(result, "command", "command.missed_ticks"),
-        "refusals": dict(sorted(refusals.items())),
+        "refusals": refusals(result.statuses),
         "segments": outcomes,
     }
+
+
+def refusals(statuses: Mapping[str, NodeStatus]) -> dict[str, int]:
+    """What all nodes refused, by reason."""
+    out: Counter[str] = Counter()
+    for status in statuses.values():
+        for name, count in status.counters.items():
+            if name.startswith("refused."):
+                out[name.removeprefix("refused.")] += count
+    return dict(sorted(out.items()))
 
 
 def _rate(entries: list[Any]) -> float:
@@ -236,7 +243,17 @@ def _write_folder(
         plotting = bars.add_task("drawing plot.png", total=1)
         plot_run(folder / "plot.png", profile, run.poses, run.commands, marks, first)
         bars.update(plotting, completed=1)
-        frames = _frames(run, _camera(profile))
+    film(folder, run, profile, marks, screen)
+
+
+def film(
+    folder: Path, run: Run, profile: Profile, marks: list[tuple[int, str]], screen: Console
+) -> None:
+    """Write front.mp4, with the prompts in it."""
+    frames = _frames(run, _camera(profile))
+    with Progress(
+        TextColumn("{task.description:<24}"), BarColumn(), TimeElapsedColumn(), console=screen
+    ) as bars:
         filming = bars.add_task("writing front.mp4", total=max(1, len(frames)))
         written = write_video(
             folder / "front.mp4",

@@ -1,0 +1,55 @@
+"""The tasks a demo lets a policy do: prompts as given, or one of every family."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from vla_zenoh.bench.task import Asked, Plan
+from vla_zenoh.tasks import FAMILIES, Episode, Order
+from vla_zenoh.tasks.understand import makes_no_sense, understand
+from vla_zenoh.types import ObjectPoses
+
+STAY = "stay"
+FIRST_SEED = 2_000_000
+"""Layouts of demos: none of them is in the data of a policy, or of its figures."""
+
+
+@dataclass(frozen=True, slots=True)
+class Said(Asked):
+    """An episode with a prompt that somebody thought of.
+
+    Args:
+        prompt: as put.
+    """
+
+    prompt: str = ""
+
+    def draw(self, objects: ObjectPoses, *, held_out: bool) -> Episode:
+        """What the prompt asks for; the arm is to stay where it asks for nothing."""
+        return Episode(self.seed, understand(self.prompt) or Order(STAY), self.prompt)
+
+
+@dataclass(frozen=True, slots=True)
+class Tour(Plan):
+    """Some prompts in one layout each, or one task of every family.
+
+    Args:
+        prompts: to be put one after the other; empty: one of every family, drawn.
+    """
+
+    prompts: tuple[str, ...] = ()
+
+    def asked(self) -> Iterator[Asked]:
+        """Every episode; the layouts follow each other."""
+        if self.prompts:
+            for index, prompt in enumerate(self.prompts):
+                yield Said(self.seed + index, STAY, None, prompt)
+        else:
+            for index, family in enumerate(FAMILIES):
+                yield Asked(self.seed + index, family)
+
+
+def judged(prompt: str) -> bool:
+    """Whether it is known here what `prompt` asks for."""
+    return understand(prompt) is not None or makes_no_sense(prompt)
