@@ -16,7 +16,9 @@
 """OpenVLA (Kim et al., CoRL 2024) from a directory of weights, as published or fine-tuned.
 
 One picture and the prompt in, one step out: metres and radians by which the TCP shall go, in the
-axes of the robot's base, and how far the gripper shall be open. No code of the checkpoint runs.
+axes of the robot's base, and how far the gripper shall be open. A directory fine-tuned by
+OpenVLA-OFT may want more pictures and the robot's state, and gives a chunk. No code of the
+checkpoint runs.
 
     vla-zenoh worker openvla --set checkpoint=DIR --set unnorm_key=bridge_orig
 """
@@ -29,8 +31,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from vla_zenoh_model_openvla.checkpoint import TOKENIZER, Checkpoint, read_checkpoint
+from vla_zenoh_model_openvla.chunk_files import chunk_steps, find_chunk_files
 from vla_zenoh_model_openvla.picture import trained_form
-from vla_zenoh_model_openvla.statistics import AXES, choose, read_range
+from vla_zenoh_model_openvla.statistics import AXES, Range, choose, read_range
 from vla_zenoh_model_openvla.tokens import PROMPTS, ActionBins, prompt_text, prompt_tokens
 
 from vla_zenoh.errors import SpecError, WorkerError
@@ -42,6 +45,7 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
 )
+from vla_zenoh.state_vector import parts_of, read_state, state_vector
 
 Device = str
 Dtype = Literal["auto", "bfloat16", "float16", "float32"]
@@ -69,7 +73,7 @@ class OpenVLA:
         unnorm_key: data set whose statistics turn numbers into metres; may be left out where there
             is only one.
         adapter: directory of a LoRA adapter that was not merged.
-        camera: the picture that the model is given.
+        camera: the picture that the model is given; OFT: several, separated by commas.
         dt_s: duration of a step; known for some data sets, and asked for otherwise.
         center_crop: give it the middle 90 % of the picture. ``auto``: where the directory's name
             says that it was trained with ``image_aug``.
@@ -77,6 +81,9 @@ class OpenVLA:
         device: as torch names it; ``auto``: a GPU where there is one.
         dtype: of weights; ``auto``: bfloat16 on a GPU, else float32.
         quantise: ``int8`` or ``nf4``: Llama's layers in less memory.
+        chunk: OFT: steps of a chunk; known for LIBERO and Bridge.
+        state: OFT: what the numbers of the robot's state are, see `vla_zenoh.state_vector`.
+        max_width_m: OFT: of the open gripper, for parts of the state that are fractions of it.
     """
 
     def __init__(
@@ -91,6 +98,9 @@ class OpenVLA:
         device: str = "auto",
         dtype: str = "auto",
         quantise: str = "none",
+        chunk: str = "auto",
+        state: str = "",
+        max_width_m: str = "0.08",
     ) -> None:
         if not checkpoint:
             raise WorkerError("it needs weights: --set checkpoint=DIRECTORY")
@@ -108,17 +118,27 @@ class OpenVLA:
         trained = AUGMENTED in str(self._adapter or found.folder.resolve())
         self._crop = trained if center_crop == "auto" else center_crop == "yes"
         self._device, self._dtype, self._quantise = device, dtype, quantise
-        self._camera = camera
+        self._cameras = tuple(name.strip() for name in camera.split(","))
+        self._files = find_chunk_files(self._adapter or found.folder)
+        steps = 1 if self._files is None else chunk_steps(chunk, self._key)
+        self._state_range: Range | None = None
+        self._state: tuple[str, ...] = ()
+        self._max_width_m = _seconds_or_metres("max_width_m", max_width_m)
+        if self._files is None and (len(self._cameras) > 1 or state):
+            raise WorkerError("plain OpenVLA sees one camera and no state; camera= names one")
+        if self._files is not None and self._files.state is not None:
+            self._state_range = read_range(found.statistics, self._key, "proprio", size=None)
+            self._state = read_state(state, len(self._state_range.low))
         self.spec = ModelSpec(
             name="openvla",
             observation=ObservationSpec(
                 # The picture as it comes: shrinking it is a part of what the model was trained on.
-                cameras=(CameraSpec(camera=camera),),
-                state=(),
+                cameras=tuple(CameraSpec(camera=name) for name in self._cameras),
+                state=parts_of(self._state),
                 prompt=True,
             ),
             action=ActionSpec(
-                horizon=1,
+                horizon=steps,
                 dt_s=_step_s(dt_s, self._key),
                 kind="delta",
                 frame="base",
@@ -130,6 +150,7 @@ class OpenVLA:
         )
         self.network: Any = None
         self._tokenizer: Any = None
+        self._head: Any = None
 
     def load(self) -> None:
         """Read the weights and try them once.
@@ -162,6 +183,10 @@ class OpenVLA:
         )
         quantise(network, self._quantise)
         self.network = network
+        if self._files is not None:
+            from vla_zenoh_model_openvla.chunk_head import load_chunk_head
+
+            self._head = load_chunk_head(self._files, network, self.spec.action.horizon)
         self._must_see()
 
     def _must_see(self) -> None:
@@ -177,7 +202,9 @@ class OpenVLA:
             if torch.equal(gray, mixed):
                 raise WorkerError("the picture encoders answer alike whatever the picture is")
         # The first inference of a process costs much more than the others.
-        self.network.act(self.ids("stand still"), self._pixels(noise), AXES)
+        ids, pictures = self.ids("stand still"), [self._pixels(noise)] * len(self._cameras)
+        state = [0.0] * len(self._state_range.low) if self._state_range else None
+        self._answer(ids, pictures, state)
 
     def ids(self, task: str) -> list[int]:
         """Tokens of the prompt for a task in a person's words.
@@ -191,7 +218,9 @@ class OpenVLA:
         if not found or found[0] != config.bos_token_id:
             found = [config.bos_token_id, *found]
         ids = prompt_tokens(found)
-        if len(ids) + self.network.vision_backbone.patches + AXES > config.max_position_embeddings:
+        patches = self.network.vision_backbone.patches * len(self._cameras)
+        places = AXES * self.spec.action.horizon + 2
+        if len(ids) + patches + places > config.max_position_embeddings:
             raise SpecError(f"a prompt of {len(ids)} tokens is more than the model reads")
         return ids
 
@@ -201,25 +230,39 @@ class OpenVLA:
         )
 
     def infer(self, observation: Observation) -> ActionSteps:
-        """One step for the newest picture.
+        """One step for the newest picture; OFT: a chunk.
 
         Raises:
             SpecError: the model answered with something that is no action.
             WorkerError: it computes NaN.
         """
-        picture = trained_form(observation.images[self._camera], crop=self._crop)
+        seen = {
+            name: trained_form(observation.images[name], crop=self._crop) for name in self._cameras
+        }
         ids = self.ids(observation.prompt)
-        tokens = self.network.act(ids, self._pixels(picture), AXES)
-        normalised = self.bins.decode(tokens)
-        step = self._range.expand(normalised)
-        step[-1] = np.clip(step[-1], 0.0, 1.0)
-        raw = {
+        raw: dict[str, Any] = {
             "prompt": prompt_text(self._template, observation.prompt),
             "prompt_tokens": ids,
-            "action_tokens": tokens,
-            "normalised": normalised.tolist(),
         }
-        return ActionSteps(step[None], raw=raw, pictures={self._camera: picture})
+        state = None
+        if self._state_range is not None:
+            measured = state_vector(self._state, observation, self._max_width_m)
+            state = raw["state"] = self._state_range.shrink(measured).tolist()
+        answer = self._answer(ids, [self._pixels(picture) for picture in seen.values()], state)
+        if self._head is None:
+            raw["action_tokens"] = answer
+            answer = [self.bins.decode(answer)]
+        normalised = np.asarray(answer, np.float64)
+        raw["normalised"] = normalised.tolist()
+        steps = self._range.expand(normalised)
+        steps[:, -1] = np.clip(steps[:, -1], 0.0, 1.0)
+        return ActionSteps(steps, raw=raw, pictures=seen)
+
+    def _answer(self, ids: list[int], pictures: list[Any], state: list[float] | None) -> Any:
+        """Tokens of a step; OFT: (steps, 7) numbers."""
+        if self._head is None:
+            return self.network.act(ids, pictures[0], AXES)
+        return self._head.act(self.network, ids, pictures, state).cpu().numpy()
 
 
 def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
@@ -228,14 +271,19 @@ def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
 
 
 def _step_s(given: str, key: str) -> float:
-    if given == "auto":
-        if key not in STEP_S:
-            raise WorkerError(
-                f"how long does a step of {key!r} last? Say so with --set dt_s=SECONDS "
-                "(a delta that is carried out at another rate is another speed)"
-            )
-        return STEP_S[key]
+    if given != "auto":
+        return _seconds_or_metres("dt_s", given)
+    if key not in STEP_S:
+        raise WorkerError(
+            f"how long does a step of {key!r} last? Say so with --set dt_s=SECONDS "
+            "(a delta that is carried out at another rate is another speed)"
+        )
+    return STEP_S[key]
+
+
+def _seconds_or_metres(name: str, given: str) -> float:
     try:
         return float(given)
     except ValueError as error:
-        raise WorkerError(f"dt_s is {given!r}; wanted seconds") from error
+        unit = "seconds" if name.endswith("_s") else "metres"
+        raise WorkerError(f"{name} is {given!r}; wanted {unit}") from error

@@ -1,0 +1,172 @@
+"""OpenVLA-OFT (Kim, Finn, Liang, 2025): a chunk of steps from one pass through Llama.
+
+The places of all the chunk's numbers are read at once, every token sees every other one, and a
+small network turns what Llama makes of these places into numbers. The other weights are laid out as
+those of OpenVLA; the head and the projector of the robot's state are files of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from vla_zenoh_model_openvla.chunk_files import ChunkFiles
+from vla_zenoh_model_openvla.network import Network
+from vla_zenoh_model_openvla.statistics import AXES
+
+from vla_zenoh.errors import WorkerError
+
+BLOCKS = 2
+STOP_TOKEN = 2
+
+
+class Block(nn.Module):
+    """A layer that adds to what it is given."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.ffn = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.ReLU())
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(..., width) of the same."""
+        return features + self.ffn(features)
+
+
+class Head(nn.Module):
+    """From what Llama makes of a step's seven places to its seven numbers in [-1, 1]."""
+
+    def __init__(self, read: int) -> None:
+        super().__init__()
+        self.layer_norm1 = nn.LayerNorm(read * AXES)
+        self.fc1 = nn.Linear(read * AXES, read)
+        self.mlp_resnet_blocks = nn.ModuleList(Block(read) for _ in range(BLOCKS))
+        self.layer_norm2 = nn.LayerNorm(read)
+        self.fc2 = nn.Linear(read, AXES)
+
+    def forward(self, places: Tensor) -> Tensor:
+        """(1, steps, 7) of (1, steps * 7, read)."""
+        rows = places.reshape(1, -1, places.shape[-1] * AXES)
+        features = torch.relu(self.fc1(self.layer_norm1(rows)))
+        for block in self.mlp_resnet_blocks:
+            features = block(features)
+        return self.fc2(self.layer_norm2(features))
+
+
+class StateProjector(nn.Module):
+    """The robot's state as one more token."""
+
+    def __init__(self, size: int, read: int) -> None:
+        super().__init__()
+        self.fc1, self.fc2 = nn.Linear(size, read), nn.Linear(read, read)
+
+    def forward(self, state: Tensor) -> Tensor:
+        """(1, read) of (1, size)."""
+        return self.fc2(nn.functional.gelu(self.fc1(state)))
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkHead:
+    """What OFT adds to a network.
+
+    Args:
+        head: of the actions.
+        state: of the robot's state, where the policy reads it.
+        steps: of a chunk.
+    """
+
+    head: Head
+    state: StateProjector | None
+    steps: int
+
+    @torch.inference_mode()
+    def act(
+        self,
+        network: Network,
+        ids: Sequence[int],
+        pictures: Sequence[Sequence[Tensor]],
+        state: Sequence[float] | None,
+    ) -> Tensor:
+        """(steps, 7) numbers about [-1, 1].
+
+        Args:
+            network: its eyes, projector and Llama.
+            ids: T tokens of the prompt.
+            pictures: for each camera, what `Eyes.look` makes of it.
+            state: normalised, where the policy reads it.
+
+        Raises:
+            WorkerError: the network computes NaN.
+        """
+        seen = [network.vision_backbone(pixels) for pixels in pictures]
+        # Before the projector, which treats every patch alike: one pass for all pictures.
+        patches = network.projector(torch.cat(seen, dim=1))
+        if self.state is not None:
+            row = torch.tensor([list(state or ())], device=network.device, dtype=network.dtype)
+            patches = torch.cat([patches, self.state(row)[:, None]], dim=1)
+        read = network.read([*ids, STOP_TOKEN], patches)
+        places = read.new_zeros(1, self.steps * AXES, read.shape[-1])
+        read = torch.cat([read[:, :-1], places, read[:, -1:]], dim=1)
+        count = read.shape[1]
+        # All see all. What is not hidden is added as zero.
+        mask = read.new_zeros(1, 1, count, count)
+        out = network.language_model.model(
+            inputs_embeds=read, attention_mask=mask, use_cache=False
+        ).last_hidden_state
+        # A place is answered one place before it, as next tokens are.
+        first = count - 1 - places.shape[1] - 1
+        numbers = self.head(out[:, first : first + places.shape[1]])[0].float()
+        if not torch.isfinite(numbers).all():
+            raise WorkerError("the network computes NaN or infinity; try --set dtype=float32")
+        return numbers
+
+
+def load_chunk_head(files: ChunkFiles, network: Network, steps: int) -> ChunkHead:
+    """Read head and projector.
+
+    Raises:
+        WorkerError: they are damaged, of another kind or of another size.
+    """
+    width = network.language_model.config.hidden_size
+    weights = _read(files.head)
+    if not all(name.startswith("model.") for name in weights):
+        raise WorkerError(f"{files.head.name} is not a head that regresses actions (L1)")
+    head = Head(width)
+    _give(head, {name.removeprefix("model."): w for name, w in weights.items()}, files.head)
+    state = None
+    if files.state is not None:
+        weights = _read(files.state)
+        first = weights.get("fc1.weight")
+        if first is None or first.ndim != 2:
+            raise WorkerError(f"{files.state.name} is not a projector of the robot's state")
+        state = StateProjector(first.shape[1], width)
+        _give(state, weights, files.state)
+        state.to(network.device, network.dtype).requires_grad_(False)
+    head.to(network.device, network.dtype).requires_grad_(False)
+    return ChunkHead(head, state, steps)
+
+
+def _read(file: Path) -> dict[str, Tensor]:
+    try:
+        content: Any = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch and its unpickler raise many kinds
+        raise WorkerError(
+            f"{file} is damaged or holds more than weights: {str(error)[:200]}"
+        ) from error
+    fits = isinstance(content, Mapping) and all(torch.is_tensor(w) for w in content.values())
+    if not fits:
+        raise WorkerError(f"{file} holds something else than weights by name")
+    # Training on several GPUs wraps what it saves.
+    return {str(name).removeprefix("module."): weight for name, weight in content.items()}
+
+
+def _give(module: nn.Module, weights: Mapping[str, Tensor], file: Path) -> None:
+    try:
+        module.load_state_dict(weights, strict=True)
+    except RuntimeError as error:
+        raise WorkerError(f"{file}: {str(error)[:300]}") from error
+    if not all(bool(torch.isfinite(weight).all()) for weight in weights.values()):
+        raise WorkerError(f"{file} holds NaN or infinity")
