@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,42 +20,47 @@ from vla_zenoh.recording.definitions import Unfit, fields_of, type_name
 from vla_zenoh.recording.kinds import RECORDS
 from vla_zenoh.types import Cause
 
+if TYPE_CHECKING:
+    from vla_zenoh.interop.ros2.messages import Messages
+
 IMAGE, JPEG_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 TEXT = "std_msgs/msg/String"
 LAST_SECOND = 2**31
+MAX_MESSAGE_BYTES = 256 * 1024 * 1024
+DISTRIBUTION = "humble"
+"""Its standard messages are those of all later ones."""
 
 
 @cache
-def typestore() -> Any:
+def messages() -> Messages:
     """The message types of ROS 2 and ours.
 
     Raises:
         MissingExtraError: rosbags is not installed.
     """
     try:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        from vla_zenoh.interop.ros2.messages import Messages
     except ImportError as error:
         raise MissingExtraError("rosbags", "record") from error
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    store.register(
-        get_types_from_msg(definitions.definition(Cause, header=False), type_name(Cause))
-    )
-    for kind in RECORDS:
-        store.register(get_types_from_msg(definitions.definition(kind), type_name(kind)))
-    store.register(get_types_from_msg(definitions.SAMPLE, definitions.SAMPLE_NAME))
-    return store
+    ours = {type_name(kind): definitions.definition(kind) for kind in RECORDS}
+    ours[type_name(Cause)] = definitions.definition(Cause, header=False)
+    ours[definitions.SAMPLE_NAME] = definitions.SAMPLE
+    return Messages(DISTRIBUTION, ours)
 
 
 def schema_text(name: str) -> bytes:
     """A message's definition and those it is made of, in the form MCAP calls ``ros2msg``."""
-    text, _ = typestore().generate_msgdef(name, ros_version=2)
-    return text.encode()
+    return messages().definition(name).encode()
 
 
 def serialize(name: str, *values: Any) -> bytes:
-    """CDR of a message whose fields are `values`, in order."""
-    store = typestore()
-    return bytes(store.serialize_cdr(store.types[name](*values), name))
+    """CDR of a message whose fields are `values`, in order.
+
+    Raises:
+        CodecError: a value that does not fit its field.
+    """
+    every = messages()
+    return every.encode(every.types[name](*values))
 
 
 def deserialize(name: str, data: bytes) -> Any:
@@ -64,10 +69,7 @@ def deserialize(name: str, data: bytes) -> Any:
     Raises:
         CodecError: other bytes.
     """
-    try:
-        return typestore().deserialize_cdr(data, name)
-    except Exception as error:  # whatever generated code does with bytes that are not its own
-        raise CodecError("malformed", f"not a CDR message {name}: {error}") from error
+    return messages().decode(name, data, MAX_MESSAGE_BYTES)
 
 
 def header(stamp_ns: int, frame: str) -> Any:
@@ -76,7 +78,7 @@ def header(stamp_ns: int, frame: str) -> Any:
     Raises:
         Unfit: seconds after 2038 do not fit in.
     """
-    types = typestore().types
+    types = messages().types
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     if not 0 <= seconds < LAST_SECOND:
         raise Unfit
@@ -125,7 +127,7 @@ def write_record(kind: type, data: dict[str, Any], stamp_ns: int, frame: str) ->
             if field.shaped:
                 values += [value.ravel(), np.array(value.shape, np.uint32)]
             elif field.name == "cause":
-                values.append([typestore().types[type_name(Cause)](**each) for each in value])
+                values.append([messages().types[type_name(Cause)](**each) for each in value])
             else:
                 values.append(value)
         return serialize(type_name(kind), *values)

@@ -214,7 +214,7 @@ def open_recording(path: Path) -> RunFile:
         RecordingError: it cannot be read, is no MCAP file, or is one of another program.
         MissingExtraError: rosbags is not installed.
     """
-    cdr.typestore()
+    cdr.messages()
     about: dict[str, str] | None = None
     problems: list[str] = []
     topics: Counter[str] = Counter()

@@ -15,7 +15,7 @@ POSES = "geometry_msgs/msg/PoseArray"
 
 
 def _pose(position_m: Any, quat_xyzw: Any) -> Any:
-    types = cdr.typestore().types
+    types = cdr.messages().types
     return types["geometry_msgs/msg/Pose"](
         types["geometry_msgs/msg/Point"](*(float(value) for value in position_m)),
         types["geometry_msgs/msg/Quaternion"](*(float(value) for value in quat_xyzw)),

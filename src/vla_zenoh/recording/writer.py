@@ -73,7 +73,7 @@ class RunWriter:
         began_ns: int,
         about: Mapping[str, str] | None = None,
     ) -> None:
-        cdr.typestore()
+        cdr.messages()
         self._robot, self._frame = robot, base_frame
         self._kinds: dict[str, Kinds] = {}
         self._schemas: dict[str, int] = {}
@@ -165,7 +165,7 @@ class RunWriter:
         try:
             text = sample.payload.decode()
             data = cdr.serialize(cdr.TEXT, text)
-        except UnicodeError as error:
+        except (UnicodeError, CodecError) as error:
             raise Unfit from error
         self._put(sample, cdr.TEXT, data)
 

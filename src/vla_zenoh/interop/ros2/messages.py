@@ -113,6 +113,15 @@ class Messages:
             if name != "structure_needs_at_least_one_member"
         }
 
+    @property
+    def types(self) -> Mapping[str, Any]:
+        """Type -> its class, which takes all fields in order."""
+        return self._store.types
+
+    def definition(self, kind: str) -> str:
+        """Text of a message and of all that it is made of, as bags and MCAP files keep it."""
+        return self._store.generate_msgdef(kind, ros_version=2)[0]
+
     def new(self, kind: str, **values: Any) -> Any:
         """A message with these fields; the others are zero, empty or false."""
         made = self._store.types[kind]
