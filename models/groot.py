@@ -84,7 +84,7 @@ class Groot:
             raise PeerError("peer_gone", f"{self._url} was lost; tried again in {wait_s:.1f} s")
         try:
             actions = groot.read_actions(self._asked(observation))
-            return ActionSteps(self._layout.steps(actions, observation))
+            return self._layout.read(actions, observation)
         except PeerError:
             self._drop()
             raise

@@ -97,7 +97,7 @@ class OpenPi:
             raise PeerError("peer_gone", f"{self._url} was lost; tried again in {wait_s:.1f} s")
         try:
             answer = self._ask(observation)
-            return ActionSteps(self._layout.steps(answer, observation, self._forward))
+            return self._layout.read(answer, observation, self._forward)
         except PeerError:
             self._drop()
             raise

@@ -85,12 +85,12 @@ class OpenVlaRest:
         body = openvla_rest.request(fields, self._unnorm_key, encoded=self._encoded)
         try:
             answer = openvla_rest.read_answer(*self._post(body))
-            steps = self._layout.steps(answer, observation)
+            steps = self._layout.read(answer, observation)
         except PeerError:
             self._backoff.failed(time.monotonic())
             raise
         self._backoff.succeeded()
-        return ActionSteps(steps)
+        return steps
 
     def _post(self, body: bytes) -> tuple[int, bytes]:
         kind = http.client.HTTPSConnection if self._secure else http.client.HTTPConnection

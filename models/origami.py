@@ -89,7 +89,7 @@ class Origami:
                 self._ask("reset")
                 self._begins = False
             actions = self._ask("infer", self._layout.request(observation))
-            return ActionSteps(self._layout.steps(actions, observation, self._forward))
+            return self._layout.read(actions, observation, self._forward)
         except PeerError:
             # It may be another one when it answers again.
             self._known, self._begins = False, True

@@ -146,6 +146,14 @@ def test_one_unit_of_libero_is_5_cm_and_half_a_radian_and_more_is_clipped() -> N
     )
 
 
+def test_what_the_server_said_is_kept_for_people() -> None:
+    of = layout()
+    answer = np.array([[1.0, 0, 0, 0, 0, 0, -1]])
+    result = of.read(answer, seen(of))
+    assert result.raw == {"first_step": answer[0].tolist()}
+    np.testing.assert_array_equal(result.steps, of.steps(answer, seen(of)))
+
+
 def test_joint_deltas_add_up_from_the_measured_joints_and_become_poses() -> None:
     of = layout(preset="droid")
     observation, forward = seen(of), make_forward(load_profile("panda_sim"))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.errors import PeerError
 from vla_zenoh.interop.parts import numbers_of
-from vla_zenoh.policy import ModelSpec, Observation
+from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
 from vla_zenoh.types import JointState, shown
 
 Action = Literal["delta", "absolute", "joint_delta", "joint_position"]
@@ -127,6 +127,13 @@ class Layout:
         if not np.isfinite(rows).all():
             raise PeerError("peer_reply", "the answer holds NaN or infinity")
         return rows[: self.spec.action.horizon]
+
+    def read(
+        self, answer: Any, observation: Observation, forward: Forward | None = None
+    ) -> ActionSteps:
+        """`steps`, and what the server said for people who look at it."""
+        said = self.gather(answer)[0].tolist()
+        return ActionSteps(self.steps(answer, observation, forward), raw={"first_step": said})
 
     def steps(
         self, answer: Any, observation: Observation, forward: Forward | None = None
