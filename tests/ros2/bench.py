@@ -31,12 +31,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bridge import Bridge, load_script
 from camera_rig import free_endpoint
-from chain import running_chain
+from chain import Chain, running_chain
 from panda_robot import CAMERAS, DESIRED_POSE
 from rich.console import Console
 from rich.table import Table
 from rig import Robot
-from ros_messages import CartesianImpedanceGoal, Header, Image, Pose, Time
+from ros_messages import CartesianImpedanceGoal, Header, Image, Pose, PoseStamped, Time
 from ros_node import Listener, RosNode, free_domain
 
 from vla_zenoh.bench.picture import noisy_picture
@@ -49,14 +49,15 @@ FRONT = CAMERAS["front"]
 WIDTH, HEIGHT = 640, 480
 WARM_UP, PATIENCE_S = 20, 0.5
 APART_S = (0.012, 0.020)
-PROMPT = "HARD: go up x9999 within 0.05"
-"""Always in motion: then no two poses are equal, and a pose is known again wherever it comes by."""
+POSES = "/bench/desired_pose"
+"""Stamped poses, so that each is known again wherever it comes by; the robot stands meanwhile."""
 
 PROFILE = """\
 extends: panda_ros2
-cameras: {{wrist: null}}
+cameras: {{front: {{rate_hz: 200}}, wrist: null}}
 ros2:
   cameras: {{wrist: null}}
+  pose_command: {{topic: {poses}, type: geometry_msgs/msg/PoseStamped}}
 task: {{prompt: hold, rate_hz: 100, worker: scripted}}
 session: {{listen: ["{endpoint}"], connect: ["{endpoint}"]}}
 """
@@ -76,11 +77,22 @@ ALONE = {
 
 
 class Times:
-    """When what was seen: key -> wall clock at its first arrival."""
+    """When what was seen: stamp -> wall clock at its first arrival."""
 
     def __init__(self) -> None:
         self._seen: dict[object, int] = {}
         self._news = threading.Condition()
+
+    def first_after(self, stamp_ns: int, until_s: float) -> int:
+        """The first stamp later than this; raises `TimeoutError` where none comes by."""
+
+        def found() -> list[int]:
+            return [seen for seen in self._seen if isinstance(seen, int) and seen > stamp_ns]
+
+        with self._news:
+            if not self._news.wait_for(found, until_s - time.monotonic()):
+                raise TimeoutError
+            return min(found())
 
     def see(self, key: object, at_ns: int) -> None:
         with self._news:
@@ -97,16 +109,6 @@ class Times:
     def clear(self) -> None:
         with self._news:
             self._seen.clear()
-
-
-def pose_key(position_m: object, quat_xyzw: object) -> tuple[float, ...]:
-    """A pose as something to look up, to the last digit."""
-    return tuple(np.concatenate((position_m, quat_xyzw)).tolist())  # type: ignore[arg-type]
-
-
-def goal_key(goal: CartesianImpedanceGoal) -> tuple[float, ...]:
-    p, q = goal.pose.position, goal.pose.orientation
-    return pose_key((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
 
 
 def summary(values_ms: list[float]) -> dict[str, float]:
@@ -193,7 +195,7 @@ def measure_dds(requests: int) -> dict[str, list[float]]:
 
 # -- the whole way --------------------------------------------------------------------------------
 @contextmanager
-def lab() -> Iterator[tuple[Camera, RosNode, Bridge, object]]:
+def lab() -> Iterator[tuple[Camera, RosNode, Bridge, Chain]]:
     """Robot without cameras, bridge, our nodes; this process is the camera."""
     domain, endpoint = free_domain(), free_endpoint()
     program = load_script().find_bridge()
@@ -202,7 +204,7 @@ def lab() -> Iterator[tuple[Camera, RosNode, Bridge, object]]:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-ros2-")))
         profile = folder / "bench_ros2.yaml"
-        profile.write_text(PROFILE.format(endpoint=endpoint))
+        profile.write_text(PROFILE.format(endpoint=endpoint, poses=POSES))
         bridge = Bridge(program, folder, domain, connect=endpoint).start()
         stack.callback(bridge.kill)
         robot = Robot(domain, "--no-cameras")
@@ -229,8 +231,7 @@ def measure_chain(requests: int) -> tuple[dict[str, list[float]], dict[str, floa
             return session.declare_subscriber(key, handler)
 
         def on_picture(sample: zenoh.Sample, at_ns: int) -> None:
-            sec, nanosec = np.frombuffer(sample.payload.to_bytes()[4:12], "<u4").tolist()
-            on_ros.see(sec * 10**9 + nanosec, at_ns)
+            on_ros.see(_ros_stamp_ns(sample), at_ns)
 
         def on_raw(sample: zenoh.Sample, at_ns: int) -> None:
             raw.see(_header(sample).stamp_wall_ns, at_ns)
@@ -238,42 +239,36 @@ def measure_chain(requests: int) -> tuple[dict[str, list[float]], dict[str, floa
         def on_pose(sample: zenoh.Sample, at_ns: int) -> None:
             pose = records.decode(PoseCommand, sample.payload.to_bytes())
             if pose.cause is not None:
-                found_key = pose_key(pose.position_m, pose.quat_xyzw)
-                poses.setdefault(pose.cause.observation_stamp_ns, found_key)
                 posed.see(pose.cause.observation_stamp_ns, at_ns)
 
         def on_ros_pose(sample: zenoh.Sample, at_ns: int) -> None:
-            goal = CartesianImpedanceGoal.deserialize(sample.payload.to_bytes())
-            posed_on_ros.see(goal_key(goal), at_ns)
+            posed_on_ros.see(_ros_stamp_ns(sample), at_ns)
 
-        poses: dict[int, tuple[float, ...]] = {}
+        def in_dds_pose(pose: PoseStamped, at_ns: int) -> None:
+            in_dds.see(pose.header.stamp.ns, at_ns)
+
         subscribers = [
             hear(FRONT[1:], on_picture),
             hear(keys.camera_raw("front"), on_raw),
             hear(keys.command_pose, on_pose),
-            hear(DESIRED_POSE[1:], on_ros_pose),
+            hear(POSES[1:], on_ros_pose),
         ]
-        listener = Listener(
-            {
-                node.subscription(DESIRED_POSE, CartesianImpedanceGoal, depth=1000): (
-                    lambda goal, at_ns: in_dds.see(goal_key(goal), at_ns)
-                )
-            }
-        )
+        listener = Listener({node.subscription(POSES, PoseStamped, depth=1000): in_dds_pose})
         _activate(camera, chain)
         before_s, began_s = _cpu(bridge, chain), time.monotonic()
         for number in range(-WARM_UP, requests):
             for times in (on_ros, raw, posed, posed_on_ros, in_dds):
                 times.clear()
-            poses.clear()
             stamp_ns = camera.show()
             give_up = time.monotonic() + PATIENCE_S
             try:
                 t_ros = on_ros.wait(stamp_ns, give_up)
                 t_raw = raw.wait(stamp_ns, give_up)
                 t_pose = posed.wait(stamp_ns, give_up)
-                t_ros_pose = posed_on_ros.wait(poses[stamp_ns], give_up)
-                t_dds = in_dds.wait(poses[stamp_ns], give_up)
+                # The first that our node made after it had the command.
+                pose_ns = posed_on_ros.first_after(t_pose, give_up)
+                t_ros_pose = posed_on_ros.wait(pose_ns, give_up)
+                t_dds = in_dds.wait(pose_ns, give_up)
             except TimeoutError:
                 lost += number >= 0
                 continue
@@ -296,7 +291,13 @@ def _header(sample: zenoh.Sample) -> header_codec.Header:
     return header_codec.decode(attachment.to_bytes() if attachment else None)
 
 
-def _activate(camera: Camera, chain: object) -> None:
+def _ros_stamp_ns(sample: zenoh.Sample) -> int:
+    """Of a message that begins with a header, behind the four bytes of CDR's own."""
+    sec, nanosec = np.frombuffer(sample.payload.to_bytes()[4:12], "<u4").tolist()
+    return sec * 10**9 + nanosec
+
+
+def _activate(camera: Camera, chain: Chain) -> None:
     stop = threading.Event()
 
     def show() -> None:
@@ -307,13 +308,12 @@ def _activate(camera: Camera, chain: object) -> None:
     thread.start()
     try:
         chain.activate_when_ready()
-        chain.client.set_prompt(PROMPT)
     finally:
         stop.set()
         thread.join()
 
 
-def _cpu(bridge: Bridge, chain: object) -> dict[str, float]:
+def _cpu(bridge: Bridge, chain: Chain) -> dict[str, float]:
     pids = {"bridge": bridge.pid} | chain.host.supervisor.pids()
     return {name: cpu_s(pid) for name, pid in pids.items()}
 

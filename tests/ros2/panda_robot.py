@@ -32,6 +32,7 @@ from types import FrameType
 
 import numpy as np
 import pinocchio as pin
+from cyclonedds.sub import DataReader
 from move_server import MoveServer
 from numpy.typing import NDArray
 from ros_messages import (
@@ -112,7 +113,8 @@ class PandaRobot:
         self._node = RosNode("panda", domain)
         self._joints = self._node.publisher(JOINT_STATES, JointState)
         self._pose = self._node.publisher(CURRENT_POSE, PoseStamped)
-        self._goals = self._node.subscription(DESIRED_POSE, CartesianImpedanceGoal)
+        self._goals: DataReader[CartesianImpedanceGoal] | None = None
+        self.controlled = True
         self._gripper = MoveServer(self._node, MOVE, self.world)
         self._finger_joints = tuple(profile.robot.finger_joints)
         self._state_every = max(1, round(1e9 / STEP_NS / state_hz))
@@ -136,7 +138,9 @@ class PandaRobot:
         self._node.close()
 
     def _tick(self) -> None:
-        for goal in self._goals.take(10):
+        if self.controlled is (self._goals is None):
+            self._switch_controller()
+        for goal in self._goals.take(10) if self._goals is not None else ():
             if goal.sample_info.valid_data:
                 self._follower.lead(goal)
         self.world.tick(self._follower.tick(STEP_NS / 1e9))
@@ -146,6 +150,13 @@ class PandaRobot:
             self._publish()
         if self._ticks % 10 == 0:
             self._show()
+
+    def _switch_controller(self) -> None:
+        if self._goals is None:
+            self._goals = self._node.subscription(DESIRED_POSE, CartesianImpedanceGoal)
+        else:
+            self._node.leave(self._goals)
+            self._goals = None
 
     def _publish(self) -> None:
         header = Header(Time.of(time.time_ns()), BASE)
@@ -244,10 +255,15 @@ def main() -> None:
 
     signal.signal(signal.SIGINT, end)
     signal.signal(signal.SIGTERM, end)
+
+    def switch(number: int, frame: FrameType | None) -> None:
+        robot.controlled = not robot.controlled
+
     profile = load_profile("panda_sim")
     context = multiprocessing.get_context("spawn")
     qpos = context.Array("d", len(build_world(profile).qpos()))
     robot = PandaRobot(profile, chosen.domain, chosen.state_hz, qpos)
+    signal.signal(signal.SIGUSR1, switch)
     pictures = (chosen.camera or list(CAMERAS), chosen.width, chosen.height, chosen.camera_hz)
     # A daemon process is ended with this one.
     cameras = context.Process(

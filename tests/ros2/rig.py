@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from bridge import Bridge
 from camera_rig import free_endpoint
@@ -30,12 +31,16 @@ cameras:
   front: {{width: {width}, height: {height}, rate_hz: {camera_hz}}}
   wrist: null
 task: {{prompt: hold, rate_hz: 5, worker: scripted}}
-ros2:
-  cameras: {{wrist: null}}
 session:
   listen: ["{endpoint}"]
   connect: ["{endpoint}"]
+ros2:
+  cameras: {{wrist: null}}
 """
+APART = """\
+  connect: ["{endpoint}"]
+"""
+Topology = Literal["beside", "router", "apart"]
 
 
 class Robot:
@@ -69,6 +74,10 @@ class Robot:
 
     def thaw(self) -> None:
         os.kill(self._process.pid, signal.SIGCONT)
+
+    def switch_controller(self) -> None:
+        """Off, or on again."""
+        os.kill(self._process.pid, signal.SIGUSR1)
 
     def end(self) -> None:
         if self._process.poll() is None:
@@ -138,25 +147,32 @@ class Lab:
 
 
 @contextmanager
-def running_lab(folder: Path, program: Path, *, bridge_is_router: bool = False) -> Iterator[Lab]:
+def running_lab(
+    folder: Path, program: Path, *, topology: Topology = "beside", state_hz: int = STATE_HZ
+) -> Iterator[Lab]:
     """Everything up while the block lasts.
 
     Args:
         folder: for profile, settings and logs.
         program: the bridge.
-        bridge_is_router: as in a lab that starts the bridge as it comes: our nodes are its clients.
+        topology: ``beside``: the bridge is a client of our router, as our nodes are; ``router``:
+            our nodes are clients of the bridge, which is a router when it is started as it comes;
+            ``apart``: it is one, but only the node ``ros2`` speaks to it, and we have our own.
+        state_hz: rate of the robot's joint states.
     """
-    domain, endpoint = free_domain(), free_endpoint()
+    domain, ours = free_domain(), free_endpoint()
+    theirs = free_endpoint() if topology == "apart" else ours
     profile = folder / "ros2_lab.yaml"
-    profile.write_text(
-        PROFILE.format(width=WIDTH, height=HEIGHT, camera_hz=CAMERA_HZ, endpoint=endpoint)
-    )
+    text = PROFILE.format(width=WIDTH, height=HEIGHT, camera_hz=CAMERA_HZ, endpoint=ours)
+    if topology == "apart":
+        text += APART.format(endpoint=theirs)
+    profile.write_text(text)
     pictures = ("--width", WIDTH, "--height", HEIGHT, "--camera-hz", CAMERA_HZ)
     with ExitStack() as stack:
-        at = {"listen": endpoint} if bridge_is_router else {"connect": endpoint}
+        at = {"connect": ours} if topology == "beside" else {"listen": theirs}
         bridge = Bridge(program, folder, domain, **at).start()
         stack.callback(bridge.kill)
-        robot = Robot(domain, "--camera", "front", "--state-hz", str(STATE_HZ), *map(str, pictures))
+        robot = Robot(domain, "--camera", "front", "--state-hz", str(state_hz), *map(str, pictures))
         stack.callback(robot.end)
         witness = Witness(domain)
         stack.callback(witness.close)

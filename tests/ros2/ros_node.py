@@ -130,6 +130,11 @@ class RosNode:
         self._tell()
         return made
 
+    def leave(self, reader: DataReader[Any]) -> None:
+        """Give a reader up; the caller has to let go of it, too."""
+        self._readers.remove(reader)
+        self._tell()
+
     def client(self, name: str, request: type[Request], reply: type[Reply]) -> Client[Reply]:
         """Of the service `name` (with its leading slash)."""
         return Client(self, name, request, reply)

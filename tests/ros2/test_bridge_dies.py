@@ -31,21 +31,17 @@ STEPS, STEP_M, WAY_TOLERANCE_M = 5, 0.01, 0.002
 FASTEST_M_S = 0.3
 
 
-@pytest.fixture(
-    scope="module",
-    params=[False, True],
-    ids=["beside_our_router", "as_the_router"],
-)
+@pytest.fixture(scope="module", params=["beside", "router", "apart"])
 def shared_lab(
     request: pytest.FixtureRequest,
     tmp_path_factory: pytest.TempPathFactory,
     bridge_program: Path,
 ) -> Iterator[Lab]:
-    """Either there is a router of ours, or the bridge is the router, as it is by itself."""
+    """Every way of putting bridge and routers: see `rig.running_lab`."""
     from rig import running_lab
 
     folder = tmp_path_factory.mktemp("lab")
-    with running_lab(folder, bridge_program, bridge_is_router=request.param) as lab:
+    with running_lab(folder, bridge_program, topology=request.param) as lab:
         lab.chain.activate_when_ready()
         yield lab
 

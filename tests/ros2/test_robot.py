@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from vla_zenoh.errors import SessionError
+
 if TYPE_CHECKING:
     from rig import Lab
 
@@ -53,6 +55,7 @@ def test_fifty_steps_up_at_5_hz_end_within_two_millimetres(lab: Lab) -> None:
     assert took_s > 50 / 5.0
 
 
+@pytest.mark.slow
 def test_the_gripper_action_moves_the_robots_fingers(lab: Lab) -> None:
     lab.activate_at_rest()
     lab.chain.client.set_prompt("HARD: close gripper x1")
@@ -94,6 +97,7 @@ def test_a_dds_client_sets_prompt_and_activation(lab: Lab) -> None:
     lab.chain.until("inactive", lambda: lab.chain.state() == "inactive")
 
 
+@pytest.mark.slow
 def test_a_dds_client_stops_and_resets(lab: Lab) -> None:
     node = lab.witness.node
     stop = node.client("/vla/stop", ros.TriggerRequest, ros.TriggerResponse)
@@ -113,6 +117,7 @@ def test_a_dds_client_stops_and_resets(lab: Lab) -> None:
     lab.chain.until("inactive", lambda: lab.chain.state() == "inactive")
 
 
+@pytest.mark.slow
 def test_a_robot_that_falls_silent_is_noticed_within_the_watchdog(lab: Lab) -> None:
     lab.move()
     lab.chain.client.take_events()
@@ -133,6 +138,21 @@ def test_a_robot_that_falls_silent_is_noticed_within_the_watchdog(lab: Lab) -> N
     assert lab.witness.wait_still() == pytest.approx(told_m[-1], abs=WAY_TOLERANCE_M)
     assert lab.chain.state() == "inactive"
     stood_m = lab.witness.position_m()
+    assert lab.activate_at_rest() == pytest.approx(stood_m, abs=WAY_TOLERANCE_M)
+
+
+@pytest.mark.slow
+def test_a_robot_whose_controller_does_not_listen_is_not_activated(lab: Lab) -> None:
+    lab.move()
+    lab.robot.switch_controller()
+    try:
+        lab.chain.until("inactive", lambda: lab.chain.state() == "inactive")
+        stood_m = lab.witness.wait_still()
+        with pytest.raises(SessionError, match="not listening at /panda/"):
+            lab.chain.client.activate()
+    finally:
+        lab.robot.switch_controller()
+    # What was sent while nobody listened is not taken for where the arm is held.
     assert lab.activate_at_rest() == pytest.approx(stood_m, abs=WAY_TOLERANCE_M)
 
 

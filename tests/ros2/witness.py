@@ -124,7 +124,7 @@ class Witness:
     def stands(self) -> bool:
         """Whether the arm has not moved for a while."""
         track = self.track(time.time_ns() - int(STAND_S * 1e9))
-        if len(track.stamp_ns) < 10:
+        if len(track.stamp_ns) < 5:
             return False
         spread = np.ptp(track.position_m, axis=0)
         return float(spread.max()) < STILL_M_S * STAND_S

@@ -95,6 +95,7 @@ class Arm:
             keys.command_joint if profile.robot.command == "joint" else keys.command_pose,
             Inbox(INBOX),
         )
+        self._topic = output.topic
         self._writer = link.write(output.topic, output.type, COMMAND)
 
     # -- setting up ---------------------------------------------------------------------------
@@ -259,6 +260,8 @@ class Arm:
             return
         if self._guard is not None and self._guard.braking:
             record = replace(record, mode="braking")
+        elif not self._writer.heard:
+            record = replace(record, mode=f"not listening at {self._topic[:100]}")
         self._gripper_out.put(record, stamp_wall_ns=stamp_ns, seq=seq)
 
     # -- commands -----------------------------------------------------------------------------
@@ -302,7 +305,8 @@ class Arm:
             self._send(reference, now_ns)
         elif self._tcp is not None:
             self._hold.look(self._tcp, now_ns)
-        if self.state == "silent":  # a bridge that is gone drops what is sent, and says nothing
+        # What nobody heard nobody holds: a bridge that is gone drops what is sent.
+        if self.state == "silent" or not self._writer.heard:
             self._hold.lose()
 
     def _send(self, reference: Reference | JointReference, now_ns: int) -> None:

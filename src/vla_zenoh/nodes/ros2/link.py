@@ -44,6 +44,11 @@ class Writer:
         self._gid = gid
         self._seq = itertools.count(1)
 
+    @property
+    def heard(self) -> bool:
+        """Somebody listens: with a bridge, a subscriber in DDS."""
+        return self._publisher.matching_status.matching  # pyright: ignore  # stub says bool
+
     def put(self, payload: bytes) -> None:
         """Write CDR bytes."""
         self._publisher.put(payload, attachment=_attachment(self._gid, self._seq))
@@ -205,20 +210,24 @@ class Link:
         handler = zenoh.handlers.Callback(handle, indirect=False)
         self._declared.append(self.session.declare_queryable(key, handler, complete=True))
 
+    def call(self, name: str, kind: str, wait_s: float = CALL_S) -> Caller:
+        """A caller of somebody's service."""
+        return Caller(self.session, *self._declare(Endpoint(Role.CLIENT, name, kind)), wait_s)
+
     def call_action(self, name: str, kind: str) -> dict[str, Caller]:
         """Callers of an action's services: ``send_goal``, ``get_result``, ``cancel_goal``."""
         action = Endpoint(Role.ACTION_CLIENT, name, kind)
-        if not self._rmw:  # a bridge is told of the action, rmw_zenoh of each of its parts
-            self._declare(action)
-        callers: dict[str, Caller] = {}
-        for part, endpoint in parts_of(action).items():
-            if self._rmw:
-                key, gid = self._declare(endpoint)
-            else:
-                key, gid = self._wire.key(endpoint), None
-            wait_s = RESULT_S if part == "get_result" else CALL_S
-            callers[part] = Caller(self.session, key, gid, wait_s)
-        return callers
+        parts = parts_of(action)
+        wait_s = {part: RESULT_S if part == "get_result" else CALL_S for part in parts}
+        if self._rmw:  # there every part is announced, a bridge is told of the action
+            return {
+                part: self.call(end.name, end.type, wait_s[part]) for part, end in parts.items()
+            }
+        self._declare(action)
+        return {
+            part: Caller(self.session, self._wire.key(end), None, wait_s[part])
+            for part, end in parts.items()
+        }
 
     def close(self) -> None:
         """Leave the graph."""
