@@ -25,8 +25,10 @@ SELECTORS = (
     "all_status",
     "all_events",
     "all_alive",
+    "without_pictures",
+    "without_raw_pictures",
 )
-NO_KEYS = ("short", "of", "on", "all_seen_of")
+NO_KEYS = ("short", "of", "on", "all_seen_of", "group", "whole")
 """Methods that give something else than one key."""
 GOOD_CHUNKS = st.from_regex(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,20}", fullmatch=True)
 
@@ -135,3 +137,37 @@ def test_a_key_is_shortened_as_people_say_it() -> None:
     assert KEYS.short(KEYS.delta("scripted")) == "delta/scripted"
     assert KEYS.short("vla/panda2/active") == "vla/panda2/active"
     assert last(KEYS.delta("scripted")) == "scripted"
+
+
+def test_a_key_is_told_from_those_of_other_robots() -> None:
+    ours, theirs = Keys("panda", "lab/a"), Keys("ur5", "lab/b")
+    key = ours.camera_jpeg("front")
+    assert Keys.of(key, "lab/a") == ours
+    assert Keys.of(key, "lab/b") is None
+    assert Keys.of("lab/a/panda", "lab/a") is None
+    assert Keys.of("lab/a/-/prompt", "lab/a") is None
+    assert ours.group(key) == "camera"
+    assert ours.group(ours.prompt) == "prompt"
+    assert theirs.group(key) == ""
+    assert ours.on(theirs, key) == theirs.camera_jpeg("front")
+
+
+def test_a_short_key_is_made_whole_and_a_whole_one_left() -> None:
+    ours = Keys("panda")
+    assert ours.whole("state/*") == "vla/panda/state/*"
+    assert ours.whole(ours.short(ours.state_pose)) == ours.state_pose
+    assert ours.whole("vla/ur5/**") == "vla/ur5/**"
+
+
+def test_a_recorder_hears_everything_but_raw_pictures() -> None:
+    ours = Keys("panda")
+    expressions = [zenoh.KeyExpr(each) for each in ours.without_raw_pictures]
+
+    def heard(key: str) -> int:
+        return sum(each.includes(zenoh.KeyExpr(key)) for each in expressions)
+
+    for key in (ours.prompt, ours.state_pose, ours.delta("w"), ours.seen_record("w")):
+        assert heard(key) == 1, key
+    assert heard(ours.camera_jpeg("front")) == 1
+    assert heard(ours.seen("w", "front")) == 1
+    assert heard(ours.camera_raw("front")) == 0

@@ -109,31 +109,38 @@ def _show(runs: Sequence[Evaluation]) -> None:
         table.add_row(*tables.summary_row(overall(runs))[:shown_columns], style="bold")
     screen.print(table)
     shown = runs[0] if len(runs) == 1 else overall(runs)
-    _show_latency(shown)
+    _show_latency([*runs, shown] if len(runs) > 1 else runs)
     if len(runs) == 1:
         _show_segments(shown)
     for name, value in tables.figures(shown):
         screen.print(f"{name}: {escape(printable(value))}")
 
 
-def _show_latency(run: Evaluation) -> None:
-    rows = tables.latency_rows(run)
-    if not rows:
-        return
+def _show_latency(runs: Sequence[Evaluation]) -> None:
     table = Table(title="latency in ms", title_justify="left", header_style="bold")
+    table.box, table.padding = box.SIMPLE_HEAD, (0, 1, 0, 0)
+    several = len(runs) > 1
+    if several:
+        table.add_column("run", overflow="fold")
     table.add_column("stage")
     for column in tables.LATENCY_COLUMNS:
         table.add_column(column, justify="right")
     wide = console().width >= WIDE
     if wide:
         table.add_column("")
-    for row in rows:
-        table.add_row(*row, *([STAGES[row[0]]] if wide else []))
-    console().print(table)
+    for run in runs:
+        name = escape(printable(run.name))
+        for index, row in enumerate(tables.latency_rows(run)):
+            first = [name if index == 0 else ""] if several else []
+            table.add_row(*first, *row, *([STAGES[row[0]]] if wide else []))
+        table.add_section()
+    if table.row_count:
+        console().print(table)
 
 
 def _show_segments(run: Evaluation) -> None:
     table = Table(title="asked and reached", title_justify="left", header_style="bold")
+    table.box, table.padding = box.SIMPLE_HEAD, (0, 1, 0, 0)
     for column in tables.SEGMENT_COLUMNS:
         table.add_column(column, justify="left" if column == "prompt" else "right")
     for row in tables.segment_rows(run):
