@@ -7,11 +7,17 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
+import pytest
 import zenoh
 from camera_rig import free_endpoint
+from typer.testing import CliRunner
 
+from vla_zenoh.cli.main import app
+from vla_zenoh.errors import NodeError, SecurityError
+from vla_zenoh.nodes.router import router_config, run_router, run_zenohd
 from vla_zenoh.profile import load_profile
 from vla_zenoh.security.identity import identities
 from vla_zenoh.security.rules import access_control
@@ -42,24 +48,11 @@ def secured(folder: Path, more: str = "") -> Path:
     return file
 
 
-def router(file: Path, *options: str, path: str = "") -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "vla_zenoh", "router", "--profile", str(file), *options],
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-        check=False,
-        env={**os.environ, "PATH": path or os.environ["PATH"]},
-    )
-
-
-def test_the_printed_configuration_is_one_that_zenoh_takes(tmp_path: Path) -> None:
-    file = secured(tmp_path)
-    shown = router(file, "--config")
-    assert shown.returncode == 0, shown.stderr
-    settings = json.loads(shown.stdout)
-    zenoh.Config.from_json5(shown.stdout)
-    assert settings["access_control"] == access_control([load_profile(str(file))])
+def test_the_configuration_is_one_that_zenoh_takes(tmp_path: Path) -> None:
+    profile = load_profile(str(secured(tmp_path)))
+    settings = router_config(profile)
+    zenoh.Config.from_json5(json.dumps(settings))
+    assert settings["access_control"] == access_control([profile])
     tls = settings["transport"]["link"]["tls"]
     assert tls["enable_mtls"]
     assert tls["listen_certificate"].endswith("here/router.pem")
@@ -71,22 +64,50 @@ def test_zenohd_gets_the_configuration_that_our_own_router_has(tmp_path: Path) -
     programs.mkdir()
     (programs / "zenohd").write_text(STAND_IN)
     (programs / "zenohd").chmod(0o755)
-    ours = json.loads(router(file, "--config").stdout)
-    given = router(file, path=f"{programs}{os.pathsep}{os.environ['PATH']}")
+    given = subprocess.run(
+        [sys.executable, "-m", "vla_zenoh", "router", "--profile", str(file)],
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        check=False,
+        env={**os.environ, "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"},
+    )
     assert given.returncode == 0, given.stderr
-    assert json.loads(given.stdout) == ours
+    assert json.loads(given.stdout) == router_config(load_profile(str(file)))
 
 
-def test_a_zenohd_that_is_not_there_is_told(tmp_path: Path) -> None:
-    file = secured(tmp_path, "  router: zenohd\n")
-    done = router(file, path=str(tmp_path))
-    assert done.returncode == 1
-    assert "there is no zenohd on PATH" in done.stderr
+def test_a_zenohd_that_is_not_there_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    profile = load_profile(str(secured(tmp_path)))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(NodeError, match="there is no zenohd on PATH: install Zenoh's router"):
+        run_zenohd(profile, tmp_path)
 
 
 def test_a_router_without_its_certificate_says_how_to_get_one(tmp_path: Path) -> None:
-    file = secured(tmp_path)
+    profile = load_profile(str(secured(tmp_path)))
     (tmp_path / "keys" / "here" / "router.key").unlink()
-    done = router(file)
-    assert done.returncode == 1
-    assert "secure add here" in done.stderr.replace("\n", " ")
+    with pytest.raises(SecurityError, match="make it with `vla-zenoh secure add here`"):
+        run_router(profile, threading.Event())
+
+
+def test_status_says_in_red_that_strangers_may_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    endpoint = free_endpoint()
+    file = tmp_path / "open.yaml"
+    session = f"{{listen: [{endpoint}], connect: [{endpoint}], insecure: true}}"
+    file.write_text(f"extends: panda_sim\nsession: {session}\n")
+    stop = threading.Event()
+    thread = threading.Thread(target=run_router, args=(load_profile(str(file)), stop))
+    thread.start()
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "200")
+    try:
+        shown = CliRunner().invoke(app, ["status", "--once", "--profile", str(file)])
+    finally:
+        stop.set()
+        thread.join(LIMIT_S)
+    red = [line for line in shown.output.splitlines() if "\x1b[1;31m" in line]
+    assert any("insecure: everybody on the network can command" in line for line in red), shown
