@@ -177,15 +177,14 @@ def free_port() -> int:
 
 
 @contextmanager
-def served(name: str, port: int | None = None, **changes: Any) -> Iterator[Server]:
-    """The server of one of `KINDS`.
+def served(kind: Kind, port: int | None = None, **changes: Any) -> Iterator[Server]:
+    """A server, until the block ends.
 
     Args:
-        name: of the kind.
+        kind: which.
         port: to listen on, or that of a router; None: any.
         changes: fields of the `Server`.
     """
-    kind = KINDS[name]
     # A policy behind a router listens nowhere itself.
     server = Server(kind, port or free_port(), listens=kind.model != "origami", **changes)
     try:
