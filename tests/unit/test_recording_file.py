@@ -340,6 +340,23 @@ def test_a_full_disk_leaves_a_file_that_any_tool_opens(tmp_path: Path) -> None:
     assert open_recording(path).damage == ""
 
 
+def test_a_disk_that_is_full_at_the_end_costs_the_index_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    out = writer(path)
+    for index in range(5):
+        out.write(picture(index))
+    out.commit()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (out.size, before[1]))
+    try:
+        with pytest.raises(RecordingError, match="too large"):
+            out.finish()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    out.abandon()
+    assert readable_anywhere(path) == 5
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="mounts a file system: needs root")
 def test_a_full_file_system_leaves_a_file_that_any_tool_opens(tmp_path: Path) -> None:
     small = tmp_path / "small"

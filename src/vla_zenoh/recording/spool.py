@@ -101,5 +101,7 @@ class Spool:
             os.ftruncate(self._file, self._done + len(END))
 
     def close(self) -> None:
-        """Close the file; what was not committed is lost."""
-        os.close(self._file)
+        """Close the file; what was not committed is lost. Closing it again does nothing."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
