@@ -20,7 +20,7 @@ from vla_zenoh.security.identity import (
     identities_of,
 )
 from vla_zenoh.security.roles import TABLE, Act, Right, expressions, key_members, rights
-from vla_zenoh.security.rules import Passage, access_control, allows, missing, passages
+from vla_zenoh.security.rules import Passage, access_control, allows, missing, passages, wide
 
 KEYS = Keys("panda")
 LAB = {
@@ -133,6 +133,13 @@ def test_a_viewer_writes_nothing_and_sees_no_picture(lab: Profile) -> None:
     seen = may(lab, "viewer@wall", Act.SUBSCRIBE)
     assert "status/*" in seen
     assert not any(key.startswith(("camera/", "seen/")) for key in seen)
+
+
+def test_a_viewer_may_ask_for_all_of_a_group_that_has_nothing_hidden(lab: Profile) -> None:
+    asked = {KEYS.short(key) for key in wide(KEYS, who(lab, "viewer@wall"))}
+    assert {"state/*", "command/*", "status/*", "event/*", "delta/*"} <= asked
+    assert not any(key.startswith(("camera", "seen", "sim")) for key in asked)
+    assert wide(KEYS, who(lab, "command@robot")) == []
 
 
 def test_a_wild_key_covers_those_it_means() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 from vla_zenoh.keys import Keys, covers
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.identity import Identity, Role, identities
-from vla_zenoh.security.roles import Act, rights
+from vla_zenoh.security.roles import TABLE, Act, expressions, rights
 
 IN, OUT = "ingress", "egress"
 EVERY_MESSAGE = (
@@ -108,13 +108,33 @@ def _rules(identity: Identity, keys: Keys) -> list[dict[str, Any]]:
             # Who listens may ask for more than this key: the writer is told all the same.
             key = "**" if wish else right.key
             granted.setdefault((flow, message), {})[key] = None
-            if right.act is Act.SUBSCRIBE and identity.role is Role.OPERATOR:
-                granted[flow, message][keys.everything] = None
+            if right.act is Act.SUBSCRIBE:
+                granted[flow, message].update(dict.fromkeys(wide(keys, identity)))
     who = f"{keys.root}/{keys.robot}:{identity.common_name}"
     return [
         _rule(f"{who}:{flow}:{message}", (flow,), (message,), list(found))
         for (flow, message), found in granted.items()
     ]
+
+
+def wide(keys: Keys, identity: Identity) -> list[str]:
+    """Expressions by which people may subscribe to many keys at once.
+
+    Zenoh allows a subscription only as a whole. An operator reads everything. A viewer may ask for
+    all of a group, as ``state/*``, where it may read each of its keys.
+    """
+    if identity.role is Role.OPERATOR:
+        return [keys.everything]
+    if identity.role is not Role.VIEWER:
+        return []
+    groups: dict[str, bool] = {}
+    for row in TABLE:
+        for key in expressions(keys, row.member, identity, Act.SUBSCRIBE):
+            above, _, _ = key.rpartition("/")
+            may = identity.role in row.subscribe
+            groups[above] = groups.get(above, True) and may
+    top = keys.everything.removesuffix("/**")
+    return [f"{group}/*" for group, may in groups.items() if may and group != top]
 
 
 def _rule(
