@@ -1,6 +1,7 @@
 """Tests of models that need an environment of their own: uv makes it from the model's header.
 
-    .venv/bin/python scripts/test_models.py [MODEL ...] [--require] [-- PYTEST OPTIONS]
+    .venv/bin/python scripts/test_models.py [MODEL ...] [--require] [--with PACKAGE]
+                                            [-- PYTEST OPTIONS]
 
 tests/models/NAME/ runs in the environment of the model NAME, with what its ``requirements.txt``
 adds; the files beside those folders run in ./.venv, with workers that have theirs. An environment
@@ -44,11 +45,13 @@ def environment(environ: Mapping[str, str]) -> dict[str, str]:
     return out
 
 
-def run_model(name: str, options: list[str], environ: Mapping[str, str]) -> tuple[str, str]:
+def run_model(
+    name: str, added: list[str], options: list[str], environ: Mapping[str, str]
+) -> tuple[str, str]:
     """Verdict and reason of the tests in the environment of the model `name`."""
     extra = TESTS / name / "requirements.txt"
     more = [line for line in extra.read_text().split("\n") if line] if extra.is_file() else []
-    command = environment_command(find_model(name), [*TOOLS, *more])
+    command = environment_command(find_model(name), [*TOOLS, *more, *added])
     made = subprocess.run(
         [*command, "python", "-c", ""], env=environ, capture_output=True, text=True, check=False
     )
@@ -77,6 +80,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("models", nargs="*", metavar="MODEL", help=f"of {', '.join(folders)}")
     parser.add_argument("--require", action="store_true", help="no environment is a failure")
+    parser.add_argument("--with", dest="added", action="append", default=[], metavar="PACKAGE")
     given = sys.argv[1:]
     split = given.index("--") if "--" in given else len(given)
     asked, options = parser.parse_args(given[:split]), given[split + 1 :]
@@ -87,7 +91,7 @@ def main() -> int:
     verdicts: dict[str, tuple[str, str]] = {}
     for name in asked.models or folders:
         began_s = time.monotonic()
-        verdict, why = run_model(name, options, environ)
+        verdict, why = run_model(name, asked.added, options, environ)
         verdicts[name] = verdict, why or f"in {time.monotonic() - began_s:.0f} s"
     ready = [name for name, (verdict, _) in verdicts.items() if verdict == "passed"]
     chains = [str(TESTS / f"test_{name}_chain.py") for name in ready]

@@ -9,6 +9,7 @@ nothing is left to the camera.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -49,13 +50,16 @@ def through_jpeg(rgb: Picture) -> Picture:
 
 def lanczos(rgb: Picture, side: int) -> Picture:
     """Resize to a square with Lanczos' kernel of three lobes, widened when it makes smaller."""
-    rows, columns = (_lanczos_weights(size, side) for size in rgb.shape[:2])
-    pixels = rgb.astype(np.float32)
-    scaled = np.einsum("yh,hwc->ywc", rows, pixels, optimize=True)
-    scaled = np.einsum("xw,ywc->yxc", columns, scaled, optimize=True)
+    height, width, colours = rgb.shape
+    rows, columns = _lanczos_weights(height, side), _lanczos_weights(width, side)
+    # Two plain products of matrices are several times faster than sums over axes.
+    tall = rows @ rgb.reshape(height, -1).astype(np.float32)
+    across = tall.reshape(side, width, colours).transpose(0, 2, 1).reshape(-1, width)
+    scaled = (across @ columns.T).reshape(side, colours, side).transpose(0, 2, 1)
     return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
 
 
+@lru_cache(maxsize=16)
 def _lanczos_weights(size: int, side: int) -> NDArray[np.float32]:
     """(side, size) weights of the old pixels in each new one; every row sums to one."""
     factor = size / side
