@@ -106,6 +106,16 @@ class Renderer:
             raise ResourceError(f"no camera {camera!r}; there are: {', '.join(self.cameras)}")
         return self._canvas.draw(self._data, camera, width, height)
 
+    def view(self, camera: str) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Where `camera` is now: position (3,) m, axes (3, 3) in columns, vertical view in rad.
+
+        The axes are MuJoCo's: x to the right, y up, looking along -z.
+        """
+        index = self._model.camera(camera).id
+        axes = self._data.cam_xmat[index].reshape(3, 3).copy()
+        fovy_rad = float(np.radians(self._model.cam_fovy[index]))
+        return self._data.cam_xpos[index].copy(), axes, fovy_rad
+
     def close(self) -> None:
         """Give the graphics context back."""
         self._canvas.close()
