@@ -26,7 +26,8 @@ from vla_zenoh.cli.main import app
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.evaluation.csv_file import COLUMNS, evaluate_csv
 from vla_zenoh.evaluation.files import evaluate
-from vla_zenoh.evaluation.result import Evaluation, overall
+from vla_zenoh.evaluation.overall import overall
+from vla_zenoh.evaluation.result import Evaluation
 
 TOLERANCE = 1e-12  # of lengths that are sums of a few floats
 ANGLE_RAD = 0.05

@@ -18,7 +18,8 @@ from rich.table import Table
 from vla_zenoh.cli.output import console, errors, fail, plain_types, printable
 from vla_zenoh.evaluation import tables
 from vla_zenoh.evaluation.files import evaluate
-from vla_zenoh.evaluation.result import STAGES, Evaluation, overall, to_mapping
+from vla_zenoh.evaluation.overall import overall, to_mapping
+from vla_zenoh.evaluation.result import STAGES, Evaluation
 
 PICTURES = 8
 WIDE = 110

@@ -10,7 +10,8 @@ from typing import Any
 from vla_zenoh import __version__
 from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.evaluation import plots
-from vla_zenoh.evaluation.result import STAGES, Evaluation, View, overall
+from vla_zenoh.evaluation.overall import overall
+from vla_zenoh.evaluation.result import STAGES, Evaluation, View
 from vla_zenoh.evaluation.tables import LATENCY_COLUMNS, figures, latency_rows, segment_rows
 
 TEMPLATE = "report.html.j2"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vla_zenoh.evaluation.numbers import Spread, concatenated, spread
+from vla_zenoh.evaluation.numbers import Spread, spread
 from vla_zenoh.types import FloatArray
 
 STAGES = {
@@ -24,7 +24,6 @@ STAGES = {
 """Stages of a request, and what they are."""
 THESIS_NAMES = {"e2e": "end_to_end", "backend": "inference", "outbound": "outbound"}
 """How the thesis calls its three stages."""
-OVERALL = "ALL"
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,71 +241,10 @@ class Evaluation:
         }
 
 
-def overall(runs: Sequence[Evaluation]) -> Evaluation:
-    """All runs as one: values of all requests together, lengths and counts added up."""
-    stages = {stage for run in runs for stage in run.stages_ms}
-
-    def joined(name: str) -> FloatArray:
-        return concatenated([getattr(run, name) for run in runs])
-
-    units = {run.jerk_unit for run in runs if len(run.jerk)}
-    judged = [run for run in runs if run.succeeded is not None]
-    return Evaluation(
-        OVERALL,
-        "/".join(sorted({run.kind for run in runs})),
-        requests=sum(run.requests for run in runs),
-        succeeded=sum(run.succeeded or 0 for run in judged) if len(judged) == len(runs) else None,
-        seconds=sum(run.seconds for run in runs),
-        prompts=list(dict.fromkeys(prompt for run in runs for prompt in run.prompts)),
-        stages_ms={
-            stage: concatenated([run.stages_ms[stage] for run in runs if stage in run.stages_ms])
-            for stage in STAGES
-            if stage in stages
-        },
-        path_m=_sum(run.path_m for run in runs),
-        path_rad=_sum(run.path_rad for run in runs),
-        command_path_m=_sum(run.command_path_m for run in runs),
-        command_path_rad=_sum(run.command_path_rad for run in runs),
-        tracking_mm=joined("tracking_mm"),
-        tracking_mrad=joined("tracking_mrad"),
-        jerk=joined("jerk") if len(units) <= 1 else np.zeros(0),
-        jerk_unit=next(iter(units), "m_s3"),
-        active_s=_sum(run.active_s for run in runs),
-        idle_s=_sum(run.idle_s for run in runs),
-        seam_goal_mm=joined("seam_goal_mm"),
-        seam_velocity_mm_s=joined("seam_velocity_mm_s"),
-        refusals=_counters(run.refusals for run in runs),
-        skipped=_counters(run.skipped for run in runs),
-        gripper_orders=_sum(run.gripper_orders for run in runs),
-        segments=[segment for run in runs for segment in run.segments],
-    )
-
-
-def _counters(counters: Any) -> Counter[str]:
-    out: Counter[str] = Counter()
-    for counter in counters:
-        out.update(counter)
-    return out
-
-
-def _sum(values: Any) -> Any:
-    there = [value for value in values if value is not None]
-    return sum(there) if there else None
-
-
-def _largest(values: Any) -> float | None:
+def _largest(values: Iterable[float | None]) -> float | None:
     return max((value for value in values if value is not None), default=None)
 
 
 def _travel(width_m: FloatArray) -> float | None:
     there = width_m[np.isfinite(width_m)]
     return float(np.abs(np.diff(there)).sum()) if len(there) else None
-
-
-def to_mapping(runs: Sequence[Evaluation], faults: Mapping[str, str]) -> dict[str, Any]:
-    """Everything, ready for JSON."""
-    return {
-        "runs": [run.to_dict() for run in runs],
-        "overall": overall(runs).to_dict() if runs else None,
-        "faults": dict(faults),
-    }

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,9 +13,10 @@ import numpy as np
 from vla_zenoh.evaluation import numbers
 from vla_zenoh.evaluation.result import Evaluation, Trace
 from vla_zenoh.evaluation.segments import segment
+from vla_zenoh.evaluation.spans import last_ns, obeyed_chunks, prompt_spans, task_spans, until
 from vla_zenoh.evaluation.strip import views_of
 from vla_zenoh.recording.run import Heard, Run, load_run
-from vla_zenoh.types import Cause, FloatArray, NodeStatus, Task
+from vla_zenoh.types import Cause, FloatArray, NodeStatus
 
 GAP_S = 0.05
 """A stream that says nothing for longer was interrupted: nothing is derived across the gap."""
@@ -61,9 +61,9 @@ def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) ->
     dropped = sum((run.file.ended or {}).get("dropped", {}).values())
     if dropped:
         out.problems.append(f"the recorder dropped {dropped} samples")
-    obeyed = _obeyed_chunks(run)
+    obeyed = obeyed_chunks(run)
     causes = run.first_commands()
-    until_ns = _last_ns(run) + 1
+    until_ns = last_ns(run) + 1
     if first is not None:
         if len(obeyed) < first:
             out.problems.append(f"it has {len(obeyed)} chunks, fewer than the {first} asked for")
@@ -75,77 +75,23 @@ def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) ->
     _requests(out, obeyed, causes, zero_ns)
     measured, commanded = _measured(run, zero_ns, until_ns), _commanded(run, zero_ns, until_ns)
     _motion(out, measured, commanded, run)
-    _seams(out, _until(run.commands, until_ns))
-    _joint_jerk(out, _until(run.joint_commands, until_ns))
+    _seams(out, until(run.commands, until_ns))
+    _joint_jerk(out, until(run.joint_commands, until_ns))
     active = _active(run, until_ns, zero_ns)
     _idle(out, active, measured)
     out.refusals = _counted(run.first_statuses, run.statuses, "refused.")
     out.skipped = _counted(run.first_statuses, run.statuses, "skipped.")
-    grippers = _until(run.grippers, until_ns)
+    grippers = until(run.grippers, until_ns)
     out.width_m = np.array([entry.record.width_m for entry in grippers])
     out.width_t_s = np.array([(e.header.stamp_wall_ns - zero_ns) / 1e9 for e in grippers])
-    out.gripper_orders = len(_until(run.gripper_commands, until_ns))
+    out.gripper_orders = len(until(run.gripper_commands, until_ns))
     _segments(out, run, causes, measured, until_ns)
     if pictures:
         out.views = views_of(run, [entry.record for entry in obeyed], pictures)
     return out
 
 
-def _until(stream: Sequence[Heard], until_ns: int) -> list[Heard]:
-    """What is stamped before a time.
-
-    Stamps of the writers say what belongs together, not when something reached the recorder: so a
-    replayed run is cut as the original is.
-    """
-    return [entry for entry in stream if entry.header.stamp_wall_ns < until_ns]
-
-
 # -- requests -------------------------------------------------------------------------------------
-def _obeyed_chunks(run: Run) -> list[Heard]:
-    """Chunks of the obeyed worker that came while the arm obeyed: the requests."""
-    spans = _task_spans(run)
-    starts = [since_ns for since_ns, _, _ in spans]
-    out: list[Heard] = []
-    for entry in run.chunks:
-        stamp_ns = entry.header.stamp_wall_ns
-        at = bisect_right(starts, stamp_ns) - 1
-        if at >= 0 and stamp_ns < spans[at][1] and entry.record.worker == spans[at][2]:
-            out.append(entry)
-    return out
-
-
-def _task_spans(run: Run) -> list[tuple[int, int, str]]:
-    """(since ns, until ns, worker) of each time in which the arm obeyed one worker."""
-    return _spans(run, lambda task: task.worker)
-
-
-def _prompt_spans(run: Run) -> list[tuple[int, int, str]]:
-    """The same for prompts."""
-    return _spans(run, lambda task: task.prompt)
-
-
-def _spans(run: Run, of: Callable[[Task], str]) -> list[tuple[int, int, str]]:
-    out: list[tuple[int, int, str]] = []
-    since_ns, now = 0, None
-    for entry in run.tasks:
-        said = of(entry.record) if entry.record.active else None
-        if said != now:
-            stamp_ns = entry.header.stamp_wall_ns
-            if now is not None:
-                out.append((since_ns, stamp_ns, now))
-            since_ns, now = stamp_ns, said
-    if now is not None:
-        out.append((since_ns, _last_ns(run) + 1, now))
-    return out
-
-
-def _last_ns(run: Run) -> int:
-    """The last stamp of robot and models: a recorder may listen on after them."""
-    streams = (run.tasks, run.chunks, run.commands, run.joint_commands, run.poses)
-    stamps = (stream[-1].header.stamp_wall_ns for stream in streams if stream)
-    return max(stamps, default=run.ended_ns)
-
-
 def _requests(
     out: Evaluation,
     obeyed: Sequence[Heard],
@@ -187,7 +133,7 @@ def _measured(run: Run, zero_ns: int, until_ns: int) -> Motion:
     return _stream(
         (
             (e.header.stamp_wall_ns, e.record.position_m, e.record.quat_xyzw, e.record.twist)
-            for e in _until(run.poses, until_ns)
+            for e in until(run.poses, until_ns)
         ),
         zero_ns,
     )
@@ -199,11 +145,11 @@ def _commanded(run: Run, zero_ns: int, until_ns: int) -> Motion:
         return _stream(
             (
                 (e.header.stamp_wall_ns, e.record.position_m, e.record.quat_xyzw, e.record.twist)
-                for e in _until(run.commands, until_ns)
+                for e in until(run.commands, until_ns)
             ),
             zero_ns,
         )
-    poses = _until(run.poses, until_ns)
+    poses = until(run.poses, until_ns)
     return _stream(
         (
             (
@@ -288,7 +234,7 @@ def _joint_jerk(out: Evaluation, commands: Sequence[Heard]) -> None:
 def _active(run: Run, until_ns: int, zero_ns: int) -> list[tuple[float, float]]:
     return [
         ((since_ns - zero_ns) / 1e9, (min(end_ns, until_ns) - zero_ns) / 1e9)
-        for since_ns, end_ns, _ in _task_spans(run)
+        for since_ns, end_ns, _ in task_spans(run)
         if since_ns < until_ns
     ]
 
@@ -332,7 +278,7 @@ def _segments(
     """One for each prompt that was in force while the arm obeyed."""
     zero_ns = run.began_ns
     steps = {(e.record.worker, e.header.seq): len(e.record.steps) for e in run.chunks}
-    for since_ns, end_ns, prompt in _prompt_spans(run):
+    for since_ns, end_ns, prompt in prompt_spans(run):
         if since_ns >= until_ns:
             break
         end_ns = min(end_ns, until_ns)
