@@ -1,4 +1,5 @@
-"""Every key expression, and what may be said on it. The only file with key text.
+"""Every key expression of ours, and what may be said on it. The only file with key text; those of
+ROS 2, which are not ours to choose, stand in ``interop/ros2/keys.py``.
 
 A key is ``{root}/{robot}/...``: `Keys` makes them for one robot, `Kind` says what each is for. Who
 reads the table below knows the whole wire.

@@ -253,6 +253,10 @@ def told(path: str) -> list[str]:
             "ros2.gripper.grasp: goes with type franka_msgs/action/Move only",
         ),
         (
+            "ros2: {joint_command: {topic: /j, type: std_msgs/msg/Float64}}",
+            "ros2.joint_command.type: is std_msgs/msg/Float64: joints are sent as trajectory_msgs/",
+        ),
+        (
             "hosts: {a: {nodes: [ros2]}}",
             "hosts.a.nodes: has ros2, which needs a section ros2",
         ),

@@ -56,6 +56,8 @@ def _placement(profile: Profile) -> Iterator[str]:
         yield "hosts: none runs the command node; nothing will move"
     if "sim" not in running and profile.robot.driver == "sim":
         yield "hosts: none runs the simulator, and robot.driver is sim"
+    if "ros2" not in running and profile.robot.driver == "ros2":
+        yield "hosts: none runs the node ros2, and robot.driver is ros2"
     for what, known, used in (
         (
             "cameras",

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from vla_zenoh.faults import nearest
+from vla_zenoh.profile.ros2 import JOINT_COMMANDS
 from vla_zenoh.profile.section import Place
 from vla_zenoh.profile.session import endpoint_faults
 
@@ -93,6 +94,10 @@ def _ros2(profile: Profile) -> Iterator[Fault]:
         source = profile.cameras[name].source if name in profile.cameras else ""
         if source.startswith("ros2:") and source.removeprefix("ros2:") != camera.topic:
             yield ("ros2", "cameras", name, "topic"), f"is not that of cameras.{name}: {source!r}"
+    joints = ros2.joint_command
+    if joints is not None and joints.type not in JOINT_COMMANDS:
+        wanted = " or ".join(JOINT_COMMANDS)
+        yield ("ros2", "joint_command", "type"), f"is {joints.type}: joints are sent as {wanted}"
     gripper = ros2.gripper
     if gripper is not None and gripper.grasp and gripper.type != "franka_msgs/action/Move":
         yield ("ros2", "gripper", "grasp"), "goes with type franka_msgs/action/Move only"

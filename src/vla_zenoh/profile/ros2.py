@@ -65,7 +65,9 @@ class Ros2Output(Section):
 
     Args:
         topic: its name.
-        type: of `POSE_COMMANDS`, `JOINT_COMMANDS`, or one of your own with a pose in it.
+        type: for poses geometry_msgs/msg/PoseStamped,
+            multi_mode_control_msgs/msg/CartesianImpedanceGoal, or any other with a pose in it; for
+            joints one of `JOINT_COMMANDS`.
         frame: frame_id of its header; None: robot.base_frame.
     """
 
@@ -91,7 +93,7 @@ class Ros2Gripper(Section):
 
     Args:
         topic: name of the action or topic.
-        type: of `GRIPPER_ACTIONS` or `WIDTHS`.
+        type: one of `GRIPPER_ACTIONS`, or a topic of plain numbers.
         grasp: action of franka_msgs/action/Grasp that closes, where ``topic`` only moves.
         per_finger: positions are those of one finger, half of the width.
     """
