@@ -77,7 +77,7 @@ def _path(run: Evaluation) -> Any:
         return None
     import plotly.graph_objects as go
 
-    figure = _figure("TCP path, and its shadow on the floor", 430)
+    figure = _figure("TCP path and its shadow", 430)
     traces = [("measured" if run.commanded else "pose", MEASURED, 4, _thin(run.measured))]
     if run.commanded is not None:
         traces.insert(0, ("commanded", COMMANDED, 7, _thin(run.commanded)))
@@ -167,7 +167,7 @@ def _mark(figure: Any, run: Evaluation) -> None:
 
 
 def _position(run: Evaluation) -> Any:
-    title = "position, commanded (thick) and measured" if run.commanded else "position"
+    title = "position (thick: commanded)" if run.commanded else "position"
     return _lines(run, title, "position_m", "m, base frame")
 
 
