@@ -18,6 +18,7 @@ from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.offsets import MAX_PEERS
 from vla_zenoh.nodes.rehearsal import rehearse
 from vla_zenoh.nodes.session import QOS, open_session
 from vla_zenoh.nodes.slots import Latest
@@ -27,7 +28,7 @@ from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.security.roles import Act
 from vla_zenoh.security.rules import access_control
-from vla_zenoh.types import Image, Stamped, Task
+from vla_zenoh.types import Header, Image, Stamped, Task
 
 AHEAD_NS = 60_000_000
 """How far the other clock is ahead in these tests; within the bound of the profile."""
@@ -113,6 +114,17 @@ def test_a_clock_beyond_the_bound_is_told_and_its_stamps_stay() -> None:
         assert len(said) == 1
         assert "at most 0.1 s is allowed (timing.max_clock_offset_s)" in said[0]
         assert found.offset_s == pytest.approx(2.0, abs=OFFSET_TOLERANCE_S * 10)
+
+
+def test_a_source_that_cannot_be_a_node_is_not_asked() -> None:
+    with two_nodes() as (near, _):
+        for name in ("", "a/b", "**", "x" * 100, "\n", "sim/../..", "command"):
+            near.clocks.here(Header(0, 0, f"{name}#1"), None)
+        near.clocks.tick()
+        assert near.clocks._peers == {}
+        for number in range(500):
+            near.clocks.here(Header(0, 0, f"stranger{number}#1"), None)
+        assert len(near.clocks._peers) == MAX_PEERS
 
 
 def test_commands_and_pictures_travel_on_links_of_their_own() -> None:

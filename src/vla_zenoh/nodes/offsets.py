@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import zenoh
 
 from vla_zenoh.codec import message
-from vla_zenoh.errors import CodecError
+from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.keys import Keys, Kind
 from vla_zenoh.nodes.clock import Clock
 from vla_zenoh.nodes.session import QOS
@@ -41,7 +41,9 @@ Record = TypeVar("Record")
 
 @dataclass(slots=True)
 class _Peer:
+    key: str
     filter: OffsetFilter
+    since_s: float
     asks: int = 0
     next_ask_s: float = 0.0
     answered_s: float = -1e9
@@ -69,11 +71,16 @@ class Clocks:
 
     # -- asking -------------------------------------------------------------------------------
     def follow(self, node: str) -> None:
-        """From now on know the clock of `node`."""
-        if node != self._name and node not in self._peers and len(self._peers) < MAX_PEERS:
-            with self._lock:
-                self._peers[node] = _Peer(OffsetFilter(self._bound_s))
-            self._next_look_s = 0.0
+        """From now on know the clock of `node`; what cannot be a node's name is left out."""
+        if node == self._name or node in self._peers or len(self._peers) >= MAX_PEERS:
+            return
+        try:
+            key = self._keys.clock(node)
+        except ProfileError:
+            return
+        with self._lock:
+            self._peers[node] = _Peer(key, OffsetFilter(self._bound_s), time.monotonic())
+        self._next_look_s = 0.0
 
     def tick(self) -> None:
         """Ask whoever is due. Cheap; call it from the loop that owns the node."""
@@ -87,9 +94,12 @@ class Clocks:
                 peer.next_ask_s = now_s + (
                     FIRST_PERIOD_S if peer.asks <= FIRST_ASKS else ASK_PERIOD_S
                 )
-                self._ask(node, peer)
+                self._ask(peer)
+            if now_s - max(peer.answered_s, peer.since_s) > FORGET_S:
+                with self._lock:  # room for others; who is still heard comes back
+                    del self._peers[node]
 
-    def _ask(self, node: str, peer: _Peer) -> None:
+    def _ask(self, peer: _Peer) -> None:
         asked_ns = time.monotonic_ns()
 
         def take(reply: zenoh.Reply) -> None:
@@ -105,7 +115,7 @@ class Clocks:
                     peer.answered_s = time.monotonic()
 
         self._session.get(
-            self._keys.clock(node),
+            peer.key,
             zenoh.handlers.Callback(take, indirect=False),
             timeout=PATIENCE_S,
             **QOS[Kind.CONTROL],
