@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from chain import command_line
 
 TIMEOUT_S = 110.0
+ORACLE = Path(__file__).parents[1] / "oracle"
+"""A worker that cheats: it listens to where the objects are."""
 
 
 @pytest.mark.slow
@@ -31,3 +36,22 @@ def test_who_knows_no_task_does_none_through_the_real_chain(
     assert result["latency_ms"]["worker-scripted.inference"][0] >= 60.0
     assert (out / "failures.jpg").exists() == (successes == 0)
     assert "worker-scripted" in (out / "nodes.log").read_text()
+
+
+@pytest.mark.slow
+def test_who_does_the_task_through_the_real_chain_is_said_to_have_done_it(tmp_path: Path) -> None:
+    json_file = tmp_path / "result.json"
+    words = ["bench", "task", "--model", "oracle", "--family", "put", "--episodes", "3"]
+    words += ["--rate", "10", "--json", str(json_file), "--out", str(tmp_path / "run")]
+    done = subprocess.run(
+        [sys.executable, "-m", "vla_zenoh", *words],
+        env={**os.environ, "VLA_ZENOH_PATH": str(ORACLE)},
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads(json_file.read_text())
+    assert result["successes"] == 3, result["all"]
+    assert result["time_to_success_s"]["p95"] < result["limit_s"]
