@@ -148,7 +148,12 @@ class Lab:
 
 @contextmanager
 def running_lab(
-    folder: Path, program: Path, *, topology: Topology = "beside", state_hz: int = STATE_HZ
+    folder: Path,
+    program: Path,
+    *,
+    topology: Topology = "beside",
+    state_hz: int = STATE_HZ,
+    watch_goals: bool = True,
 ) -> Iterator[Lab]:
     """Everything up while the block lasts.
 
@@ -159,6 +164,7 @@ def running_lab(
             our nodes are clients of the bridge, which is a router when it is started as it comes;
             ``apart``: it is one, but only the node ``ros2`` speaks to it, and we have our own.
         state_hz: rate of the robot's joint states.
+        watch_goals: the witness listens to what the robot is told, too.
     """
     domain, ours = free_domain(), free_endpoint()
     theirs = free_endpoint() if topology == "apart" else ours
@@ -174,7 +180,7 @@ def running_lab(
         stack.callback(bridge.kill)
         robot = Robot(domain, "--camera", "front", "--state-hz", str(state_hz), *map(str, pictures))
         stack.callback(robot.end)
-        witness = Witness(domain)
+        witness = Witness(domain, watch_goals=watch_goals)
         stack.callback(witness.close)
         chain = stack.enter_context(running_chain(folder, profile_file=profile))
         chain.recorder.only = {"state": "ros2#", "command": "command#"}

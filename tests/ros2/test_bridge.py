@@ -44,7 +44,7 @@ class Border:
     def announce(self, endpoint: Endpoint) -> list[Any]:
         """Tokens of one of our endpoints; it is announced while they are kept."""
         liveliness = self.session.liveliness()
-        keys = [*self.wire.node_tokens(), *self.wire.tokens(endpoint, 1)]
+        keys = [self.wire.node_token(), self.wire.token(endpoint, 1)]
         return [liveliness.declare_token(key) for key in keys]
 
     def hear(self, endpoint: Endpoint) -> tuple[list[bytes], Any]:

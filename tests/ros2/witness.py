@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from camera_rig import until
 from chain import Track
+from cyclonedds.sub import DataReader
 from numpy.typing import NDArray
 from panda_robot import CURRENT_POSE, DESIRED_POSE, JOINT_STATES
 from ros_messages import CartesianImpedanceGoal, JointState, PoseStamped
@@ -35,22 +38,24 @@ class Witness:
 
     Args:
         domain: ROS domain id.
+        watch_goals: see what the robot is told, too.
     """
 
-    def __init__(self, domain: int) -> None:
+    def __init__(self, domain: int, *, watch_goals: bool = True) -> None:
         self.node = RosNode("witness", domain)
         self._lock = threading.Lock()
         self._poses: list[Seen] = []
         self._goals: list[Seen] = []
         self.fingers_m: list[tuple[int, float]] = []
         node = self.node
-        self._listener = Listener(
-            {
-                node.subscription(CURRENT_POSE, PoseStamped, depth=1000): self._on_pose,
-                node.subscription(DESIRED_POSE, CartesianImpedanceGoal, depth=1000): self._on_goal,
-                node.subscription(JOINT_STATES, JointState, depth=1000): self._on_joints,
-            }
-        )
+        handlers: dict[DataReader[Any], Callable[[Any, int], None]] = {
+            node.subscription(CURRENT_POSE, PoseStamped, depth=1000): self._on_pose,
+            node.subscription(JOINT_STATES, JointState, depth=1000): self._on_joints,
+        }
+        if watch_goals:
+            goals = node.subscription(DESIRED_POSE, CartesianImpedanceGoal, depth=1000)
+            handlers[goals] = self._on_goal
+        self._listener = Listener(handlers)
 
     def close(self) -> None:
         self._listener.close()

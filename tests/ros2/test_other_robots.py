@@ -1,0 +1,47 @@
+"""Robots that are not quite as ours: slow joint states, a controller that is off."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vla_zenoh.errors import SessionError
+
+pytest.importorskip("ros_messages", exc_type=ImportError)
+
+pytestmark = [pytest.mark.ros2, pytest.mark.slow]
+
+STATE_HZ = 30
+"""What joint_state_publisher sends when nobody changes its rate."""
+STEPS, STEP_M, WAY_TOLERANCE_M = 10, 0.01, 0.002
+
+
+def test_joint_states_at_30_hz_are_enough(tmp_path: Path, bridge_program: Path) -> None:
+    from rig import running_lab
+
+    with running_lab(tmp_path, bridge_program, state_hz=STATE_HZ) as lab:
+        lab.chain.activate_when_ready()
+        began_m = lab.activate_at_rest()
+        lab.chain.go("up", STEPS)
+        way_m = lab.witness.wait_still() - began_m
+        assert way_m == pytest.approx((0, 0, STEPS * STEP_M), abs=WAY_TOLERANCE_M)
+
+
+def test_a_robot_whose_controller_does_not_listen_is_not_activated(
+    tmp_path: Path, bridge_program: Path
+) -> None:
+    from rig import running_lab
+
+    with running_lab(tmp_path, bridge_program, watch_goals=False) as lab:
+        lab.chain.activate_when_ready()
+        lab.move()
+        lab.robot.switch_controller()
+        lab.chain.until("inactive", lambda: lab.chain.state() == "inactive")
+        stood_m = lab.witness.wait_still()
+        with pytest.raises(SessionError, match="not listening at /panda/"):
+            lab.chain.client.activate()
+        lab.robot.switch_controller()
+        # What was sent while nobody listened is not taken for where the arm is held.
+        assert np.linalg.norm(lab.activate_at_rest() - stood_m) < WAY_TOLERANCE_M
