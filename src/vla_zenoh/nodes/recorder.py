@@ -196,9 +196,12 @@ class Recorder:
                 self._change.wait_for(lambda: self._queue or self._closing, POLL_S)
                 closing = self._closing
                 taken, self._queue = self._queue, deque()
-                self._queued_bytes = 0
+                taken_bytes = self._queued_bytes
             for sample in taken:
                 self._writer.write(sample)
+            taken.clear()
+            with self._change:
+                self._queued_bytes -= taken_bytes
             if time.monotonic() >= commit_s:
                 self._writer.commit()
                 commit_s = time.monotonic() + COMMIT_S
