@@ -203,14 +203,14 @@ def test_the_offset_of_the_robots_clock_is_the_least_delay(behind_s: float, diff
         now_ns = 10**15 + number * 10 * MS
         delay_ns = (3 + number % 7) * MS
         stamp_ns = now_ns - int(behind_s * 1e9)
-        assert clock.take(stamp_ns, now_ns + delay_ns) == stamp_ns
+        clock.take(stamp_ns, now_ns + delay_ns)
     assert clock.offset_s == pytest.approx(behind_s + 0.003)
     assert clock.differs is differs
 
 
-def test_without_stamps_the_arrival_counts() -> None:
+def test_what_has_no_stamp_says_nothing_of_the_clock() -> None:
     clock = RobotClock()
-    assert clock.take(0, 123) == 123
+    clock.take(0, 123)
     assert clock.unstamped == 1
     assert clock.offset_s is None
     assert not clock.differs

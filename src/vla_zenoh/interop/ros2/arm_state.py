@@ -69,7 +69,7 @@ class ArmState:
 
         Args:
             joints: the message.
-            stamp_ns: to go by, see `RobotClock.take`.
+            stamp_ns: its own, or when it arrived where it has none.
 
         Raises:
             CodecError: ``frozen``, ``out_of_order``, ``partial`` (some of the arm's joints), or

@@ -21,13 +21,12 @@ class RobotClock:
         self._delays_ns: deque[int] = deque(maxlen=WINDOW)
         self.unstamped = 0
 
-    def take(self, stamp_ns: int, arrived_ns: int) -> int:
-        """The stamp to go by: the robot's own, or the arrival where it gives none."""
+    def take(self, stamp_ns: int, arrived_ns: int) -> None:
+        """A message of this stamp came; 0 is none."""
         if stamp_ns == 0:
             self.unstamped += 1
-            return arrived_ns
+            return
         self._delays_ns.append(arrived_ns - stamp_ns)
-        return stamp_ns
 
     @property
     def offset_s(self) -> float | None:

@@ -162,13 +162,16 @@ class Arm:
                 topic = str(arrival.sample.key_expr)
                 try:
                     joints = self._read(joint_state.TYPE, arrival)
-                    stamp_ns = self.clock.take(joints.stamp_ns, self._node.wall_of(arrival))
-                    fresh = self._state.take(joints, stamp_ns) is not None or fresh
+                    arrived_ns = self._node.wall_of(arrival)
+                    if self._state.take(joints, joints.stamp_ns or arrived_ns) is None:
+                        continue  # of the fingers alone, or another robot's
                 except CodecError as error:
                     self._refuse(topic, error)
-                else:
-                    self._heard_ns = arrival.mono_ns
-                    self.rate.tick()
+                    continue
+                fresh = True
+                self.clock.take(joints.stamp_ns, arrived_ns)
+                self._heard_ns = arrival.mono_ns
+                self.rate.tick()
         return fresh
 
     def _read(self, kind: str, arrival: Arrival) -> Any:
