@@ -232,3 +232,17 @@ def test_a_router_of_two_robots_lets_each_lab_at_its_own_robot_only(lab: Profile
 @pytest.mark.parametrize("act", Act)
 def test_every_act_needs_the_router_on_the_way_in_and_on_the_way_out(act: Act) -> None:
     assert {passage.flow for passage in passages(act, "k")} == {"ingress", "egress"}
+
+
+def test_a_ros_node_speaks_for_ros_people_only_where_services_are_offered() -> None:
+    security = {"listen": ["tls/10.0.0.2:7447"], "connect": ["tls/10.0.0.2:7447"], "security": {}}
+    bridge = {"connect": ["tcp/127.0.0.1:7448"]}
+    plain = load_profile("panda_ros2")
+    with pytest.raises(ProfileError, match=r"ros2\.connect: is missing: the bridge has no certif"):
+        override(plain, {"session": security})
+    for services, drives in (("/vla", True), (None, False)):
+        ros2 = {**bridge, "services": services}
+        lab = override(plain, {"session": security, "ros2": ros2})
+        written = may(lab, "ros2@here", Act.PUT)
+        assert {"state/pose", "camera/front/jpeg", "status/ros2"} <= written
+        assert ("prompt" in written) == drives

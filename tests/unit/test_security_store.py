@@ -224,6 +224,17 @@ def test_a_profile_without_the_list_is_left_alone() -> None:
 
 
 # -- the command ------------------------------------------------------------------------------
+def test_a_profile_that_cannot_be_secured_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "keys"
+    done = runner.invoke(secure_app, ["init", "-p", "panda_ros2", "--folder", str(folder)])
+    assert done.exit_code == 1
+    assert "ros2.connect: is missing: the bridge has no certificate" in str(done.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_lab_is_secured_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "keys"

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, JsonOption, ProfileOption
 from vla_zenoh.cli.output import console, errors, fail, print_json
-from vla_zenoh.errors import SecurityError
+from vla_zenoh.errors import SecurityError, VlaZenohError
 from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.profile.session import DEFAULT_FOLDER
 from vla_zenoh.security.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
@@ -71,11 +71,15 @@ def init(
     addresses = _places(at or ())
     places = moved(plain, addresses)
     text = profile_text(plain, _extends(profile, file), store.folder.absolute(), places)
-    made = [store.make_authority(lab, now)]
-    serving = serving_addresses(plain, (*addresses.values(), *(address or ())))
-    made += store.add(identities(plain), now, days=days, addresses=serving)
     _write(file, text)
-    written = load_profile(str(file))
+    try:
+        written = load_profile(str(file))
+        made = [store.make_authority(lab, now)]
+        serving = serving_addresses(plain, (*addresses.values(), *(address or ())))
+        made += store.add(identities(plain), now, days=days, addresses=serving)
+    except VlaZenohError:
+        file.unlink()
+        raise
     out = console()
     for path in made:
         out.print(f"made {path}", highlight=False, soft_wrap=True)

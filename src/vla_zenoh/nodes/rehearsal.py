@@ -331,7 +331,7 @@ def _judge(
 
 
 def _must(keys: Keys, one: Identity, granted: Sequence[Right], act: Act, key: str) -> bool:
-    if act is Act.SUBSCRIBE and one.role is Role.OPERATOR:
+    if act is Act.SUBSCRIBE and Role.OPERATOR in one.roles:
         return covers(keys.everything, key)
     return any(right.act is act and covers(right.key, key) for right in granted)
 

@@ -94,6 +94,12 @@ def _ros2(profile: Profile) -> Iterator[Fault]:
         source = profile.cameras[name].source if name in profile.cameras else ""
         if source.startswith("ros2:") and source.removeprefix("ros2:") != camera.topic:
             yield ("ros2", "cameras", name, "topic"), f"is not that of cameras.{name}: {source!r}"
+    if robot.driver == "ros2" and ros2.connect is None and profile.session.security is not None:
+        yield (
+            ("ros2", "connect"),
+            "is missing: the bridge has no certificate of this lab. Let it listen on the robot's "
+            "computer alone, at another port, and name that, as connect: [tcp/127.0.0.1:7448]",
+        )
     joints = ros2.joint_command
     if joints is not None and joints.type not in JOINT_COMMANDS:
         wanted = " or ".join(JOINT_COMMANDS)

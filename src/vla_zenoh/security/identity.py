@@ -48,6 +48,7 @@ class Identity:
         host: where.
         worker: the worker it is, if it is one.
         cameras: the cameras it serves.
+        speaks_for: whose part it plays as well: the node of a ROS 2 robot puts what ROS people ask.
     """
 
     role: Role
@@ -55,6 +56,12 @@ class Identity:
     host: str
     worker: str = ""
     cameras: tuple[str, ...] = ()
+    speaks_for: tuple[Role, ...] = ()
+
+    @property
+    def roles(self) -> frozenset[Role]:
+        """Its own role, and those it plays as well."""
+        return frozenset({self.role, *self.speaks_for})
 
     @property
     def common_name(self) -> str:
@@ -127,5 +134,7 @@ def _nodes(profile: Profile, host: str) -> list[Identity]:
             Role.ROBOT: from_ros2 if kind == "ros2" else (),
         }
         name = node_name(profile, host, kind)
-        found.append(Identity(role, name, host, cameras=cameras.get(role, ())))
+        offers = kind == "ros2" and profile.ros2 is not None and profile.ros2.services is not None
+        people = (Role.OPERATOR,) if offers else ()
+        found.append(Identity(role, name, host, cameras=cameras.get(role, ()), speaks_for=people))
     return found

@@ -204,6 +204,6 @@ def rights(keys: Keys, identity: Identity) -> list[Right]:
         Right(identity, act, key)
         for row in TABLE
         for act in Act
-        if identity.role in row.roles(act)
+        if identity.roles & row.roles(act)
         for key in expressions(keys, row.member, identity, act)
     ]

@@ -123,7 +123,7 @@ def wide(keys: Keys, identity: Identity) -> list[str]:
     Zenoh allows a subscription only as a whole. An operator reads everything. A viewer may ask for
     all of a group, as ``state/*``, where it may read each of its keys.
     """
-    if identity.role is Role.OPERATOR:
+    if Role.OPERATOR in identity.roles:
         return [keys.everything]
     if identity.role is not Role.VIEWER:
         return []
