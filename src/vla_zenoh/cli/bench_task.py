@@ -119,7 +119,7 @@ def task(
     try:
         with _bar(episodes) as advance:
             if lockstep:
-                _lockstep(loaded, score, options or [], camera, stop, processes, advance)
+                _lockstep(loaded, profile, score, options or [], camera, stop, processes, advance)
             else:
                 _real_time(loaded, score, options or [], python, camera, stop, out, advance)
     finally:
@@ -183,6 +183,7 @@ def _bar(episodes: int) -> Iterator[Any]:
 
 def _lockstep(
     profile: Profile,
+    named: str,
     score: Any,
     options: list[str],
     camera: str | None,
@@ -199,6 +200,7 @@ def _lockstep(
         camera,
         stop,
         processes or os.cpu_count() or 1,
+        named=named,
     ):
         score.ended.append(ended)
         score.latency_ms = latency_ms

@@ -66,7 +66,16 @@ def check(
     run_in_own_environment(found, python)
     with contextlib.redirect_stdout(sys.stderr):  # a model's own words are not the result
         report = _examine(
-            found, chosen, name or found.name, against, rate_hz, prompts, runs, budget_s, patience_s
+            found,
+            chosen,
+            name or found.name,
+            profile,
+            against,
+            rate_hz,
+            prompts,
+            runs,
+            budget_s,
+            patience_s,
         )
     if as_json:
         print_json(report.to_dict())
@@ -82,6 +91,7 @@ def _examine(
     found: ModelFile,
     options: dict[str, str],
     worker: str,
+    named: str | None,
     profile: Profile | None,
     rate_hz: float | None,
     prompts: list[str] | None,
@@ -90,7 +100,7 @@ def _examine(
     patience_s: float,
 ) -> Report:
     try:
-        policy = make_policy(found, options, profile=profile.name if profile else None)
+        policy = make_policy(found, options, profile=named)
     except WorkerError as fault:
         return Report(worker, findings=[error("cannot_be_made", str(fault))])
     return Examination(

@@ -48,6 +48,8 @@ def run_in_lockstep(
     camera: str | None,
     stop: threading.Event,
     processes: int,
+    *,
+    named: str | None = None,
 ) -> Iterator[tuple[Ended, dict[str, tuple[float, float]]]]:
     """One outcome after the other, each with what an inference took in its process.
 
@@ -58,12 +60,13 @@ def run_in_lockstep(
         camera: whose pictures go into the sheet of failures.
         stop: set by Ctrl-C; episodes not begun are left out.
         processes: at once.
+        named: name or path of the profile, for a model that takes one.
     """
     with ProcessPoolExecutor(
         processes,
         mp_context=multiprocessing.get_context("spawn"),
         initializer=_begin,
-        initargs=(profile, plan, dict(options), camera),
+        initargs=(profile, plan, dict(options), camera, named),
     ) as pool:
         futures: list[Future[Any]] = [pool.submit(_one, asked) for asked in plan.asked()]
         for future in futures:
@@ -138,7 +141,9 @@ class _Loaded:
 _bench: _Bench | None = None
 
 
-def _begin(profile: Profile, plan: Plan, options: dict[str, str], camera: str | None) -> None:
+def _begin(
+    profile: Profile, plan: Plan, options: dict[str, str], camera: str | None, named: str | None
+) -> None:
     global _bench
     die_with_parent()
     world = build_world(profile)
@@ -146,7 +151,7 @@ def _begin(profile: Profile, plan: Plan, options: dict[str, str], camera: str | 
     renderer = Renderer(
         profile.sim.scene, world.robot, choose_backend(None if wanted == AUTO else wanted)
     )
-    policy = _Loaded(make_policy(find_model(plan.worker), options))
+    policy = _Loaded(make_policy(find_model(plan.worker), options, profile=named))
     _bench = _Bench(profile, plan, camera, world, renderer, policy)
 
 
