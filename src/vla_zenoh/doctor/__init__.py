@@ -17,7 +17,7 @@ from vla_zenoh.doctor.wallclock import wall_clock
 
 __all__ = ["Finding", "Level", "Needs", "Role", "examine", "needs_of"]
 
-ROLES: tuple[Role, ...] = ("base", "control", "sim")
+ROLES: tuple[Role, ...] = ("base", "control", "sim", "ros2")
 
 
 def examine(needs: Needs, try_zenoh: Callable[[str], str]) -> Iterator[Finding]:

@@ -8,7 +8,7 @@ from typing import Literal
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile
 
-Role = Literal["base", "control", "sim"]
+Role = Literal["base", "control", "sim", "ros2"]
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -45,6 +45,8 @@ def needs_of(profile: Profile, host: str | None = None) -> Needs:
     roles: set[Role] = {"base"}
     if "command" in nodes:
         roles.add("control")
+    if "ros2" in nodes:
+        roles |= {"control", "ros2"}
     if "sim" in nodes:
         roles.add("sim")
     cameras: set[str] = set()
