@@ -11,8 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import zenoh
-from camera_rig import await_match, camera_rig, free_endpoint, grey, until
+from camera_rig import camera_rig, free_endpoint, grey, until
 
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
@@ -20,12 +19,13 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.offsets import MAX_PEERS
 from vla_zenoh.nodes.rehearsal import rehearse
-from vla_zenoh.nodes.session import QOS, open_session
+from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.slots import Latest
 from vla_zenoh.observe import form_of, prepare
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.profile.schema import CameraProfile
+from vla_zenoh.profile.session import second_link
 from vla_zenoh.security.roles import Act
 from vla_zenoh.security.rules import access_control
 from vla_zenoh.types import Header, Image, Stamped, Task
@@ -135,24 +135,24 @@ def test_commands_and_pictures_travel_on_links_of_their_own() -> None:
     )
     with (
         open_session(profile.session, mode="router"),
-        open_session(profile.session) as writer,
-        open_session(profile.session) as reader,
+        open_session(profile.session) as there,
+        open_session(profile.session) as here,
     ):
-        links = sorted(link.priorities for link in writer.info.links())
-        assert links == [(0, 3), (4, 7)]
-        heard: dict[str, int] = {}
-
-        def take(sample: zenoh.Sample) -> None:
-            heard[str(sample.priority)] = heard.get(str(sample.priority), 0) + 1
-
-        subscriber = reader.declare_subscriber(
-            profile.keys.everything, zenoh.handlers.Callback(take, indirect=False)
-        )
-        await_match(writer, profile.keys.command_pose)
-        for kind in Kind:
-            writer.put(profile.keys.command_pose, b"x", **QOS[kind])
-        until("one of each kind", lambda: sum(heard.values()) == len(Kind))
-        subscriber.undeclare()
+        camera, worker = Node("camera", profile, there), Node("worker-far", profile, here)
+        pictures = camera.stream(profile.keys.camera_jpeg("front"), Kind.FRAME)
+        news = camera.stream(profile.keys.state_pose, Kind.STATE)
+        seen = worker.listen(pictures.key, Latest(), Kind.FRAME)
+        heard = worker.listen(news.key, Latest())
+        until("a reader of both", lambda: pictures.wanted and news.wanted)
+        for stream, slot in ((pictures, seen), (news, heard)):
+            stream.put(b"something")
+            assert slot.wait(2.0)
+        port, own = endpoint.removeprefix("tcp/"), second_link(endpoint).removeprefix("tcp/")
+        for node in (camera, worker):
+            assert node.traffic.links() == sorted([f"tcp/{port}", f"tcp/{own}"])
+        assert [str(link.dst) for link in there.info.links()] == [f"tcp/{port}"]
+        camera.close()
+        worker.close()
 
 
 def chart(folder: Path) -> Path:

@@ -20,7 +20,7 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.nodes import offsets
 from vla_zenoh.nodes.clock import Clock
 from vla_zenoh.nodes.offsets import Clocks
-from vla_zenoh.nodes.session import QOS
+from vla_zenoh.nodes.session import QOS, open_session
 from vla_zenoh.nodes.slots import Arrival, Inbox, Latest, Mailbox
 from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.nodes.traffic import Traffic
@@ -29,6 +29,7 @@ from vla_zenoh.types import Event, Header, NodeStatus, Stamped
 
 MSGPACK = zenoh.Encoding("application/msgpack")
 STATUS_PERIOD_S = 0.5
+PICTURES_PATIENCE_S = 10.0
 EVENT_PERIOD_S = 0.25
 """The same kind of event is written at most this often; what came between is counted in `count`."""
 
@@ -95,6 +96,7 @@ class Node:
         self.started_wall_ns = time.time_ns()
         self._declared: list[Any] = []
         self._streams: list[Stream] = []
+        self._pictures: zenoh.Session | None = None
         self.traffic = Traffic(session)
         self._last_event: dict[tuple[str, str, str], float] = {}
         self._held_events: Counter[tuple[str, str, str]] = Counter()
@@ -120,10 +122,25 @@ class Node:
 
     # -- writing ------------------------------------------------------------------------------
     def stream(self, key: str, kind: Kind) -> Stream:
-        """A writer for `key`."""
-        made = Stream(self.session, key, kind, self.source, self.clock)
+        """A writer for `key`.
+
+        Raises:
+            SessionError: it is for pictures, and the router does not answer at their port.
+        """
+        made = Stream(self._session_for(kind), key, kind, self.source, self.clock)
         self._streams.append(made)
         return made
+
+    def _session_for(self, kind: Kind) -> zenoh.Session:
+        """Pictures have a connection of their own where the profile says so."""
+        if kind is not Kind.FRAME or not self.profile.session.separate_links:
+            return self.session
+        if self._pictures is None:
+            self._pictures = open_session(
+                self.profile.session, identity=self.name, pictures=True, wait_s=PICTURES_PATIENCE_S
+            )
+            self.traffic.add(self._pictures)
+        return self._pictures
 
     def tell(self, event: Event) -> None:
         """Write an event; a flood of the same is thinned out and counted."""
@@ -218,15 +235,20 @@ class Node:
         return due or state != self._last_state
 
     # -- reading ------------------------------------------------------------------------------
-    def listen(self, key: str, slot: Slot) -> Slot:
-        """Let samples on `key` fall into `slot`."""
+    def listen(self, key: str, slot: Slot, kind: Kind = Kind.STATE) -> Slot:
+        """Let samples on `key` fall into `slot`; of `kind` it matters whether they are pictures.
+
+        Raises:
+            SessionError: the router does not answer at the port of pictures.
+        """
+        session = self._session_for(kind)
         if isinstance(slot, Mailbox):
-            subscriber = self.session.declare_subscriber(key, slot.channel())
+            subscriber = session.declare_subscriber(key, slot.channel())
             slot.take_from(subscriber.try_recv)
             self._declared.append(subscriber)
             return slot
         handler = zenoh.handlers.Callback(slot, indirect=False)
-        self._declared.append(self.session.declare_subscriber(key, handler))
+        self._declared.append(session.declare_subscriber(key, handler))
         return slot
 
     def on_alive(self, callback: Callable[[str, bool], None]) -> None:
@@ -307,3 +329,6 @@ class Node:
         for declared in self._declared:
             declared.undeclare()
         self._declared.clear()
+        if self._pictures is not None:
+            self._pictures.close()
+            self._pictures = None

@@ -17,9 +17,6 @@ from vla_zenoh.profile.session import SecurityProfile, second_link
 from vla_zenoh.security.store import Store
 
 RETRY_S = 0.1
-FAST, BULK = "0-3", "4-7"
-"""Priorities of Zenoh on the first and on the second of separate links; see `QOS`."""
-MAX_LINKS = 4
 
 _DROP = zenoh.CongestionControl.DROP
 _BLOCK = zenoh.CongestionControl.BLOCK
@@ -47,6 +44,7 @@ def config(
     connect: tuple[str, ...] | None = None,
     identity: str | None = None,
     access: Mapping[str, Any] | None = None,
+    pictures: bool = False,
 ) -> dict[str, Any]:
     """Zenoh's configuration as plain data, before it is handed to its strict parser.
 
@@ -56,6 +54,7 @@ def config(
         connect: overrides the profile's endpoints; of a router: other routers.
         identity: which node's certificate is shown; None: that of the people at this computer.
         access: section ``access_control``, of a router.
+        pictures: of a client: the link that pictures have to themselves.
 
     Raises:
         SecurityError: the certificate is not there.
@@ -67,7 +66,7 @@ def config(
         "mode": mode,
         "listen": {"endpoints": _listening(profile) if routes else []},
         "connect": {
-            "endpoints": [_connecting(profile, endpoint) for endpoint in targets],
+            "endpoints": [second_link(e) if pictures else e for e in targets],
             # A router waits for nobody, and goes on looking for the others.
             "timeout_ms": -1 if routes else 0,
             "exit_on_failure": not routes,
@@ -79,7 +78,6 @@ def config(
         },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": mode == "peer"}},
         "transport": {
-            "unicast": {"max_links": MAX_LINKS if profile.separate_links else 1},
             "shared_memory": {"enabled": profile.shared_memory},
             "link": {
                 "tx": {
@@ -102,17 +100,7 @@ def config(
 def _listening(profile: SessionProfile) -> list[str]:
     if not profile.separate_links:
         return list(profile.listen)
-    return [link for endpoint in profile.listen for link in _links(endpoint)]
-
-
-def _connecting(profile: SessionProfile, endpoint: str) -> Any:
-    if not profile.separate_links:
-        return endpoint
-    return {"strategy": "allOf", "locators": _links(endpoint)}
-
-
-def _links(endpoint: str) -> list[str]:
-    return [f"{endpoint}?prio={FAST}", f"{second_link(endpoint)}?prio={BULK}"]
+    return [link for endpoint in profile.listen for link in (endpoint, second_link(endpoint))]
 
 
 def _tls(security: SecurityProfile, identity: str | None, routes: bool) -> dict[str, Any]:
@@ -135,6 +123,7 @@ def open_session(
     connect: tuple[str, ...] | None = None,
     identity: str | None = None,
     access: Mapping[str, Any] | None = None,
+    pictures: bool = False,
     wait_s: float = 0.0,
     stop: threading.Event | None = None,
 ) -> zenoh.Session:
@@ -146,6 +135,7 @@ def open_session(
         connect: overrides the profile's endpoints; of a router: other routers.
         identity: which node this is, for its certificate; None: the people at this computer.
         access: who may do what, of a router.
+        pictures: the link that pictures have to themselves, where ``separate_links``.
         wait_s: keep trying for this long.
         stop: give up at once when it is set.
 
@@ -153,7 +143,14 @@ def open_session(
         SecurityError: the certificate is not there.
         SessionError: nobody answers there, or the address is taken; says what to do.
     """
-    settings = config(profile, mode=mode, connect=connect, identity=identity, access=access)
+    settings = config(
+        profile,
+        mode=mode,
+        connect=connect,
+        identity=identity,
+        access=access,
+        pictures=pictures,
+    )
     give_up = time.monotonic() + wait_s
     stop = stop or threading.Event()
     while True:
@@ -174,7 +171,7 @@ def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
             f"the router cannot listen on {where}: {error}. Is another router or program there? "
             "`vla-zenoh doctor` tells; choose another address with --listen or session.listen"
         )
-    where = ", ".join(map(_shown, settings["connect"]["endpoints"]))
+    where = ", ".join(settings["connect"]["endpoints"])
     tls = settings["transport"]["link"].get("tls")
     if tls is not None:
         return SessionError(
@@ -186,7 +183,3 @@ def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
         f"no Zenoh router answers at {where}. Start one with `vla-zenoh router`, or everything "
         "with `vla-zenoh up`; another address is given with --connect or session.connect"
     )
-
-
-def _shown(endpoint: Any) -> str:
-    return endpoint if isinstance(endpoint, str) else " and ".join(endpoint["locators"])

@@ -12,6 +12,7 @@ from vla_zenoh.types import Header
 
 LINKS_PERIOD_S = 5.0
 MAX_SENDERS = 256
+MAX_LINKS = 8
 
 
 class Sender(Protocol):
@@ -33,13 +34,17 @@ class Traffic:
     """
 
     def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
+        self._sessions = [session]
         self._reported_s = time.monotonic()
         self._sent: dict[str, tuple[int, int]] = {}
         self._first: dict[tuple[str, str], tuple[int, int]] = {}
         self._lost: dict[tuple[str, str], int] = {}
         self._links: list[str] = []
         self._links_s = -1e9
+
+    def add(self, session: zenoh.Session) -> None:
+        """Show the links of this one as well."""
+        self._sessions.append(session)
 
     def heard(self, key: str, header: Header, arrivals: int) -> None:
         """A record was read.
@@ -82,10 +87,11 @@ class Traffic:
         return out
 
     def links(self) -> list[str]:
-        """Where this session is connected to, as Zenoh writes it."""
+        """Where this node is connected to, as Zenoh writes it."""
         if time.monotonic() - self._links_s > LINKS_PERIOD_S:
             self._links_s = time.monotonic()
-            self._links = sorted(str(link.dst) for link in self._session.info.links())[:8]
+            found = {str(link.dst) for one in self._sessions for link in one.info.links()}
+            self._links = sorted(found)[:MAX_LINKS]
         return self._links
 
     def detail(self, streams: Iterable[Sender]) -> Mapping[str, Any]:

@@ -100,7 +100,7 @@ class WorkerNode:
             return (keys.camera_jpeg if self._jpeg else keys.camera_raw)(camera.camera)
 
         self._image_slots = {
-            camera.camera: node.listen(key_of(camera), Latest())
+            camera.camera: node.listen(key_of(camera), Latest(), Kind.FRAME)
             for camera in self.spec.observation.cameras
         }
         self._state_slots = {

@@ -137,9 +137,8 @@ class SessionProfile(Section):
         listen: where the router listens.
         router: ``own``: in a Python process of ours; ``zenohd``: the program of that name, with
             the same configuration.
-        separate_links: commands, orders and states travel on a link of their own, pictures and
-            news on a second one at the next port. A reader that is stuck in a picture then does
-            not hold up the arm.
+        separate_links: pictures travel over connections of their own, to the router's next port.
+            A reader that is stuck in a picture then does not hold up the arm.
         shared_memory: move large payloads through shared memory between processes of one host.
         lease_ms: a silent link is given up after this.
         security: certificates and who may do what; null: there are none, and the router listens
