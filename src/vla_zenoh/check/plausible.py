@@ -164,9 +164,11 @@ def _gripper(spec: ActionSpec, value: NDArray[np.float64], max_width_m: float) -
     if spec.gripper not in bounds:
         return
     low, high = bounds[spec.gripper]
+    # A choice of two is one whatever the numbers; the others the command node would refuse.
+    level = warning if spec.gripper == "binary" else error
     for found in (float(value.min()), float(value.max())):
         if not low <= found <= high:
-            yield error(
+            yield level(
                 "gripper_range",
                 f"gripper {found:.4g}, declared as {spec.gripper}: at most {low:.3g} to "
                 f"{high:.3g} (this gripper opens to {max_width_m:g} m)",

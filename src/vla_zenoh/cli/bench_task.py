@@ -6,7 +6,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,9 +15,11 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from vla_zenoh.bench.task import Plan, Score
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, model_options
 from vla_zenoh.cli.output import console, errors, printable
 from vla_zenoh.profile import Profile, override
+from vla_zenoh.tasks import FAMILIES, LIMIT_S
 
 SCENE = "bricks"
 VARIATIONS = ("lights", "table", "camera", "distractors")
@@ -92,9 +94,7 @@ def task(
     The judge looks at the true poses of the objects. Tasks come from the scene's layouts: put a
     brick in the box, stack it on another one, push it somewhere.
     """
-    from vla_zenoh.bench.task import Plan, Score
     from vla_zenoh.nodes.process import stop_on_signals
-    from vla_zenoh.tasks import FAMILIES, LIMIT_S
 
     if family not in (None, "stay", *FAMILIES):
         raise typer.BadParameter(f"--family is one of {', '.join(FAMILIES)}, stay")
@@ -158,7 +158,7 @@ def _with_bricks(profile: Profile, worker: str, vary: list[str]) -> Profile:
 
 
 @contextmanager
-def _bar(episodes: int) -> Iterator[Any]:
+def _bar(episodes: int) -> Iterator[Callable[[Score], None]]:
     with Progress(
         TextColumn("{task.description:<44}"),
         BarColumn(),
@@ -168,7 +168,7 @@ def _bar(episodes: int) -> Iterator[Any]:
     ) as bars:
         bar = bars.add_task("starting", total=episodes)
 
-        def advance(score: Any) -> None:
+        def advance(score: Score) -> None:
             done = sum(each.success for each in score.ended)
             last = score.ended[-1]
             word = "done" if last.success else last.failure
@@ -184,12 +184,12 @@ def _bar(episodes: int) -> Iterator[Any]:
 def _lockstep(
     profile: Profile,
     named: str,
-    score: Any,
+    score: Score,
     options: list[str],
     camera: str | None,
     stop: threading.Event,
     processes: int | None,
-    advance: Any,
+    advance: Callable[[Score], None],
 ) -> None:
     from vla_zenoh.nodes.bench_task_lockstep import run_in_lockstep
 
@@ -209,13 +209,13 @@ def _lockstep(
 
 def _real_time(
     profile: Profile,
-    score: Any,
+    score: Score,
     options: list[str],
     python: str | None,
     camera: str | None,
     stop: threading.Event,
     out: Path | None,
-    advance: Any,
+    advance: Callable[[Score], None],
 ) -> None:
     from vla_zenoh.cli.demo_run import own_address
     from vla_zenoh.nodes.bench_task import TaskRun
@@ -256,7 +256,7 @@ def _real_time(
                 pass
 
 
-def _write(score: Any, json_file: Path | None, out: Path | None) -> None:
+def _write(score: Score, json_file: Path | None, out: Path | None) -> None:
     from vla_zenoh.bench.task_sheet import failure_sheet
 
     text = json.dumps(score.to_dict(), indent=2) + "\n"
