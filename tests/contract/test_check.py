@@ -182,7 +182,7 @@ def test_replay_keeps_its_contract(tmp_path: Path) -> None:
     ],
 )
 def test_an_adapter_keeps_its_contract_with_its_server(name: str) -> None:
-    with served(name) as server:
+    with served(KINDS[name]) as server:
         passes(server.kind.model, **server.settings)
 
 
