@@ -31,7 +31,7 @@ from vla_zenoh.nodes.listener import Listener
 from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
 from vla_zenoh.nodes.recorder import Recorder
 from vla_zenoh.nodes.session import open_session
-from vla_zenoh.profile import Profile, override, to_yaml
+from vla_zenoh.profile import Profile, SessionProfile, override, to_yaml
 from vla_zenoh.recording.run import Run, load_run, pictures
 from vla_zenoh.types import NodeStatus
 
@@ -82,6 +82,11 @@ def own_address(profile: Profile) -> Profile:
     """The profile where nobody answers: a demo must never reach a lab's real robot."""
     if profile.robot.driver != "sim":
         raise typer.BadParameter(f"profile {profile.name} is of a real robot; demos are simulated")
+    # It stays on this computer, and needs no certificates.
+    plain = {"security": None, "insecure": False, "separate_links": False}
+    if profile.session.security is not None:
+        local = list(SessionProfile().connect)
+        profile = override(profile, {"session": {**plain, "connect": local, "listen": local}})
     try:
         open_session(profile.session).close()
         port = _free_port()
@@ -90,7 +95,7 @@ def own_address(profile: Profile) -> Profile:
     except SessionError:
         endpoints = profile.session.connect
     here = list(endpoints)
-    return override(profile, {"session": {"connect": here, "listen": here}})
+    return override(profile, {"session": {**plain, "connect": here, "listen": here}})
 
 
 def _free_port() -> int:
