@@ -1,0 +1,279 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["numpy", "onnxruntime>=1.20"]
+# ///
+"""Puts, stacks and pushes bricks by prompt: a small policy, trained in the scene ``bricks``.
+
+Two pictures, the hand and the prompt go in, waypoints of the hand come out, relative to where it
+was measured. What was asked for already, and is not reached yet, is taken off them, because a delta
+is put on the goal in force when the observation was taken. See README.md beside this file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.errors import WorkerError
+from vla_zenoh.policy import (
+    ActionSpec,
+    ActionSteps,
+    CameraSpec,
+    ModelSpec,
+    Observation,
+    ObservationSpec,
+)
+from vla_zenoh.types import PoseState
+
+FloatArray = NDArray[np.float64]
+
+FOLDER = Path(__file__).parent
+GRAPH, MANIFEST = "brick.onnx", "weights.json"
+HORIZON, DT_S = 8, 0.1
+FRONT, WRIST = (128, 96), (96, 72)
+"""Width and height of the pictures."""
+STEP_M, STEP_RAD = 0.045, 0.18
+"""A waypoint further from the one before is approached in several steps."""
+WIDTH_STEP_M = 0.08
+LOW_M = 0.035
+AT_REST_M_S = 0.004
+MAX_WORDS = 24
+PAD, UNKNOWN = 0, 1
+
+
+class Waypoints(NamedTuple):
+    """What is to be done, relative to the measured hand.
+
+    Args:
+        offset: (H, 4) x, y, z in m along the base axes and a turn about the vertical in rad.
+        opened: (H,) the gripper has to be open.
+        understood: the prompt is a task; else the arm stays.
+    """
+
+    offset: FloatArray
+    opened: NDArray[np.bool_]
+    understood: bool
+
+
+@dataclass(slots=True)
+class Hand:
+    """The TCP, and what has to be remembered of it in an episode.
+
+    Args:
+        position_m: (3,) measured.
+        yaw_rad: measured turn about the vertical.
+        width_m: measured opening.
+        swept_m: see `expert.Hand`.
+        down_m: (2,) where it came down below `LOW_M`; None while it is above.
+    """
+
+    position_m: FloatArray
+    yaw_rad: float
+    width_m: float
+    swept_m: float = 0.0
+    down_m: FloatArray | None = None
+
+    def numbers(self) -> FloatArray:
+        """(9,) what the network is told of it."""
+        x, y, z = self.position_m
+        return np.array(
+            [
+                (x - 0.48) / 0.15,
+                y / 0.25,
+                (z - 0.1) / 0.08,
+                math.log(max(z, 0.008) / 0.05),
+                math.sin(self.yaw_rad),
+                math.cos(self.yaw_rad),
+                (self.width_m - 0.04) / 0.04,
+                min(self.swept_m, 0.15) / 0.05,
+                float(self.down_m is not None),
+            ]
+        )
+
+
+def words_of(prompt: str) -> list[str]:
+    """The prompt as words: small letters, nothing but letters and apostrophes."""
+    return re.findall(r"[a-z']+", prompt.lower())
+
+
+def tokens_of(prompt: str, vocabulary: dict[str, int]) -> NDArray[np.int64]:
+    """(1, MAX_WORDS) numbers of the words; a prompt that is too long is one unknown word."""
+    words = words_of(prompt)
+    numbers = [vocabulary.get(word, UNKNOWN) for word in words]
+    if not numbers or len(numbers) > MAX_WORDS:
+        numbers = [UNKNOWN]
+    return np.array([numbers + [PAD] * (MAX_WORDS - len(numbers))], np.int64)
+
+
+class Brick:
+    """See the module.
+
+    Args:
+        weights: folder with graph and manifest; empty: beside this file.
+        threads: of the inference.
+    """
+
+    def __init__(self, weights: str = "", threads: str = "2") -> None:
+        self.spec = ModelSpec(
+            name="brick",
+            observation=ObservationSpec(
+                cameras=(
+                    CameraSpec(camera="front", width=FRONT[0], height=FRONT[1], resize="stretch"),
+                    CameraSpec(camera="wrist", width=WRIST[0], height=WRIST[1], resize="stretch"),
+                ),
+                state=("pose", "gripper"),
+                prompt=True,
+            ),
+            action=ActionSpec(
+                horizon=HORIZON, dt_s=DT_S, rotation="rotvec", gripper="delta_m", frame="base"
+            ),
+        )
+        self._folder = Path(weights) if weights else FOLDER
+        self._threads = int(threads)
+        self._session: Any = None
+        self.reset()
+
+    def load(self) -> None:
+        """Read the weights.
+
+        Raises:
+            WorkerError: a file is missing, or not the one its manifest speaks of.
+        """
+        manifest = read_manifest(self._folder)
+        graph = checked(self._folder, GRAPH, manifest["sha256"])
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = self._threads
+        # Threads that wait for work must not take the time the controller needs.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        self._session = onnxruntime.InferenceSession(
+            graph, options, providers=["CPUExecutionProvider"]
+        )
+        self._vocabulary = {word: index + 2 for index, word in enumerate(manifest["words"])}
+
+    def reset(self) -> None:
+        """Forget what was asked for and how the hand moved."""
+        self._hand: Hand | None = None
+        self._asked: tuple[int, FloatArray] | None = None
+
+    def infer(self, observation: Observation) -> ActionSteps:
+        """The next chunk."""
+        hand = self._hand = self._follow(observation)
+        waypoints = self.think(observation, hand)
+        goal = self._goal(observation, hand)
+        steps = np.zeros((HORIZON, 7))
+        if waypoints.understood:
+            start = np.append(hand.position_m, hand.yaw_rad)
+            before = goal
+            for row, (offset, opened) in enumerate(
+                zip(waypoints.offset, waypoints.opened, strict=True)
+            ):
+                step = start + offset - before
+                step[3] = (step[3] + math.pi) % (2 * math.pi) - math.pi
+                step[:3] *= min(1.0, STEP_M / max(float(np.linalg.norm(step[:3])), 1e-9))
+                step[3] = min(max(step[3], -STEP_RAD), STEP_RAD)
+                before = before + step
+                steps[row, :3], steps[row, 5] = step[:3], step[3]
+                steps[row, 6] = WIDTH_STEP_M if opened else -WIDTH_STEP_M
+        if observation.task.active:
+            goals = goal + np.cumsum(steps[:, [0, 1, 2, 5]], axis=0)
+            self._asked = (observation.stamp_wall_ns, goals)
+        return ActionSteps(steps.astype(np.float32))
+
+    def think(self, observation: Observation, hand: Hand) -> Waypoints:
+        """What to do, as the network says."""
+        feed = {
+            "tokens": tokens_of(observation.prompt, self._vocabulary),
+            "front": observation.images["front"][None],
+            "wrist": observation.images["wrist"][None],
+            "hand": hand.numbers()[None].astype(np.float32),
+        }
+        offset, opened, understood = self._session.run(["offset", "opened", "understood"], feed)
+        return Waypoints(offset[0].astype(np.float64), opened[0] > 0.5, bool(understood[0] > 0.5))
+
+    def _follow(self, observation: Observation) -> Hand:
+        pose, gripper = observation.pose, observation.gripper
+        assert pose is not None
+        assert gripper is not None
+        hand = Hand(np.array(pose.position_m), yaw_of(pose), gripper.width_m)
+        last = self._hand
+        if last is not None:
+            hand.swept_m = last.swept_m
+        if hand.position_m[2] < LOW_M:
+            down_m = None if last is None else last.down_m
+            hand.down_m = hand.position_m[:2] if down_m is None else down_m
+            way_m = float(np.linalg.norm(hand.position_m[:2] - hand.down_m))
+            hand.swept_m = max(hand.swept_m, way_m)
+        return hand
+
+    def _goal(self, observation: Observation, hand: Hand) -> FloatArray:
+        """(4,) x, y, z, yaw that had been asked for when the observation was taken."""
+        pose = observation.pose
+        assert pose is not None
+        here = np.append(hand.position_m, hand.yaw_rad)
+        if pose.reference_position_m is not None:
+            here[:3] = pose.reference_position_m
+        # What the command node cut off is not known here; an arm at rest shows it.
+        at_rest = bool(np.linalg.norm(pose.twist[:3]) < AT_REST_M_S)
+        if self._asked is None:
+            return here
+        stamp_ns, goals = self._asked
+        steps = (observation.stamp_wall_ns - stamp_ns) / (DT_S * 1e9)
+        done = min(max(steps, 1.0), float(HORIZON))
+        row = min(int(done), HORIZON - 1)
+        share = done - row if done < HORIZON else 1.0
+        asked = goals[row - 1] + share * (goals[row] - goals[row - 1])
+        if at_rest and steps > 1.0 and np.linalg.norm(np.ptp(goals[: row + 1, :3], axis=0)) < 1e-3:
+            return np.append(here[:3], asked[3])
+        return asked
+
+
+def yaw_of(pose: PoseState) -> float:
+    """Turn about the vertical; 0 where the tool's x axis points along the base's."""
+    x, y, z, w = pose.quat_xyzw.tolist()
+    return math.atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """What belongs to the weights: their sha256 and the words they know.
+
+    Raises:
+        WorkerError: it is not there, or not readable.
+    """
+    path = folder / MANIFEST
+    try:
+        return json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise WorkerError(f"{path} cannot be read: {error}; train and export a policy") from error
+
+
+def checked(folder: Path, name: str, sha256: dict[str, str]) -> bytes:
+    """The file's content, if it is what the manifest says.
+
+    Raises:
+        WorkerError: it is missing, or its sha256 differs.
+    """
+    path = folder / name
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise WorkerError(f"{path} cannot be read: {error}") from error
+    found = hashlib.sha256(content).hexdigest()
+    if found != sha256.get(name):
+        raise WorkerError(
+            f"{path} has sha256 {found}, {MANIFEST} says {sha256.get(name)}: the file was changed "
+            "or is not whole; take both from one export"
+        )
+    return content
+
+
+MODEL = Brick

@@ -1,0 +1,351 @@
+"""The network: finds the bricks and the box in both pictures, reads the prompt, says where to go.
+
+    pictures -> a map per object and camera -> where it is, relative to the hand   (`Eyes`)
+    words    -> what is asked: kind of task, brick, brick below                     (`Reader`)
+    both     -> the next waypoints and when the gripper is open                     (`Will`)
+
+What passes between the parts has a meaning, so each can be taught by itself, every picture teaches
+about every brick, and a prompt never read before is either one of the tasks or none.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+BRICKS = 4
+KINDS = ("put", "stack", "left", "right", "away", "closer")
+HORIZON = 8
+HAND = 9
+STRIDE = 4
+FRONT_WIDTHS, WRIST_WIDTHS = (16, 32, 32, 32), (16, 32, 32, 32)
+UNIT_M = 0.1
+PATCH = 32
+"""Pixels of a square around a brick, as wide as one right before the camera."""
+REST_M = 0.0096
+BOX_RIM_M = 0.03
+# Of the scene and of the wrist's mounting: where a camera is, its axes (columns), tan of half its
+# vertical view. The wrist camera's in the frame of the hand: the base's, turned by the hand's yaw.
+FRONT_POSITION = (1.13, -0.50, 0.82)
+FRONT_AXES = (
+    (0.580074, -0.561113, 0.590479),
+    (0.814564, 0.399585, -0.420497),
+    (0.0, 0.724902, 0.688852),
+)
+FRONT_VIEW = math.tan(math.radians(20.0))
+WRIST_POSITION = (0.085, 0.0, 0.0734)
+WRIST_AXES = ((0.0, 0.838444, 0.544988), (-1.0, 0.0, 0.0), (0.0, -0.544988, 0.838444))
+WRIST_VIEW = math.tan(0.6)
+ASPECT = 4 / 3
+
+
+class Camera(nn.Module):
+    """A picture to one map per object.
+
+    Args:
+        objects: how many maps.
+        widths: channels of the four layers.
+    """
+
+    def __init__(self, objects: int, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        a, b, c, d = widths
+        self.layers = nn.Sequential(
+            *self._layer(3, a, 5, 2, 1),
+            *self._layer(a, b, 3, 2, 1),
+            *self._layer(b, c, 3, 1, 1),
+            *self._layer(c, d, 3, 1, 2),
+        )
+        self.maps = nn.Conv2d(d, objects, 1)
+        self.nowhere = nn.Parameter(torch.zeros(objects))
+
+    @staticmethod
+    def _layer(inside: int, out: int, size: int, stride: int, spread: int) -> list[nn.Module]:
+        padding = (size // 2) * spread
+        return [
+            nn.Conv2d(inside, out, size, stride, padding, dilation=spread, bias=False),
+            nn.GroupNorm(8, out),
+            nn.ReLU(),
+        ]
+
+    def forward(self, rgb: Tensor) -> tuple[Tensor, Tensor]:
+        """Log-probability (B, K, cells + 1) of each object's cell, the last: nowhere; features."""
+        features = self.layers(rgb)
+        maps = self.maps(features).flatten(2)
+        nowhere = self.nowhere[None, :, None].expand(len(maps), -1, 1)
+        return F.log_softmax(torch.cat([maps, nowhere], 2), 2), features
+
+
+class Seen(NamedTuple):
+    """What a camera makes of its objects: uv (B, K, 2) in [0, 1], there (B, K), features."""
+
+    uv: Tensor
+    there: Tensor
+    features: Tensor
+
+
+def gather(log_maps: Tensor, features: Tensor) -> Seen:
+    """Mean place and mean features under each map."""
+    height, width = features.shape[2:]
+    weight = log_maps[:, :, :-1].exp()
+    there = weight.sum(2)
+    weight = weight / there[..., None].clamp(min=1e-6)
+    rows, columns = torch.meshgrid(
+        (torch.arange(height, device=features.device) + 0.5) / height,
+        (torch.arange(width, device=features.device) + 0.5) / width,
+        indexing="ij",
+    )
+    grid = torch.stack([columns.flatten(), rows.flatten()], 1)
+    return Seen(weight @ grid, there, weight @ features.flatten(2).transpose(1, 2))
+
+
+def onto_plane(uv: Tensor, axes: Tensor, position: Tensor, view: float, z_m: Tensor) -> Tensor:
+    """(B, K, 2) where rays through uv meet the height z_m (B, K), in the frame of `position`."""
+    across = (uv[..., 0] - 0.5) * (2 * view * ASPECT)
+    up = (0.5 - uv[..., 1]) * (2 * view)
+    local = torch.stack([across, up, -torch.ones_like(up)], -1)
+    ray = local @ axes.T
+    far = (z_m - position[2]) / ray[..., 2].clamp(max=-0.05)
+    return position[:2] + far[..., None] * ray[..., :2]
+
+
+class Turn(nn.Module):
+    """How bricks are turned, from what is around them in the wrist camera's picture."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.look = nn.Sequential(
+            nn.Conv2d(3, 16, 5, 2, 2, bias=False), nn.GroupNorm(4, 16), nn.ReLU(),
+            nn.Conv2d(16, 32, 3, 2, 1, bias=False), nn.GroupNorm(4, 32), nn.ReLU(),
+            nn.Conv2d(32, 32, 3, 1, 1, bias=False), nn.GroupNorm(4, 32), nn.ReLU(),
+        )  # fmt: skip
+        cells = (PATCH // 4) ** 2
+        self.think = nn.Sequential(
+            nn.Linear(32 * cells + 4, 96), nn.ReLU(), nn.Linear(96, 48), nn.ReLU(), nn.Linear(48, 2)
+        )
+
+    def forward(self, patches: Tensor, uv: Tensor, hand: Tensor) -> Tensor:
+        """(n, 2) cosine and sine of four times the yaw relative to the hand.
+
+        Args:
+            patches: (n, 3, PATCH, PATCH) about zero.
+            uv: (n, 2) where in the picture each was cut out, in [0, 1].
+            hand: (n, 9).
+        """
+        place = torch.cat([uv - 0.5, hand[:, 2:4]], 1)
+        return self.think(torch.cat([self.look(patches).flatten(1), place], 1))
+
+
+def cut_out(picture: Tensor, uv: Tensor) -> Tensor:
+    """(B * K, 3, PATCH, PATCH) patches around uv (B, K, 2) of pictures (B, 3, h, w)."""
+    count, places = uv.shape[:2]
+    height, width = picture.shape[2:]
+    steps = torch.arange(PATCH, device=uv.device) - (PATCH - 1) / 2
+    across, down = uv[..., 0] * 2 - 1, uv[..., 1] * 2 - 1
+    x = across[..., None, None] + (2 * steps / width)[None, None, None, :]
+    y = down[..., None, None] + (2 * steps / height)[None, None, :, None]
+    grid = torch.stack(torch.broadcast_tensors(x, y), -1).reshape(count, places * PATCH, PATCH, 2)
+    cut = F.grid_sample(picture, grid, align_corners=False)
+    cut = cut.view(count, 3, places, PATCH, PATCH).transpose(1, 2)
+    return cut.reshape(count * places, 3, PATCH, PATCH)
+
+
+class Scene(NamedTuple):
+    """Where things are, relative to the hand, in its frame, in `UNIT_M`.
+
+    Args:
+        bricks: (B, 4, 5) x, y, z, and cosine and sine of four times the yaw to the hand.
+        box: (B, 2) x, y.
+        maps: front and wrist camera's log-probabilities, for teaching.
+    """
+
+    bricks: Tensor
+    box: Tensor
+    maps: tuple[Tensor, Tensor] = ()  # pyright: ignore
+
+
+class Eyes(nn.Module):
+    """Pictures and hand to a `Scene`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.front = Camera(BRICKS + 2, FRONT_WIDTHS)  # the bricks, the box and the hand itself
+        self.wrist = Camera(BRICKS + 1, WRIST_WIDTHS)
+        inside = FRONT_WIDTHS[-1] + WRIST_WIDTHS[-1] + 6 + 6 + 2 + 2 + HAND
+        self.turn = Turn()
+        self.brick = nn.Sequential(
+            nn.Linear(inside, 160), nn.ReLU(), nn.Linear(160, 96), nn.ReLU(), nn.Linear(96, 6)
+        )
+        self.box = nn.Sequential(
+            nn.Linear(inside, 96), nn.ReLU(), nn.Linear(96, 64), nn.ReLU(), nn.Linear(64, 3)
+        )
+        for name, value in (
+            ("front_axes", FRONT_AXES),
+            ("front_position", FRONT_POSITION),
+            ("wrist_axes", WRIST_AXES),
+            ("wrist_position", WRIST_POSITION),
+        ):
+            self.register_buffer(name, torch.tensor(value), persistent=False)
+
+    def forward(self, front: Tensor, wrist: Tensor, hand: Tensor) -> Scene:
+        """Pictures (B, 3, h, w) about zero, hand (B, 9)."""
+        front_maps, front_features = self.front(front)
+        wrist_maps, wrist_features = self.wrist(wrist)
+        seen, near = gather(front_maps, front_features), gather(wrist_maps, wrist_features)
+        x, y, z = hand[:, 0] * 0.15 + 0.48, hand[:, 1] * 0.25, hand[:, 2] * 0.08 + 0.1
+        sin, cos = hand[:, 4], hand[:, 5]
+
+        heights = torch.full_like(seen.uv[:, :, 0], REST_M)
+        heights[:, BRICKS] = BOX_RIM_M
+        heights = torch.cat([heights[:, : BRICKS + 1], z[:, None]], 1)
+        flat = onto_plane(seen.uv, self.front_axes, self.front_position, FRONT_VIEW, heights)
+        flat = flat - torch.stack([x, y], 1)[:, None]
+        turn = torch.stack([torch.stack([cos, -sin], 1), torch.stack([sin, cos], 1)], 1)
+        flat = (flat @ turn).clamp(-0.6, 0.6) / UNIT_M  # into the hand's frame
+        # Where it sees the hand tells how far the front camera is from where it should be.
+        astray = flat[:, BRICKS + 1 :]
+        flat = flat[:, : BRICKS + 1]
+        below = heights[:, : BRICKS + 1] - z[:, None]
+        close = onto_plane(near.uv, self.wrist_axes, self.wrist_position, WRIST_VIEW, below)
+        close = close.clamp(-0.6, 0.6) / UNIT_M
+        level = onto_plane(
+            near.uv, self.wrist_axes, self.wrist_position, WRIST_VIEW, torch.zeros_like(below)
+        )
+        level = level.clamp(-0.6, 0.6) / UNIT_M
+
+        count = BRICKS + 1
+        numbers = torch.cat(
+            [
+                seen.features[:, :count],
+                near.features,
+                seen.uv[:, :count],
+                seen.there[:, :count, None],
+                near.uv,
+                near.there[..., None],
+                flat - astray,
+                close,
+                level,
+                seen.uv[:, count:].expand(-1, count, -1),
+                astray.expand(-1, count, -1) * 0.3,
+                hand[:, None].expand(-1, count, -1),
+            ],
+            2,
+        )
+        brick, box = self.brick(numbers[:, :BRICKS]), self.box(numbers[:, BRICKS])
+        trust = torch.sigmoid(brick[..., 5:])
+        xy = trust * close[:, :BRICKS] + (1 - trust) * (flat - astray)[:, :BRICKS] + brick[..., :2]
+        trust = torch.sigmoid(box[:, 2:])
+        box_xy = trust * close[:, BRICKS] + (1 - trust) * (flat - astray)[:, BRICKS] + box[:, :2]
+        places = near.uv[:, :BRICKS].detach()
+        around = hand.repeat_interleave(BRICKS, 0)
+        turn = self.turn(cut_out(wrist, places), places.flatten(0, 1), around).view(-1, BRICKS, 2)
+        # Out of the wrist camera's sight nothing is known of how a brick is turned.
+        turn = turn * near.there[:, :BRICKS, None].detach()
+        bricks = torch.cat([xy, brick[..., 2:3], turn], 2)
+        return Scene(bricks, box_xy, (front_maps, wrist_maps))
+
+
+class Reader(nn.Module):
+    """Words to what is asked.
+
+    Args:
+        words: size of the vocabulary, pad and unknown included.
+    """
+
+    def __init__(self, words: int) -> None:
+        super().__init__()
+        self.words = nn.Embedding(words, 32, padding_idx=0)
+        self.order = nn.GRU(32, 48, batch_first=True, bidirectional=True)
+        self.kind = nn.Linear(96, len(KINDS) + 1)
+        self.target = nn.Linear(96, BRICKS)
+        self.onto = nn.Linear(96, BRICKS)
+
+    def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Logits of kind (the last: no task), target and onto of tokens (B, T)."""
+        read, _ = self.order(self.words(tokens))
+        read = read.masked_fill((tokens == 0)[..., None], -1.0).amax(1)
+        return self.kind(read), self.target(read), self.onto(read)
+
+
+def asinh(value: Tensor) -> Tensor:
+    """Grows like the logarithm on both sides, so that millimetres count near zero."""
+    size = value.abs()
+    return value.sign() * torch.log(size + torch.sqrt(size * size + 1))
+
+
+class Will(nn.Module):
+    """A scene and what is asked to waypoints."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        inside = len(KINDS) + 2 * (5 + 3) + 2 + 2 * (2 + 2 + 1) + HAND
+        self.think = nn.Sequential(
+            nn.Linear(inside, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 256),
+            nn.ReLU(), nn.Linear(256, HORIZON * 5),
+        )  # fmt: skip
+
+    def forward(
+        self, scene: Scene, hand: Tensor, kind: Tensor, target: Tensor, onto: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Offsets (B, H, 4) in `UNIT_M` (rad) and logits (B, H) of an open gripper.
+
+        Args:
+            scene: relative to the hand.
+            hand: (B, 9).
+            kind: (B, 6) one of them 1.
+            target: (B, 4) likewise.
+            onto: (B, 4) likewise, or all 0.
+        """
+        moved = torch.einsum("bk,bkd->bd", target, scene.bricks)
+        below = torch.einsum("bk,bkd->bd", onto, scene.bricks)
+        way = (scene.box - moved[:, :2]) * kind[:, :1]
+        up = below[:, :2] - moved[:, :2] * kind[:, 1:2]
+        numbers = [kind, moved, below, scene.box * kind[:, :1], way, up]
+        numbers += [asinh(moved[:, :3] / 0.1), asinh(below[:, :3] / 0.1)]
+        numbers += [asinh(way / 0.1), asinh(up / 0.1)]
+        numbers += [way.abs().amax(1, keepdim=True), up.norm(dim=1, keepdim=True), hand]
+        out = self.think(torch.cat(numbers, 1)).view(-1, HORIZON, 5)
+        # Written in the hand's frame, wanted in the base's.
+        sin, cos = hand[:, 4, None], hand[:, 5, None]
+        x, y = out[..., 0], out[..., 1]
+        offset = torch.stack([cos * x - sin * y, sin * x + cos * y, out[..., 2], out[..., 3]], -1)
+        return offset, out[..., 4]
+
+
+class Policy(nn.Module):
+    """All of it, as it is exported."""
+
+    def __init__(self, words: int) -> None:
+        super().__init__()
+        self.eyes, self.reader, self.will = Eyes(), Reader(words), Will()
+
+    def forward(
+        self, tokens: Tensor, front: Tensor, wrist: Tensor, hand: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """See `model.Brick.think`; pictures (B, h, w, 3) uint8.
+
+        Returns:
+            offset (B, H, 4) m and rad, opened (B, H), understood (B,), and what it believes: bricks
+            (B, 4, 5) and box (B, 2), relative to the hand in its frame, in m.
+        """
+        kind, target, onto = (torch.softmax(logits, 1) for logits in self.reader(tokens))
+        is_stack = kind[:, 1]
+        sure = target.amax(1) * (1 - is_stack + is_stack * onto.amax(1))
+        understood = (1 - kind[:, -1]) * sure
+        kind = F.one_hot(kind[:, :-1].argmax(1), len(KINDS)).float()
+        target = F.one_hot(target.argmax(1), BRICKS).float()
+        onto = F.one_hot(onto.argmax(1), BRICKS).float() * kind[:, 1:2]
+        scene = self.eyes(normal(front), normal(wrist), hand)
+        offset, opened = self.will(scene, hand, kind, target, onto)
+        metres = torch.tensor([UNIT_M, UNIT_M, UNIT_M, 1.0])
+        believed = scene.bricks * torch.tensor([UNIT_M, UNIT_M, UNIT_M, 1.0, 1.0])
+        return offset * metres, torch.sigmoid(opened), understood, believed, scene.box * UNIT_M
+
+
+def normal(rgb: Tensor) -> Tensor:
+    """(B, h, w, 3) uint8 to (B, 3, h, w) about zero."""
+    return rgb.permute(0, 3, 1, 2).float() / 255.0 - 0.5
