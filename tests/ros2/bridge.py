@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import zenoh
 from ros_node import LOOPBACK_XML
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,6 +37,7 @@ class Bridge:
         domain: ROS domain id.
         connect: the router; None: it is the router itself and listens at `listen`.
         listen: its own address as a router.
+        settings: a file whose section for the plugin it takes; None: the plugin's own.
     """
 
     def __init__(
@@ -46,26 +48,29 @@ class Bridge:
         *,
         connect: str | None = None,
         listen: str | None = None,
+        settings: Path | None = None,
     ) -> None:
         self._program = program
         self._settings = folder / "bridge.json5"
         self.log = folder / "bridge.log"
-        settings: dict[str, Any] = {
+        plugin: dict[str, Any] = {}
+        if settings is not None:
+            plugin = json.loads(zenoh.Config.from_file(str(settings)).get_json("plugins/ros2dds"))
+        plugin |= {"domain": domain, "ros_automatic_discovery_range": "LOCALHOST"}
+        config: dict[str, Any] = {
             "mode": "router" if connect is None else "client",
             "listen": {"endpoints": [listen] if listen else []},
             "connect": {"endpoints": [connect] if connect else []},
             "scouting": {"multicast": {"enabled": False}},
-            "plugins": {
-                "ros2dds": {"domain": domain, "ros_automatic_discovery_range": "LOCALHOST"}
-            },
+            "plugins": {"ros2dds": plugin},
         }
         if connect is not None:
-            settings["connect"] |= {
+            config["connect"] |= {
                 "timeout_ms": -1,
                 "exit_on_failure": False,
                 "retry": {"period_init_ms": 100, "period_max_ms": 500},
             }
-        self._settings.write_text(json.dumps(settings))
+        self._settings.write_text(json.dumps(config))
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> Bridge:

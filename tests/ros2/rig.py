@@ -154,6 +154,7 @@ def running_lab(
     topology: Topology = "beside",
     state_hz: int = STATE_HZ,
     watch_goals: bool = True,
+    bridge_settings: Path | None = None,
 ) -> Iterator[Lab]:
     """Everything up while the block lasts.
 
@@ -164,6 +165,7 @@ def running_lab(
             our nodes are clients of the bridge, which is a router when it is started as it comes;
             ``apart``: it is one, but only the node ``ros2`` speaks to it, and we have our own.
         state_hz: rate of the robot's joint states.
+        bridge_settings: file of the bridge's settings for ROS.
         watch_goals: the witness listens to what the robot is told, too.
     """
     domain, ours = free_domain(), free_endpoint()
@@ -176,7 +178,7 @@ def running_lab(
     pictures = ("--width", WIDTH, "--height", HEIGHT, "--camera-hz", CAMERA_HZ)
     with ExitStack() as stack:
         at = {"connect": ours} if topology == "beside" else {"listen": theirs}
-        bridge = Bridge(program, folder, domain, **at).start()
+        bridge = Bridge(program, folder, domain, settings=bridge_settings, **at).start()
         stack.callback(bridge.kill)
         robot = Robot(domain, "--camera", "front", "--state-hz", str(state_hz), *map(str, pictures))
         stack.callback(robot.end)

@@ -9,12 +9,15 @@ import pytest
 
 from vla_zenoh.errors import SessionError
 
-pytest.importorskip("ros_messages", exc_type=ImportError)
+ros = pytest.importorskip("ros_messages", exc_type=ImportError)
 
 pytestmark = [pytest.mark.ros2, pytest.mark.slow]
 
 STATE_HZ = 30
 """What joint_state_publisher sends when nobody changes its rate."""
+BRIDGE_SETTINGS = Path(__file__).parents[2] / "profiles" / "panda_ros2_bridge.json5"
+TOKENS = "@/*/@ros2_lv/**"
+CALL_S = 10.0
 STEPS, STEP_M, WAY_TOLERANCE_M = 10, 0.01, 0.002
 
 
@@ -27,6 +30,28 @@ def test_joint_states_at_30_hz_are_enough(tmp_path: Path, bridge_program: Path) 
         lab.chain.go("up", STEPS)
         way_m = lab.witness.wait_still() - began_m
         assert way_m == pytest.approx((0, 0, STEPS * STEP_M), abs=WAY_TOLERANCE_M)
+
+
+def test_the_shipped_settings_of_a_bridge_let_through_what_is_needed(
+    tmp_path: Path, bridge_program: Path
+) -> None:
+    from panda_robot import CURRENT_POSE
+    from rig import running_lab
+
+    with running_lab(tmp_path, bridge_program, bridge_settings=BRIDGE_SETTINGS) as lab:
+        set_active = lab.witness.node.client(
+            "/vla/set_active", ros.SetBoolRequest, ros.SetBoolResponse
+        )
+        lab.chain.until("activated", lambda: set_active.call(True, timeout_s=CALL_S).success, 40.0)
+        began_m = lab.witness.wait_still()
+        lab.chain.go("up", STEPS)
+        way_m = lab.witness.wait_still() - began_m
+        assert way_m == pytest.approx((0, 0, STEPS * STEP_M), abs=WAY_TOLERANCE_M)
+        lab.chain.client.set_prompt("HARD: close gripper x1")
+        lab.chain.until("the fingers close", lambda: lab.witness.width_m() < 0.06)
+        tokens = [str(reply.ok.key_expr) for reply in lab.chain.session.liveliness().get(TOKENS)]
+        assert any("joint_states" in token for token in tokens)
+        assert not any(CURRENT_POSE[1:].replace("/", "§") in token for token in tokens)
 
 
 def test_a_robot_whose_controller_does_not_listen_is_not_activated(
