@@ -19,6 +19,7 @@ from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.supervisor import NodeCommand, Supervisor
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
 from vla_zenoh.profile.fit import node_name
+from vla_zenoh.security.identity import Role, person
 
 START_ORDER = ("router", "sim", "ros2", "command", "camera", "worker")
 ROUTER_PATIENCE_S = 10.0
@@ -170,7 +171,12 @@ class Host:
     def stop(self) -> None:
         """Brake the arm, then end every node; within `STOP_BUDGET_S` in all."""
         deadline_s = time.monotonic() + STOP_BUDGET_S
-        if self.client is not None and "command" in self.client.alive:
+        # Where people may only look on, the arm brakes because the nodes of this host end.
+        may = (
+            self.profile.session.security is None
+            or person(self.profile, self.host) is Role.OPERATOR
+        )
+        if may and self.client is not None and "command" in self.client.alive:
             self._brake(self.client)
         if self.session is not None:
             self.session.close()
