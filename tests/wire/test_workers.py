@@ -226,6 +226,9 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
         )
         keys = {json.loads(line)["key"].rsplit("/", 1)[-1] for line in said.stdout.splitlines()}
         assert keys == {"scripted", "riser"}
+        said = command_line("status", "--once", profile=chain.profile_file)
+        assert "obeyed" in said.stdout
+        assert "in the shadow" in said.stdout
 
 
 def test_a_worker_that_is_not_there_cannot_be_compared(chain: Chain) -> None:

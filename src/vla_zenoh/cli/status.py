@@ -144,7 +144,10 @@ def _word(found: NodeStatus) -> str:
             f"{detail.get('worker', '')}, {detail.get('rate_hz', 0):g} Hz, "
             f"{detail.get('accepted_chunks', 0)} chunks carried out"
         )
-    return str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
+    word = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
+    if not word and "obeyed" in detail:
+        return "obeyed" if detail["obeyed"] else "in the shadow"
+    return word
 
 
 def _event(node: str, header: Header, event: Event) -> Text:
