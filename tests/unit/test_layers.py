@@ -102,3 +102,17 @@ def test_importing_the_core_loads_nothing_heavy(name: str) -> None:
 
 def test_importing_the_package_loads_no_library_at_all() -> None:
     assert loaded_after("vla_zenoh").isdisjoint({*HEAVY, "numpy", "cv2", "pydantic", "pinocchio"})
+
+
+OPTIONAL = ("pinocchio", "ruckig", "mujoco", "matplotlib", "av", "flask", "zmq", "websockets")
+
+
+def test_the_command_line_knows_every_command_without_any_optional_library() -> None:
+    """A model's environment has what the package itself needs, and no more."""
+    code = (
+        f"import sys\nfor name in {OPTIONAL!r}: sys.modules[name] = None\nimport vla_zenoh.cli.main"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 0, done.stderr

@@ -2,13 +2,34 @@
 
 from __future__ import annotations
 
+import importlib
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import pinocchio as pin
 
+from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.types import FloatArray, PoseState
+
+
+class _Pinocchio:
+    """Pinocchio, imported when something of it is needed first.
+
+    The command line knows every command also where a model runs, and there is no Pinocchio there.
+    What was asked for once stays an attribute, so later calls cost nothing more.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            library = importlib.import_module("pinocchio")
+        except ImportError as error:
+            raise MissingExtraError("pinocchio", "control") from error
+        found = getattr(library, name)
+        setattr(self, name, found)
+        return found
+
+
+pin = _Pinocchio()
 
 
 class Pose(NamedTuple):

@@ -74,7 +74,8 @@ def environment_command(model: ModelFile, more: Sequence[str] = ()) -> list[str]
             f"model {model.name!r} needs {', '.join(model.dependencies)}. Install uv (pip install "
             "uv) and it gets an environment of its own, or name a prepared one with --python"
         )
-    command = [uv, "run", "--no-project", "--quiet"]
+    # Isolated, because uv would put the packages of a .venv in the working directory below.
+    command = [uv, "run", "--no-project", "--isolated", "--quiet"]
     if model.requires_python:
         command += ["--python", model.requires_python]
     for requirement in (*model.dependencies, *more):
