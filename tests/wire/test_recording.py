@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import resource
 import signal
@@ -18,26 +17,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_rig import free_endpoint, until
-from chain import READY_PATIENCE_S, Chain, command_line, running_chain
+from camera_rig import until
+from chain import READY_PATIENCE_S, Chain, command_line
+from recording_rig import assert_same, ghost_of, recording
 from rosbags.rosbag2 import Reader
 
 from vla_zenoh.codec import records
 from vla_zenoh.errors import NodeError
-from vla_zenoh.evaluation.result import Evaluation
 from vla_zenoh.evaluation.run_file import evaluate_run
 from vla_zenoh.keys import Keys, Kind
 from vla_zenoh.nodes.node import Stream
 from vla_zenoh.nodes.recorder import Recorder
 from vla_zenoh.nodes.replay import CAMERAS, Replay
-from vla_zenoh.profile import Profile, override
 from vla_zenoh.recording.reader import open_recording
 from vla_zenoh.recording.run import Run, load_run, pictures
 from vla_zenoh.types import Event, NodeStatus
 
 STEPS, STEP_M = 5, 0.01
 REACHED_M = 0.002
-RELATIVE = 1e-6  # stamps are floats of seconds since another beginning
 FILE_LIMIT_BYTES = 400_000
 PATIENCE_S = 30.0
 
@@ -55,19 +52,6 @@ def run_file(shared_chain: Chain, tmp_path_factory: pytest.TempPathFactory) -> P
         chain.client.deactivate()
         chain.client.set_prompt("hold")
     return path
-
-
-@contextmanager
-def recording(chain: Chain, path: Path, profile: Profile | None = None) -> Iterator[Recorder]:
-    recorder = Recorder(profile or chain.profile, chain.session, path).start()
-    try:
-        yield recorder
-    finally:
-        recorder.close()
-
-
-def ghost_of(chain: Chain, name: str = "ghost") -> Profile:
-    return override(chain.profile, {"robot": {"name": name}})
 
 
 def test_the_file_holds_everything_that_was_said(run_file: Path, shared_chain: Chain) -> None:
@@ -154,27 +138,6 @@ def moved_equally(one: Run, other: Run, kind: str) -> None:
     assert [entry.header.seq for entry in a] == [entry.header.seq for entry in b]
     shifts = {y.header.stamp_wall_ns - x.header.stamp_wall_ns for x, y in zip(a, b, strict=True)}
     assert len(shifts) == 1
-
-
-ARRIVAL = {"end_to_end", "inbound", "command_to_pose"}
-"""Stages that end when the recorder heard a command: those are the replay's own."""
-
-
-def assert_same(one: Evaluation, other: Evaluation) -> None:
-    """All figures but those of arrival times at the recorder."""
-    a, b = one.row(), other.row()
-    for name, value in a.items():
-        if name.startswith("e2e_") or name == "record_id":
-            continue
-        if isinstance(value, float):
-            assert math.isclose(value, b[name], rel_tol=RELATIVE, abs_tol=1e-9), name
-        else:
-            assert value == b[name], name
-    for stage, values in one.stages_ms.items():
-        assert len(values) == len(other.stages_ms[stage])
-        if stage not in ARRIVAL:
-            np.testing.assert_array_equal(values, other.stages_ms[stage])
-    assert [s.prompt for s in one.segments] == [s.prompt for s in other.segments]
 
 
 def test_a_replayed_run_evaluates_as_the_original(
@@ -352,53 +315,3 @@ def test_the_recorder_says_how_it_goes(chain: Chain, tmp_path: Path) -> None:
         *(chain.profile.keys.whole(f"state/{part}") for part in ("joint", "pose", "gripper")),
         chain.profile.keys.status("recorder"),
     }
-
-
-# -- a minute of a whole lab ----------------------------------------------------------------------
-LAB = """\
-extends: panda_sim
-task: {{prompt: hold, rate_hz: 5, worker: scripted}}
-session:
-  listen: [{endpoint}]
-  connect: [{endpoint}]
-"""
-LAB_S = 60.0
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(400)
-def test_a_minute_of_two_cameras_is_recorded_whole_and_replayed(tmp_path: Path) -> None:
-    lab, first, again = (tmp_path / name for name in ("lab.yaml", "first.mcap", "again.mcap"))
-    lab.write_text(LAB.format(endpoint=free_endpoint()))
-    words = ("record", "--out", str(first), "--seconds", f"{LAB_S:g}", "--json")
-    with running_chain(tmp_path, profile_file=lab) as chain:
-        chain.activate_when_ready()
-        results: list[Any] = []
-        thread = threading.Thread(
-            target=lambda: results.append(command_line(*words, profile=lab, timeout_s=2 * LAB_S))
-        )
-        thread.start()
-        time.sleep(8.0)
-        for prompt in ("go up", "yaw left", "go down", "yaw right"):
-            chain.client.set_prompt(f"HARD: {prompt} x20", timeout_s=10.0)
-            time.sleep(8.0)
-        chain.client.deactivate()
-        thread.join()
-        with recording(chain, again, ghost_of(chain)):
-            done = command_line(
-                *("replay", str(first), "--as", "ghost", "--json"),
-                profile=lab,
-                timeout_s=2 * LAB_S,
-            )
-    recorded, replayed = json.loads(results[0].stdout), json.loads(done.stdout)
-    print(
-        f"\nrecorded {recorded['bytes_per_s'] / 1e3:.0f} kB/s at {recorded['cpu_share']:.1%} of "
-        f"a core, {sum(recorded['samples'].values())} samples, dropped {recorded['dropped']}; "
-        f"replayed, time between samples off by {replayed['interval_error_ms']} ms"
-    )
-    assert recorded["dropped"] == {}
-    run = load_run(first)
-    for camera in ("front", "wrist"):
-        taken = [picture.seq for picture in pictures(run.file, camera)]
-        assert taken == list(range(taken[0], taken[0] + len(taken))), "a picture is missing"
-    assert_same(evaluate_run(first), evaluate_run(again))
