@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import threading
 import zlib
 from typing import Annotated
@@ -17,8 +18,11 @@ from vla_zenoh.cli.options import (
     effective_profile,
 )
 from vla_zenoh.cli.output import console
+from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.nodes.launch import Host
 from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
+from vla_zenoh.profile import Profile
+from vla_zenoh.security.store import Store
 
 COLOURS = ("cyan", "magenta", "green", "yellow", "blue", "bright_cyan", "bright_magenta")
 
@@ -48,7 +52,20 @@ def up(
     with Host(loaded, host, log=log, tell=tell) as running:
         where = ", ".join(running.profile.session.connect)
         tell("up", f"profile {loaded.name}, host {running.host}, router at {where}")
+        for sentence in _soon(running.profile, running.host):
+            tell("up", sentence)
         tell("up", "look: vla-zenoh status; drive: vla-zenoh prompt/activate; end: Ctrl-C")
         running.serve(stop)
         tell("up", "braking the arm, then ending every node")
     tell("up", "all nodes have ended")
+
+
+def _soon(profile: Profile, host: str) -> list[str]:
+    """What is to be done soon about the certificates of this host."""
+    if profile.session.security is None:
+        return []
+    try:
+        entries = Store(profile.session.security.folder).entries(dt.datetime.now(dt.UTC), host)
+    except MissingExtraError:
+        return []  # a host that only uses certificates need not be able to read them
+    return [f"certificate {entry.path} {entry.warning}" for entry in entries if entry.warning]
