@@ -166,6 +166,12 @@ def test_scripted_keeps_its_contract_and_is_blind() -> None:
     assert report.depends_on == {"pictures": False, "prompt": True}
 
 
+def test_brick_keeps_its_contract_and_looks_and_listens() -> None:
+    report = passes("brick")
+    assert report.depends_on == {"pictures": True, "colour order": True, "prompt": True}
+    assert report.deterministic is True
+
+
 def test_replay_keeps_its_contract(tmp_path: Path) -> None:
     steps = np.full((3, 4, 7), 0.01, np.float32)
     recorded = json.dumps(spec(gripper="absolute_m").to_dict())
