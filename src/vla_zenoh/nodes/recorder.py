@@ -6,6 +6,7 @@ cannot take is counted by key, in status and in the file.
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections import Counter, deque
@@ -19,7 +20,7 @@ import zenoh
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.profile import Profile, to_yaml
-from vla_zenoh.recording.sample import TEXT, Sample, heard
+from vla_zenoh.recording.sample import TEXT, heard
 from vla_zenoh.recording.writer import RunWriter
 from vla_zenoh.types import Event
 
@@ -31,6 +32,7 @@ COMMIT_S = 0.5
 """Who kills the recorder with -9 loses at most what was said in this time."""
 POLL_S = 0.1
 ANSWER_S = 1.0
+SWITCH_INTERVAL_S = 5e-4
 RECORDING, FAILED, STOPPED = "recording", "failed", "stopped"
 
 
@@ -85,7 +87,7 @@ class Recorder:
     ) -> None:
         self.node = Node(name, profile, session)
         self._expressions = expressions or self.node.keys.without_raw_pictures
-        self._queue: deque[Sample] = deque()
+        self._queue: deque[tuple[str, bytes, str, bytes | None, int]] = deque()
         self._queued_bytes, self._queue_limit = 0, queue_bytes
         self._change = threading.Condition()
         self._closing = False
@@ -109,6 +111,8 @@ class Recorder:
         Raises:
             RecordingError: not a key expression.
         """
+        # Else Zenoh's thread may wait 5 ms for the writing one at every sample, and hears late.
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
         handler = zenoh.handlers.Callback(self._take, indirect=False)
         for expression in self._expressions:
             try:
@@ -172,7 +176,7 @@ class Recorder:
                 return
             # The stamp is taken under the lock: the file is in the order of its stamps.
             now_ns = self.node.clock.wall_ns()
-            self._queue.append(heard(key, payload, encoding, attachment, now_ns))
+            self._queue.append((key, payload, encoding, attachment, now_ns))
             self._queued_bytes += size
             if len(self._queue) == 1:
                 self._change.notify()
@@ -197,8 +201,8 @@ class Recorder:
                 closing = self._closing
                 taken, self._queue = self._queue, deque()
                 taken_bytes = self._queued_bytes
-            for sample in taken:
-                self._writer.write(sample)
+            for each in taken:
+                self._writer.write(heard(*each))
             taken.clear()
             with self._change:
                 self._queued_bytes -= taken_bytes
