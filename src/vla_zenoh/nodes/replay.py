@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import secrets
+import sys
 import threading
 import time
 from collections import Counter, deque
@@ -51,6 +52,7 @@ AHEAD = 400
 START_AFTER_NS = 500_000_000
 """Until the first sample: publishers are known to the router by then."""
 SLICE_S = 0.1
+SWITCH_INTERVAL_S = 5e-4
 MAX_ERRORS = 1_000_000
 ALIVE_S = 1.0
 # One way for all: Zenoh keeps the order within a priority, and nothing is dropped.
@@ -147,6 +149,8 @@ class Replay:
     # -- running ------------------------------------------------------------------------------
     def run(self, stop: threading.Event) -> Replayed:
         """Replay until the end, or until `stop` is set."""
+        # Else this thread may wait 5 ms for the one that reads ahead.
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
         make_this_thread_realtime()
         began_s = time.monotonic()
         try:
