@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import itertools
 import random
 import time
@@ -53,7 +52,16 @@ STREAMS = (
     "sim_objects",
 )
 SETTINGS = ("prompt", "active", "worker", "rate", "reset", "sim_reset")
-OTHERS = ("camera_raw", "camera_jpeg", "seen", "alive", "sim_step")
+OTHERS = (
+    "camera_raw",
+    "camera_jpeg",
+    "camera_fitted",
+    "seen",
+    "seen_record",
+    "alive",
+    "clock",
+    "sim_step",
+)
 OBEYED = ("stop",)
 """Whatever is put there stops the arm; it is tried at the end."""
 SELDOM = {
@@ -63,7 +71,7 @@ SELDOM = {
     "task": Task(1 << 60, True, "HARD: yaw left", "scripted", 100.0),
 }
 """Not written all the time: true but for their writer."""
-NAMES = {"camera": "front", "worker": "scripted", "node": "command"}
+NAMES = {"camera": "front", "form": "224x224-pad", "worker": "scripted", "node": "command"}
 
 
 class Junk(NamedTuple):
@@ -78,14 +86,9 @@ class Junk(NamedTuple):
 def all_keys(keys: Keys) -> dict[str, str]:
     """Every key of the table by its name there, with names of parts that exist."""
     out: dict[str, str] = {}
-    for name, member in inspect.getmembers(Keys):
-        if name.startswith(("_", "all_")) or name in ("robot", "root", "everything", "short"):
-            continue
-        if isinstance(member, property):
-            out[name] = getattr(keys, name)
-        else:
-            parameters = list(inspect.signature(member).parameters)[1:]
-            out[name] = getattr(keys, name)(*(NAMES[parameter] for parameter in parameters))
+    for name, parameters in key_members().items():
+        member = getattr(keys, name)
+        out[name] = member(*(NAMES[part] for part in parameters)) if parameters else member
     return out
 
 

@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 from camera_rig import until
-from chain import READY_PATIENCE_S, Recorder
+from chain import READY_PATIENCE_S, FloatArray, Recorder
 
 from vla_zenoh.errors import SessionError
 from vla_zenoh.nodes.client import Client
@@ -19,6 +19,7 @@ from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import load_profile
 
 STILL_M_S = 0.005
+ATTEMPTS = 3
 EARLY = "refused.activate_refused"
 """While nodes are still starting."""
 
@@ -38,24 +39,31 @@ def main(name: str, direction: str, count: int) -> None:
                 return False
 
         client.wait_for(lambda: client.status("command"), READY_PATIENCE_S)
-        client.set_prompt("hold")
-        try:
-            until("an active arm", activated, READY_PATIENCE_S)
-        except AssertionError as error:
-            raise AssertionError(f"{error}: {reasons[-1]}") from error
-        state = until("a pose", recorder.newest_state)
-        assert state.reference_position_m is not None
-        start_m = np.array(state.reference_position_m)
-        client.set_prompt(f"HARD: go {direction} x{count}")
+
+        def begin() -> FloatArray:
+            client.set_prompt("hold")
+            try:
+                until("an active arm", activated, READY_PATIENCE_S)
+            except AssertionError as error:
+                raise AssertionError(f"{error}: {reasons[-1]}") from error
+            state = until("a pose", recorder.newest_state)
+            assert state.reference_position_m is not None
+            client.set_prompt(f"HARD: go {direction} x{count}")
+            return np.array(state.reference_position_m)
 
         def done() -> bool:
             command, now = client.status("command"), recorder.newest_state()
             assert now is not None
+            if command is not None and command.state == "inactive" and len(starts_m) < ATTEMPTS:
+                # A busy machine let the arm brake; that is right, and the motion begins anew.
+                starts_m.append(begin())
+                return False
             still = float(np.abs(now.twist[:3]).max()) < STILL_M_S
             return bool(command and command.detail.get("policy_done") and still)
 
+        starts_m = [begin()]
         try:
-            until("the motion", done, 10.0 + 2.0 * count)
+            until("the motion", done, ATTEMPTS * (10.0 + count))
         except AssertionError as error:
             news = [f"{node} {event.what}: {event.why}" for node, _, event in client.events]
             raise AssertionError("\n".join([str(error), str(client.task), *news[-20:]])) from error
@@ -72,7 +80,7 @@ def main(name: str, direction: str, count: int) -> None:
         print(
             json.dumps(
                 {
-                    "way_m": (np.array(end.reference_position_m) - start_m).tolist(),
+                    "way_m": (np.array(end.reference_position_m) - starts_m[-1]).tolist(),
                     "jpeg": camera.counters.get("front.jpeg", 0) if camera else 0,
                     "raw": camera.counters.get("front.raw", 0) if camera else 0,
                     "refused": {node: found for node, found in refused.items() if found},

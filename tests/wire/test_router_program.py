@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -12,12 +13,14 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from camera_rig import free_endpoint
+from camera_rig import free_endpoint, until
 from typer.testing import CliRunner
 
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import NodeError, SecurityError
 from vla_zenoh.nodes.router import router_config, run_router, run_zenohd
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.nodes.slots import Inbox
 from vla_zenoh.profile import load_profile
 from vla_zenoh.security.identity import identities
 from vla_zenoh.security.rules import access_control
@@ -74,6 +77,41 @@ def test_zenohd_gets_the_configuration_that_our_own_router_has(tmp_path: Path) -
     )
     assert given.returncode == 0, given.stderr
     assert json.loads(given.stdout) == router_config(load_profile(str(file)))
+
+
+@pytest.mark.skipif(shutil.which("zenohd") is None, reason="there is no zenohd on PATH")
+def test_a_real_zenohd_lets_each_do_its_part_and_no_more(tmp_path: Path) -> None:
+    file = secured(tmp_path, "  router: zenohd\n")
+    profile = load_profile(str(file))
+    words = [sys.executable, "-m", "vla_zenoh", "router", "--profile", str(file)]
+    program = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    keys, heard = profile.keys, Inbox(16)
+    try:
+        with (
+            open_session(profile.session, identity="command", wait_s=LIMIT_S) as command,
+            open_session(profile.session, identity="worker-scripted") as worker,
+            open_session(profile.session, identity="camera") as camera,
+        ):
+            handler = zenoh.handlers.Callback(heard, indirect=False)
+            reader = command.declare_subscriber(keys.all_deltas, handler)
+            own = worker.declare_publisher(keys.delta("scripted"))
+            until("the command node", lambda: own.matching_status.matching)
+            for session, key in (
+                (worker, keys.delta("other")),
+                (worker, keys.prompt),
+                (camera, keys.delta("scripted")),
+            ):
+                session.put(key, "not mine")
+            own.put("mine")
+            until("the chunk", lambda: heard._arrivals)
+            said = [arrival.sample.payload.to_string() for arrival in heard.take_all()]
+            assert said == ["mine"]
+            own.undeclare()
+            reader.undeclare()
+        assert Path(f"/proc/{program.pid}/comm").read_text().strip() == "zenohd"
+    finally:
+        program.terminate()
+        program.wait(LIMIT_S)
 
 
 def test_a_zenohd_that_is_not_there_is_told(
