@@ -16,6 +16,7 @@ from chain import Chain, Recorder
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import message, records
 from vla_zenoh.keys import SCHEMA, Keys
+from vla_zenoh.security.roles import key_members
 from vla_zenoh.types import Event, GripperCommand, GripperState, Header, JointCommand, Task
 
 SHORT_S, LONG_S = 8.0, 30.0
