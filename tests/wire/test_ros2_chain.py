@@ -1,0 +1,107 @@
+"""``vla-zenoh up panda_ros2`` whole, with a kinematic robot in a bridge's and in rmw_zenoh's form.
+
+What a real bridge and DDS add is tested in tests/ros2; here are the real processes of ours.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from chain import Chain, running_chain
+from ros2_peer import KinematicPanda, Ros2Peer
+from ros2_rig import CAMERA, HEIGHT, WIDTH, write_profile
+
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.profile import load_profile
+
+pytestmark = pytest.mark.slow
+
+STEPS, STEP_M = 10, 0.01
+WAY_TOLERANCE_M = 0.0005
+CAMERA_HZ = 30
+DONE_S = 20.0
+SET_BOOL, TRIGGER = "std_srvs/srv/SetBool", "std_srvs/srv/Trigger"
+REQUEST = "vla_msgs/srv/SetRequest"
+
+
+@pytest.fixture(scope="module", params=["ros2dds", "rmw_zenoh"])
+def lab(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Chain, KinematicPanda]]:
+    folder = tmp_path_factory.mktemp("ros2chain")
+    path = write_profile(folder, request.param)
+    with (
+        running_chain(folder, profile_file=path) as chain,
+        open_session(load_profile(str(path)).session) as session,
+    ):
+        peer = Ros2Peer(session, request.param)
+        robot = KinematicPanda(peer)
+        stop = threading.Event()
+
+        def film() -> None:
+            pixels = np.zeros(3 * WIDTH * HEIGHT, np.uint8)
+            while not stop.wait(1 / CAMERA_HZ):
+                picture = peer.message(
+                    "sensor_msgs/msg/Image",
+                    header=peer.header(time.time_ns()),
+                    height=HEIGHT,
+                    width=WIDTH,
+                    encoding="rgb8",
+                    step=3 * WIDTH,
+                    data=pixels,
+                )
+                peer.put(CAMERA, picture)
+
+        thread = threading.Thread(target=film)
+        thread.start()
+        try:
+            chain.activate_when_ready()
+            yield chain, robot
+        finally:
+            stop.set()
+            thread.join()
+            robot.close()
+            peer.close()
+
+
+def test_ten_steps_asked_by_service_move_the_robot_by_ten_steps(
+    lab: tuple[Chain, KinematicPanda],
+) -> None:
+    chain, robot = lab
+    chain.client.set_prompt("hold")
+    chain.until("it stands", lambda: chain.detail("at_rest"))
+    began_m = robot.tcp_m
+    answer = robot.peer.call(
+        "/vla/set_request", REQUEST, prompt=f"HARD: go up x{STEPS}", rate_hz=10.0, active=True
+    )
+    assert answer.success, answer.message
+    chain.until("the steps are done", lambda: chain.detail("policy_done"), DONE_S)
+    chain.until("it stands", lambda: chain.detail("at_rest"))
+    time.sleep(0.2)
+    way_m = robot.tcp_m - began_m
+    assert way_m == pytest.approx([0, 0, STEPS * STEP_M], abs=WAY_TOLERANCE_M)
+
+
+def test_stop_and_reset_by_service_are_those_of_our_keys(
+    lab: tuple[Chain, KinematicPanda],
+) -> None:
+    chain, robot = lab
+    answer = robot.peer.call("/vla/stop", TRIGGER)
+    assert answer.success, answer.message
+    assert chain.state() == "stopped"
+    refused = robot.peer.call("/vla/set_active", SET_BOOL, data=True)
+    assert not refused.success
+    assert robot.peer.call("/vla/reset", TRIGGER).success
+    chain.until("it is reset", lambda: chain.state() == "inactive")
+    answer = robot.peer.call("/vla/set_active", SET_BOOL, data=True)
+    assert answer.success, answer.message
+    answer = robot.peer.call("/vla/set_active", SET_BOOL, data=False)
+    assert answer.success, answer.message
+    chain.until("nobody is followed", lambda: chain.detail("following", "ros2") is False)
+    count = len(robot.goals)
+    time.sleep(0.3)
+    assert len(robot.goals) == count, "an inactive arm is sent nothing"
