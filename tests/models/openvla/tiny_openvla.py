@@ -19,6 +19,7 @@ from safetensors.torch import save_file
 from tokenizers import Tokenizer, decoders, models, normalizers, processors
 from torch import nn
 from transformers import LlamaConfig, LlamaForCausalLM
+from transformers.models.llama.modeling_llama import LlamaRotaryEmbedding
 
 DINO, SIGLIP = "vit_large_patch14_reg4_dinov2.lvd142m", "vit_so400m_patch14_siglip_224"
 SIZES: dict[str, dict[str, Any]] = {
@@ -72,6 +73,8 @@ class Parts:
             self.llama.lm_head.weight[VOCABULARY:] = 0
         for module in (*self.encoders, *self.projector, self.llama):
             module.to(torch.bfloat16).eval()
+        # Not a weight, and not rounded to bfloat16 where a checkpoint is loaded either.
+        self.llama.model.rotary_emb = LlamaRotaryEmbedding(self.llama.config)
 
     def published(self) -> dict[str, torch.Tensor]:
         """Every tensor under the name that the published checkpoints give it."""
