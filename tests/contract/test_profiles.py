@@ -19,7 +19,8 @@ from vla_zenoh.profile import Profile, advice, load_profile, to_yaml
 SHIPPED = sorted(path.stem for path in resources.shipped("profiles").glob("*.y*ml"))
 HOME_MARGIN_M = 0.02  # from the workspace's walls, of the TCP in its home pose
 HOME_MARGIN_RAD = 0.05  # from the joints' ends
-PLACEHOLDERS = {"panda_sim_two_hosts", "panda_sim_lab", "panda_sim_two_sites"}  # its addresses are to be replaced, which is advised
+PLACEHOLDERS = {"panda_sim_two_hosts", "panda_sim_lab", "panda_sim_two_sites"}
+"""Their addresses are to be replaced, which is advised."""
 
 
 @pytest.fixture(params=SHIPPED)
