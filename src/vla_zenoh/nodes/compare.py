@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -16,7 +17,7 @@ from vla_zenoh.nodes.slots import Arrival, Inbox
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import ActionChunk, GripperState, Header, PoseState
 
-SPEC_PATIENCE_S = 2.0
+SPEC_PATIENCE_S, ASK_AGAIN_S = 3.0, 0.1
 MAX_STATES, MAX_CHUNKS = 4096, 1024
 
 Record = TypeVar("Record")
@@ -69,12 +70,16 @@ class CompareListener:
 
 
 def _spec(session: zenoh.Session, keys: Keys, worker: str) -> ModelSpec:
-    for reply in session.get(keys.spec(worker), timeout=SPEC_PATIENCE_S):
-        if reply.ok is not None:
-            try:
-                return records.decode(ModelSpec, reply.ok.payload.to_bytes())
-            except CodecError as error:
-                raise NodeError(f"the spec of worker {worker!r} cannot be read: {error}") from error
+    """The worker's spec; a session that was opened just now does not know yet whom to ask."""
+    give_up_s = time.monotonic() + SPEC_PATIENCE_S
+    while time.monotonic() < give_up_s:
+        for reply in session.get(keys.spec(worker), timeout=SPEC_PATIENCE_S):
+            if reply.ok is not None:
+                try:
+                    return records.decode(ModelSpec, reply.ok.payload.to_bytes())
+                except CodecError as error:
+                    raise NodeError(f"worker {worker!r}: its spec is not one: {error}") from error
+        time.sleep(ASK_AGAIN_S)
     raise NodeError(f"worker {worker!r} tells no spec; is it alive? (`vla-zenoh status`)")
 
 
