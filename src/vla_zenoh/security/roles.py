@@ -24,6 +24,9 @@ ROBOT, CAMERA, WORKER, COMMAND, OPERATOR, VIEWER = (
 )
 NODES = frozenset({ROBOT, CAMERA, WORKER, COMMAND})
 LOOKERS = frozenset({OPERATOR, VIEWER})
+SPEAKERS = NODES | {OPERATOR}
+RECORDER = "recorder"
+"""The node that an operator may run: it only reads, and says how it goes."""
 NOBODY: frozenset[Role] = frozenset()
 
 _ANY = "any"
@@ -111,10 +114,10 @@ TABLE = (
     _stream("command_pose", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
     _stream("command_joint", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
     _stream("command_gripper", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
-    Row("status", put=NODES, subscribe=frozenset({COMMAND}) | LOOKERS),
-    Row("event", put=NODES, subscribe=frozenset({COMMAND}) | LOOKERS),
-    Row("alive", announce=NODES, watch=NODES | LOOKERS),
-    Row("clock", answer=NODES, ask=NODES | LOOKERS),
+    Row("status", put=SPEAKERS, subscribe=frozenset({COMMAND}) | LOOKERS),
+    Row("event", put=SPEAKERS, subscribe=frozenset({COMMAND}) | LOOKERS),
+    Row("alive", announce=SPEAKERS, watch=NODES | LOOKERS),
+    Row("clock", answer=SPEAKERS, ask=NODES | LOOKERS),
     _stream("sim_scene", {ROBOT}, {CAMERA, OPERATOR}),
     _stream("sim_objects", {ROBOT}, {OPERATOR, VIEWER}),
     _stream("sim_reset", {OPERATOR}, {ROBOT, OPERATOR}),
@@ -162,7 +165,7 @@ def _choices(parameter: str, identity: Identity, act: Act) -> tuple[str, ...]:
     if act not in OWN:
         return ("*",)
     if parameter == "node":
-        return (identity.node,)
+        return (RECORDER if identity.role is OPERATOR else identity.node,)
     if parameter == "worker":
         return (identity.worker,) if identity.worker else ()
     if parameter == "form":
