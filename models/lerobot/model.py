@@ -216,7 +216,8 @@ class LeRobot:
         from lerobot.policies.utils import prepare_observation_for_inference
 
         given: dict[str, Any] = {
-            feature: np.ascontiguousarray(observation.images[camera])
+            # Copied: what came by the bus may not be written to, and torch takes no such arrays.
+            feature: np.array(observation.images[camera])
             for camera, (feature, _) in self._pictures.items()
         }
         if self._state:

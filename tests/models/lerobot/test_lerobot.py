@@ -66,6 +66,7 @@ def loaded(folder: Path, **options: str) -> Any:
 def looking(policy: Any, seed: int) -> Any:
     shape = (tiny_act.HEIGHT, tiny_act.WIDTH, 3)
     picture = np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+    picture.setflags(write=False)  # as pictures from the bus are
     half = np.sqrt(0.5)
     return replace(
         example_observation(policy.spec),
@@ -83,7 +84,7 @@ def lerobots_own(folder: Path, seen: Any, count: int) -> np.ndarray:
     policy = ACTPolicy.from_pretrained(folder, config=config)
     before, after = make_pre_post_processors(policy.config, pretrained_path=str(folder))
     given = {
-        "observation.images.front": seen.images["front"],
+        "observation.images.front": seen.images["front"].copy(),
         "observation.state": np.array(STATE, np.float32),
     }
     steps = [
