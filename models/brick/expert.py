@@ -16,8 +16,6 @@ from vla_zenoh.tasks import DIRECTIONS
 HORIZON = 8
 DT_S = 0.1
 STEP_M, PUSH_STEP_M, STEP_RAD = 0.035, 0.025, 0.16
-GRIPPER_M = 0.010
-"""What the gripper moves in one step."""
 OPEN_M, BRICK_M = 0.08, 0.0318
 HEIGHT_M = 0.0192
 LOWEST_M = 0.0135
@@ -160,7 +158,7 @@ def _approach(hand: Hand, target: Point, near: float) -> Wish:
     turn = quarter(target.yaw_rad - hand.yaw_rad)
     grip_z = max(target.z_m + 0.003, LOWEST_M)
     # Wider once it has begun to shut, so that it does not waver.
-    slack = 1.0 if hand.width_m > 0.07 else 2.0
+    slack = 1.0 if hand.width_m > 0.07 else 2.2
     if near < 0.007 * slack and abs(hand.z_m - grip_z) < 0.007 * slack and abs(turn) < 0.25 * slack:
         return Wish(target.x_m, target.y_m, grip_z, turn, False)
     height = grip_z + clip((near - 0.004) * 3.5 + max(abs(turn) - 0.12, 0.0) * 0.4, 0.0, HOVER_M)
@@ -228,18 +226,13 @@ def foretell(
 ) -> list[tuple[float, float, float, float, float]]:
     """The next `HORIZON` waypoints: x, y, z, yaw relative to the hand now, and 1 for open.
 
-    What the hand holds goes with it, what it lets go of in the air falls into the box.
+    What the hand holds goes with it. The fingers stay as they are in what is foretold: whether they
+    have gripped is to be seen, so nothing is lifted on trust.
     """
     begin, out = hand, []
     for _ in range(HORIZON):
         wished = wish(family, hand, target, goal, direction)
         after = move(hand, wished)
-        width = hand.width_m + (GRIPPER_M if wished.opened else -GRIPPER_M)
-        between = (
-            math.hypot(target.x_m - hand.x_m, target.y_m - hand.y_m) < 0.022
-            and abs(target.z_m - hand.z_m) < 0.02
-        )
-        width = clip(width, BRICK_M if between and hand.width_m >= BRICK_M else 0.0, OPEN_M)
         if is_held(hand, target) and not wished.opened:
             target = Point(
                 target.x_m + after.x_m - hand.x_m,
@@ -247,11 +240,9 @@ def foretell(
                 target.z_m + after.z_m - hand.z_m,
                 target.yaw_rad + after.yaw_rad - hand.yaw_rad,
             )
-        elif between and wished.opened and width > 0.036 and target.z_m > 0.05:
-            target = target._replace(z_m=0.0126)
         elif family == "push" and after.z_m < LOW_M:
             target = _pushed(after, target, *DIRECTIONS[direction])
-        hand = replace(after, width_m=width).swept()
+        hand = after.swept()
         out.append(
             (
                 hand.x_m - begin.x_m,
