@@ -33,6 +33,7 @@ FORBIDDEN = {
     "security": PURE,
     "simulation": PURE - {"mujoco"},
     "tasks": PURE,
+    "teleop": PURE,
     "demo": PURE,
     "doctor": PURE,
     "nodes": frozenset({"typer", "torch", "mujoco", "asyncio", "vla_zenoh.cli"}),

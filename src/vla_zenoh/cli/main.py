@@ -34,6 +34,7 @@ from vla_zenoh.cli import (
     sim,
     status,
     switches,
+    teleop,
     up,
     worker,
 )
@@ -92,6 +93,7 @@ for panel, name, function in (
     (RUN, "camera", camera.camera),
     (RUN, "worker", worker.worker),
     (RUN, "command", command.command),
+    (RUN, "teleop", teleop.teleop),
     (DRIVE, "prompt", set_prompt.prompt),
     (DRIVE, "activate", switches.activate),
     (DRIVE, "deactivate", switches.deactivate),

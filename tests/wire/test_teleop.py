@@ -1,0 +1,169 @@
+"""``vla-zenoh teleop`` in a real terminal drives a real chain."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import subprocess
+import sys
+import termios
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from camera_rig import until
+from chain import READY_PATIENCE_S, Chain, command_line
+
+from vla_zenoh.codec import records
+from vla_zenoh.teleop.policy import SPEEDS
+from vla_zenoh.teleop.typed import END
+from vla_zenoh.types import GripperState
+
+REPEAT_S = 0.03
+"""A keyboard repeats this often."""
+MOVED_M = 0.03
+OFF_AXIS_M = 0.005
+AFTER_M = 0.03
+"""On after the key was let go: what one chunk asks for at 6 cm/s, and the brake."""
+IN_A_TERMINAL = """\
+import fcntl, runpy, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+sys.argv[0] = "vla-zenoh"
+runpy.run_module("vla_zenoh", run_name="__main__")
+"""
+
+
+class Screen:
+    """A terminal with ``vla-zenoh teleop`` in it."""
+
+    def __init__(self, chain: Chain, *options: str) -> None:
+        self.shown = b""
+        self._master, self._slave = pty.openpty()
+        self.before = termios.tcgetattr(self._slave)
+        words = [sys.executable, "-c", IN_A_TERMINAL, "teleop", *options]
+        self.process = subprocess.Popen(
+            [*words, "--profile", str(chain.profile_file)],
+            stdin=self._slave,
+            stdout=self._slave,
+            stderr=self._slave,
+            start_new_session=True,
+        )
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+        self._thread.start()
+
+    def _watch(self) -> None:
+        while not self._end.is_set():
+            if select.select([self._master], [], [], 0.05)[0]:
+                self.shown += os.read(self._master, 4096)
+
+    def type(self, keys: bytes) -> None:
+        os.write(self._master, keys)
+
+    def hold(self, key: bytes, seconds: float) -> None:
+        """As a keyboard does that repeats."""
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            self.type(key)
+            time.sleep(REPEAT_S)
+
+    def settings(self) -> list:
+        return termios.tcgetattr(self._slave)
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        self._end.set()
+        self._thread.join()
+        os.close(self._master)
+        os.close(self._slave)
+
+
+@contextmanager
+def teleop(chain: Chain, *options: str) -> Iterator[Screen]:
+    screen = Screen(chain, *options)
+    try:
+        until(
+            "teleop is there",
+            lambda: "worker-teleop" in chain.client.alive or screen.process.poll() is not None,
+            READY_PATIENCE_S,
+        )
+        assert screen.process.poll() is None, screen.shown.decode()
+        until("it shows the state", lambda: b"obeys" in screen.shown, READY_PATIENCE_S)
+        yield screen
+    finally:
+        screen.close()
+
+
+def test_a_held_key_moves_the_arm_and_a_released_one_stops_it(chain: Chain) -> None:
+    with teleop(chain) as screen:
+        chain.client.set_worker("teleop")
+        chain.activate_when_ready()
+        start_m = chain.reference_m()
+        began_ns = time.time_ns()
+        screen.hold(b"r", 1.5)
+        let_go_m = chain.reference_m()
+        chain.wait_still()
+        end_m = chain.reference_m()
+        assert let_go_m[2] - start_m[2] > MOVED_M
+        assert 0 <= end_m[2] - let_go_m[2] < AFTER_M
+        assert np.abs(end_m - start_m)[:2].max() < OFF_AXIS_M
+        track = chain.recorder.track(began_ns)
+        assert np.median(np.sort(track.speed_m_s)[-200:]) == pytest.approx(SPEEDS[2][0], rel=0.2)
+        assert chain.state() == "active", "who lets go keeps the arm"
+        assert chain.refused().get("command.shape", 0) == 0
+        # A terminal that tells releases: one press, then a release.
+        screen.type(b"\x1b[?11u\x1b[102u")
+        chain.until("the arm goes down", lambda: chain.reference_m()[2] < end_m[2] - MOVED_M)
+        screen.type(b"\x1b[102;1:3u")
+        chain.wait_still()
+        screen.type(b" ")
+        chain.until("the gripper shuts", lambda: _width_m(chain) < 0.01)
+
+
+def _width_m(chain: Chain) -> float:
+    with chain.session.declare_subscriber(chain.profile.keys.state_gripper) as widths:
+        return records.decode(GripperState, widths.recv().payload.to_bytes()).width_m
+
+
+def test_it_takes_the_arm_from_a_model_in_motion_and_gives_it_back(chain: Chain) -> None:
+    with teleop(chain) as screen:
+        chain.move()
+        done = command_line("use", "teleop", profile=chain.profile_file)
+        assert done.returncode == 0, done.stderr
+        chain.wait_still()
+        assert chain.state() == "active"
+        screen.type(b"\t")
+        chain.until("the model has it back", lambda: chain.client.task.worker == "scripted")
+        chain.until("it moves on", chain.moves)
+        screen.type(b"x")
+        chain.until("stopped", lambda: chain.state() == "stopped")
+
+
+def test_ctrl_c_in_motion_ends_it_stops_the_arm_and_restores_the_terminal(chain: Chain) -> None:
+    with teleop(chain) as screen:
+        assert screen.settings() != screen.before
+        screen.type(b"\t")
+        chain.until("it is obeyed", lambda: chain.client.task.worker == "teleop")
+        screen.type(b"\r")
+        chain.until("active", lambda: chain.state() == "active", READY_PATIENCE_S)
+        screen.hold(b"a", 0.7)
+        assert chain.moves()
+        screen.type(b"\x03")
+        assert screen.process.wait(10) == 0
+        until("everything is shown", lambda: END in screen.shown)
+        assert screen.settings() == screen.before
+        chain.until("nobody is obeyed", lambda: chain.state() == "inactive")
+        chain.wait_still()
+        assert b"Traceback" not in screen.shown
+
+
+def test_without_a_terminal_it_says_so(chain: Chain) -> None:
+    done = command_line("teleop", profile=chain.profile_file)
+    assert done.returncode == 1
+    assert "teleop needs a terminal" in done.stderr
