@@ -301,6 +301,9 @@ class Arm:
         guard = self._guard
         if guard is None:
             return
+        heard = self._writer.heard
+        if not heard and self.sending:
+            guard.restart()  # who listens later must not be led on from where nobody went
         was_braking = guard.braking
         reference = guard.tick(now_ns)
         if guard.following or guard.braking or was_braking:
@@ -309,7 +312,7 @@ class Arm:
         elif self._tcp is not None:
             self._hold.look(self._tcp, now_ns)
         # What nobody heard nobody holds: a bridge that is gone drops what is sent.
-        if self.state == "silent" or not self._writer.heard:
+        if self.state == "silent" or not heard:
             self._hold.lose()
 
     def _send(self, reference: Reference | JointReference, now_ns: int) -> None:
