@@ -191,6 +191,8 @@ class Brick:
 
     def think(self, observation: Observation, hand: Hand) -> Waypoints:
         """What to do, as the network says."""
+        if self._session is None:
+            self.load()
         feed = {
             "tokens": tokens_of(observation.prompt, self._vocabulary),
             "front": observation.images["front"][None],

@@ -1,0 +1,212 @@
+"""The shipped policy does its tasks: the whole chain in lockstep, true poses judge."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vla_zenoh import resources
+from vla_zenoh.errors import WorkerError
+from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.lockstep import Lockstep
+from vla_zenoh.nodes.sim import build_world
+from vla_zenoh.policy import ActionSteps, Policy, check_steps, example_observation
+from vla_zenoh.profile import load_profile
+from vla_zenoh.simulation.render import Renderer
+from vla_zenoh.simulation.robot_model import RobotModel
+from vla_zenoh.simulation.world import World
+from vla_zenoh.tasks import (
+    HELD_OUT,
+    NONSENSE,
+    TRAINING,
+    Episode,
+    Judge,
+    Order,
+    Verdict,
+    draw_episode,
+    say,
+)
+from vla_zenoh.types import Image, ObjectPoses
+
+FOLDER = resources.find("models", "brick")
+PROFILE = "panda_bricks"
+LIMIT_S, STAY_S = 20.0, 2.0
+CAMERA_SIZE = (320, 240)
+MAX_WEIGHTS_BYTES = 5_000_000
+SEED = 5
+STILL_M = 1e-4
+MANY = 12
+ENOUGH = 11
+
+
+@dataclass(slots=True)
+class Stage:
+    world: World
+    renderer: Renderer
+
+    def picture(self, camera: str) -> Image:
+        self.renderer.set_qpos(self.world.qpos())
+        return Image(self.renderer.render(camera, *CAMERA_SIZE))
+
+    def objects(self) -> ObjectPoses:
+        objects = self.world.objects()
+        places, turns = zip(*objects.values(), strict=True)
+        return ObjectPoses(tuple(objects), np.array(places), np.array(turns))
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Stage]:
+    profile = load_profile(PROFILE)
+    with Renderer(profile.sim.scene, RobotModel()) as renderer:
+        yield Stage(build_world(profile), renderer)
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    made = make_policy(find_model("brick"))
+    made.load()  # pyright: ignore[reportAttributeAccessIssue]
+    return made
+
+
+def carry_out(stage: Stage, episode: Episode, limit_s: float = LIMIT_S) -> Verdict:
+    """Reset, ask, and look on until it is decided."""
+    stage.world.reset(episode.seed)
+    loop = Lockstep(
+        load_profile(PROFILE), stage.world, make_policy(find_model("brick")), picture=stage.picture
+    )
+    loop.put("prompt", episode.prompt)
+    loop.run(0.6)
+    loop.put("active", True)
+    loop.run(0.02)
+    assert loop.commander.state.value == "active", loop.commander.why
+    judge = Judge(episode.order, stage.objects(), stage.world.tcp()[0])
+    begin_ns = loop.now_ns
+    while (time_s := (loop.now_ns - begin_ns) / 1e9) < limit_s:
+        loop.run(0.1)
+        world = stage.world
+        width_m = world.gripper_state().width_m
+        verdict = judge.see(stage.objects(), width_m, time_s, world.tcp()[0])
+        if verdict is not None:
+            return verdict
+    return judge.end()
+
+
+def drawn(stage: Stage, seed: int, family: str, target: str | None = None) -> Episode:
+    stage.world.reset(seed)
+    return draw_episode(seed, stage.objects(), family=family, target=target)
+
+
+@pytest.mark.parametrize("family", ["put", "stack", "push"])
+def test_each_family_of_tasks_is_done(stage: Stage, family: str) -> None:
+    verdict = carry_out(stage, drawn(stage, SEED, family))
+    assert verdict.success, verdict.failure
+
+
+def test_another_prompt_in_the_same_scene_fetches_another_brick(stage: Stage) -> None:
+    for colour in ("red", "yellow"):
+        episode = drawn(stage, SEED + 1, "put", colour)
+        verdict = carry_out(stage, episode)
+        assert verdict.success, (episode.prompt, verdict.failure)
+
+
+def test_a_prompt_without_sense_makes_it_stay(stage: Stage) -> None:
+    stage.world.reset(SEED)
+    before = stage.objects().position_m
+    verdict = carry_out(stage, Episode(SEED, Order("stay"), NONSENSE[6]), STAY_S)
+    assert verdict.success
+    np.testing.assert_allclose(stage.objects().position_m, before, atol=STILL_M)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["put", "stack", "push"])
+def test_tasks_are_done_in_many_layouts(stage: Stage, family: str) -> None:
+    verdicts = [carry_out(stage, drawn(stage, 900 + seed, family)) for seed in range(MANY)]
+    done = sum(verdict.success for verdict in verdicts)
+    assert done >= ENOUGH - (family != "put"), [verdict.failure for verdict in verdicts]
+
+
+# -- what it reads -------------------------------------------------------------------------------
+
+
+def understood(policy: Policy, prompt: str) -> bool:
+    """Whether it would do anything at all."""
+    policy.reset()  # pyright: ignore[reportAttributeAccessIssue]
+    result = policy.infer(example_observation(policy.spec, prompt=prompt))
+    assert isinstance(result, ActionSteps)
+    return bool(np.any(check_steps(policy.spec.action, result.steps)))
+
+
+def test_nonsense_is_not_understood(policy: Policy) -> None:
+    assert [sentence for sentence in NONSENSE if understood(policy, sentence)] == []
+
+
+@pytest.mark.parametrize("wordings", [TRAINING, HELD_OUT], ids=["training", "held out"])
+def test_every_wording_is_understood(policy: Policy, wordings: dict) -> None:
+    orders = {
+        "put": Order("put", "green"),
+        "stack": Order("stack", "blue", onto="red"),
+        "push": Order("push", "yellow", direction="closer"),
+    }
+    missed = [
+        sentence
+        for family, order in orders.items()
+        for choice in range(len(wordings[family]))
+        if not understood(policy, sentence := say(order, choice, held_out=wordings is HELD_OUT))
+    ]
+    assert missed == []
+
+
+@pytest.mark.parametrize(
+    "prompt", ["", "!!", "x" * 4000, "put " * 40, "put the rot brick in Kiste"]
+)
+def test_odd_prompts_make_it_stay(policy: Policy, prompt: str) -> None:
+    assert not understood(policy, prompt)
+
+
+# -- what it is made of --------------------------------------------------------------------------
+
+
+def test_the_weights_are_small_and_are_those_of_the_manifest() -> None:
+    manifest = json.loads((FOLDER / "weights.json").read_text())
+    files = [FOLDER / name for name in manifest["sha256"]]
+    assert {file.suffix for file in files} == {".onnx", ".safetensors"}
+    assert sum(file.stat().st_size for file in files) < MAX_WEIGHTS_BYTES
+    for file in files:
+        found = hashlib.sha256(file.read_bytes()).hexdigest()
+        assert found == manifest["sha256"][file.name]
+
+
+def test_changed_weights_are_refused_with_both_sums(tmp_path: Path) -> None:
+    for name in ("brick.onnx", "weights.json"):
+        shutil.copy(FOLDER / name, tmp_path / name)
+    graph = tmp_path / "brick.onnx"
+    graph.write_bytes(graph.read_bytes()[:-1] + b"x")
+    changed = make_policy(find_model("brick"), {"weights": str(tmp_path)})
+    found = hashlib.sha256(graph.read_bytes()).hexdigest()
+    with pytest.raises(WorkerError, match=found):
+        changed.load()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize("missing", ["brick.onnx", "weights.json"])
+def test_a_file_that_is_missing_is_named(tmp_path: Path, missing: str) -> None:
+    for name in {"brick.onnx", "weights.json"} - {missing}:
+        shutil.copy(FOLDER / name, tmp_path / name)
+    with pytest.raises(WorkerError, match=missing):
+        make_policy(find_model("brick"), {"weights": str(tmp_path)}).load()  # pyright: ignore
+
+
+def test_the_words_of_the_manifest_are_those_it_is_taught(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(FOLDER))
+    for name in ("model", "expert", "states", "phrases"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    from phrases import vocabulary  # pyright: ignore[reportMissingImports]
+
+    assert json.loads((FOLDER / "weights.json").read_text())["words"] == vocabulary()
