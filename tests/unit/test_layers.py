@@ -23,6 +23,7 @@ FORBIDDEN = {
     "bench": PURE - {"asyncio"},  # openpi's server is one of asyncio
     "check": PURE,
     "codec": PURE,
+    "dataset": PURE,
     "lockstep": PURE,
     "types": PURE,
     "control": PURE,
@@ -39,7 +40,7 @@ FORBIDDEN = {
     "nodes": frozenset({"typer", "torch", "mujoco", "asyncio", "vla_zenoh.cli"}),
     "cli": frozenset({"torch", "mujoco", "asyncio"}),
 }
-HEAVY = ("zenoh", "typer", "torch", "mujoco", "matplotlib", "av")
+HEAVY = ("zenoh", "typer", "torch", "mujoco", "matplotlib", "av", "pyarrow", "rerun")
 
 
 def room(path: Path) -> str:

@@ -16,6 +16,7 @@ from vla_zenoh.cli import (
     check,
     command,
     compare,
+    dataset,
     demo,
     doctor,
     echo,
@@ -116,6 +117,7 @@ for panel, name, function in (
     app.command(name, rich_help_panel=panel)(function)
 
 app.add_typer(bench.bench_app, name="bench", rich_help_panel=LOOK)
+app.add_typer(dataset.dataset_app, name="dataset", rich_help_panel=LOOK)
 app.add_typer(profile.profile_app, name="profile", rich_help_panel=LOOK)
 app.add_typer(serve.serve_app, name="serve", rich_help_panel=RUN)
 app.add_typer(secure.secure_app, name="secure", rich_help_panel=RUN)
