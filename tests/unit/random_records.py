@@ -32,6 +32,7 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
     SceneState,
+    Seen,
     Task,
 )
 from vla_zenoh.types.reports import EVENT_KINDS, EVENT_LEVELS
@@ -236,6 +237,21 @@ RECORDS: dict[type, st.SearchStrategy[Any]] = {
     SceneState: st.builds(SceneState, texts, st.integers(0, 40).flatmap(vectors)),
     ObjectPoses: object_poses(),
     ModelSpec: model_specs,
+    Seen: st.builds(
+        Seen,
+        texts,
+        counts,
+        texts,
+        counts,
+        counts,
+        texts,
+        st.tuples(st.integers(0, 6), st.integers(0, 10)).map(
+            lambda shape: np.linspace(-1, 1, shape[0] * shape[1]).reshape(shape).astype(np.float32)
+        ),
+        st.floats(0, 1e6),
+        st.dictionaries(texts, finite | texts | st.booleans(), max_size=4),
+        st.booleans(),
+    ),
 }
 
 

@@ -31,7 +31,10 @@ Captured = pytest.CaptureFixture[str]
             GripperState(0.04, moving=False, holding=True),
             {"width_m": 0.04, "moving": False, "holding": True, "mode": "ready", "faults": []},
         ),
-        (SceneState("table", np.arange(2.0)), {"scene": "table", "qpos": [0.0, 1.0]}),
+        (
+            SceneState("table", np.arange(2.0)),
+            {"scene": "table", "qpos": [0.0, 1.0], "seed": None},
+        ),
     ],
 )
 def test_whatever_a_node_says_is_valid_json(value: Any, said: Any, capsys: Captured) -> None:

@@ -63,7 +63,9 @@ class Seen:
         steps = np.array(self.steps)
         if steps.dtype.kind not in "iuf" or steps.ndim != 2:
             raise RecordError(f"steps are {steps.dtype} of shape {steps.shape}, wanted (H, D)")
-        set_field(self, "steps", np.ascontiguousarray(steps, np.float32))
+        steps = np.ascontiguousarray(steps, np.float32)
+        steps.setflags(write=False)
+        set_field(self, "steps", steps)
         set_field(self, "raw", details("raw", entries("raw", self.raw)))
 
 
