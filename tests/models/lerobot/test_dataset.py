@@ -1,0 +1,88 @@
+"""LeRobot itself opens what ``vla-zenoh dataset export`` wrote."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("lerobot", reason="needs LeRobot's environment: make test-models")
+sys.path.append(str(Path(__file__).parents[2]))  # what all tests share
+import torch
+from dataset_rig import CHUNK_MS, CHUNKS, DT_S, HEIGHT, PROMPTS, WIDTH, steps_of, write_run
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from vla_zenoh.dataset.episodes import episodes_of
+from vla_zenoh.dataset.features import read_parts
+from vla_zenoh.dataset.lerobot import export
+from vla_zenoh.recording.run import load_run
+
+pytestmark = pytest.mark.models
+
+USED = 2
+FRAMES = USED * CHUNKS
+BRIGHTNESS = 3 / 255
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    home = tmp_path_factory.mktemp("lerobot")
+    episodes = episodes_of(load_run(write_run(home / "teach.mcap")))
+    episodes[0].success = True
+    export(home / "bricks", episodes, ["front"], read_parts("position+rpy+gripper_m"))
+    return home / "bricks"
+
+
+def opened(folder: Path, **more: Any) -> LeRobotDataset:
+    return LeRobotDataset("local/bricks", root=folder, video_backend="pyav", **more)
+
+
+def test_actions_come_back_to_the_bit(folder: Path) -> None:
+    dataset = opened(folder)
+    assert (len(dataset), dataset.num_episodes, dataset.fps) == (2 * FRAMES, 2, 10)
+    found = np.stack([dataset[index]["action"].numpy() for index in range(len(dataset))])
+    wanted = [steps_of(number, chunk)[:USED] for number in range(2) for chunk in range(CHUNKS)]
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, np.concatenate(wanted))
+
+
+def test_pictures_states_and_words_belong_together(folder: Path) -> None:
+    dataset = opened(folder)
+    for index in (0, 1, FRAMES - 1, FRAMES, 2 * FRAMES - 1):
+        item = dataset[index]
+        episode, frame = divmod(index, FRAMES)
+        at_ms = 505 + episode * (CHUNK_MS * CHUNKS + 500) + frame * 100
+        picture = item["observation.images.front"]
+        assert picture.shape == (3, HEIGHT, WIDTH)
+        assert abs(float(picture.mean()) - 2 * (at_ms // 50) / 255) < BRIGHTNESS
+        assert float(item["observation.state"][2]) == pytest.approx(at_ms / 1e4, abs=6e-4)
+        assert item["task"] == PROMPTS[episode]
+        assert float(item["timestamp"]) == pytest.approx(frame * DT_S)
+
+
+def test_an_action_chunk_of_the_future_stays_within_its_episode(folder: Path) -> None:
+    dataset = opened(folder, delta_timestamps={"action": [0.0, DT_S, 2 * DT_S]})
+    item = dataset[FRAMES - 2]
+    np.testing.assert_array_equal(item["action"][1].numpy(), steps_of(0, CHUNKS - 1)[1])
+    assert item["action_is_pad"].tolist() == [False, False, True]
+
+
+def test_statistics_and_success_are_read(folder: Path) -> None:
+    dataset = opened(folder)
+    actions = torch.stack([dataset[index]["action"] for index in range(len(dataset))]).double()
+    np.testing.assert_allclose(dataset.meta.stats["action"]["mean"], actions.mean(0), rtol=1e-9)
+    assert dataset.meta.stats["observation.images.front"]["mean"].shape == (3, 1, 1)
+    assert [episode["success"] for episode in dataset.meta.episodes] == [True, None]
+
+
+def test_batches_are_made_and_one_episode_can_be_chosen(folder: Path) -> None:
+    loader = torch.utils.data.DataLoader(opened(folder), batch_size=8, shuffle=True)
+    batch = next(iter(loader))
+    assert batch["action"].shape == (8, 7)
+    assert batch["observation.images.front"].shape == (8, 3, HEIGHT, WIDTH)
+    second = opened(folder, episodes=[1])
+    assert len(second) == FRAMES
+    np.testing.assert_array_equal(second[0]["action"].numpy(), steps_of(1, 0)[0])
