@@ -31,12 +31,7 @@ def _type(value: str) -> str:
 Topic = Annotated[str, Field(max_length=256), AfterValidator(_topic)]
 RosType = Annotated[str, Field(max_length=256), AfterValidator(_type)]
 
-POSE_COMMANDS = (
-    "geometry_msgs/msg/PoseStamped",
-    "multi_mode_control_msgs/msg/CartesianImpedanceGoal",
-)
 JOINT_COMMANDS = ("trajectory_msgs/msg/JointTrajectory", "std_msgs/msg/Float64MultiArray")
-WIDTHS = ("std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray")
 GRIPPER_ACTIONS = (
     "franka_msgs/action/Move",
     "franka_msgs/action/Grasp",
