@@ -10,11 +10,11 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
-from camera_rig import until
+from camera_rig import PATIENCE_S, until
 from chain import READY_PATIENCE_S, Chain, command_line
 
 from vla_zenoh.codec import records
@@ -62,10 +62,11 @@ class Screen:
     def type(self, keys: bytes) -> None:
         os.write(self._master, keys)
 
-    def hold(self, key: bytes, seconds: float) -> None:
+    def hold(self, key: bytes, until_true: Callable[[], bool]) -> None:
         """As a keyboard does that repeats."""
-        end_s = time.monotonic() + seconds
-        while time.monotonic() < end_s:
+        give_up_s = time.monotonic() + PATIENCE_S
+        while not until_true():
+            assert time.monotonic() < give_up_s, self.shown.decode()
             self.type(key)
             time.sleep(REPEAT_S)
 
@@ -113,11 +114,10 @@ def test_a_held_key_moves_the_arm_and_a_released_one_stops_it(chain: Chain) -> N
         chain.client.set_worker("teleop")
         chain.activate_when_ready()
         start_m = chain.reference_m()
-        screen.hold(b"r", 1.5)
+        screen.hold(b"r", lambda: chain.reference_m()[2] > start_m[2] + MOVED_M)
         let_go_m = chain.reference_m()
         chain.wait_still()
         end_m = chain.reference_m()
-        assert let_go_m[2] - start_m[2] > MOVED_M
         assert 0 <= end_m[2] - let_go_m[2] < AFTER_M
         assert np.abs(end_m - start_m)[:2].max() < OFF_AXIS_M
         assert chain.state() == "active", "who lets go keeps the arm"
@@ -155,8 +155,7 @@ def test_ctrl_c_in_motion_ends_it_stops_the_arm_and_restores_the_terminal(chain:
         screen.type(b"\t")
         chain.until("it is obeyed", lambda: chain.client.task.worker == "teleop")
         activate_by_key(chain, screen)
-        screen.hold(b"a", 0.7)
-        assert chain.moves()
+        screen.hold(b"a", chain.moves)
         screen.type(b"\x03")
         assert screen.process.wait(10) == 0
         until("everything is shown", lambda: END in screen.shown)
@@ -167,6 +166,6 @@ def test_ctrl_c_in_motion_ends_it_stops_the_arm_and_restores_the_terminal(chain:
 
 
 def test_without_a_terminal_it_says_so(chain: Chain) -> None:
-    done = command_line("teleop", profile=chain.profile_file)
+    done = command_line("teleop", profile=chain.profile_file, timeout_s=READY_PATIENCE_S)
     assert done.returncode == 1
     assert "teleop needs a terminal" in done.stderr
