@@ -83,8 +83,7 @@ def export(
     """
     if not episodes:
         raise RecordingError("the recordings hold no episode: no chunk was carried out in them")
-    meanings = {episode.spec.action for episode in episodes}
-    if len(meanings) > 1:
+    if any(episode.spec.action != episodes[0].spec.action for episode in episodes):
         whose = ", ".join(sorted({episode.worker for episode in episodes}))
         raise RecordingError(
             f"the actions of the workers {whose} do not mean the same; choose one with --worker"
