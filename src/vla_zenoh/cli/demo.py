@@ -43,7 +43,7 @@ def demo(
         ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", help="Of the first layout of a task.", min=0)
+        int | None, typer.Option("--seed", help="Of the layout of the tasks.", min=0)
     ] = None,
     profile: Annotated[
         str | None, typer.Option("--profile", "-p", help="Name or path of a simulated profile.")
