@@ -26,6 +26,7 @@ def outcomes(plan: Plan) -> list[Ended]:
     return [each for each, _ in found]
 
 
+@pytest.mark.slow
 def test_who_stands_still_does_no_task() -> None:
     (end,) = outcomes(Plan("hold", 1, SEED, family="put", limit_s=LIMIT_S))
     assert (end.success, end.failure) == (False, "not_moved")
