@@ -14,7 +14,7 @@ from rich.table import Table
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
 from vla_zenoh.cli.output import console, errors
 
-WIDTH = 110
+WIDTH = 132
 SHARES = ("p50", "p95", "p99", "max")
 
 
