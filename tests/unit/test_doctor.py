@@ -28,7 +28,7 @@ from vla_zenoh.doctor.libraries import (
 )
 from vla_zenoh.doctor.opengl import judge as judge_backend
 from vla_zenoh.doctor.opengl import opengl
-from vla_zenoh.doctor.realtime import governor, processors, real_time_priority
+from vla_zenoh.doctor.realtime import governor, niceness, processors, real_time_priority
 from vla_zenoh.doctor.router import router
 from vla_zenoh.doctor.storage import SHARED_MEMORY, disk, left_segments, shared_memory
 from vla_zenoh.doctor.terminal import terminal
@@ -133,6 +133,14 @@ def test_an_unknown_renderer_fails() -> None:
 
 
 # -- time -------------------------------------------------------------------------------------
+def test_looking_at_niceness_leaves_the_process_as_it_was() -> None:
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    finding = niceness()
+    assert os.getpriority(os.PRIO_PROCESS, 0) == before
+    if finding.level != "ok":
+        assert "nice" in finding.advice
+
+
 def test_looking_at_real_time_priority_leaves_the_thread_as_it_was() -> None:
     before = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
     finding = real_time_priority()

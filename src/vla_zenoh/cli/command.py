@@ -35,4 +35,5 @@ def command(
         loaded,
         lambda session, stop: CommandNode(loaded, session, dry_run=dry_run, latch=latch).run(stop),
         identity="command",
+        preferred=True,
     )

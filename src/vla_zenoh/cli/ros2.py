@@ -16,4 +16,9 @@ def ros2(profile: ProfileOption = DEFAULT_PROFILE, connect: ConnectOption = None
     from vla_zenoh.nodes.ros2.node import Ros2Node  # loads kinematics; other commands do not wait
 
     loaded = effective_profile(profile, connect)
-    run_node(loaded, lambda session, stop: Ros2Node(loaded, session).run(stop), identity="ros2")
+    run_node(
+        loaded,
+        lambda session, stop: Ros2Node(loaded, session).run(stop),
+        identity="ros2",
+        preferred=True,
+    )

@@ -17,6 +17,7 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
+from vla_zenoh.nodes.clock import prefer_this_process
 from vla_zenoh.nodes.orphan import RUN_FOLDER_VARIABLE
 from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
 from vla_zenoh.nodes.router import router_config, run_router, run_zenohd
@@ -41,6 +42,7 @@ def router(
         print(json.dumps(router_config(loaded, host=host, also=others), indent=2))
         return
     die_with_parent()
+    prefer_this_process()
     if loaded.session.router == "zenohd":
         given = os.environ.get(RUN_FOLDER_VARIABLE)
         folder = Path(given) if given else Path(tempfile.mkdtemp(prefix="vla-zenoh-"))

@@ -33,4 +33,5 @@ def sim(
         loaded,
         lambda session, stop: SimNode(loaded, session, lockstep=lockstep).run(stop),
         identity="sim",
+        preferred=True,
     )

@@ -8,7 +8,7 @@ from vla_zenoh.doctor.finding import Finding, Level
 from vla_zenoh.doctor.libraries import libraries, msgpack_in_c, python_version
 from vla_zenoh.doctor.needs import Needs, Role, needs_of
 from vla_zenoh.doctor.opengl import opengl
-from vla_zenoh.doctor.realtime import governor, processors, real_time_priority
+from vla_zenoh.doctor.realtime import governor, niceness, processors, real_time_priority
 from vla_zenoh.doctor.router import router
 from vla_zenoh.doctor.storage import disk, left_segments, shared_memory
 from vla_zenoh.doctor.terminal import terminal
@@ -37,6 +37,7 @@ def examine(needs: Needs, try_zenoh: Callable[[str], str]) -> Iterator[Finding]:
     yield processors()
     yield governor()
     yield real_time_priority()
+    yield niceness()
     yield shared_memory()
     yield left_segments()
     yield disk()

@@ -9,6 +9,7 @@ from pathlib import Path
 from vla_zenoh.doctor.finding import Finding
 
 PRIORITY = 50
+NICENESS = -10
 FEWEST_PROCESSORS = 2
 
 LIMITS_FILE = "/etc/security/limits.d/90-vla-zenoh.conf"
@@ -31,6 +32,23 @@ def real_time_priority() -> Finding:
         )
     os.sched_setscheduler(0, policy, parameters)
     return Finding("real-time priority", "ok", f"SCHED_FIFO {PRIORITY} is permitted")
+
+
+def niceness() -> Finding:
+    """This user may put nodes before other programs: found out by doing it, and undone."""
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+    except OSError:
+        return Finding(
+            "niceness",
+            "warn",
+            f"{NICENESS} is not permitted; other programs may hold up nodes that move an arm",
+            f"add the line '{_user()} - nice {NICENESS}' to {LIMITS_FILE} and log in again; "
+            "in a container: --cap-add=SYS_NICE",
+        )
+    os.setpriority(os.PRIO_PROCESS, 0, before)
+    return Finding("niceness", "ok", f"{NICENESS} is permitted")
 
 
 def processors() -> Finding:

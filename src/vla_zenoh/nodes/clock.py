@@ -13,6 +13,7 @@ ADOPT_S = 0.005
 NOISE_S = 0.001
 """A still smaller one is mostly the time between reading two clocks: following it is jitter."""
 REALTIME_PRIORITY = 40
+NICENESS = -10
 TIMER_SLACK_OPTION = 29  # PR_SET_TIMERSLACK
 
 
@@ -52,11 +53,14 @@ class Tick(NamedTuple):
         periods: how many periods have passed since the last turn, at least 1.
         nominal_ns: the multiple this turn stands for, on the monotonic clock.
         stall_s: how late this turn was woken in all.
+        computed_s: processor time the turn before took of this thread. Where that is little and the
+            stall is long, the computer was busy with something else.
     """
 
     periods: int
     nominal_ns: int
     stall_s: float
+    computed_s: float
 
 
 class FixedRate:
@@ -65,9 +69,13 @@ class FixedRate:
     def __init__(self, rate_hz: float) -> None:
         self._period_ns = round(1e9 / rate_hz)
         self._next_ns = time.monotonic_ns() + self._period_ns
+        self._computed_ns = time.thread_time_ns()
 
     def wait(self) -> Tick:
         """Sleep until the next multiple."""
+        computed_ns = time.thread_time_ns()
+        computed_s = (computed_ns - self._computed_ns) / 1e9
+        self._computed_ns = computed_ns
         now_ns = time.monotonic_ns()
         if now_ns < self._next_ns:
             time.sleep((self._next_ns - now_ns) / 1e9)
@@ -75,7 +83,21 @@ class FixedRate:
         late_ns = max(now_ns - self._next_ns, 0)
         periods = 1 + late_ns // self._period_ns
         self._next_ns += periods * self._period_ns
-        return Tick(int(periods), self._next_ns - self._period_ns, late_ns / 1e9)
+        return Tick(int(periods), self._next_ns - self._period_ns, late_ns / 1e9, computed_s)
+
+
+def prefer_this_process() -> bool:
+    """Ask that the threads started from now on go before those of other programs; False: refused.
+
+    The loop itself asks for more (`make_this_thread_realtime`), but it shares an interpreter with
+    the threads Zenoh calls back on: one of them that is put aside while it holds the interpreter
+    holds up the loop as well.
+    """
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+    except (OSError, AttributeError):
+        return False
+    return True
 
 
 def make_this_thread_realtime() -> bool:

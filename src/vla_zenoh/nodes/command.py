@@ -21,7 +21,7 @@ from vla_zenoh.control.so3 import quat_from_rotation
 from vla_zenoh.control.states import State
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.clock import FixedRate, make_this_thread_realtime
+from vla_zenoh.nodes.clock import FixedRate, Tick, make_this_thread_realtime
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.slots import Arrival, Inbox, Mailbox
@@ -135,7 +135,7 @@ class CommandNode:
             extra: list[Setting] = []
             if tick.periods > 1:
                 self.node.counters["command.missed_ticks"] += tick.periods - 1
-                extra += self._after_a_stall(tick.stall_s)
+                extra += self._after_a_stall(tick)
             if stop.is_set():
                 give_up = give_up or time.monotonic() + BRAKE_BEFORE_EXIT_S
                 extra.append(Setting("active", False))
@@ -145,10 +145,11 @@ class CommandNode:
         self.node.report("stopped", now=True)
         self.node.close()
 
-    def _after_a_stall(self, stall_s: float) -> list[Setting]:
-        if stall_s <= self.node.profile.timing.command_timeout_s:
+    def _after_a_stall(self, tick: Tick) -> list[Setting]:
+        if tick.stall_s <= self.node.profile.timing.command_timeout_s:
             return []
-        return [Setting("lose", f"the command loop stood still for {stall_s:.3f} s")]
+        why = f"the command loop stood still for {tick.stall_s:.3f} s"
+        return [Setting("lose", f"{why}, {tick.computed_s:.3f} s of it at work")]
 
     def _turn(self, extra: list[Setting], periods: int, nominal_ns: int) -> None:
         began = time.perf_counter()

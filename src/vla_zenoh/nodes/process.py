@@ -10,6 +10,7 @@ from collections.abc import Callable
 import zenoh
 
 from vla_zenoh.errors import SessionError
+from vla_zenoh.nodes.clock import prefer_this_process
 from vla_zenoh.nodes.orphan import PARENT_VARIABLE, die_with_parent
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile
@@ -31,6 +32,7 @@ def run_node(
     *,
     identity: str | None,
     wait_s: float | None = None,
+    preferred: bool = False,
 ) -> None:
     """Open a session and run a node in it until a signal comes.
 
@@ -40,6 +42,7 @@ def run_node(
         identity: the node's name, for its certificate; None: the people's at this computer.
         wait_s: patience with a router that does not answer; longer under a supervisor, which may
             be starting it.
+        preferred: it keeps an arm in motion, and goes before other programs where that is allowed.
 
     Raises:
         SecurityError: its certificate is not there.
@@ -47,6 +50,8 @@ def run_node(
     """
     stop = stop_on_signals()
     die_with_parent()
+    if preferred:  # before Zenoh starts its threads
+        prefer_this_process()
     if wait_s is None:
         wait_s = ROUTER_PATIENCE_S if PARENT_VARIABLE in os.environ else 0.0
     try:
