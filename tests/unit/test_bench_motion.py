@@ -81,6 +81,12 @@ def test_what_the_arm_did_not_do_is_a_fault_by_name(changes: dict[str, float], f
     assert row["faults"][0].startswith(fault)
 
 
+def test_a_step_that_is_missing_is_told_with_what_was_refused_meanwhile() -> None:
+    few, refused = outcome(steps_done=49), {"command.stale": 1}
+    row = make_row(GO_UP, Conditions(5.0), PROFILE, few, SMOOTH, refused)
+    assert row["faults"] == ["49 of 50 steps (refused: command.stale 1)"]
+
+
 def test_a_jerk_over_its_limit_is_a_fault_and_found_at_the_seam_it_is_at() -> None:
     jerky = stream([JERK_M_S3, 0.0, -1.5 * JERK_M_S3, 0.0], [1, 1, 1, 2, 2])
     row = make_row(GO_UP, Conditions(5.0), PROFILE, outcome(), jerky)

@@ -6,7 +6,7 @@ all of it can be carried out. A prompt begins where the one named as preparation
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
@@ -125,9 +125,14 @@ def failed_row(trial: Trial, conditions: Conditions, why: str) -> dict[str, Any]
 
 
 def make_row(
-    trial: Trial, conditions: Conditions, profile: Profile, outcome: Outcome, stream: Stream
+    trial: Trial,
+    conditions: Conditions,
+    profile: Profile,
+    outcome: Outcome,
+    stream: Stream,
+    refused: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
-    """One row of the result."""
+    """One row of the result; `refused`: what nodes refused meanwhile, by ``node.reason``."""
     translation, rotation = profile.limits.translation, profile.limits.rotation
     # Commands are whole periods apart; what their stamps say beyond that is the clock being read.
     period_s = 1.0 / profile.timing.command_hz
@@ -179,6 +184,7 @@ def make_row(
             _peak_norm(change[:, 3:]) / rotation.acceleration_rad_s2,
         ),
     }
+    row["refused"] = dict(refused or {})
     row["faults"] = faults_of(row, outcome)
     row["ok"] = not row["faults"]
     return row
@@ -206,7 +212,9 @@ def faults_of(row: dict[str, Any], outcome: Outcome) -> list[str]:
     # Steps of chunks that overlap are asked for more than once and carried out once.
     wanted = outcome.segment.steps
     if outcome.steps_done < wanted or (row["horizon"] == 1 and outcome.steps_done > wanted):
-        out.append(f"{outcome.steps_done} of {outcome.segment.steps} steps")
+        why = ", ".join(f"{name} {count}" for name, count in row["refused"].items())
+        steps = f"{outcome.steps_done} of {outcome.segment.steps} steps"
+        out.append(f"{steps} (refused: {why or 'nothing'})")
     return out
 
 

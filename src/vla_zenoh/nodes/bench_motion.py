@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -77,6 +78,7 @@ def run_in_real_time(
                     if prepared.faults():
                         raise NodeError(f"{trial.preparation}: {'; '.join(prepared.faults())}")
                 host.client.set_rate(each.rate_hz)
+                before = _refusals(host)
                 since_ns = time.time_ns()
                 outcome = run.carry_out(0, trial.segment, each.rate_hz)
             except NodeError as error:
@@ -88,7 +90,8 @@ def run_in_real_time(
             recording = listener.close()
             first = first_commands(recording.commands or recording.joint_commands)
             stream = stream_of(recording, first, since_ns, profile.timing.state_hz)
-            yield make_row(trial, each, profile, outcome, stream), recording
+            refused = _refusals(host) - before
+            yield make_row(trial, each, profile, outcome, stream, refused), recording
 
 
 def _go_home(host: Host, listener: Listener) -> None:
@@ -101,6 +104,19 @@ def _go_home(host: Host, listener: Listener) -> None:
     if not client.wait_for(lambda: _resets(host) > resets, RESET_PATIENCE_S):
         raise NodeError("the simulator did not reset; it says: " + str(client.status("sim")))
     time.sleep(0.3)
+
+
+def _refusals(host: Host) -> Counter[str]:
+    """What every node has refused so far, by ``node.reason``."""
+    assert host.client is not None
+    return Counter(
+        {
+            f"{node}.{name.removeprefix('refused.')}": count
+            for node, (status, _, _) in host.client.snapshot().items()
+            for name, count in status.counters.items()
+            if name.startswith("refused.")
+        }
+    )
 
 
 def _resets(host: Host) -> int:
