@@ -14,6 +14,16 @@ settings.register_profile("default", deadline=None)
 settings.register_profile("thorough", deadline=None, max_examples=2000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
+IN_REAL_TIME = {"wire", "fault", "netns", "ros2"}
+"""Folders of tests that begin processes and wait for them: they want the computer for themselves."""
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m chooses
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.parent.name in IN_REAL_TIME:
+            item.add_marker(pytest.mark.realtime)
+
 
 @pytest.fixture(scope="module")
 def shared_chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
