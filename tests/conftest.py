@@ -15,7 +15,7 @@ settings.register_profile("thorough", deadline=None, max_examples=2000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 IN_REAL_TIME = {"wire", "fault", "netns", "ros2"}
-"""Folders of tests that begin processes and wait for them: they want the computer for themselves."""
+"""Folders of tests that begin processes and wait for them: they have the computer to themselves."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses
