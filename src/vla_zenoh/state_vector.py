@@ -1,20 +1,23 @@
-"""A robot's state as the numbers a policy was trained on; for model environments, numpy alone.
+"""A robot's state as the numbers a policy was trained on, and those numbers back as a state.
 
-Parts are joined by ``+``, as in ``position+rotvec+gripper_m``:
+For model environments: numpy alone. Parts are joined by ``+``, as in ``position+rotvec+gripper_m``:
 
     joint                           positions of the arm's joints, rad
-    position                        TCP in the base frame, m
-    rpy, rotvec                     its rotation: extrinsic x, y, z, or axis times angle, rad
-    quat_xyzw, quat_wxyz            likewise as a unit quaternion whose w is not negative
+    position, x y z                 TCP in the base frame, m
+    rpy, roll pitch yaw             its rotation: extrinsic x, y, z, rad
+    rotvec, rx ry rz                likewise axis times angle, rad
+    quat_xyzw, quat_wxyz            likewise a unit quaternion whose w is not negative
     gripper_m, fingers_m            opening, m; both fingers, +half and -half of it, m
     gripper_open, gripper_closed    0 shut to 1 open, and 0 open to 1 shut
-    zero                            0, for what this robot does not have
+    zero, zero*N                    N zeros, for what this robot does not have
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +25,16 @@ from numpy.typing import NDArray
 from vla_zenoh.errors import SpecError
 from vla_zenoh.policy import Observation, StatePart
 
+COORDINATES: Mapping[str, tuple[str, ...]] = {
+    "position": ("x", "y", "z"),
+    "rpy": ("roll", "pitch", "yaw"),
+    "rotvec": ("rx", "ry", "rz"),
+}
+"""Parts whose numbers have names of their own."""
 PARTS: Mapping[str, tuple[StatePart | None, int]] = {
     "joint": ("joint", 7),
-    "position": ("pose", 3),
-    "rpy": ("pose", 3),
-    "rotvec": ("pose", 3),
+    **{whole: ("pose", 3) for whole in COORDINATES},
+    **{name: ("pose", 1) for names in COORDINATES.values() for name in names},
     "quat_xyzw": ("pose", 4),
     "quat_wxyz": ("pose", 4),
     "gripper_m": ("gripper", 1),
@@ -39,7 +47,26 @@ PARTS: Mapping[str, tuple[StatePart | None, int]] = {
 UPRIGHT = 1e-7
 """Cosine of a pitch so near to 90 degrees that roll and yaw turn about the same axis."""
 
-Quaternion = Sequence[float] | NDArray[np.float64]
+_ZEROS = re.compile(r"zero\*([1-9][0-9]{0,3})")
+_WHOLE = {name: (whole, i) for whole, names in COORDINATES.items() for i, name in enumerate(names)}
+
+Numbers = Sequence[float] | NDArray[np.float64]
+
+
+# -- names ----------------------------------------------------------------------------------------
+def read_parts(text: str) -> tuple[str, ...]:
+    """Names of the parts in ``position+rotvec+zero*2``, zeros one by one; none of an empty text.
+
+    Raises:
+        SpecError: a name that is not known; says what there is.
+    """
+    names: list[str] = []
+    for name in (part.strip() for part in text.split("+") if text.strip()):
+        zeros = _ZEROS.fullmatch(name)
+        if zeros is None and name not in PARTS:
+            raise SpecError(f"no part of the state is called {name!r}; there are: {_known()}")
+        names += ["zero"] * int(zeros[1]) if zeros is not None else [name]
+    return tuple(names)
 
 
 def read_state(text: str, size: int) -> tuple[str, ...]:
@@ -48,18 +75,18 @@ def read_state(text: str, size: int) -> tuple[str, ...]:
     Raises:
         SpecError: a name that is not known, or another count; says what there is.
     """
-    names = tuple(name.strip() for name in text.split("+") if name.strip())
-    known = ", ".join(f"{name} ({count})" for name, (_, count) in PARTS.items())
-    strange = [name for name in names if name not in PARTS]
-    if strange:
-        raise SpecError(f"no part of the state is called {strange[0]!r}; there are: {known}")
+    names = read_parts(text)
     found = sum(PARTS[name][1] for name in names)
     if found != size:
         raise SpecError(
             f"the model's state has {size} numbers, {text!r} has {found}; "
-            f"join its parts by +, in order: {known}"
+            f"join its parts by +, in order: {_known()}"
         )
     return names
+
+
+def _known() -> str:
+    return ", ".join(f"{name} ({count})" for name, (_, count) in PARTS.items())
 
 
 def parts_of(names: Sequence[str]) -> tuple[StatePart, ...]:
@@ -67,45 +94,48 @@ def parts_of(names: Sequence[str]) -> tuple[StatePart, ...]:
     return tuple(dict.fromkeys(part for name in names if (part := PARTS[name][0]) is not None))
 
 
+# -- out ------------------------------------------------------------------------------------------
 def state_vector(
     names: Sequence[str], observation: Observation, max_width_m: float
 ) -> NDArray[np.float32]:
     """(n,) the numbers.
 
     Args:
-        names: of `read_state`.
+        names: of `read_parts`.
         observation: has what `parts_of` says.
         max_width_m: of the open gripper.
     """
     joint, pose, gripper = observation.joint, observation.pose, observation.gripper
     out: list[float] = []
     for name in names:
+        whole, index = _WHOLE.get(name, (name, None))
         if joint is not None and name == "joint":
-            out += joint.position_rad.tolist()
-        elif pose is not None and name == "position":
-            out += pose.position_m.tolist()
-        elif pose is not None and name in ROTATIONS:
-            out += ROTATIONS[name](pose.quat_xyzw)
+            numbers = joint.position_rad.tolist()
+        elif pose is not None and whole == "position":
+            numbers = pose.position_m.tolist()
+        elif pose is not None and whole in ROTATIONS:
+            numbers = ROTATIONS[whole](pose.quat_xyzw)
         elif gripper is not None and name in GRIPPERS:
-            out += GRIPPERS[name](gripper.width_m, max_width_m)
+            numbers = GRIPPERS[name](gripper.width_m, max_width_m)
         else:
-            out.append(0.0)
+            numbers = [0.0]
+        out += numbers if index is None else [numbers[index]]
     return np.array(out, np.float32)
 
 
-def quat_xyzw(quaternion: Quaternion) -> list[float]:
+def quat_xyzw(quaternion: Numbers) -> list[float]:
     """The same rotation, x, y, z, w with w >= 0."""
     sign = -1.0 if quaternion[3] < 0 else 1.0
     return [sign * float(value) for value in quaternion]
 
 
-def quat_wxyz(quaternion: Quaternion) -> list[float]:
+def quat_wxyz(quaternion: Numbers) -> list[float]:
     """Likewise w, x, y, z."""
     *axis, w = quat_xyzw(quaternion)
     return [w, *axis]
 
 
-def rotvec(quaternion: Quaternion) -> list[float]:
+def rotvec(quaternion: Numbers) -> list[float]:
     """Axis times angle in rad, angle within [0, pi]."""
     x, y, z, w = quat_xyzw(quaternion)
     sine = math.sqrt(x * x + y * y + z * z)
@@ -113,7 +143,7 @@ def rotvec(quaternion: Quaternion) -> list[float]:
     return [factor * x, factor * y, factor * z]
 
 
-def rpy(quaternion: Quaternion) -> list[float]:
+def rpy(quaternion: Numbers) -> list[float]:
     """Roll, pitch, yaw in rad: turns about the fixed x, y, z, one after the other."""
     x, y, z, w = quat_xyzw(quaternion)
     ahead, aside = 1 - 2 * (y * y + z * z), 2 * (w * z + x * y)
@@ -129,7 +159,7 @@ def _open(width_m: float, max_width_m: float) -> float:
     return min(max(width_m / max_width_m, 0.0), 1.0)
 
 
-ROTATIONS: Mapping[str, Callable[[Quaternion], list[float]]] = {
+ROTATIONS: Mapping[str, Callable[[Numbers], list[float]]] = {
     "rpy": rpy,
     "rotvec": rotvec,
     "quat_xyzw": quat_xyzw,
@@ -140,4 +170,74 @@ GRIPPERS: Mapping[str, Callable[[float, float], list[float]]] = {
     "fingers_m": lambda width_m, _: [width_m / 2, -width_m / 2],
     "gripper_open": lambda width_m, most_m: [_open(width_m, most_m)],
     "gripper_closed": lambda width_m, most_m: [1 - _open(width_m, most_m)],
+}
+
+
+# -- back -----------------------------------------------------------------------------------------
+def state_of(
+    names: Sequence[str], numbers: NDArray[np.float64], joints: int, max_width_m: float
+) -> dict[str, Any]:
+    """The other way round: what the numbers say of the robot.
+
+    Args:
+        names: of `read_parts`; single coordinates (``x``, ``roll``) are not read back.
+        numbers: (n,).
+        joints: how many the arm has.
+        max_width_m: of the open gripper.
+
+    Returns:
+        any of ``joint`` (n,) rad, ``position_m`` (3,), ``quat_xyzw`` (4,), ``width_m``.
+
+    Raises:
+        SpecError: another count of numbers, or a part that cannot be read back.
+    """
+    sizes = [joints if name == "joint" else PARTS[name][1] for name in names]
+    if numbers.shape != (sum(sizes),):
+        raise SpecError(
+            f"{'+'.join(names)} has shape {numbers.shape}, wanted ({sum(sizes)},)", "shape"
+        )
+    out: dict[str, Any] = {}
+    at = 0
+    for name, size in zip(names, sizes, strict=True):
+        values, at = numbers[at : at + size], at + size
+        if name == "joint":
+            out["joint"] = values
+        elif name == "position":
+            out["position_m"] = values
+        elif name in _ROTATIONS_BACK:
+            out["quat_xyzw"] = np.array(_ROTATIONS_BACK[name](values))
+        elif name in _WIDTHS_BACK:
+            out["width_m"] = _WIDTHS_BACK[name](float(values[0]), max_width_m)
+        elif name != "zero":
+            raise SpecError(f"{name} alone says too little; give position and rpy or quat_xyzw")
+    return out
+
+
+def _of_rotvec(turn_rad: Numbers) -> list[float]:
+    angle_rad = math.hypot(*turn_rad)
+    factor = math.sin(angle_rad / 2) / angle_rad if angle_rad > 0 else 0.5
+    return [*(factor * value for value in turn_rad), math.cos(angle_rad / 2)]
+
+
+def _of_rpy(turns_rad: Numbers) -> list[float]:
+    (sr, cr), (sp, cp), (sy, cy) = ((math.sin(a / 2), math.cos(a / 2)) for a in turns_rad)
+    return [
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    ]
+
+
+_ROTATIONS_BACK: Mapping[str, Callable[[Numbers], Numbers]] = {
+    "rpy": _of_rpy,
+    "rotvec": _of_rotvec,
+    "quat_xyzw": lambda values: values,
+    "quat_wxyz": lambda values: [*values[1:], values[0]],
+}
+_WIDTHS_BACK: Mapping[str, Callable[[float, float], float]] = {
+    "gripper_m": lambda value, _: value,
+    "fingers_m": lambda value, _: 2.0 * value,
+    "gripper_open": lambda value, most_m: value * most_m,
+    "gripper_closed": lambda value, most_m: (1.0 - value) * most_m,
 }

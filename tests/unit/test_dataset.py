@@ -14,12 +14,13 @@ from dataset_rig import CHUNK_MS, CHUNKS, DT_S, HEIGHT, HORIZON, PROMPTS, WIDTH,
 from dataset_rig import write_run as make_run
 
 from vla_zenoh.dataset.episodes import episodes_of, fps_of, hold
-from vla_zenoh.dataset.features import action_names, read_parts
+from vla_zenoh.dataset.features import action_names
 from vla_zenoh.dataset.lerobot import export
 from vla_zenoh.dataset.openvla import openvla_statistics
 from vla_zenoh.dataset.statistics import Colours, of_numbers
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.recording.run import load_run
+from vla_zenoh.state_vector import read_parts
 
 FPS, USED = 10, 2
 """Steps of a chunk until the next one takes over."""

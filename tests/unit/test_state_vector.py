@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from vla_zenoh import state_vector
-from vla_zenoh.control.so3 import exp3, rotation_from_quat, rotation_from_rpy
+from vla_zenoh.control.so3 import exp3, quat_from_rotation, rotation_from_quat, rotation_from_rpy
 from vla_zenoh.errors import SpecError
 from vla_zenoh.policy import (
     ActionSpec,
@@ -26,17 +28,16 @@ ATOL = 1e-6
 MAX_WIDTH_M = 0.08
 
 
-def seen() -> Observation:
+def seen(quat_xyzw: Any = (0, 0, -(0.5**0.5), -(0.5**0.5)), width_m: float = 0.02) -> Observation:
     spec = ModelSpec(
         name="all",
         observation=ObservationSpec(state=("joint", "pose", "gripper")),
         action=ActionSpec(horizon=1, dt_s=0.1),
     )
-    half = np.sqrt(0.5)
     return replace(
         example_observation(spec),
-        pose=PoseState(np.array([0.4, 0.1, 0.3]), np.array([0, 0, -half, -half]), np.zeros(6)),
-        gripper=GripperState(width_m=0.02, moving=False, holding=False),
+        pose=PoseState(np.array([0.4, 0.1, 0.3]), np.array(quat_xyzw), np.zeros(6)),
+        gripper=GripperState(width_m=width_m, moving=False, holding=False),
     )
 
 
@@ -75,10 +76,47 @@ def test_every_part_has_as_many_numbers_as_it_says() -> None:
         assert len(state_vector.state_vector([name], seen(), MAX_WIDTH_M)) == size
 
 
+@given(
+    rotvec=hnp.arrays(np.float64, 3, elements=st.floats(-3.0, 3.0)),
+    width_m=st.floats(0, MAX_WIDTH_M),
+    turn=st.sampled_from(tuple(state_vector.ROTATIONS)),
+    grip=st.sampled_from(tuple(state_vector.GRIPPERS)),
+)
+@example(np.zeros(3), 0.0, "rotvec", "gripper_m")
+def test_a_state_in_any_form_is_read_back(
+    rotvec: np.ndarray[Any, Any], width_m: float, turn: str, grip: str
+) -> None:
+    quat = quat_from_rotation(exp3(rotvec))
+    names = state_vector.read_parts(f"position+{turn}+zero*2+{grip}")
+    numbers = state_vector.state_vector(names, seen(quat, width_m), MAX_WIDTH_M)
+    back = state_vector.state_of(names, numbers.astype(float), 7, MAX_WIDTH_M)
+    np.testing.assert_allclose(back["position_m"], [0.4, 0.1, 0.3], atol=ATOL)
+    assert abs(back["quat_xyzw"] @ quat) == pytest.approx(1.0, abs=1e-5)
+    assert back["width_m"] == pytest.approx(width_m, abs=ATOL)
+
+
+@pytest.mark.parametrize("whole", state_vector.COORDINATES)
+def test_single_coordinates_are_those_of_the_whole(whole: str) -> None:
+    names = state_vector.COORDINATES[whole]
+    observation = seen(quat_from_rotation(exp3(np.array([0.1, -0.2, 0.3]))))
+    np.testing.assert_array_equal(
+        state_vector.state_vector(names, observation, MAX_WIDTH_M),
+        state_vector.state_vector([whole], observation, MAX_WIDTH_M),
+    )
+
+
+def test_what_says_too_little_is_not_read_back() -> None:
+    with pytest.raises(SpecError, match="roll alone says too little"):
+        state_vector.state_of(["roll"], np.zeros(1), 7, MAX_WIDTH_M)
+    with pytest.raises(SpecError, match=r"rpy has shape \(2,\), wanted \(3,\)"):
+        state_vector.state_of(["rpy"], np.zeros(2), 7, MAX_WIDTH_M)
+
+
 @pytest.mark.parametrize(
     ("text", "match"),
     [
         ("position+grip", r"called 'grip'; there are: joint \(7\)"),
+        ("position+", r"called ''; there are"),
         ("position", r"state has 8 numbers, 'position' has 3"),
         ("", r"state has 8 numbers, '' has 0"),
     ],

@@ -42,10 +42,10 @@ def export(
 ) -> None:
     """Make a dataset of recorded runs: an episode for each time a worker was obeyed."""
     from vla_zenoh.dataset.episodes import episodes_of
-    from vla_zenoh.dataset.features import read_parts
     from vla_zenoh.dataset.lerobot import export as write
     from vla_zenoh.dataset.success import succeeded
     from vla_zenoh.recording.run import load_run
+    from vla_zenoh.state_vector import read_parts
 
     parts = read_parts(state)
     episodes, seen = [], None

@@ -14,7 +14,7 @@ from vla_zenoh.dataset.episodes import Episode
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.policy import ActionSpec, Observation
 from vla_zenoh.recording.run import Heard
-from vla_zenoh.state_vector import PARTS, parts_of, read_state, state_vector
+from vla_zenoh.state_vector import parts_of, state_vector
 from vla_zenoh.types import Task
 
 DEFAULT_STATE = "position+rpy+gripper_m"
@@ -31,16 +31,6 @@ NAMES = {
 }
 NEAR_NS = 100_000_000
 """A state belongs to a frame when it lies no further from it than this."""
-
-
-def read_parts(text: str) -> tuple[str, ...]:
-    """Names of the parts in `text`, as the worker ``lerobot`` has them.
-
-    Raises:
-        SpecError: a name that is not known.
-    """
-    names = [name.strip() for name in text.split("+") if name.strip()]
-    return read_state(text, sum(PARTS[name][1] for name in names if name in PARTS))
 
 
 def state_names(parts: Sequence[str]) -> list[str]:

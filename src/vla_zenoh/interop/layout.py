@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import PeerError
-from vla_zenoh.interop.parts import numbers_of
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
+from vla_zenoh.state_vector import state_vector
 from vla_zenoh.types import JointState, shown
 
 Action = Literal["delta", "absolute", "joint_delta", "joint_position"]
@@ -90,7 +90,7 @@ class Layout:
             elif source.prompt:
                 out[theirs] = observation.prompt
             else:
-                out[theirs] = numbers_of(source.parts, observation, self.max_width_m)
+                out[theirs] = state_vector(source.parts, observation, self.max_width_m)
         return out
 
     # -- in -----------------------------------------------------------------------------------

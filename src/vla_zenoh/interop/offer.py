@@ -11,9 +11,9 @@ import numpy as np
 from vla_zenoh.errors import PeerError, RecordError, SpecError
 from vla_zenoh.interop.layout import Source
 from vla_zenoh.interop.options import read_map
-from vla_zenoh.interop.parts import OF_STATE, state_of
 from vla_zenoh.observe import prepare
 from vla_zenoh.policy import ModelSpec, Observation
+from vla_zenoh.state_vector import ROTATIONS, parts_of, read_parts, state_of
 from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task, shown
 
 _OF_PART = {"pose": "position+quat_xyzw", "gripper": "gripper_m", "joint": "joint"}
@@ -115,10 +115,10 @@ def make_offer(
     unknown = named - {camera.camera for camera in spec.observation.cameras}
     if unknown:
         raise SpecError(f"the model has no camera {', '.join(sorted(unknown))}")
-    covered = {OF_STATE[part] for source in own for part in source.parts}
+    covered = {part for source in own for part in parts_of(source.parts)}
     for part in spec.observation.state:
         if part not in covered:
-            parts = tuple(_OF_PART[part].split("+"))
+            parts = read_parts(_OF_PART[part])
             fields[f"observation/{part}"] = Source(parts=parts)
     _check_whole(spec, fields)
     if not any(source.prompt for source in own):
@@ -128,8 +128,5 @@ def make_offer(
 
 def _check_whole(spec: ModelSpec, fields: Mapping[str, Source]) -> None:
     parts = {part for source in fields.values() for part in source.parts}
-    turns = {"rpy", "rotvec", "quat_xyzw", "quat_wxyz"}
-    if "pose" in spec.observation.state and not ("position" in parts and parts & turns):
-        raise SpecError(
-            "map must give the whole pose: position and one of rpy, rotvec, quat_xyzw, quat_wxyz"
-        )
+    if "pose" in spec.observation.state and not ("position" in parts and parts & set(ROTATIONS)):
+        raise SpecError(f"map must give the whole pose: position and one of {', '.join(ROTATIONS)}")

@@ -35,7 +35,6 @@ from pydantic import ValidationError
 from vla_zenoh.errors import SpecError
 from vla_zenoh.faults import in_words
 from vla_zenoh.interop.layout import Action, Layout, Source, TheirRotation
-from vla_zenoh.interop.parts import OF_STATE, read_parts
 from vla_zenoh.policy import (
     ActionSpec,
     CameraSpec,
@@ -47,6 +46,7 @@ from vla_zenoh.policy import (
     Rotation,
     StatePart,
 )
+from vla_zenoh.state_vector import parts_of, read_parts
 
 DEFAULTS: Mapping[str, str] = {
     "map": "",
@@ -158,7 +158,7 @@ def _observation(
     size = _SIZE.fullmatch(chosen["size"])
     if chosen["size"] and size is None:
         raise SpecError(f"size is {chosen['size']!r}, wanted WIDTHxHEIGHT, or nothing")
-    parts = {OF_STATE[part] for source in fields.values() for part in source.parts} - {None}
+    parts = {part for source in fields.values() for part in parts_of(source.parts)}
     parts |= {"joint"} if joints else set()
     order: tuple[StatePart, ...] = ("joint", "pose", "gripper")
     cameras = dict.fromkeys(source.camera for source in fields.values() if source.camera)

@@ -16,9 +16,9 @@ from dataset_rig import CHUNK_MS, CHUNKS, DT_S, HEIGHT, PROMPTS, WIDTH, steps_of
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_zenoh.dataset.episodes import episodes_of
-from vla_zenoh.dataset.features import read_parts
 from vla_zenoh.dataset.lerobot import export
 from vla_zenoh.recording.run import load_run
+from vla_zenoh.state_vector import read_parts
 
 pytestmark = pytest.mark.models
 
