@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from chain import MOVING_M_S, Chain
 
+from vla_zenoh.nodes.hang import HANG_S
+
 BRAKE_S = 0.35
 """A jerk-limited stop from 0.15 m/s takes 0.17 s, the rest is the arm's lag."""
 BUSY_S = 0.15
@@ -211,4 +213,21 @@ def test_a_hung_command_node_is_braked_by_the_robot_and_comes_back_inactive(chai
     assert stood_s <= chain.profile.timing.command_timeout_s + BRAKE_S + BUSY_S
     assert_gentle(chain)
     chain.until("it says why", lambda: "stood still" in str(chain.detail("why")))
+    assert_waits_and_works_again(chain)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("node", ["camera", "router"])
+def test_a_node_that_hangs_for_good_is_ended_and_started_again(chain: Chain, node: str) -> None:
+    chain.move()
+    pid = chain.pid(node)
+    os.kill(pid, signal.SIGSTOP)
+    chain.until(
+        f"{node} runs again",
+        lambda: chain.host.supervisor.pids().get(node, pid) != pid,
+        HANG_S + RESTART_S,
+    )
+    assert_restarted(chain, node, pid)
+    assert any(name == node and "hangs" in line for name, line in chain.told)
+    chain.recorder.forget()
     assert_waits_and_works_again(chain)

@@ -15,6 +15,7 @@ import zenoh
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import NodeError, ProfileError, SessionError
 from vla_zenoh.nodes.client import Client
+from vla_zenoh.nodes.hang import Said, hanging
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.supervisor import NodeCommand, Supervisor
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
@@ -192,13 +193,24 @@ class Host:
             self._tell("command", f"cannot be told to brake ({error}); ending it brakes too")
 
     def serve(self, stop: threading.Event) -> None:
-        """Watch over the nodes until `stop` is set.
+        """Watch over the nodes until `stop` is set: what dies or hangs is started again.
 
         Raises:
             NodeError: a node dies again and again.
         """
         while not stop.wait(0.1):
+            self._end_what_hangs()
             if not self.supervisor.watch():
                 given_up = self.supervisor.given_up
                 name = given_up.command.name if given_up else "a node"
                 raise NodeError(f"{name} dies again and again; its last lines above say why")
+
+    def _end_what_hangs(self) -> None:
+        if self.client is None:
+            return
+        said = {
+            name: Said(status.pid, age_s)
+            for name, (status, age_s, _) in self.client.snapshot().items()
+        }
+        for name in hanging(self.supervisor.running(), said):
+            self.supervisor.end(name, f"silent for {said[name].age_s:.0f} s; it hangs, ending it")

@@ -127,6 +127,22 @@ class Supervisor:
             if child.process is not None and child.process.poll() is None
         }
 
+    def running(self) -> dict[str, tuple[str, int]]:
+        """Node name -> (kind, process number) of those that run."""
+        pids = self.pids()
+        return {
+            child.command.name: (child.command.kind, pids[child.command.name])
+            for child in self.children
+            if child.command.name in pids
+        }
+
+    def end(self, name: str, why: str) -> None:
+        """End a node at once; `watch` starts it again."""
+        for child in self.children:
+            if child.command.name == name and child.process is not None:
+                self._tell(name, why)
+                _kill_group(child.process)
+
     def _spawn(self, child: Child) -> None:
         environment = dict(os.environ)
         environment[PARENT_VARIABLE] = str(os.getpid())
