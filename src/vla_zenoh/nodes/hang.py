@@ -1,7 +1,7 @@
 """Which nodes of a host hang: they run, and have said nothing for long.
 
 A node that hangs does no harm, since the arm brakes without it, but nothing goes on either, and at
-night nobody is there to end it. Workers are left alone: a large model may load or think for minutes.
+night nobody is there to end it. Workers are left alone: a large model may load or think long.
 """
 
 from __future__ import annotations
