@@ -1,7 +1,8 @@
 """Hosts that are network namespaces of this machine, joined by a switch that nothing else is on.
 
 Each host has a name and an address of its own, its own loopback and its own /dev/shm, so that
-nothing but the network joins them. `Lab.shape` makes a host's link slow or lossy (tc netem).
+nothing but the network joins them. Hosts named in `wires` hang on a `netns.wire`, which `Lab.shape`
+makes slow or lossy; the others on a cable of the kernel's.
 """
 
 from __future__ import annotations
@@ -20,12 +21,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from netns.wire import GOOD, TUN_DEVICE, Shape
 
 NETWORK = "10.213.0."
 """Exists inside the namespaces only."""
 COMMAND_PATIENCE_S = 10.0
 END_S = 6.0
 SWITCH = "switch"
+WIRE = Path(__file__).parent / "wire.py"
 OWN_NAME = ("unshare", "--uts", "sh", "-c")
 
 
@@ -37,6 +40,8 @@ def why_not() -> str:
         return "only root may make network namespaces"
     if shutil.which("ip") is None:
         return "the program ip (package iproute2) is not there"
+    if not os.access(TUN_DEVICE, os.R_OK | os.W_OK):
+        return f"{TUN_DEVICE} is not there"
     made = subprocess.run(
         ["unshare", "--net", "--mount", "true"], capture_output=True, check=False, timeout=10
     )
@@ -54,15 +59,38 @@ def _ip(*words: str, check: bool = True) -> str:
     return done.stdout
 
 
+def _arguments(pid: int) -> list[str]:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+    except OSError:
+        return []
+
+
 @dataclass
 class Host:
-    """One host of the lab."""
+    """One host of the lab.
+
+    Args:
+        name: of the computer.
+        namespace: where it is.
+        address: on the lab's network.
+        device: its network device.
+        environment: of all that is started here.
+        python_folders: where Python looks first, here.
+        processes: started here.
+    """
 
     name: str
     namespace: str
     address: str
     device: str
+    environment: dict[str, str] = field(default_factory=dict)
+    python_folders: list[str] = field(default_factory=list)
     processes: list[subprocess.Popen[str]] = field(default_factory=list)
+
+    def _environment(self) -> dict[str, str]:
+        path = os.pathsep.join([*self.python_folders, *sys.path])
+        return {**os.environ, **self.environment, "PYTHONPATH": path}
 
     def words(self, *words: str) -> list[str]:
         """A command line that runs `words` on this host."""
@@ -79,10 +107,34 @@ class Host:
                 stderr=subprocess.STDOUT,
                 text=True,
                 start_new_session=True,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+                env=self._environment(),
             )
         self.processes.append(process)
         return process
+
+    def talk(self, *words: str) -> subprocess.Popen[str]:
+        """Start a process here that is spoken to, line by line; the lab ends it at last."""
+        process = subprocess.Popen(
+            self.words(*words),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            env=self._environment(),
+        )
+        self.processes.append(process)
+        return process
+
+    def pids(self) -> list[int]:
+        """What runs here."""
+        return list(map(int, _ip("netns", "pids", self.namespace).split()))
+
+    def kill(self, node: str) -> None:
+        """Kill a node of this kind, as nothing that it could notice."""
+        found = [pid for pid in self.pids() if _arguments(pid)[1:4] == ["-m", "vla_zenoh", node]]
+        assert found, f"no {node} runs on {self.name}"
+        for pid in found:
+            os.kill(pid, signal.SIGKILL)
 
     def run(self, *words: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
         """Run a command here to its end."""
@@ -92,12 +144,7 @@ class Host:
             text=True,
             timeout=timeout_s,
             check=False,
-            env={
-                **os.environ,
-                "PYTHONPATH": os.pathsep.join(sys.path),
-                "COLUMNS": "200",
-                "NO_COLOR": "1",
-            },
+            env={**self._environment(), "COLUMNS": "200", "NO_COLOR": "1"},
         )
 
     def ask(self, program: Path, *arguments: str, timeout_s: float = 60.0) -> Any:
@@ -108,7 +155,7 @@ class Host:
 
     def crash(self) -> None:
         """Kill everything that runs here at once, as if the power went."""
-        for pid in map(int, _ip("netns", "pids", self.namespace).split()):
+        for pid in self.pids():
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
@@ -128,15 +175,17 @@ class Lab:
 
     Args:
         names: of the hosts; the first has the address ``.1``, and so on.
+        wires: those of them whose link can be shaped.
     """
 
-    def __init__(self, names: Sequence[str]) -> None:
+    def __init__(self, names: Sequence[str], wires: Sequence[str] = ()) -> None:
         self._mark = f"vz{os.getpid() % 100000}"
         self.hosts = {
             name: Host(name, f"{self._mark}-{name}", f"{NETWORK}{at}", f"vz{at}")
             for at, name in enumerate(names, start=1)
         }
         self._switch = f"{self._mark}-{SWITCH}"
+        self._wires: dict[str, subprocess.Popen[str] | None] = dict.fromkeys(wires)
 
     def __getitem__(self, name: str) -> Host:
         return self.hosts[name]
@@ -150,13 +199,29 @@ class Lab:
             space, port = host.namespace, f"p{host.device}"
             _ip("netns", "add", space)
             _ip("-n", space, "link", "set", "lo", "up")
-            _ip(
-                *("-n", self._switch, "link", "add", port, "type", "veth"),
-                *("peer", "name", host.device, "netns", space),
-            )
+            if host.name in self._wires:
+                self._wires[host.name] = self._draw_wire(host, port)
+            else:
+                _ip(
+                    *("-n", self._switch, "link", "add", port, "type", "veth"),
+                    *("peer", "name", host.device, "netns", space),
+                )
             _ip("-n", self._switch, "link", "set", port, "master", "bridge0", "up")
             _ip("-n", space, "addr", "add", f"{host.address}/24", "dev", host.device)
             _ip("-n", space, "link", "set", host.device, "up")
+
+    def _draw_wire(self, host: Host, port: str) -> subprocess.Popen[str]:
+        wire = subprocess.Popen(
+            ["ip", "netns", "exec", self._switch, sys.executable, str(WIRE), host.device, port],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        assert wire.stdout is not None
+        assert wire.stdout.readline().strip() == "ready"
+        _ip("-n", self._switch, "link", "set", host.device, "netns", host.namespace)
+        return wire
 
     def remove(self) -> None:
         """End what still runs, and take everything down."""
@@ -164,19 +229,30 @@ class Lab:
             for process in host.processes:
                 if process.poll() is None:
                     host.end(process, signal.SIGKILL)
+                for pipe in filter(None, (process.stdin, process.stdout)):
+                    with suppress(OSError):
+                        pipe.close()
+        for wire in self._wires.values():
+            if wire is not None:
+                wire.kill()
+                wire.communicate()
         for space in (*(host.namespace for host in self.hosts.values()), self._switch):
             _ip("netns", "del", space, check=False)
 
-    def shape(self, name: str, *netem: str) -> None:
-        """Make a host's link bad both ways, as ``"delay", "20ms", "5ms", "loss", "1%"``."""
+    def shape(self, name: str, shape: Shape = GOOD) -> list[dict[str, int]]:
+        """From now on do this to a host's frames; how many were carried and lost, each way."""
+        wire = self._wires[name]
+        assert wire is not None
+        assert wire.stdin is not None
+        assert wire.stdout is not None
+        wire.stdin.write(f"{shape.to_json()}\n")
+        wire.stdin.flush()
+        return json.loads(wire.stdout.readline())
+
+    def set_mtu(self, name: str, mtu: int = 1500) -> None:
+        """What a host takes for the largest packet of its link."""
         host = self.hosts[name]
-        for space, device in (
-            (host.namespace, host.device),
-            (self._switch, f"p{host.device}"),
-        ):
-            words = ["tc", "-n", space, "qdisc", "replace", "dev", device, "root"]
-            rule = ["netem", *netem] if netem else ["pfifo"]
-            subprocess.run([*words, *rule], check=True, timeout=COMMAND_PATIENCE_S)
+        _ip("-n", host.namespace, "link", "set", host.device, "mtu", str(mtu))
 
     def cut(self, name: str, *, cable: bool = True) -> None:
         """Pull a host's cable, or with ``cable=False`` plug it in again."""
@@ -185,9 +261,9 @@ class Lab:
 
 
 @contextmanager
-def lab(*names: str) -> Iterator[Lab]:
+def lab(*names: str, wires: Sequence[str] = ()) -> Iterator[Lab]:
     """Hosts of these names while the block lasts."""
-    made = Lab(names)
+    made = Lab(names, wires)
     try:
         made.build()
         yield made

@@ -68,29 +68,64 @@ class Site:
             words = (sys.executable, "-m", "vla_zenoh", "up", str(self.profile(host)))
             self.hosts[host].start(*words, "--host", host, output=self.folder / f"{host}.log")
 
+    def impostor(self, host: str, name: str) -> None:
+        """Let a computer call itself `name`, and start the part of that host with its papers."""
+        words = (sys.executable, "-m", "vla_zenoh", "up", str(self.profile(name)), "--host", name)
+        self.hosts[host].start("sh", "-c", f'hostname {name} && exec "$@"', "sh", *words)
+
+    def fake_clock(self, host: str) -> str:
+        """Give a host a wall clock of its own, before anything is started; why not, if not."""
+        library = next(Path("/usr/lib").glob("*/faketime/libfaketime.so.1"), None)
+        if library is None:
+            return "libfaketime is not installed"
+        self._clock(host).write_text("+0")
+        self.hosts[host].environment.update(
+            LD_PRELOAD=str(library),
+            FAKETIME_TIMESTAMP_FILE=str(self._clock(host)),
+            FAKETIME_NO_CACHE="1",
+            FAKETIME_DONT_FAKE_MONOTONIC="1",
+            FAKETIME_DONT_RESET="1",
+        )
+        return ""
+
+    def step_clock(self, host: str, offset_s: float) -> None:
+        """Set a host's clock so far from what it would be."""
+        beside = self._clock(host).with_suffix(".new")
+        beside.write_text(f"{offset_s:+g}")
+        beside.replace(self._clock(host))
+
+    def _clock(self, host: str) -> Path:
+        return self.folder / f"{host}.clock"
+
     def drive(self, host: str, direction: str, count: int) -> Any:
         """Drive the arm from a host; what came of it."""
         words = (str(self.profile(host)), direction, str(count))
         try:
             return self.hosts[host].ask(HERE / "drive.py", *words, timeout_s=DRIVE_S)
         except AssertionError as error:
-            logs = [
-                f"{path.stem}:\n{path.read_text()[-LINES_SHOWN:]}"
-                for path in sorted(self.folder.glob("*.log"))
-            ]
-            raise AssertionError("\n".join([str(error), *logs])) from None
+            raise AssertionError(f"{error}\n{self.logs()}") from None
+
+    def logs(self) -> str:
+        """The last lines of every host, for the message of a test that fails."""
+        return "\n".join(
+            f"{path.stem}:\n{path.read_text()[-LINES_SHOWN:]}"
+            for path in sorted(self.folder.glob("*.log"))
+        )
 
 
 @contextmanager
-def secured_site(plain: str, hosts: Sequence[str], routers: Sequence[str]) -> Iterator[Site]:
+def secured_site(
+    plain: str, hosts: Sequence[str], routers: Sequence[str], wires: Sequence[str] = ()
+) -> Iterator[Site]:
     """A lab whose profile is `plain`, with certificates, nothing started yet.
 
     Args:
         plain: the profile, all of it on loopback.
         hosts: of the network.
         routers: those that run one.
+        wires: those whose link can be shaped.
     """
-    with scratch() as folder, lab(*hosts) as made:
+    with scratch() as folder, lab(*hosts, wires=wires) as made:
         (folder / "plain.yaml").write_text(plain)
         site = Site(made, folder, Store(folder / "authority"))
         places = [word for host in routers for word in ("--at", f"{host}={made[host].address}")]

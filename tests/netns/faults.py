@@ -1,0 +1,172 @@
+"""The faults of a lab network, each of them done to real processes on a real network stack."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+from netns.stage import Fault, Stage
+from netns.wire import CUT, GOOD, Shape
+
+LOSSES = (0.0, 0.01, 0.02, 0.05, 0.10)
+DELAYS_MS = ((20, 5), (50, 10), (100, 20), (200, 40))
+CUTS_S = (0.1, 0.5, 1.0, 5.0, 20.0, 60.0)
+CLOCK_STEP_S = 2.0
+SMALL_MTU = 1280
+SMALL = Shape(mtu=SMALL_MTU)
+"""What IPv6 asks of every link, and many a tunnel has."""
+
+
+def _nothing(_: Stage) -> None:
+    """It ends by itself."""
+
+
+def _shape(shape: Shape, stage: Stage) -> None:
+    stage.site.hosts.shape("gpu", shape)
+
+
+_good = partial(_shape, GOOD)
+
+
+def _bad_link(name: str, about: str, shape: Shape, *, goes_on: bool = True) -> Fault:
+    return Fault(name, about, partial(_shape, shape), _good, goes_on=goes_on)
+
+
+def _kill_router(stage: Stage) -> None:
+    stage.site.hosts["robot"].kill("router")
+
+
+def _crash_hub(stage: Stage) -> None:
+    stage.site.hosts["hub"].crash()
+
+
+def _hub_again(stage: Stage) -> None:
+    stage.site.up("hub")
+
+
+def _pull_eyes(stage: Stage) -> None:
+    stage.site.hosts.cut("eyes")
+
+
+def _plug_eyes(stage: Stage) -> None:
+    stage.site.hosts.cut("eyes", cable=False)
+
+
+def _second_gpu(stage: Stage) -> None:
+    stage.site.impostor("desk", "gpu")
+
+
+def _end_impostor(stage: Stage) -> None:
+    stage.site.hosts["desk"].crash()
+
+
+def _small_link(stage: Stage) -> None:
+    stage.site.hosts.set_mtu("gpu", SMALL_MTU)
+    _shape(SMALL, stage)
+
+
+def _usual_link(stage: Stage) -> None:
+    stage.site.hosts.set_mtu("gpu")
+    _good(stage)
+
+
+def _step_clock(host: str, step_s: float, stage: Stage) -> None:
+    stage.site.step_clock(host, step_s)
+
+
+def catalogue() -> Iterator[Fault]:
+    """All of them, those of one layout together."""
+    yield from _links()
+    yield from _cuts()
+    yield Fault(
+        "mtu",
+        "the model's link and host go down to an MTU of 1280",
+        _small_link,
+        _usual_link,
+        seconds=8.0,
+    )
+    yield Fault(
+        "mtu-silent",
+        "packets above 1280 bytes vanish, and nobody is told",
+        partial(_shape, SMALL),
+        _good,
+        seconds=8.0,
+    )
+    yield Fault(
+        "twin",
+        "a second computer called gpu, with its certificates, starts the same worker",
+        _second_gpu,
+        _end_impostor,
+        seconds=6.0,
+        goes_on=True,
+    )
+    for host, alone in (("gpu", False), ("robot", False)):
+        for sign in (1, -1):
+            yield Fault(
+                f"clock-{host}{sign * CLOCK_STEP_S:+g}",
+                f"the clock of {host} is set by {sign * CLOCK_STEP_S:+g} s",
+                partial(_step_clock, host, sign * CLOCK_STEP_S),
+                partial(_step_clock, host, 0.0),
+                seconds=4.0,
+                alone=alone,
+            )
+    yield Fault(
+        "router-killed",
+        "the only router is killed (SIGKILL); its supervisor starts it again",
+        _kill_router,
+        _nothing,
+        seconds=0.0,
+        from_fault=True,
+        alone=True,
+    )
+    yield Fault(
+        "router-moved",
+        "the computer of the first router dies; another one has a second",
+        _crash_hub,
+        _hub_again,
+        layout="routers",
+        seconds=5.0,
+        from_fault=True,
+    )
+    yield Fault(
+        "camera-pulled",
+        "the cable of the camera's computer is pulled for 5 s",
+        _pull_eyes,
+        _plug_eyes,
+        layout="eyes",
+        seconds=5.0,
+    )
+
+
+def _links() -> Iterator[Fault]:
+    for loss in LOSSES:
+        yield _bad_link(
+            f"loss-{loss * 100:g}",
+            f"{loss:.0%} of all frames are lost",
+            Shape(loss=loss),
+            goes_on=loss <= 0.02,
+        )
+    for delay, jitter in DELAYS_MS:
+        yield _bad_link(
+            f"delay-{delay}",
+            f"{delay} ms more each way, varying by +-{jitter} ms",
+            Shape(delay_s=delay / 1e3, jitter_s=jitter / 1e3),
+            goes_on=delay <= 100,
+        )
+    yield _bad_link(
+        "reorder",
+        "20 ms more each way, which every fifth frame is spared: it overtakes",
+        Shape(delay_s=0.02, reorder=0.2),
+    )
+    yield _bad_link("slow", "the link carries 1 Mbit/s", Shape(rate_bit_s=1e6), goes_on=False)
+
+
+def _cuts() -> Iterator[Fault]:
+    for seconds in CUTS_S:
+        yield Fault(
+            f"cut-{seconds:g}",
+            f"the link is dead for {seconds:g} s",
+            partial(_shape, CUT),
+            _good,
+            seconds=seconds,
+        )

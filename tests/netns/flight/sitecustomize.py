@@ -1,0 +1,45 @@
+"""A flight recorder: what the simulator and the command node say, written down where they say it.
+
+Python imports this file at its start, where its folder is on PYTHONPATH. Between an arm and whoever
+watches it there is a network that may be down, and what is measured of a fault must not depend on
+it. So `state/pose` and `command/pose` are kept in files beside their writers, in the folder that
+FLIGHT_FOLDER names: one row of float64 a record, see `netns.flight_log`.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any
+
+RECORDED = {"sim": "state/pose", "command": "command/pose"}
+
+
+def _install(key_end: str, path: str) -> None:
+    import numpy as np
+
+    from vla_zenoh.nodes.node import Stream
+
+    put = Stream.put
+    file = open(path, "ab", buffering=0)  # noqa: SIM115  # as long as the process lives
+
+    def put_and_keep(self: Stream, record: Any, **named: Any) -> Any:
+        header = put(self, record, **named)
+        if self.key.endswith(key_end):
+            if key_end == RECORDED["sim"]:
+                reference = record.reference_position_m
+                parts = (record.position_m, record.twist, reference)
+            else:
+                parts = (record.position_m, record.twist, record.acceleration[:3])
+            # The computer's own clock, which nobody sets.
+            at_s = (header.stamp_wall_ns - self._clock.offset_ns) / 1e9
+            file.write(np.concatenate([[at_s], *parts]).tobytes())
+        return header
+
+    Stream.put = put_and_keep
+
+
+_node = sys.orig_argv[3] if sys.orig_argv[1:3] == ["-m", "vla_zenoh"] else ""
+_folder = os.environ.get("FLIGHT_FOLDER")
+if _folder and _node in RECORDED:
+    _install(RECORDED[_node], os.path.join(_folder, f"{_node}.flight"))

@@ -1,0 +1,348 @@
+"""A lab with an arm at work in it, to which something is done in mid-motion, and a row about that.
+
+`Stage` is the lab: the arm's host with router, simulator, cameras and command node, the host of the
+model, and who else a layout has. `Stage.suffer` carries one `Fault` out and measures it by what the
+simulator and the command node wrote down themselves (`netns.flight_log`).
+"""
+
+from __future__ import annotations
+
+import json
+import select
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from netns.flight_log import Flight, brake_s, read_flight
+from netns.site import HERE, Site, secured_site
+
+from vla_zenoh.profile import Profile, load_profile
+
+RATE_HZ = 10.0
+STEP_S, STEP_M = 0.1, 0.01
+STEPS = 40
+"""Of a motion that is to reach its goal: 0.4 m."""
+MOVING_M_S = 0.05
+UNDER_WAY_S = 0.8
+ANSWER_S = 200.0
+RECOVERY_S = 60.0
+GOAL_M = 0.001
+MEASURED_SLACK, OWN_BRAKE_SLACK = 1.15, 2.0
+"""Share of the acceleration limit that the measured arm may take; where the robot brakes alone."""
+COMMANDED_SLACK = 1.001
+FRONT = '{source: "sim:front", width: 160, height: 120, rate_hz: 20}'
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Hosts of a lab.
+
+    Args:
+        plain: its profile on loopback.
+        hosts: names.
+        routers: those that run one, the first one first.
+        shaped: whose link can be made bad.
+    """
+
+    plain: str
+    hosts: tuple[str, ...]
+    routers: tuple[str, ...]
+    shaped: tuple[str, ...]
+
+
+def _profile(extends: str, more: str = "") -> str:
+    return f"extends: {extends}\ncameras:\n  front: {FRONT}\n  wrist: null\n{more}"
+
+
+LAYOUTS = {
+    # The robot's computer, one for models, and a desk.
+    "lab": Layout(_profile("panda_sim_lab"), ("robot", "gpu", "desk"), ("robot",), ("gpu",)),
+    # The cameras have a computer of their own.
+    "eyes": Layout(
+        _profile(
+            "panda_sim_lab",
+            "hosts:\n"
+            "  robot: {nodes: [router, sim, command]}\n"
+            "  eyes: {nodes: [camera], connect: [tcp/127.0.0.1:7447]}\n"
+            "  gpu: {nodes: [worker], connect: [tcp/127.0.0.1:7447]}\n",
+        ),
+        ("robot", "eyes", "gpu"),
+        ("robot",),
+        (),
+    ),
+    # Two routers that are nobody else's computer.
+    "routers": Layout(
+        _profile(
+            "panda_sim",
+            "session:\n"
+            "  listen: [tcp/127.0.0.1:7447]\n"
+            "  connect: [tcp/127.0.0.1:7447, tcp/127.0.0.1:7457]\n"
+            "  separate_links: true\n"
+            "hosts:\n"
+            "  hub: {nodes: [router], connect: [tcp/127.0.0.1:7447]}\n"
+            "  spare:\n"
+            "    nodes: [router]\n"
+            "    listen: [tcp/127.0.0.1:7457]\n"
+            "    link: [tcp/127.0.0.1:7447]\n"
+            "    connect: [tcp/127.0.0.1:7457]\n"
+            "  robot: {nodes: [sim, camera, command]}\n"
+            "  gpu: {nodes: [worker]}\n",
+        ),
+        ("hub", "spare", "robot", "gpu"),
+        ("hub", "spare"),
+        (),
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something that goes wrong while the arm moves.
+
+    Args:
+        name: for ``--only``.
+        about: a sentence for people.
+        inject: makes it happen.
+        clear: ends it.
+        layout: of `LAYOUTS`.
+        seconds: how long it lasts; None: until the motion has come to its end.
+        goes_on: the arm is to reach its goal all the same.
+        from_fault: recovery counts from the fault itself, which ends without us.
+        alone: the robot's side notices by itself, and brakes.
+    """
+
+    name: str
+    about: str
+    inject: Callable[[Stage], None]
+    clear: Callable[[Stage], None]
+    layout: str = "lab"
+    seconds: float | None = None
+    goes_on: bool = False
+    from_fault: bool = False
+    alone: bool = False
+
+
+@dataclass
+class Row:
+    """What a fault did. Times are in seconds, None where there is none.
+
+    Args:
+        name: of the fault.
+        about: likewise.
+        did: what the arm did, in words.
+        stood_s: from the fault until the arm stood.
+        stood_bound_s: what the watchdog and one Ruckig brake allow.
+        way_mm: how far it went meanwhile.
+        acceleration: largest measured, as a share of the limit.
+        jerk: largest commanded, likewise.
+        recovered_s: from the end of the fault until the arm moved again.
+        activated: a person had to activate it.
+        off_mm: beside the goal in the end, where it reached one.
+        lost: records that were written and never arrived, by reader and key.
+        refused: by node and reason.
+        wrong: what of our promises it broke.
+    """
+
+    name: str
+    about: str
+    did: str = ""
+    stood_s: float | None = None
+    stood_bound_s: float | None = None
+    way_mm: float | None = None
+    acceleration: float = 0.0
+    jerk: float = 0.0
+    recovered_s: float | None = None
+    activated: bool = False
+    off_mm: float | None = None
+    lost: dict[str, int] = field(default_factory=dict)
+    refused: dict[str, int] = field(default_factory=dict)
+    wrong: list[str] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass
+class Stage:
+    """See the module."""
+
+    site: Site
+    layout: Layout
+    profile: Profile
+    _probe: Any = None
+
+    # -- the operator on the robot's host -----------------------------------------------------
+    def start_probe(self) -> None:
+        words = (sys.executable, str(HERE / "probe.py"), str(self.site.profile("robot")))
+        self._probe = self.site.hosts["robot"].talk(*words)
+        assert self._hear().get("listening")
+
+    def ask(self, do: str, **named: Any) -> dict[str, Any]:
+        """Give the operator an order; the answer."""
+        self._probe.stdin.write(json.dumps({"do": do, **named}) + "\n")
+        self._probe.stdin.flush()
+        return self._hear()
+
+    def _hear(self) -> dict[str, Any]:
+        ready, _, _ = select.select([self._probe.stdout], [], [], ANSWER_S)
+        line = self._probe.stdout.readline() if ready else ""
+        assert line, f"the operator says nothing\n{self.site.logs()}"
+        return json.loads(line)
+
+    def flight(self, node: str) -> Flight:
+        """What a node wrote down of itself."""
+        return read_flight(self.site.folder / f"{node}.flight")
+
+    # -- a fault ------------------------------------------------------------------------------
+    def suffer(self, fault: Fault) -> Row:
+        """Move the arm, let the fault happen, and measure.
+
+        Raises:
+            AssertionError: the arm does not come up at all.
+        """
+        row = Row(fault.name, fault.about)
+        ready = self.ask("ready", rate_hz=RATE_HZ)
+        assert ready["ready"], f"{ready}\n{self.site.logs()}"
+        time.sleep(0.5)
+        before = self.ask("count")
+        moving = self.ask("move", count=STEPS if fault.seconds is None else 0)
+        assert moving["moving"], self.site.logs()
+        time.sleep(UNDER_WAY_S)
+        self.ask("count")  # what happened until now is no news
+        began_s = time.monotonic()
+        fault.inject(self)
+        if fault.seconds is None:
+            finished = self.ask("finish", patience_s=3.0 * STEPS / RATE_HZ)
+            ended_s = time.monotonic()
+            fault.clear(self)
+        else:
+            finished = {}
+            time.sleep(max(0.0, fault.seconds - (time.monotonic() - began_s)))
+            ended_s = time.monotonic()
+            fault.clear(self)
+        recovered: dict[str, Any] = {}
+        if not finished.get("done"):
+            recovered = self.ask("recover", patience_s=RECOVERY_S)
+        time.sleep(0.3)
+        self.ask("rest")
+        time.sleep(1.2)  # status comes twice a second
+        after = self.ask("count")
+        self._measure_motion(row, fault, began_s)
+        self._measure_recovery(row, fault, recovered, began_s if fault.from_fault else ended_s)
+        self._measure_goal(row, moving, finished)
+        self._count(row, before, after)
+        self._tell(row, fault, finished, recovered, after["news"])
+        self._judge(row, fault, finished, recovered)
+        return row
+
+    def _measure_motion(self, row: Row, fault: Fault, began_s: float) -> None:
+        profile, limits = self.profile, self.profile.limits.translation
+        measured, commanded = self.flight("sim"), self.flight("command")
+        # A motion that comes to its goal stands there, too: only who stops on the way was braked.
+        stood_s = measured.stood_at_s(began_s, began_s + (fault.seconds or 0.0) + 5.0)
+        if stood_s is not None and fault.seconds is not None:
+            row.stood_s = stood_s - began_s
+            way = measured.between(began_s, stood_s).position_m
+            row.way_mm = float(np.linalg.norm(way[-1] - way[0])) * 1e3
+            row.stood_bound_s = self._bound_s(fault, commanded, began_s)
+        row.acceleration = measured.between(began_s - 0.2).hardest_m_s2() / limits.acceleration_m_s2
+        period_s = 1.0 / profile.timing.command_hz
+        row.jerk = commanded.between(began_s - 0.2).jerk_m_s3(period_s) / limits.jerk_m_s3
+
+    def _bound_s(self, fault: Fault, commanded: Flight, began_s: float) -> float:
+        timing = self.profile.timing
+        around = commanded.between(began_s - 0.05, began_s + 0.05)
+        brake = max(
+            brake_s(self.profile, twist[:3], change)
+            for twist, change in zip(around.twist[::5], around.last[::5], strict=True)
+        )
+        if fault.alone:
+            return timing.command_timeout_s + brake
+        return STEP_S + 1.0 / RATE_HZ + timing.watchdog_s + brake
+
+    def _measure_recovery(
+        self, row: Row, fault: Fault, recovered: dict[str, Any], since_s: float
+    ) -> None:
+        if fault.seconds is None and not recovered:
+            return
+        measured = self.flight("sim")
+        row.activated = recovered.get("activated_s") is not None
+        begun_s = recovered.get("activated_s") or since_s
+        moved_s = measured.moved_at_s(max(begun_s, since_s), MOVING_M_S)
+        if recovered.get("moves") and moved_s is not None:
+            row.recovered_s = moved_s - since_s
+
+    @staticmethod
+    def _measure_goal(row: Row, moving: dict[str, Any], finished: dict[str, Any]) -> None:
+        if finished.get("done"):
+            way = np.subtract(finished["end_m"], moving["start_m"])
+            asked = np.array([0.0, 0.0, moving["sign"] * STEPS * STEP_M])
+            row.off_mm = float(np.linalg.norm(way - asked)) * 1e3
+
+    @staticmethod
+    def _count(row: Row, before: dict[str, Any], after: dict[str, Any]) -> None:
+        for what in ("lost", "refused"):
+            more = {name: count - before[what].get(name, 0) for name, count in after[what].items()}
+            setattr(row, what, {name: count for name, count in more.items() if count > 0})
+
+    def _tell(
+        self,
+        row: Row,
+        fault: Fault,
+        finished: dict[str, Any],
+        recovered: dict[str, Any],
+        news: list[Any],
+    ) -> None:
+        whats = [what for node, what, _ in news if node == "command"]
+        if finished.get("done"):
+            held = whats.count("active->holding")
+            row.did = "went on to its goal" + (f", held {held} times on the way" if held else "")
+        elif row.stood_s is None and fault.seconds is not None and recovered.get("moves"):
+            row.did = "went on"
+        elif recovered.get("moves") and not row.activated:
+            row.did = "stood, then went on by itself"
+        elif recovered.get("moves"):
+            why = next((why for _, what, why in news if what.endswith("->inactive")), "")
+            row.did = "stood until it was activated" + (f" ({why})" if why else "")
+        else:
+            row.did = f"did not come back: {recovered.get('why', '')[:300]}"
+
+    def _judge(
+        self, row: Row, fault: Fault, finished: dict[str, Any], recovered: dict[str, Any]
+    ) -> None:
+        stood_s, bound_s = row.stood_s, row.stood_bound_s
+        if stood_s is not None and bound_s is not None and stood_s > bound_s:
+            row.wrong.append(f"stood after {stood_s:.3f} s, allowed {bound_s:.3f} s")
+        slack = OWN_BRAKE_SLACK if fault.alone else MEASURED_SLACK
+        if row.acceleration > slack:
+            row.wrong.append(f"acceleration {row.acceleration:.2f} of its limit")
+        if row.jerk > COMMANDED_SLACK:
+            row.wrong.append(f"commanded jerk {row.jerk:.3f} of its limit")
+        if recovered and not recovered.get("moves"):
+            row.wrong.append("did not come back")
+        if fault.goes_on and fault.seconds is None:
+            if not finished.get("done"):
+                row.wrong.append("did not reach its goal")
+            elif (row.off_mm or 0.0) > GOAL_M * 1e3:
+                row.wrong.append(f"{row.off_mm:.2f} mm beside its goal")
+
+
+@contextmanager
+def stage(name: str) -> Iterator[Stage]:
+    """A lab of this layout with certificates, everything up, the operator at the keyboard."""
+    layout = LAYOUTS[name]
+    with secured_site(layout.plain, layout.hosts, layout.routers, layout.shaped) as site:
+        profile = load_profile(str(site.secured))
+        robot = site.hosts["robot"]
+        robot.environment["FLIGHT_FOLDER"] = str(site.folder)
+        robot.python_folders.append(str(HERE / "flight"))
+        parts = [host for host in layout.hosts if host in profile.hosts]
+        site.equip(*parts)
+        site.up(*layout.routers, *(host for host in parts if host not in layout.routers))
+        found = Stage(site, layout, profile)
+        found.start_probe()
+        yield found
