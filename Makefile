@@ -8,7 +8,7 @@ READY := .venv/.ready
 SUITE := not slow and not models and not ros2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow test-ros2 test-models check format bench bench-ros2 build ros2-bridge clean
+.PHONY: help setup demo test slow test-ros2 test-models check format bench bench-faults bench-ros2 build ros2-bridge clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -47,6 +47,9 @@ format: $(READY) ## Let ruff put files into shape
 
 bench: $(READY) ## Measure camera to command on this machine
 	$(BIN)/vla-zenoh bench chain $(ARGS)
+
+bench-faults: $(READY) ## Faults of a lab network on an arm in motion (root), table into docs/reliability.md
+	$(BIN)/python tests/netns/bench_faults.py $(ARGS)
 
 bench-ros2: $(READY) ros2-bridge ## Measure a picture's way to a pose through ROS 2
 	$(BIN)/python tests/ros2/bench.py $(ARGS)
