@@ -26,6 +26,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from vla_zenoh.model_options import number, whole_number
 from vla_zenoh.motions import parse_hard
 from vla_zenoh.policy import (
     ActionSpec,
@@ -66,10 +67,14 @@ class Scripted:
             name="scripted",
             observation=ObservationSpec(cameras=cameras, state=("pose", "gripper"), prompt=True),
             action=ActionSpec(
-                horizon=int(horizon), dt_s=float(dt_s), rotation="rpy", gripper="delta_m"
+                horizon=whole_number("horizon", horizon),
+                dt_s=number("dt_s", dt_s),
+                rotation="rpy",
+                gripper="delta_m",
             ),
         )
-        self._delay_s, self._jitter = float(delay_ms) / 1e3, float(jitter)
+        self._delay_s = number("delay_ms", delay_ms) / 1e3
+        self._jitter = number("jitter", jitter)
         self._random = random.Random(0)
         self.reset()
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import WorkerError
+from vla_zenoh.model_options import read_json, whole_number
 from vla_zenoh.state_vector import read_state
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
@@ -26,9 +26,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     Raises:
         WorkerError: it is none, or of a kind that is not run.
     """
-    if not folder.is_dir():
-        raise WorkerError(f"checkpoint {str(folder)!r} is not a folder")
-    config = _json(folder / CONFIG)
+    config = read_json(folder / CONFIG)
     if not isinstance(config.get("type"), str):
         raise WorkerError(f"{folder / 'config.json'} has no type; it is not a LeRobot policy")
     if config.get("use_peft"):
@@ -39,16 +37,6 @@ def read_config(folder: Path) -> dict[str, Any]:
             "such policies are not loaded"
         )
     return config
-
-
-def _json(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise WorkerError(f"{file} cannot be read: {error}") from error
-    if not isinstance(content, dict):
-        raise WorkerError(f"{file}: wanted a JSON object")
-    return content
 
 
 def features(folder: Path, config: Mapping[str, Any], name: str) -> dict[str, tuple[int, ...]]:
@@ -126,28 +114,13 @@ def horizon(config: Mapping[str, Any], told: str) -> int:
 
     Raises:
         WorkerError: more than its chunks have.
+        SpecError: no whole number.
     """
     most = config.get("chunk_size", MAX_STEPS)
-    steps = told or config.get("n_action_steps", most)
-    try:
-        number = int(steps)
-    except (TypeError, ValueError) as error:
-        raise WorkerError(f"steps is {steps!r}; wanted a whole number") from error
-    if not 1 <= number <= min(most, MAX_STEPS):
-        raise WorkerError(f"steps is {number}; the policy's chunks have {most}")
-    return number
-
-
-def number(name: str, given: str) -> float:
-    """An option's number.
-
-    Raises:
-        WorkerError: it is none.
-    """
-    try:
-        return float(given)
-    except ValueError as error:
-        raise WorkerError(f"{name} is {given!r}; wanted a number") from error
+    steps = whole_number("steps", told or str(config.get("n_action_steps", most)), least=1)
+    if steps > min(most, MAX_STEPS):
+        raise WorkerError(f"steps is {steps}; the policy's chunks have {most}")
+    return steps
 
 
 def device_step(pipeline: Path) -> bool:
@@ -161,7 +134,7 @@ def device_step(pipeline: Path) -> bool:
             f"{pipeline.parent} holds no {pipeline.name}; a policy from before LeRobot 0.4 is "
             "brought up to date by lerobot's own script migrate_policy_normalization.py"
         )
-    steps = _json(pipeline).get("steps")
+    steps = read_json(pipeline).get("steps")
     if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
         raise WorkerError(f"{pipeline}: wanted a list of steps")
     for step in steps:

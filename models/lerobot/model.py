@@ -14,7 +14,6 @@ checked against the sizes in its config. Weights are read from safetensors; noth
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -27,7 +26,6 @@ from vla_zenoh_model_lerobot.mapping import (
     device_step,
     features,
     horizon,
-    number,
     one_by_one,
     pictures,
     read_config,
@@ -35,6 +33,7 @@ from vla_zenoh_model_lerobot.mapping import (
 )
 
 from vla_zenoh.errors import SpecError, WorkerError
+from vla_zenoh.model_options import checkpoint_folder, number, one_of, yes_no
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -89,9 +88,7 @@ class LeRobot:
         steps: str = "",
         device: str = "auto",
     ) -> None:
-        if not checkpoint:
-            raise WorkerError("it needs a policy: --set checkpoint=DIRECTORY")
-        self._folder = Path(checkpoint).expanduser()
+        self._folder = checkpoint_folder(checkpoint)
         config = read_config(self._folder)
         for name, value, allowed in (
             ("kind", kind, get_args(MotionKind)),
@@ -99,13 +96,8 @@ class LeRobot:
             ("gripper", gripper, get_args(GripperMeaning)),
             ("frame", frame, get_args(Frame)),
             ("resize", resize, get_args(Resize)),
-            ("open_is_high", open_is_high, ("yes", "no")),
         ):
-            if value not in allowed:
-                raise WorkerError(
-                    f"{name} is {value!r}; say what the data meant with --set {name}= one of: "
-                    f"{', '.join(allowed)}"
-                )
+            one_of(name, value, allowed)
         if not dt_s:
             raise WorkerError("how long is a step? Say --set dt_s=SECONDS, which is 1 / fps")
         inputs = features(self._folder, config, "input_features")
@@ -138,7 +130,7 @@ class LeRobot:
                 rotation=rotation,
                 position_scale_m=number("scale_m", scale_m),
                 gripper=gripper,
-                gripper_open_is_high=open_is_high == "yes",
+                gripper_open_is_high=yes_no("open_is_high", open_is_high),
             ),
         )
         self._check_action(config)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import WorkerError
+from vla_zenoh.model_options import read_json
 
 CONFIG, STATISTICS = "config.json", "dataset_statistics.json"
 TOKENIZER, ADAPTER_CONFIG = "tokenizer.json", "adapter_config.json"
@@ -77,8 +77,6 @@ def read_checkpoint(folder: Path, adapter: Path | None = None) -> Checkpoint:
     Raises:
         WorkerError: something is missing or not as published; says what.
     """
-    if not folder.is_dir():
-        raise WorkerError(f"checkpoint {str(folder)!r} is not a folder")
     if not (folder / CONFIG).is_file():
         if (folder / ADAPTER_CONFIG).is_file():
             raise WorkerError(
@@ -156,21 +154,6 @@ def _statistics(
         f"{folder} has neither {STATISTICS} nor norm_stats in its {CONFIG}: "
         "without them actions have no units"
     )
-
-
-def read_json(file: Path) -> dict[str, Any]:
-    """Content of a JSON file that is an object.
-
-    Raises:
-        WorkerError: it cannot be read or is something else.
-    """
-    try:
-        content = json.loads(file.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise WorkerError(f"{file} cannot be read: {error}") from error
-    if not isinstance(content, dict):
-        raise WorkerError(f"{file}: wanted a JSON object")
-    return content
 
 
 def shards(folder: Path) -> dict[Path, list[str] | None]:

@@ -37,6 +37,7 @@ from vla_zenoh_model_openvla.statistics import AXES, Range, choose, read_range
 from vla_zenoh_model_openvla.tokens import PROMPTS, ActionBins, prompt_text, prompt_tokens
 
 from vla_zenoh.errors import SpecError, WorkerError
+from vla_zenoh.model_options import checkpoint_folder, number, one_of
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -102,14 +103,13 @@ class OpenVLA:
         state: str = "",
         max_width_m: str = "0.08",
     ) -> None:
-        if not checkpoint:
-            raise WorkerError("it needs weights: --set checkpoint=DIRECTORY")
-        _one_of("dtype", dtype, get_args(Dtype))
-        _one_of("quantise", quantise, get_args(Quantise))
-        _one_of("center_crop", center_crop, get_args(Choice))
-        _one_of("template", template, ("auto", *PROMPTS))
+        folder = checkpoint_folder(checkpoint)
+        one_of("dtype", dtype, get_args(Dtype))
+        one_of("quantise", quantise, get_args(Quantise))
+        one_of("center_crop", center_crop, get_args(Choice))
+        one_of("template", template, ("auto", *PROMPTS))
         self._adapter = Path(adapter).expanduser() if adapter else None
-        self.checkpoint: Checkpoint = read_checkpoint(Path(checkpoint).expanduser(), self._adapter)
+        self.checkpoint: Checkpoint = read_checkpoint(folder, self._adapter)
         found = self.checkpoint
         self._key = choose(found.statistics, unnorm_key, found.statistics_file)
         self._range = read_range(found.statistics, self._key)
@@ -123,12 +123,13 @@ class OpenVLA:
         steps = 1 if self._files is None else chunk_steps(chunk, self._key)
         self._state_range: Range | None = None
         self._state: tuple[str, ...] = ()
-        self._max_width_m = _seconds_or_metres("max_width_m", max_width_m)
+        self._max_width_m = number("max_width_m", max_width_m)
         if self._files is None and (len(self._cameras) > 1 or state):
             raise WorkerError("plain OpenVLA sees one camera and no state; camera= names one")
         if self._files is not None and self._files.state is not None:
-            self._state_range = read_range(found.statistics, self._key, "proprio", size=None)
-            self._state = read_state(state, len(self._state_range.low))
+            trained_on = read_range(found.statistics, self._key, "proprio", size=None)
+            self._state_range = trained_on
+            self._state = read_state(state, len(trained_on.low))
         self.spec = ModelSpec(
             name="openvla",
             observation=ObservationSpec(
@@ -265,25 +266,12 @@ class OpenVLA:
         return self._head.act(self.network, ids, pictures, state).cpu().numpy()
 
 
-def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise WorkerError(f"{name} is {value!r}; it may be {', '.join(allowed)}")
-
-
 def _step_s(given: str, key: str) -> float:
     if given != "auto":
-        return _seconds_or_metres("dt_s", given)
+        return number("dt_s", given)
     if key not in STEP_S:
         raise WorkerError(
             f"how long does a step of {key!r} last? Say so with --set dt_s=SECONDS "
             "(a delta that is carried out at another rate is another speed)"
         )
     return STEP_S[key]
-
-
-def _seconds_or_metres(name: str, given: str) -> float:
-    try:
-        return float(given)
-    except ValueError as error:
-        unit = "seconds" if name.endswith("_s") else "metres"
-        raise WorkerError(f"{name} is {given!r}; wanted {unit}") from error

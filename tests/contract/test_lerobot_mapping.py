@@ -65,9 +65,9 @@ def test_a_policy_that_plans_by_itself_gives_one_step(
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"kind": ""}, r"kind is ''; .* one of: delta, absolute"),
-        ({"rotation": "euler"}, r"rotation is 'euler'; .* rpy, rotvec, quaternion"),
-        ({"gripper": ""}, r"gripper is ''; .* open_fraction"),
+        ({"kind": ""}, r"kind is '', allowed: delta, absolute"),
+        ({"rotation": "euler"}, r"rotation is 'euler', allowed: rpy, rotvec, quaternion"),
+        ({"gripper": ""}, r"gripper is '', allowed: .* open_fraction"),
         ({"resize": "squash"}, r"resize is 'squash'"),
         ({"dt_s": ""}, r"how long is a step"),
         ({"dt_s": "fast"}, r"dt_s is 'fast'"),

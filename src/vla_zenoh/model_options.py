@@ -1,0 +1,106 @@
+"""What a person tells a model: options are text (``--set name=value``), weights lie in a folder."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import SplitResult, urlsplit
+
+from vla_zenoh.errors import SpecError, WorkerError
+
+
+def one_of(name: str, value: str, allowed: Sequence[str]) -> str:
+    """The option's value.
+
+    Raises:
+        SpecError: it is not allowed; lists what is.
+    """
+    if value not in allowed:
+        raise SpecError(f"{name} is {value!r}, allowed: {', '.join(allowed)} (--set {name}=...)")
+    return value
+
+
+def yes_no(name: str, value: str) -> bool:
+    """The option as a truth value.
+
+    Raises:
+        SpecError: it is neither yes nor no.
+    """
+    return one_of(name, value, ("yes", "no")) == "yes"
+
+
+def number(name: str, text: str, *, least: float = 0.0) -> float:
+    """The option's number, `least` or more.
+
+    Raises:
+        SpecError: it is none, not finite, or smaller.
+    """
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise SpecError(f"{name} is {text!r}, wanted a number") from error
+    if not math.isfinite(value) or value < least:
+        bound = "a finite number" if least == -math.inf else f"a finite number from {least:g} up"
+        raise SpecError(f"{name} is {text!r}, wanted {bound}")
+    return value
+
+
+def whole_number(name: str, text: str, *, least: int = 0) -> int:
+    """Likewise a whole one.
+
+    Raises:
+        SpecError: it is none, or smaller.
+    """
+    value = number(name, text, least=least)
+    if value != int(value):
+        raise SpecError(f"{name} is {text!r}, wanted a whole number")
+    return int(value)
+
+
+def address(text: str, *schemes: str) -> SplitResult:
+    """The option `url`; without a scheme the first of `schemes` is meant.
+
+    Raises:
+        SpecError: another scheme, or no host.
+    """
+    parts = urlsplit(text if "://" in text else f"{schemes[0]}://{text}")
+    try:
+        fits = parts.scheme in schemes and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # a port that is none
+        fits = False
+    if not fits:
+        wanted = " or ".join(f"{scheme}://HOST:PORT" for scheme in schemes)
+        raise SpecError(f"url is {text!r}, wanted {wanted}")
+    return parts
+
+
+def checkpoint_folder(text: str) -> Path:
+    """The option `checkpoint`.
+
+    Raises:
+        WorkerError: it is empty, or no folder.
+    """
+    if not text:
+        raise WorkerError("it needs weights: --set checkpoint=DIRECTORY")
+    folder = Path(text).expanduser()
+    if not folder.is_dir():
+        raise WorkerError(f"checkpoint {str(folder)!r} is not a folder")
+    return folder
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """Content of a JSON file that is an object.
+
+    Raises:
+        WorkerError: it cannot be read or is something else.
+    """
+    try:
+        content = json.loads(file.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise WorkerError(f"{file} cannot be read: {error}") from error
+    if not isinstance(content, dict):
+        raise WorkerError(f"{file}: wanted a JSON object")
+    return content
