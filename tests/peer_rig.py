@@ -82,7 +82,7 @@ KINDS: Mapping[str, Kind] = {
         "openvla_rest",
         "openvla_server.py",
         "http://127.0.0.1:PORT/act",
-        {**_SMALL, "encoded": "true"},
+        {**_SMALL, "encoded": "yes"},
         "text",
     ),
     "oft": Kind(

@@ -324,7 +324,7 @@ def test_what_the_server_says_of_itself_is_held_against_the_options(
         ("groot", {"map": "image=camera:front"}, "must begin with 'video.'"),
         ("groot", {"action": "joint_delta"}, "joints are not read"),
         ("openvla_rest", {"url": "ftp://x"}, "http://HOST:PORT"),
-        ("openvla_rest", {"encoded": "perhaps"}, "true, false"),
+        ("openvla_rest", {"encoded": "perhaps"}, "yes, no"),
         ("origami", {"session_id": ""}, "session_id is empty"),
     ],
 )

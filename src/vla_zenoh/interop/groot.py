@@ -25,7 +25,7 @@ from typing import Any, Literal
 import msgpack
 import numpy as np
 
-from vla_zenoh.codec.message import MAX_ITEMS, MAX_PAYLOAD_BYTES
+from vla_zenoh.codec.message import MAX_ITEMS, MAX_PAYLOAD_BYTES, count_containers
 from vla_zenoh.errors import PeerError
 from vla_zenoh.interop import npy
 from vla_zenoh.interop.layout import Layout
@@ -66,10 +66,12 @@ def unpack(payload: bytes) -> Any:
         )
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise PeerError("peer_reply", f"an answer of {len(payload)} bytes")
+    count = count_containers(lambda why: PeerError("peer_reply", f"the answer holds {why}"))
     try:
         return msgpack.unpackb(
             payload,
-            object_hook=_from_map,
+            object_hook=lambda found: _from_map(count(found)),
+            list_hook=count,
             ext_hook=_refuse_extension,
             raw=False,
             strict_map_key=True,

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Literal, cast, get_args
 
 from pydantic import ValidationError
@@ -35,6 +35,7 @@ from pydantic import ValidationError
 from vla_zenoh.errors import SpecError
 from vla_zenoh.faults import in_words
 from vla_zenoh.interop.layout import Action, Layout, Source, TheirRotation
+from vla_zenoh.model_options import number, one_of, whole_number
 from vla_zenoh.policy import (
     ActionSpec,
     CameraSpec,
@@ -106,26 +107,24 @@ def read_layout(
     fields = {theirs: source for theirs, source in entries.items() if source is not None}
     if not fields:
         raise SpecError("map is empty: say which of the server's names is filled with what")
-    action = _one_of("action", chosen["action"], get_args(Action))
-    rotation = _one_of("rotation", chosen["rotation"], get_args(TheirRotation))
-    horizon = _number("horizon", chosen["horizon"])
-    if horizon != int(horizon):
-        raise SpecError(f"horizon is {chosen['horizon']!r}, wanted a whole number")
+    action = one_of("action", chosen["action"], get_args(Action))
+    rotation = one_of("rotation", chosen["rotation"], get_args(TheirRotation))
     joints = action.startswith("joint")
     try:
         spec = ModelSpec(
             name=name,
             observation=_observation(fields, chosen, joints),
             action=ActionSpec(
-                horizon=int(horizon),
-                dt_s=_number("dt_s", chosen["dt_s"]),
+                horizon=whole_number("horizon", chosen["horizon"]),
+                dt_s=number("dt_s", chosen["dt_s"]),
                 kind="delta" if action == "delta" else "absolute",
                 frame=cast(Frame, "base" if joints else chosen["frame"]),
                 rotation=_our_rotation(rotation, joints),
                 gripper=cast(GripperMeaning, chosen["gripper"]),
-                gripper_open_is_high=_one_of("gripper_open", chosen["gripper_open"], OPEN)
-                == "high",
-                gripper_threshold=_number("gripper_threshold", chosen["gripper_threshold"]),
+                gripper_open_is_high=one_of("gripper_open", chosen["gripper_open"], OPEN) == "high",
+                gripper_threshold=number(
+                    "gripper_threshold", chosen["gripper_threshold"], least=-math.inf
+                ),
                 normalisation=normalisation,
             ),
         )
@@ -142,11 +141,11 @@ def read_layout(
         columns=read_columns(chosen["columns"]),
         action=cast(Action, action),
         rotation=cast(TheirRotation, rotation),
-        clip=_number("clip", chosen["clip"] or "0"),
+        clip=number("clip", chosen["clip"] or "0"),
         scales=(
-            _number("position_scale_m", chosen["position_scale_m"]),
-            _number("rotation_scale_rad", chosen["rotation_scale_rad"]),
-            _number("joint_scale_rad", chosen["joint_scale_rad"]),
+            number("position_scale_m", chosen["position_scale_m"]),
+            number("rotation_scale_rad", chosen["rotation_scale_rad"]),
+            number("joint_scale_rad", chosen["joint_scale_rad"]),
         ),
         max_width_m=max_width_m,
     )
@@ -182,29 +181,13 @@ def _our_rotation(theirs: str, joints: bool) -> Rotation:
     return "quaternion" if joints or theirs.startswith("quat") else cast(Rotation, theirs)
 
 
-def _one_of(name: str, value: str, allowed: Sequence[str]) -> str:
-    if value not in allowed:
-        raise SpecError(f"{name} is {value!r}, allowed: {', '.join(allowed)}")
-    return value
-
-
-def _number(name: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError as error:
-        raise SpecError(f"{name} is {text!r}, wanted a number") from error
-    if not math.isfinite(value) or (value < 0 and name != "gripper_threshold"):
-        raise SpecError(f"{name} is {text!r}, wanted a finite number from 0 up")
-    return value
-
-
 def read_timeout(text: str) -> float:
     """The option `timeout_s`.
 
     Raises:
         SpecError: it is no number of seconds up to a minute.
     """
-    value = _number("timeout_s", text)
+    value = number("timeout_s", text)
     if not 0.01 <= value <= 60:
         raise SpecError(f"timeout_s is {text!r}, wanted 0.01 to 60: a late answer is of no use")
     return value
