@@ -90,7 +90,7 @@ class CommandNode:
         self._pose_out = node.stream(keys.command_pose, Kind.CONTROL)
         self._joint_out = node.stream(keys.command_joint, Kind.CONTROL)
         self._gripper_out = node.stream(keys.command_gripper, Kind.ORDER)
-        self._task_out = node.stream(keys.task, Kind.ORDER)
+        self._task_out = node.stream(keys.task, Kind.CONTROL)
         self._speakers = {
             kind: Speaker(profile.timing.state_timeout_s)
             for kind in (PoseState, JointState, GripperState)
