@@ -20,6 +20,9 @@ from vla_zenoh.security.rules import access_control
 
 POLL_S = 0.25
 ZENOHD = "zenohd"
+RUNTIME_VARIABLE, RUNTIME = "ZENOH_RUNTIME", "(rx: (worker_threads: 16))"
+"""What arrives is handed on by the thread that received it, which waits where a link is stuck. With
+the usual two of them one bad link would hold up all others, the arm's among them."""
 
 
 def run_router(
@@ -43,6 +46,7 @@ def run_router(
     """
     profile, name, links = _placed(profile, host)
     access = _access(profile, also)
+    os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)
     with open_session(
         profile.session, mode="router", connect=links, identity=name, access=access
     ) as session:
@@ -77,6 +81,7 @@ def run_zenohd(
         )
     file = folder / "zenohd.json5"
     file.write_text(json.dumps(router_config(profile, host=host, also=also), indent=2))
+    os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)
     os.execv(program, [ZENOHD, "--config", str(file)])
 
 
