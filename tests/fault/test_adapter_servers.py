@@ -36,8 +36,7 @@ def obeyed(folder: Path, name: str) -> Iterator[tuple[Chain, Server]]:
     profile = write_profile(
         folder,
         endpoint=f"tcp/127.0.0.1:{port}" if kind.model == "origami" else None,
-        # A busy machine starves the simulator now and then; that is another test's fault.
-        more=f"workers: [{kind.model}]\ntiming: {{state_timeout_s: 0.5}}\n",
+        more=f"workers: [{kind.model}]\n",
     )
     profile.write_text(profile.read_text().replace("worker: scripted", f"worker: {kind.model}"))
     options = {kind.model: [f"{key}={value}" for key, value in kind.settings(port).items()]}
