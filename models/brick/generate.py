@@ -19,11 +19,11 @@ import cv2
 import mujoco
 import numpy as np
 import pinocchio as pin
-from expert import OPEN_M, Hand, foretell
+from expert import OPEN_M, Hand
+from geometry import numbers
 from model import FRONT, WRIST
-from model import Hand as Memory
 from rich.progress import track
-from states import Situation, draw, draw_order
+from states import Situation, draw
 
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.look import VARIATIONS
@@ -31,16 +31,12 @@ from vla_zenoh.simulation.placement import DISTRACTOR_PREFIX, regions_of
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import PREFIX, TCP_SITE, build_model
-from vla_zenoh.tasks import COLOURS, DIRECTIONS, FAMILIES, Order, brick
+from vla_zenoh.tasks import brick
 
 SCENE = "bricks"
 SHARD = 500
-ORDERS = 4
-"""Orders per picture: what the teacher would do under each."""
 PROFILE = "panda_bricks"
 IK_STEPS, IK_TOLERANCE = 12, 2e-4
-FINGER_OFFSET = 2
-NO_OBJECT = -1.0
 
 
 class Studio:
@@ -145,23 +141,6 @@ def pixels(renderer: Renderer, camera: str, points: np.ndarray) -> np.ndarray:
     return np.stack([column, row, -local[:, 2]], 1)
 
 
-def order_numbers(order: Order) -> list[int]:
-    """Family (pushes apart by direction), target, onto as numbers; -1: none."""
-    kinds = [*FAMILIES[:2], *DIRECTIONS]
-    kind = order.direction if order.family == "push" else order.family
-    onto = COLOURS.index(order.onto) if order.onto else -1
-    return [kinds.index(kind), COLOURS.index(order.target), onto]
-
-
-def label(situation: Situation, order: Order) -> np.ndarray:
-    """(H, 5) what the teacher would do."""
-    goal = situation.bricks[order.onto] if order.family == "stack" else situation.box
-    way = foretell(
-        order.family, situation.hand, situation.bricks[order.target], goal, order.direction
-    )
-    return np.array(way, np.float32)
-
-
 def sample(studio: Studio, random: np.random.Generator) -> dict[str, np.ndarray]:
     """One sample, see the keys."""
     while True:
@@ -189,24 +168,13 @@ def labelled(
         renderer: shows the situation.
         random: draws other orders, of which the teacher is asked too.
     """
-    hand = situation.hand
-    points = np.array([situation.bricks[c][:3] for c in COLOURS] + [situation.box[:3]])
-    points[4, 2] = 0.03
-    tcp = np.array([[hand.x_m, hand.y_m, hand.z_m]])
-    orders = [situation.order] + [draw_order(random) for _ in range(ORDERS - 1)]
-    down = None if hand.down is None else np.array(hand.down)
-    memory = Memory(tcp[0], hand.yaw_rad, hand.width_m, hand.swept_m, down)
-    return {
+    known = numbers(situation, random)
+    points, hand = known["objects"], known["pose"][None, :3]
+    return known | {
         "front": pictures[0],
         "wrist": pictures[1],
-        "hand": memory.numbers().astype(np.float32),
-        "pose": np.array([*tcp[0], hand.yaw_rad], np.float32),
-        "objects": points.astype(np.float32),
-        "yaw": np.array([situation.bricks[c].yaw_rad for c in COLOURS], np.float32),
-        "front_px": pixels(renderer, "front", np.concatenate([points, tcp])).astype(np.float32),
+        "front_px": pixels(renderer, "front", np.concatenate([points, hand])).astype(np.float32),
         "wrist_px": pixels(renderer, "wrist", points).astype(np.float32),
-        "orders": np.array([order_numbers(o) for o in orders], np.int8),
-        "way": np.stack([label(situation, o) for o in orders]),
     }
 
 
@@ -221,8 +189,8 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
     studio = Studio()
-    numbers = range(args.part, -(-args.samples // SHARD), args.parts)
-    for number in track(numbers, description="shards"):
+    shards = range(args.part, -(-args.samples // SHARD), args.parts)
+    for number in track(shards, description="shards"):
         path = args.out / f"{args.seed}-{number:04d}.npz"
         if path.exists():
             continue

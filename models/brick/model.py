@@ -163,10 +163,14 @@ class Brick:
     def reset(self) -> None:
         """Forget what was asked for and how the hand moved."""
         self._hand: Hand | None = None
+        self._prompt = ""
         self._asked: tuple[int, FloatArray] | None = None
 
     def infer(self, observation: Observation) -> ActionSteps:
         """The next chunk."""
+        if observation.prompt != self._prompt:
+            # A push that was made belongs to the task that was.
+            self._prompt, self._hand = observation.prompt, None
         hand = self._hand = self._follow(observation)
         waypoints = self.think(observation, hand)
         goal = self._goal(observation, hand)

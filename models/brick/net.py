@@ -160,12 +160,28 @@ class Scene(NamedTuple):
     Args:
         bricks: (B, 4, 5) x, y, z, and cosine and sine of four times the yaw to the hand.
         box: (B, 2) x, y.
-        maps: front and wrist camera's log-probabilities, for teaching.
     """
 
     bricks: Tensor
     box: Tensor
-    maps: tuple[Tensor, Tensor] = ()  # pyright: ignore
+
+
+class Places(NamedTuple):
+    """Where things are, before anything is known of how they are turned.
+
+    Args:
+        bricks: (B, 4, 3) as in `Scene`.
+        box: (B, 2) likewise.
+        maps: front and wrist camera's log-probabilities, for teaching.
+        uv: (B, 4, 2) of the bricks in the wrist camera's picture.
+        there: (B, 4) how surely they are in it.
+    """
+
+    bricks: Tensor
+    box: Tensor
+    maps: tuple[Tensor, Tensor]
+    uv: Tensor
+    there: Tensor
 
 
 class Eyes(nn.Module):
@@ -193,6 +209,16 @@ class Eyes(nn.Module):
 
     def forward(self, front: Tensor, wrist: Tensor, hand: Tensor) -> Scene:
         """Pictures (B, 3, h, w) about zero, hand (B, 9)."""
+        places = self.find(front, wrist, hand)
+        uv = places.uv.detach()
+        around = hand.repeat_interleave(BRICKS, 0)
+        turn = self.turn(cut_out(wrist, uv), uv.flatten(0, 1), around).view(-1, BRICKS, 2)
+        # Out of the wrist camera's sight nothing is known of how a brick is turned.
+        turn = turn * places.there[..., None].detach()
+        return Scene(torch.cat([places.bricks, turn], 2), places.box)
+
+    def find(self, front: Tensor, wrist: Tensor, hand: Tensor) -> Places:
+        """Where things are; arguments as for all of it."""
         front_maps, front_features = self.front(front)
         wrist_maps, wrist_features = self.wrist(wrist)
         seen, near = gather(front_maps, front_features), gather(wrist_maps, wrist_features)
@@ -240,13 +266,9 @@ class Eyes(nn.Module):
         xy = trust * close[:, :BRICKS] + (1 - trust) * (flat - astray)[:, :BRICKS] + brick[..., :2]
         trust = torch.sigmoid(box[:, 2:])
         box_xy = trust * close[:, BRICKS] + (1 - trust) * (flat - astray)[:, BRICKS] + box[:, :2]
-        places = near.uv[:, :BRICKS].detach()
-        around = hand.repeat_interleave(BRICKS, 0)
-        turn = self.turn(cut_out(wrist, places), places.flatten(0, 1), around).view(-1, BRICKS, 2)
-        # Out of the wrist camera's sight nothing is known of how a brick is turned.
-        turn = turn * near.there[:, :BRICKS, None].detach()
-        bricks = torch.cat([xy, brick[..., 2:3], turn], 2)
-        return Scene(bricks, box_xy, (front_maps, wrist_maps))
+        found = torch.cat([xy, brick[..., 2:3]], 2)
+        maps = (front_maps, wrist_maps)
+        return Places(found, box_xy, maps, near.uv[:, :BRICKS], near.there[:, :BRICKS])
 
 
 class Reader(nn.Module):
@@ -271,22 +293,62 @@ class Reader(nn.Module):
         return self.kind(read), self.target(read), self.onto(read)
 
 
+# What matters about a number of the hand, or how near it is to the brick, is on which side of a
+# border it is: has the gripper shut on a brick, is it open, was the push made. In the numbers' own
+# scales: the border and how soft it is.
+EDGES = (
+    ("width", (0.0375 - 0.04) / 0.04, 0.002 / 0.04),
+    ("width", (0.055 - 0.04) / 0.04, 0.006 / 0.04),
+    ("width", (0.070 - 0.04) / 0.04, 0.002 / 0.04),
+    ("width", (0.016 - 0.04) / 0.04, 0.005 / 0.04),
+    ("height", (0.035 - 0.1) / 0.08, 0.004 / 0.08),
+    ("height", (0.104 - 0.1) / 0.08, 0.006 / 0.08),
+    ("swept", 0.105 / 0.05, 0.004 / 0.05),
+    ("near", 0.007 / UNIT_M, 0.003 / UNIT_M),
+    ("near", 0.0154 / UNIT_M, 0.004 / UNIT_M),
+    ("near", 0.022 / UNIT_M, 0.004 / UNIT_M),
+)
+AHEAD = ((0.0, 0.0), (0.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
+"""Direction of each of `KINDS` in the base frame, for those that have one."""
+
+
 def asinh(value: Tensor) -> Tensor:
     """Grows like the logarithm on both sides, so that millimetres count near zero."""
     size = value.abs()
     return value.sign() * torch.log(size + torch.sqrt(size * size + 1))
 
 
+def turned(xy: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """xy (..., 2) turned by the angle of cos and sin (...)."""
+    x, y = xy[..., 0], xy[..., 1]
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], -1)
+
+
+def fine(value: Tensor) -> tuple[Tensor, Tensor]:
+    """What tells centimetres and millimetres apart."""
+    return asinh(value / 0.1), asinh(value / 0.02)
+
+
 class Will(nn.Module):
-    """A scene and what is asked to waypoints."""
+    """A scene and what is asked to waypoints.
+
+    Pushes are seen along their direction, so that all four are one task; where in the room it
+    happens makes no difference and is not told.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        inside = len(KINDS) + 2 * (5 + 3) + 2 + 2 * (2 + 2 + 1) + HAND
+        inside = 3 + (5 + 6) + (3 + 6) + 3 * 5 + len(EDGES) + HAND - 2 + 2
         self.think = nn.Sequential(
             nn.Linear(inside, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 256),
             nn.ReLU(), nn.Linear(256, HORIZON * 5),
         )  # fmt: skip
+        for name, value in (
+            ("ahead", AHEAD),
+            ("edges", [edge for _, edge, _ in EDGES]),
+            ("widths", [width for _, _, width in EDGES]),
+        ):
+            self.register_buffer(name, torch.tensor(value), persistent=False)
 
     def forward(
         self, scene: Scene, hand: Tensor, kind: Tensor, target: Tensor, onto: Tensor
@@ -300,20 +362,35 @@ class Will(nn.Module):
             target: (B, 4) likewise.
             onto: (B, 4) likewise, or all 0.
         """
+        put, stack = kind[:, :1], kind[:, 1:2]
+        push = 1 - put - stack
+        sin, cos = hand[:, 4], hand[:, 5]
+        # The frame: the hand's, but for a push the one whose x axis is its direction.
+        ahead = kind @ self.ahead
+        there_cos = push[:, 0] * ahead[:, 0] + (1 - push[:, 0]) * cos
+        there_sin = push[:, 0] * ahead[:, 1] + (1 - push[:, 0]) * sin
+        by_cos = there_cos * cos + there_sin * sin
+        by_sin = there_cos * sin - there_sin * cos
         moved = torch.einsum("bk,bkd->bd", target, scene.bricks)
-        below = torch.einsum("bk,bkd->bd", onto, scene.bricks)
-        way = (scene.box - moved[:, :2]) * kind[:, :1]
-        up = below[:, :2] - moved[:, :2] * kind[:, 1:2]
-        numbers = [kind, moved, below, scene.box * kind[:, :1], way, up]
-        numbers += [asinh(moved[:, :3] / 0.1), asinh(below[:, :3] / 0.1)]
-        numbers += [asinh(way / 0.1), asinh(up / 0.1)]
-        numbers += [way.abs().amax(1, keepdim=True), up.norm(dim=1, keepdim=True), hand]
+        below = torch.einsum("bk,bkd->bd", onto, scene.bricks)[:, :3] * stack
+        moved = torch.cat([turned(moved[:, :2], by_cos, by_sin), moved[:, 2:]], 1)
+        way = (scene.box - moved[:, :2]) * put
+        up = (below[:, :2] - moved[:, :2]) * stack
+        square = turned(way, cos, sin)  # the box lies along the base's axes
+        turn = moved[:, 3:] * (1 - push)
+        numbers = [put, stack, push, moved[:, :3], turn, *fine(moved[:, :3])]
+        numbers += [below, *fine(below)]
+        for each in (way, up, square):
+            numbers += [each, *fine(each)[:1], each.norm(dim=1, keepdim=True)]
+        near = moved[:, :2].norm(dim=1, keepdim=True)
+        width, height, swept = hand[:, 6:7], hand[:, 2:3], hand[:, 7:8]
+        values = {"width": width, "height": height, "swept": swept, "near": near}
+        edges = torch.cat([values[name] for name, _, _ in EDGES], 1)
+        numbers += [torch.tanh((edges - self.edges) / self.widths)]
+        numbers += [hand[:, 2:], near, square.abs().amax(1, keepdim=True)]
         out = self.think(torch.cat(numbers, 1)).view(-1, HORIZON, 5)
-        # Written in the hand's frame, wanted in the base's.
-        sin, cos = hand[:, 4, None], hand[:, 5, None]
-        x, y = out[..., 0], out[..., 1]
-        offset = torch.stack([cos * x - sin * y, sin * x + cos * y, out[..., 2], out[..., 3]], -1)
-        return offset, out[..., 4]
+        xy = turned(out[..., :2], there_cos[:, None], there_sin[:, None])
+        return torch.cat([xy, out[..., 2:4]], -1), out[..., 4]
 
 
 class Policy(nn.Module):

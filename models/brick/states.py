@@ -8,7 +8,7 @@ all samples are independent, and the mistakes of a learner are among them.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from expert import (
@@ -68,6 +68,8 @@ def draw(random: np.random.Generator) -> Situation:
         _do_something(random, bricks, box, other, order)
     stage = {"put": _grip, "stack": _grip, "push": _push}[order.family]
     hand = stage(random, bricks, box, order)
+    if order.family != "push":
+        hand = _with_past(random, hand)
     tilt = random.normal(size=2) * 0.006
     return Situation(bricks, box, order, hand, (float(tilt[0]), float(tilt[1])))
 
@@ -187,10 +189,12 @@ def _grip(random: np.random.Generator, bricks: dict[str, Point], box: Point, ord
         return Hand(target.x_m + x, target.y_m + y, z, aligned + float(turn), width)
     turn = float(random.normal() * 0.06)
     if stage == "shutting":
-        x, y = random.normal(size=2) * 0.004
-        z = LOWEST_M + abs(random.normal() * 0.003)
+        x, y = random.normal(size=2) * random.choice([0.004, 0.008])
+        z = LOWEST_M + abs(random.normal()) * random.choice([0.003, 0.008])
         bricks[order.target] = target._replace(yaw_rad=aligned + turn)
-        width = float(random.uniform(BRICK_M, OPEN_M))
+        # Just before it has gripped, little tells that it has not.
+        most = OPEN_M if random.uniform() < 0.6 else 0.045
+        width = float(random.uniform(BRICK_M, most))
         return Hand(target.x_m + x, target.y_m + y, float(z), aligned + turn, width)
     if stage == "done":
         bricks[order.target] = placed = (
@@ -215,13 +219,17 @@ def _grip(random: np.random.Generator, bricks: dict[str, Point], box: Point, ord
             width = float(random.uniform(0.036, OPEN_M))
         return Hand(*place, yaw, width)
     # In the hand. Gripped not quite in the middle.
-    hold_x = float(np.clip(random.normal() * 0.002, -0.006, 0.006))
-    hold_y = float(np.clip(random.normal() * 0.004, -0.010, 0.010))
-    hang = float(np.clip(0.0042 + random.normal() * 0.0015, 0.0, 0.01))
+    hold_x = float(np.clip(random.normal() * 0.004, -0.011, 0.011))
+    hold_y = float(np.clip(random.normal() * 0.0015, -0.004, 0.004))
+    hang = 0.0042 + random.normal() * 0.0015
+    if random.uniform() < 0.35:
+        hang = random.uniform(0.0, 0.013)
+    hang = float(np.clip(hang, 0.0, 0.013))
     width = BRICK_M + float(abs(random.normal())) * 0.0006
     if stage == "lifting":
         x, y = target.x_m, target.y_m
-        z = LOWEST_M + random.uniform(0.0, 0.12)
+        just = random.uniform() < 0.4
+        z = REST_M + hang + (abs(random.normal()) * 0.002 if just else random.uniform(0.0, 0.12))
     elif stage == "carrying":
         x, y = _between(random, target, goal)
         z = random.normal() * 0.015 + (CARRY_M if order.family == "put" else 0.11)
@@ -246,6 +254,15 @@ def _grip(random: np.random.Generator, bricks: dict[str, Point], box: Point, ord
         # Just being let go of.
         return Hand(hand.x_m, hand.y_m, hand.z_m, yaw, float(random.uniform(BRICK_M, 0.045)))
     return hand
+
+
+def _with_past(random: np.random.Generator, hand: Hand) -> Hand:
+    """It has swept over the table before, as hands that grip do without meaning to."""
+    few = random.uniform() < 0.7
+    swept = abs(random.normal()) * 0.006 if few else random.uniform(0.0, 0.15)
+    x, y = random.normal(size=2) * 0.003
+    down = (hand.x_m + float(x), hand.y_m + float(y)) if hand.z_m < LOW_M else None
+    return replace(hand, swept_m=float(swept), down=down).swept()
 
 
 def _push(random: np.random.Generator, bricks: dict[str, Point], box: Point, order: Order) -> Hand:
