@@ -20,6 +20,11 @@ from typing import Any
 import pytest
 from camera_rig import free_endpoint, until
 
+from vla_zenoh.interop import origami
+from vla_zenoh.keys import origami_key
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.profile import SessionProfile
+
 PEERS = Path(__file__).parent / "peers"
 START_S = 20.0
 ENVIRONMENT_S = 300
@@ -192,3 +197,24 @@ def served(kind: Kind, port: int | None = None, **changes: Any) -> Iterator[Serv
         yield server
     finally:
         server.end()
+
+
+@contextmanager
+def reachable(kind: Kind, **changes: Any) -> Iterator[Server]:
+    """A server and, for a policy behind a router, that too."""
+    port = free_port()
+    if kind.model != "origami":
+        with served(kind, port, **changes) as server:
+            yield server
+        return
+    where = (f"tcp/127.0.0.1:{port}",)
+    router = SessionProfile(listen=where, connect=where)
+    with open_session(router, mode="router") as session, served(kind, port, **changes) as server:
+        asked = origami.request("metadata", "rig", "vla-zenoh")
+
+        def answers() -> bool:
+            replies = session.get(origami_key("metadata"), payload=asked, timeout=1.0)
+            return any(reply.ok is not None for reply in replies)
+
+        until(f"{kind.script} answers", answers, START_S)
+        yield server

@@ -21,14 +21,14 @@ from peer_rig import (
     Server,
     free_port,
     python_with,
+    reachable,
     served,
 )
 
 from vla_zenoh.errors import PeerError, SpecError, WorkerError
 from vla_zenoh.loader import find_model, make_policy
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.policy import Observation, Policy, check_steps, example_observation
-from vla_zenoh.profile import SessionProfile, load_profile
+from vla_zenoh.profile import load_profile
 from vla_zenoh.types import JointState
 
 STEP_M, ATOL_M = 0.01, 1e-6
@@ -61,21 +61,12 @@ def made(model: str, settings: Mapping[str, str]) -> Iterator[Policy]:
 def asked(
     name: str, *, python: str = sys.executable, **options: str
 ) -> Iterator[tuple[Server, Policy]]:
-    """A server and the adapter that asks it; for a policy behind a router, that too."""
-    port = free_port()
-    router = None
-    if KINDS[name].model == "origami":
-        where = (f"tcp/127.0.0.1:{port}",)
-        router = open_session(SessionProfile(listen=where, connect=where), mode="router")
-    try:
-        with (
-            served(KINDS[name], port, python=python) as server,
-            made(server.kind.model, {**server.settings, **options}) as policy,
-        ):
-            yield server, policy
-    finally:
-        if router is not None:
-            router.close()
+    """A server and the adapter that asks it."""
+    with (
+        reachable(KINDS[name], python=python) as server,
+        made(server.kind.model, {**server.settings, **options}) as policy,
+    ):
+        yield server, policy
 
 
 def seen(policy: Policy, prompt: str) -> Observation:
@@ -270,11 +261,8 @@ def test_groots_pickles_are_refused() -> None:
 
 
 def test_an_answer_with_another_questions_number_is_refused() -> None:
-    port = free_port()
-    where = (f"tcp/127.0.0.1:{port}",)
     with (
-        open_session(SessionProfile(listen=where, connect=where), mode="router"),
-        served(replace(KINDS["origami"], variant="other"), port) as server,
+        reachable(replace(KINDS["origami"], variant="other")) as server,
         made("origami", server.settings) as policy,
     ):
         until_s = time.monotonic() + PATIENCE_S

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 from chain import command_line
-from peer_rig import KINDS, free_port, served
+from peer_rig import KINDS, free_port, reachable
 
+from vla_zenoh import resources
 from vla_zenoh.check import fit, plausible
 from vla_zenoh.check.examine import Examination, Report
 from vla_zenoh.check.examples import chart, looks
@@ -145,6 +146,14 @@ def test_every_finding_has_a_meaning() -> None:
 
 
 # -- what is shipped ------------------------------------------------------------------------------
+ADAPTERS = ("openpi", "groot", "openvla_rest", "origami")
+IN_ENVIRONMENTS_OF_THEIR_OWN = {"lerobot", "openvla"}
+"""Checked by tests/models/test_*_chain.py."""
+
+
+def test_every_shipped_worker_is_checked() -> None:
+    here = {"brick", "replay", "scripted", *ADAPTERS}
+    assert here | IN_ENVIRONMENTS_OF_THEIR_OWN == set(resources.names("models"))
 
 
 def passes(model: str, **options: str) -> Report:
@@ -180,16 +189,11 @@ def test_replay_keeps_its_contract(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        "openpi",
-        pytest.param("groot", marks=pytest.mark.slow),
-        pytest.param("openvla_rest", marks=pytest.mark.slow),
-    ],
+    "name", [pytest.param(n, marks=() if n == "openpi" else pytest.mark.slow) for n in ADAPTERS]
 )
 def test_an_adapter_keeps_its_contract_with_its_server(name: str) -> None:
-    with served(KINDS[name]) as server:
-        passes(server.kind.model, **server.settings)
+    with reachable(KINDS[name]) as server:
+        passes(server.kind.model, **{**server.settings, "timeout_s": "5"})
 
 
 def test_an_adapter_without_its_server_is_said_to_fail_at_loading_or_inference() -> None:

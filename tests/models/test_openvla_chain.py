@@ -64,6 +64,17 @@ def test_the_arm_goes_where_openvla_says(robot: Chain) -> None:
     robot.client.deactivate(10.0)
 
 
+def test_it_keeps_its_contract(checkpoint: Path) -> None:
+    options = [f"--set=checkpoint={checkpoint}", *(f"--set={option}" for option in OPTIONS)]
+    done = command_line(
+        "check", "openvla", *options, "--profile=panda_sim", "--json", timeout_s=START_S
+    )
+    report = json.loads(done.stdout)
+    assert report["ok"], report["findings"]
+    assert report["depends_on"]["pictures"]
+    assert report["depends_on"]["prompt"]
+
+
 def test_the_stages_of_an_action_are_measured(checkpoint: Path, tmp_path: Path) -> None:
     file = tmp_path / "stages.json"
     options = [f"--set=checkpoint={checkpoint}", *(f"--set={option}" for option in OPTIONS)]

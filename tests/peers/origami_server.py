@@ -1,7 +1,7 @@
 """A policy as origami-zenoh-v1 is published: a Zenoh client with three queryables.
 
 ``--port`` is that of the router. It speaks of 65 joints; those of the right arm are a Panda's, and
-the prompt moves its fourth joint. Variants: ``other`` (answers with another request's number).
+the prompt moves its second joint. Variants: ``other`` (answers with another request's number).
 """
 
 from __future__ import annotations
