@@ -14,10 +14,11 @@ from panda_arm import HOME_RAD, moved, panda, tool_down_at
 from vla_zenoh.control.collision import TABLE, CollisionModel
 from vla_zenoh.control.kinematics import smallest_singular_value
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.reach import ReachLimits, Shadow
+from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.slowdown import SLOWEST
 from vla_zenoh.control.so3 import Pose, angle_between, log3
 from vla_zenoh.errors import RecordError
+from vla_zenoh.profile import Limits, ReachLimits
 from vla_zenoh.types import FloatArray
 
 STEP_M, STEP_RAD = 0.01, 0.05
@@ -43,9 +44,13 @@ ROLL, PITCH, YAW = np.eye(3)
 STILL = np.zeros(3)
 
 KINEMATICS = panda()
-LIMITS = ReachLimits()
+LIMITS = Limits().reach
 SHADOW = Shadow(KINEMATICS, HOME_RAD, known_good_rad=[HOME_RAD])
 MIDDLE_RAD = tool_down_at(KINEMATICS, 0.45, 0.0, 0.4)
+
+
+def limits(**reach: float | None) -> Limits:
+    return Limits(reach=ReachLimits.model_validate(reach))
 
 
 class Walk(NamedTuple):
@@ -101,8 +106,8 @@ def assert_sane(shadow: Shadow, pose: Pose) -> None:
     assert (joints <= KINEMATICS.upper_rad - margin).all()
     singular_value = smallest_singular_value(KINEMATICS.jacobian(joints))
     assert singular_value >= LIMITS.singularity_stop - ROUNDING
-    distances = shadow.collisions.distances(joints)
-    for pair, distance_m in zip(shadow.collisions.pairs, distances, strict=True):
+    distances = shadow.barriers.collisions.distances(joints)
+    for pair, distance_m in zip(shadow.barriers.collisions.pairs, distances, strict=True):
         hand_at_table = pair.second == TABLE and pair.is_hand
         stop_m = LIMITS.table_stop_m if hand_at_table else LIMITS.collision_stop_m
         assert distance_m >= stop_m - DISTANCE_NOISE_M, pair
@@ -162,7 +167,7 @@ def test_the_hand_stops_just_above_the_table() -> None:
 
 
 def test_the_height_of_the_table_counts() -> None:
-    shadow = Shadow(KINEMATICS, HOME_RAD, ReachLimits(table_z_m=0.1))
+    shadow = Shadow(KINEMATICS, HOME_RAD, limits(table_z_m=0.1))
     pose = KINEMATICS.forward(HOME_RAD)
     for _ in range(20):
         pose, _ = shadow.bound(pose, moved(pose, STEP_M * DOWN, STILL))
@@ -170,7 +175,7 @@ def test_the_height_of_the_table_counts() -> None:
 
 
 def test_without_a_table_the_arm_may_go_below_it() -> None:
-    shadow = Shadow(KINEMATICS, HOME_RAD, ReachLimits(table_z_m=None))
+    shadow = Shadow(KINEMATICS, HOME_RAD, limits(table_z_m=None))
     pose = KINEMATICS.forward(HOME_RAD)
     for _ in range(25):
         pose, hits = shadow.bound(pose, moved(pose, STEP_M * DOWN, STILL))
@@ -301,11 +306,11 @@ def test_a_joint_found_outside_its_margin_may_come_in_and_not_go_out() -> None:
 
 
 def test_a_hand_found_too_near_the_table_may_rise_and_not_sink() -> None:
-    strict = ReachLimits(table_stop_m=0.08, table_slow_m=0.10)
+    strict = limits(table_stop_m=0.08, table_slow_m=0.10)
     low = tool_down_at(KINEMATICS, 0.45, 0.0, 0.05)
     shadow = Shadow(KINEMATICS, low, strict, known_good_rad=[])
     pose = KINEMATICS.forward(low)
-    assert shadow.margins.table_m < strict.table_stop_m
+    assert shadow.margins.table_m < strict.reach.table_stop_m
     stays, hits = shadow.bound(pose, moved(pose, STEP_M * DOWN, STILL))
     assert stays is pose
     assert {hit.name for hit in hits} == {"table_distance"}
@@ -318,9 +323,9 @@ def test_a_hand_found_too_near_the_table_may_rise_and_not_sink() -> None:
 
 def test_an_arm_found_stretched_may_bend_and_not_stretch() -> None:
     straight = np.array([0.0, 0.6, 0.0, -0.5, 0.0, 1.8, 0.785])
-    strict = ReachLimits(singularity_stop=0.08, singularity_slow=0.1)
+    strict = limits(singularity_stop=0.08, singularity_slow=0.1)
     shadow = Shadow(KINEMATICS, straight, strict)
-    assert shadow.margins.singular_value < strict.singularity_stop
+    assert shadow.margins.singular_value < strict.reach.singularity_stop
     pose = KINEMATICS.forward(straight)
     outwards = pose.position_m - (0, 0, 0.333)
     outwards = outwards / np.linalg.norm(outwards)
@@ -382,7 +387,7 @@ def test_after_a_reset_the_shadow_stands_where_the_robot_is() -> None:
 
 
 def test_an_elbow_that_is_free_turns_further() -> None:
-    free = Shadow(KINEMATICS, MIDDLE_RAD, ReachLimits(free_elbow=True))
+    free = Shadow(KINEMATICS, MIDDLE_RAD, free_elbow=True)
     steps = walk(free, STILL, -STEP_RAD * YAW, 50)
     assert steps.turned_rad > 2.3
     assert np.abs(steps.moved_m).max() < DRIFT_M
@@ -400,7 +405,7 @@ def test_margins_name_what_is_nearest() -> None:
 
 
 def test_neighbours_are_no_collision_and_far_links_are_watched() -> None:
-    pairs = {str(pair) for pair in SHADOW.collisions.pairs}
+    pairs = {str(pair) for pair in SHADOW.barriers.collisions.pairs}
     for first in range(7):
         assert f"panda_link{first} and panda_link{first + 1}" not in pairs
     assert {"panda_link0 and panda_hand", "panda_link5 and panda_hand"} <= pairs
@@ -429,11 +434,6 @@ def test_pairs_that_touch_in_a_good_pose_are_left_out() -> None:
 def test_joints_that_are_none_are_refused(joints: FloatArray) -> None:
     with pytest.raises(RecordError, match="7 finite numbers"):
         at(joints)
-
-
-def test_a_stop_above_its_slow_is_refused() -> None:
-    with pytest.raises(RecordError, match=r"collision_slow \(0.01\) .* collision_stop \(0.02\)"):
-        Shadow(KINEMATICS, HOME_RAD, ReachLimits(collision_slow_m=0.01))
 
 
 @pytest.mark.parametrize(

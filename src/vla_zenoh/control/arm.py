@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vla_zenoh import resources
 from vla_zenoh.control.kinematics import Kinematics
-from vla_zenoh.control.reach import ReachLimits, Shadow
+from vla_zenoh.control.reach import Shadow
 from vla_zenoh.profile import Profile
 
 
@@ -33,18 +33,13 @@ def make_shadow(profile: Profile, kinematics: Kinematics | None = None) -> Shado
         ProfileError: frames or joints that the description does not have.
     """
     kinematics = kinematics or make_kinematics(profile)
-    limits, reach = profile.limits, profile.limits.reach
     home_rad = kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
     return Shadow(
         kinematics,
         home_rad,
-        ReachLimits(
-            **reach.model_dump(),
-            velocity_m_s=limits.translation.velocity_m_s,
-            velocity_rad_s=limits.rotation.velocity_rad_s,
-            # Its joints are ours to command only where the profile says so.
-            free_elbow=profile.robot.command == "joint",
-        ),
+        profile.limits,
+        # Its joints are ours to command only where the profile says so.
+        free_elbow=profile.robot.command == "joint",
         posture_rad=home_rad,
         known_good_rad=[home_rad],
     )

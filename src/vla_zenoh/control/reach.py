@@ -18,23 +18,21 @@ the elbow to swing aside is none. `free_elbow` is for arms whose joints are comm
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vla_zenoh.control.collision import TABLE, CollisionModel
+from vla_zenoh.control.barriers import Barriers, Margins
 from vla_zenoh.control.ik import Approach, IkSettings, InverseKinematics, pose_error
-from vla_zenoh.control.kinematics import Kinematics, smallest_singular_value
+from vla_zenoh.control.kinematics import Kinematics
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.slowdown import Slowdown, slowdown
+from vla_zenoh.control.slowdown import Slowdown
 from vla_zenoh.control.so3 import Pose, exp3, orthonormal
 from vla_zenoh.errors import RecordError
+from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
-DECAY = 0.5
-"""Part of the way to a stop that one step may take once it is nearer than `slow`."""
 HALVINGS = 4
 REFINEMENTS = 4
 SMALLEST_FRACTION = 1 / 128
@@ -44,62 +42,6 @@ GUESS_SHORT = 0.95
 SOLVER_ITERATIONS = 12
 """Steps are short and the start is near: who has not arrived by then will not."""
 SAME_POSE = 1e-9
-NOISE = 2e-6
-"""m, and singular value: what distance and solver may differ by between two equal poses."""
-
-
-@dataclass(frozen=True, slots=True)
-class ReachLimits:
-    """Bounds of the shadow.
-
-    Args:
-        joint_margin_rad: kept from both ends of every joint's range.
-        singularity_slow: smallest singular value of the Jacobian below which the arm gets slower
-            and steps shorter.
-        singularity_stop: it gets no smaller than this.
-        collision_slow_m: distance of the arm to itself below which likewise.
-        collision_stop_m: it comes no nearer; also the arm, without its hand, to the table.
-        table_z_m: height of the table in the base frame; None: there is none.
-        table_slow_m: likewise for hand and fingers, which have work to do there.
-        table_stop_m: they come no nearer.
-        velocity_m_s: speed of the TCP; a step takes at least as long as that.
-        velocity_rad_s: likewise.
-        free_elbow: a redundant arm may leave its posture where a joint meets its range.
-    """
-
-    joint_margin_rad: float = 0.05
-    singularity_slow: float = 0.05
-    singularity_stop: float = 0.015
-    collision_slow_m: float = 0.05
-    collision_stop_m: float = 0.02
-    table_z_m: float | None = 0.0
-    table_slow_m: float = 0.002
-    table_stop_m: float = 0.001
-    velocity_m_s: float = 0.5
-    velocity_rad_s: float = 1.5
-    free_elbow: bool = False
-
-
-class Margins(NamedTuple):
-    """How much room the shadow has.
-
-    Args:
-        joint_rad: smallest distance of a joint to the end of its range.
-        joint: its name.
-        singular_value: smallest of the Jacobian.
-        self_m: smallest distance of the arm to itself, inf where nothing can touch.
-        self_pair: the two links.
-        table_m: smallest distance to the table, inf without one.
-        table_link: the link.
-    """
-
-    joint_rad: float
-    joint: str
-    singular_value: float
-    self_m: float
-    self_pair: str
-    table_m: float
-    table_link: str
 
 
 class _Stand(NamedTuple):
@@ -117,13 +59,15 @@ class Shadow:
     Args:
         kinematics: of the arm.
         joints_rad: (n,) where the robot stands.
-        limits: see `ReachLimits`.
+        limits: how near it may come to what, and how fast its TCP may be: a step takes at least
+            as long as that.
+        free_elbow: a redundant arm may leave its posture where a joint meets its range.
         posture_rad: (n,) what the robot's controller pulls a redundant arm to; None: where the
             robot stood at the last `reset`.
         known_good_rad: configurations known to be free, besides `joints_rad`.
 
     Raises:
-        RecordError: joints of the wrong number, or a stop above its slow.
+        RecordError: joints of the wrong number.
         ResourceError: the URDF's collision shapes cannot be loaded.
     """
 
@@ -131,46 +75,21 @@ class Shadow:
         self,
         kinematics: Kinematics,
         joints_rad: ArrayLike,
-        limits: ReachLimits | None = None,
+        limits: Limits | None = None,
         *,
+        free_elbow: bool = False,
         posture_rad: ArrayLike | None = None,
         known_good_rad: Sequence[FloatArray] = (),
     ) -> None:
         self.kinematics = kinematics
-        self.limits = limits = limits or ReachLimits()
-        for name in ("singularity", "collision", "table"):
-            suffix = "" if name == "singularity" else "_m"
-            slow, stop = (
-                getattr(limits, f"{name}_slow{suffix}"),
-                getattr(limits, f"{name}_stop{suffix}"),
-            )
-            if slow < stop:
-                raise RecordError(
-                    f"{name}_slow ({slow:g}) must not be below {name}_stop ({stop:g})"
-                )
+        self._limits = limits = limits or Limits()
+        self._free_elbow = free_elbow
         settings = IkSettings(
-            joint_margin_rad=limits.joint_margin_rad, max_iterations=SOLVER_ITERATIONS
+            joint_margin_rad=limits.reach.joint_margin_rad, max_iterations=SOLVER_ITERATIONS
         )
         self._solver = InverseKinematics(kinematics, posture_rad, settings)
         self._follow_posture = posture_rad is None
-        self.collisions = CollisionModel(
-            kinematics,
-            near_m=limits.collision_slow_m,
-            touching_m=limits.collision_stop_m,
-            table_z_m=limits.table_z_m,
-            known_good_rad=known_good_rad,
-        )
-        pairs = self.collisions.pairs
-        hand = np.array([pair.second == TABLE and pair.is_hand for pair in pairs], dtype=bool)
-        self._names = ["singularity"] + [
-            "table_distance" if pair.second == TABLE else "self_collision" for pair in pairs
-        ]
-        self._stop = np.array([limits.singularity_stop, *np.where(
-            hand, limits.table_stop_m, limits.collision_stop_m
-        )])  # fmt: skip
-        self._slow = np.array([limits.singularity_slow, *np.where(
-            hand, limits.table_slow_m, limits.collision_slow_m
-        )])  # fmt: skip
+        self.barriers = Barriers(kinematics, limits.reach, known_good_rad)
         self.reset(joints_rad)
 
     def reset(self, joints_rad: ArrayLike) -> None:
@@ -187,7 +106,7 @@ class Shadow:
         if self._follow_posture:
             self._solver.posture_rad = joints.copy()
         pose, jacobian = self.kinematics.pose_and_jacobian(joints)
-        self._here = _Stand(pose, joints, 0.0, self._barriers(joints, jacobian))
+        self._here = _Stand(pose, joints, 0.0, self.barriers.at(joints, jacobian))
         self.slowdown: Slowdown | None = None
         """Why the step bounded last is to be taken slower than at full speed."""
 
@@ -199,21 +118,7 @@ class Shadow:
     @property
     def margins(self) -> Margins:
         """Room left where the shadow stands."""
-        joints, kinematics = self._here.joints_rad, self.kinematics
-        room = np.minimum(joints - kinematics.lower_rad, kinematics.upper_rad - joints)
-        tightest = int(np.argmin(room))
-        values = self._here.barriers + self._stop
-        nearest = {"self_collision": (np.inf, ""), "table_distance": (np.inf, "")}
-        for index, value in enumerate(values[1:], start=1):
-            name = self._names[index]
-            nearest[name] = min(nearest[name], (float(value), self._where(index)))
-        return Margins(
-            float(room[tightest]),
-            kinematics.arm_joints[tightest],
-            float(values[0]),
-            *nearest["self_collision"],
-            *nearest["table_distance"],
-        )
+        return self.barriers.margins(self._here.joints_rad, self._here.barriers)
 
     def bound(
         self,
@@ -263,9 +168,7 @@ class Shadow:
 
     def _settle(self, start: _Stand, end: _Stand) -> None:
         self._here = end
-        self.slowdown = slowdown(
-            start.barriers, end.barriers, self._stop, self._slow, self._names, self._where
-        )
+        self.slowdown = self.barriers.slowdown(start.barriers, end.barriers)
 
     def _guess(self, start: _Stand, end: _Stand, hits: Sequence[LimitHit]) -> float:
         """Where to begin to look for the feasible part, from how the whole step failed."""
@@ -287,15 +190,8 @@ class Shadow:
 
     def _stand(self, pose: Pose, found: Approach) -> _Stand:
         error = 0.0 if found.solved else found.error_m + found.error_rad
-        return _Stand(
-            pose, found.joints_rad, error, self._barriers(found.joints_rad, found.jacobian)
-        )
-
-    def _barriers(self, joints_rad: FloatArray, jacobian: FloatArray) -> FloatArray:
-        values = np.empty(len(self._stop))
-        values[0] = smallest_singular_value(jacobian)
-        values[1:] = self.collisions.distances(joints_rad)
-        return values - self._stop
+        barriers = self.barriers.at(found.joints_rad, found.jacobian)
+        return _Stand(pose, found.joints_rad, error, barriers)
 
     def _try(self, start: _Stand, pose: Pose, dt_s: float) -> tuple[_Stand, list[LimitHit]]:
         """Where a step would lead, and what forbids it."""
@@ -310,10 +206,10 @@ class Shadow:
         floor = self._floor(start)
         hits = [
             LimitHit(
-                self._names[index],
-                float(end.barriers[index] + self._stop[index]),
-                float(floor[index] + self._stop[index]),
-                where=self._where(int(index)),
+                self.barriers.names[index],
+                float(end.barriers[index] + self.barriers.stop[index]),
+                float(floor[index] + self.barriers.stop[index]),
+                where=self.barriers.where(int(index)),
             )
             for index in np.flatnonzero(end.barriers < floor)
         ]
@@ -324,17 +220,13 @@ class Shadow:
 
     def _floor(self, start: _Stand) -> FloatArray:
         """What the barriers may come down to in one step from there."""
-        floor = np.where(
-            start.barriers > 0,
-            np.minimum(self._slow - self._stop, (1 - DECAY) * start.barriers),
-            start.barriers - NOISE,
-        )
+        floor = self.barriers.floor(start.barriers)
         if start.error > 0:  # an arm that points to what it cannot reach is singular
             floor[0] = -np.inf
         return floor
 
     def _approach(self, pose: Pose, start_rad: FloatArray) -> Approach:
-        return self._solver.approach(pose, start_rad, bounded=self.limits.free_elbow)
+        return self._solver.approach(pose, start_rad, bounded=self._free_elbow)
 
     def _out_of_range(self, start: _Stand, joints_rad: FloatArray) -> LimitHit | None:
         lower, upper = self._solver.bounds(start.joints_rad)
@@ -354,8 +246,8 @@ class Shadow:
         error = pose_error(end.pose, start.pose)
         time_s = max(
             dt_s,
-            float(np.linalg.norm(error[:3])) / self.limits.velocity_m_s,
-            float(np.linalg.norm(error[3:])) / self.limits.velocity_rad_s,
+            float(np.linalg.norm(error[:3])) / self._limits.translation.velocity_m_s,
+            float(np.linalg.norm(error[3:])) / self._limits.rotation.velocity_rad_s,
         )
         speed = np.abs(end.joints_rad - start.joints_rad) / time_s
         joint = int(np.argmax(speed / self.kinematics.velocity_rad_s))
@@ -364,12 +256,6 @@ class Shadow:
             return []
         name = self.kinematics.arm_joints[joint]
         return [LimitHit("joint_velocity", float(speed[joint]), limit, where=name)]
-
-    def _where(self, index: int) -> str:
-        if index == 0:
-            return ""
-        pair = self.collisions.pairs[index - 1]
-        return pair.first if pair.second == TABLE else str(pair)
 
 
 def _same(a: Pose, b: Pose) -> bool:

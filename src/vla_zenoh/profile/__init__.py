@@ -2,19 +2,10 @@
 
 from vla_zenoh.profile.advice import advice
 from vla_zenoh.profile.joint_limits import JointLimits
+from vla_zenoh.profile.limits import REACH_M, REFUSE_FACTOR, Limits, ReachLimits
 from vla_zenoh.profile.load import load_profile, override, profile_file, profile_names, to_yaml
-from vla_zenoh.profile.schema import (
-    REACH_M,
-    REFUSE_FACTOR,
-    CameraProfile,
-    Composition,
-    GripperProfile,
-    HostProfile,
-    Limits,
-    Profile,
-    RobotProfile,
-    Timing,
-)
+from vla_zenoh.profile.robot import GripperProfile, RobotProfile
+from vla_zenoh.profile.schema import CameraProfile, Composition, HostProfile, Profile, Timing
 from vla_zenoh.profile.session import SessionProfile
 
 __all__ = [
@@ -27,6 +18,7 @@ __all__ = [
     "JointLimits",
     "Limits",
     "Profile",
+    "ReachLimits",
     "RobotProfile",
     "SessionProfile",
     "Timing",

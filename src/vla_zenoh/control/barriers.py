@@ -1,0 +1,127 @@
+"""What must not become negative: singular value and distances of an arm, each minus its stop.
+
+The arm to itself and to the table, the hand and fingers to the table with bounds of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from vla_zenoh.control.collision import TABLE, CollisionModel
+from vla_zenoh.control.kinematics import Kinematics, smallest_singular_value
+from vla_zenoh.control.slowdown import Slowdown, slowdown
+from vla_zenoh.profile import ReachLimits
+from vla_zenoh.types import FloatArray
+
+DECAY = 0.5
+"""Part of the way to a stop that one step may take once it is nearer than `slow`."""
+NOISE = 2e-6
+"""m, and singular value: what distance and solver may differ by between two equal poses."""
+
+
+class Margins(NamedTuple):
+    """How much room an arm has.
+
+    Args:
+        joint_rad: smallest distance of a joint to the end of its range.
+        joint: its name.
+        singular_value: smallest of the Jacobian.
+        self_m: smallest distance of the arm to itself, inf where nothing can touch.
+        self_pair: the two links.
+        table_m: smallest distance to the table, inf without one.
+        table_link: the link.
+    """
+
+    joint_rad: float
+    joint: str
+    singular_value: float
+    self_m: float
+    self_pair: str
+    table_m: float
+    table_link: str
+
+
+class Barriers:
+    """See the module. Number 0 is the singular value, the others are pairs that may touch.
+
+    Args:
+        kinematics: of the arm.
+        limits: stop and slow of each kind.
+        known_good_rad: configurations known to be free.
+
+    Attributes:
+        names: of each, as in `vla_zenoh.control.limits.LimitHit`.
+        stop: (n,) what each is measured from.
+        slow: (n,) where its zone begins.
+
+    Raises:
+        ResourceError: the URDF's collision shapes cannot be loaded.
+    """
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        limits: ReachLimits,
+        known_good_rad: Sequence[FloatArray] = (),
+    ) -> None:
+        self._kinematics = kinematics
+        self.collisions = CollisionModel(
+            kinematics,
+            near_m=limits.collision_slow_m,
+            touching_m=limits.collision_stop_m,
+            table_z_m=limits.table_z_m,
+            known_good_rad=known_good_rad,
+        )
+        pairs = self.collisions.pairs
+        hand = np.array([pair.second == TABLE and pair.is_hand for pair in pairs], dtype=bool)
+        self.names = ["singularity"] + [
+            "table_distance" if pair.second == TABLE else "self_collision" for pair in pairs
+        ]
+        stops_m = np.where(hand, limits.table_stop_m, limits.collision_stop_m)
+        slows_m = np.where(hand, limits.table_slow_m, limits.collision_slow_m)
+        self.stop = np.array([limits.singularity_stop, *stops_m])
+        self.slow = np.array([limits.singularity_slow, *slows_m])
+
+    def at(self, joints_rad: FloatArray, jacobian: FloatArray) -> FloatArray:
+        """(n,) of an arm in these joints, whose Jacobian is (6, n) m and rad."""
+        values = np.empty(len(self.stop))
+        values[0] = smallest_singular_value(jacobian)
+        values[1:] = self.collisions.distances(joints_rad)
+        return values - self.stop
+
+    def floor(self, before: FloatArray) -> FloatArray:
+        """(n,) what they may come down to in one step from `before`."""
+        zone = self.slow - self.stop
+        return np.where(before > 0, np.minimum(zone, (1 - DECAY) * before), before - NOISE)
+
+    def where(self, index: int) -> str:
+        """What of the arm number `index` is about; empty: the whole of it."""
+        if index == 0:
+            return ""
+        pair = self.collisions.pairs[index - 1]
+        return pair.first if pair.second == TABLE else str(pair)
+
+    def slowdown(self, before: FloatArray, after: FloatArray) -> Slowdown | None:
+        """Why a step from `before` to `after` is to be taken slower than at full speed."""
+        return slowdown(before, after, self.stop, self.slow, self.names, self.where)
+
+    def margins(self, joints_rad: FloatArray, barriers: FloatArray) -> Margins:
+        """Room left in these joints, whose barriers are known."""
+        kinematics = self._kinematics
+        room = np.minimum(joints_rad - kinematics.lower_rad, kinematics.upper_rad - joints_rad)
+        tightest = int(np.argmin(room))
+        values = barriers + self.stop
+        nearest = {"self_collision": (np.inf, ""), "table_distance": (np.inf, "")}
+        for index, value in enumerate(values[1:], start=1):
+            name = self.names[index]
+            nearest[name] = min(nearest[name], (float(value), self.where(index)))
+        return Margins(
+            float(room[tightest]),
+            kinematics.arm_joints[tightest],
+            float(values[0]),
+            *nearest["self_collision"],
+            *nearest["table_distance"],
+        )

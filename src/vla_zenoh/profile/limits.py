@@ -1,0 +1,144 @@
+"""The part of a profile that bounds every motion. The defaults are the safe choice."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from vla_zenoh.profile.joint_limits import JointLimits
+from vla_zenoh.profile.section import Range, Section, refuse
+
+REACH_M = 3.0
+"""No arm that fits a table reaches further: a workspace beyond it is in other units."""
+REFUSE_FACTOR = 4.0
+"""A step this many times over its limit is a mistake (a wrong unit), not a motion: refused."""
+
+
+def _within_reach(pair: tuple[float, float]) -> tuple[float, float]:
+    if max(map(abs, pair)) > REACH_M:
+        raise ValueError(f"[{pair[0]:g}, {pair[1]:g}] is further than {REACH_M:g} m; give metres")
+    return pair
+
+
+Reach = Annotated[Range, AfterValidator(_within_reach)]
+
+
+class Workspace(Section):
+    """Box in the base frame that the TCP must not leave, in m."""
+
+    x_m: Reach = (0.2, 0.75)
+    y_m: Reach = (-0.45, 0.45)
+    z_m: Reach = (0.012, 0.9)
+
+
+class TranslationLimits(Section):
+    """Per axis of the base frame."""
+
+    velocity_m_s: float = Field(default=0.5, gt=0, le=1.7)
+    acceleration_m_s2: float = Field(default=2.0, gt=0, le=13)
+    jerk_m_s3: float = Field(default=20.0, gt=0, le=6500)
+
+
+class RotationLimits(Section):
+    """Per axis of the rotation vector."""
+
+    velocity_rad_s: float = Field(default=1.5, gt=0, le=2.5)
+    acceleration_rad_s2: float = Field(default=6.0, gt=0, le=25)
+    jerk_rad_s3: float = Field(default=60.0, gt=0, le=12500)
+
+
+class ReachLimits(Section):
+    """What the arm's kinematics allow a goal to be; see `vla_zenoh.control.reach`.
+
+    Args:
+        joint_margin_rad: kept from both ends of every joint's range.
+        singularity_slow: smallest singular value of the Jacobian below which the arm gets slower
+            and steps shorter.
+        singularity_stop: it gets no smaller than this.
+        collision_slow_m: distance of the arm to itself below which likewise.
+        collision_stop_m: it comes no nearer; also the arm, without its hand, to the table.
+        table_z_m: height of the table in the base frame; null: there is none.
+        table_slow_m: likewise for hand and fingers, which have work to do there.
+        table_stop_m: they come no nearer.
+    """
+
+    joint_margin_rad: float = Field(default=0.05, ge=0, le=0.5)
+    singularity_slow: float = Field(default=0.05, ge=0, le=0.5)
+    singularity_stop: float = Field(default=0.015, ge=0, le=0.5)
+    collision_slow_m: float = Field(default=0.05, ge=0, le=0.3)
+    collision_stop_m: float = Field(default=0.02, ge=0, le=0.3)
+    table_z_m: float | None = Field(default=0.0, ge=-2, le=2)
+    table_slow_m: float = Field(default=0.002, ge=0, le=0.3)
+    table_stop_m: float = Field(default=0.001, ge=0, le=0.3)
+
+    @model_validator(mode="after")
+    def _a_stop_lies_behind_its_slow(self) -> ReachLimits:
+        refuse(
+            [
+                ((stop,), f"is {at:g}, which must not be above {slow} ({before:g})")
+                for slow, before, stop, at in (
+                    (
+                        "singularity_slow",
+                        self.singularity_slow,
+                        "singularity_stop",
+                        self.singularity_stop,
+                    ),
+                    (
+                        "collision_slow_m",
+                        self.collision_slow_m,
+                        "collision_stop_m",
+                        self.collision_stop_m,
+                    ),
+                    ("table_slow_m", self.table_slow_m, "table_stop_m", self.table_stop_m),
+                )
+                if at > before
+            ]
+        )
+        return self
+
+
+class Limits(Section):
+    """Bounds of every motion; upper bounds are Franka's published ones for the Panda.
+
+    Args:
+        workspace: box of the TCP.
+        translation: of the smoothed motion.
+        rotation: likewise.
+        joint: of a motion commanded by joint positions.
+        reach: what joints, singularities, the arm itself and the table allow.
+        step_m: largest translation of one model step.
+        step_rad: largest rotation of one model step.
+        out_of_bounds: ``clamp`` shortens to the bound and tells, ``refuse`` drops the whole chunk.
+        lead_m: leash: the goal may run ahead of the commanded pose by this much.
+        lead_rad: likewise.
+        tracking_m: leash: commanded minus measured pose; more brakes the arm (it is blocked).
+        tracking_rad: likewise.
+    """
+
+    workspace: Workspace = Workspace()
+    translation: TranslationLimits = TranslationLimits()
+    rotation: RotationLimits = RotationLimits()
+    joint: JointLimits = JointLimits()
+    reach: ReachLimits = ReachLimits()
+    step_m: float = Field(default=0.05, gt=0, le=0.2)
+    step_rad: float = Field(default=0.2, gt=0, le=0.8)
+    out_of_bounds: Literal["clamp", "refuse"] = "clamp"
+    lead_m: float = Field(default=0.15, gt=0, le=0.5)
+    lead_rad: float = Field(default=0.6, gt=0, le=1.5)
+    tracking_m: float = Field(default=0.05, gt=0, le=0.2)
+    tracking_rad: float = Field(default=0.3, gt=0, le=1.0)
+
+    @model_validator(mode="after")
+    def _a_step_fits_the_leash(self) -> Limits:
+        refuse(
+            [
+                ((step,), f"is {value:g}, longer than the leash {lead} ({limit:g})")
+                for step, value, lead, limit in (
+                    ("step_m", self.step_m, "lead_m", self.lead_m),
+                    ("step_rad", self.step_rad, "lead_rad", self.lead_rad),
+                )
+                if value > limit
+            ]
+        )
+        return self
