@@ -71,6 +71,10 @@ def main() -> int:
         screen.print(f"skipped: {why}")
         return 0
     chosen = [fault for fault in every if not given.only or fault.name in given.only]
+    for fault in chosen:
+        if fault.needs:
+            screen.print(f"skipped: {fault.name}: {fault.needs}")
+    chosen = [fault for fault in chosen if not fault.needs]
     done: list[Row] = []
     try:
         for row in rows(chosen, screen):

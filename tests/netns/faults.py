@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
+from netns.site import faketime
 from netns.stage import Fault, Stage
 from netns.wire import CUT, GOOD, Shape
 
@@ -100,15 +101,16 @@ def catalogue() -> Iterator[Fault]:
         seconds=6.0,
         goes_on=True,
     )
-    for host, alone in (("gpu", False), ("robot", False)):
+    for host in ("gpu", "robot"):
         for sign in (1, -1):
             yield Fault(
                 f"clock-{host}{sign * CLOCK_STEP_S:+g}",
                 f"the clock of {host} is set by {sign * CLOCK_STEP_S:+g} s",
                 partial(_step_clock, host, sign * CLOCK_STEP_S),
                 partial(_step_clock, host, 0.0),
+                layout="clocks",
+                needs="" if faketime() else "libfaketime is not installed",
                 seconds=4.0,
-                alone=alone,
             )
     yield Fault(
         "router-killed",

@@ -29,7 +29,7 @@ from vla_zenoh.types import PoseState
 
 MOVING_M_S, STILL_M_S = 0.05, 0.005
 POLL_S = 0.005
-TRY_S = 0.1
+TRY_S, SETTLE_S = 0.1, 0.6
 FRESH_S = 0.2
 LOW_M, HIGH_M = 0.25, 0.62
 EARLY = "refused.activate_refused"
@@ -71,21 +71,30 @@ class Probe:
         start_m = self._reference()
         self._client.set_prompt(f"HARD: go {'up' if up else 'down'}{f' x{count}' if count else ''}")
         moving = self._until(lambda: self._speed_m_s() > MOVING_M_S, patience_s)
-        return {"moving": moving, "start_m": start_m, "sign": 1 if up else -1}
+        return {
+            "moving": moving,
+            "start_m": start_m,
+            "sign": 1 if up else -1,
+            "why": self._saying(),
+        }
 
     def finish(self, patience_s: float) -> dict[str, Any]:
         """Until the policy's last step is in force and the arm stands, or it obeys no more."""
 
+        slow_since_s = [time.monotonic()]
+
         def ended() -> bool:
-            command = self._client.status("command")
-            still = self._speed_m_s() < STILL_M_S
-            if command is None or not still:
+            command, now_s = self._client.status("command"), time.monotonic()
+            if self._speed_m_s() > STILL_M_S:
+                slow_since_s[0] = now_s
+            if command is None or now_s - slow_since_s[0] < SETTLE_S:
                 return False
             return command.state == "inactive" or bool(command.detail.get("policy_done"))
 
-        done = self._until(ended, patience_s)
-        time.sleep(0.6)
-        return {"done": done and self._state() == "active", "end_m": self._reference()}
+        ended_at_all = self._until(ended, patience_s)
+        command = self._client.status("command")
+        done = ended_at_all and command is not None and bool(command.detail.get("policy_done"))
+        return {"done": done, "end_m": self._reference(), "why": self._saying()}
 
     def recover(self, patience_s: float) -> dict[str, Any]:
         """Make it move again; says whether it had to be activated, and when it was."""
@@ -139,6 +148,10 @@ class Probe:
     def _state(self) -> str:
         status = self._client.status("command")
         return status.state if status else ""
+
+    def _saying(self) -> str:
+        status = self._client.status("command")
+        return f"{status.state}: {status.detail.get('why')}" if status else "no command node"
 
     def _prompt(self) -> str:
         task = self._client.task

@@ -19,6 +19,11 @@ DRIVE_S = 120.0
 LINES_SHOWN = 3000
 
 
+def faketime() -> Path | None:
+    """The library libfaketime, where it is installed."""
+    return next(Path("/usr/lib").glob("*/faketime/libfaketime.so.1"), None)
+
+
 @dataclass
 class Site:
     """The lab.
@@ -73,20 +78,17 @@ class Site:
         words = (sys.executable, "-m", "vla_zenoh", "up", str(self.profile(name)), "--host", name)
         self.hosts[host].start("sh", "-c", f'hostname {name} && exec "$@"', "sh", *words)
 
-    def fake_clock(self, host: str) -> str:
-        """Give a host a wall clock of its own, before anything is started; why not, if not."""
-        library = next(Path("/usr/lib").glob("*/faketime/libfaketime.so.1"), None)
-        if library is None:
-            return "libfaketime is not installed"
+    def fake_clock(self, host: str) -> None:
+        """Give a host a wall clock of its own, before anything is started there."""
+        library = faketime()
+        assert library is not None
         self._clock(host).write_text("+0")
         self.hosts[host].environment.update(
             LD_PRELOAD=str(library),
             FAKETIME_TIMESTAMP_FILE=str(self._clock(host)),
             FAKETIME_NO_CACHE="1",
             FAKETIME_DONT_FAKE_MONOTONIC="1",
-            FAKETIME_DONT_RESET="1",
         )
-        return ""
 
     def step_clock(self, host: str, offset_s: float) -> None:
         """Set a host's clock so far from what it would be."""

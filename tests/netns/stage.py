@@ -46,12 +46,14 @@ class Layout:
         hosts: names.
         routers: those that run one, the first one first.
         shaped: whose link can be made bad.
+        clocks: whose wall clock can be set.
     """
 
     plain: str
     hosts: tuple[str, ...]
     routers: tuple[str, ...]
-    shaped: tuple[str, ...]
+    shaped: tuple[str, ...] = ()
+    clocks: tuple[str, ...] = ()
 
 
 def _profile(extends: str, more: str = "") -> str:
@@ -72,7 +74,10 @@ LAYOUTS = {
         ),
         ("robot", "eyes", "gpu"),
         ("robot",),
-        (),
+    ),
+    # The same with wall clocks of their own: reading one then takes longer.
+    "clocks": Layout(
+        _profile("panda_sim_lab"), ("robot", "gpu"), ("robot",), clocks=("robot", "gpu")
     ),
     # Two routers that are nobody else's computer.
     "routers": Layout(
@@ -94,7 +99,6 @@ LAYOUTS = {
         ),
         ("hub", "spare", "robot", "gpu"),
         ("hub", "spare"),
-        (),
     ),
 }
 
@@ -109,6 +113,7 @@ class Fault:
         inject: makes it happen.
         clear: ends it.
         layout: of `LAYOUTS`.
+        needs: why it cannot be done here; empty: it can.
         seconds: how long it lasts; None: until the motion has come to its end.
         goes_on: the arm is to reach its goal all the same.
         from_fault: recovery counts from the fault itself, which ends without us.
@@ -120,6 +125,7 @@ class Fault:
     inject: Callable[[Stage], None]
     clear: Callable[[Stage], None]
     layout: str = "lab"
+    needs: str = ""
     seconds: float | None = None
     goes_on: bool = False
     from_fault: bool = False
@@ -210,7 +216,7 @@ class Stage:
         time.sleep(0.5)
         before = self.ask("count")
         moving = self.ask("move", count=STEPS if fault.seconds is None else 0)
-        assert moving["moving"], self.site.logs()
+        assert moving["moving"], f"{moving}\n{self.site.logs()}"
         time.sleep(UNDER_WAY_S)
         self.ask("count")  # what happened until now is no news
         began_s = time.monotonic()
@@ -340,6 +346,8 @@ def stage(name: str) -> Iterator[Stage]:
         robot = site.hosts["robot"]
         robot.environment["FLIGHT_FOLDER"] = str(site.folder)
         robot.python_folders.append(str(HERE / "flight"))
+        for host in layout.clocks:
+            site.fake_clock(host)
         parts = [host for host in layout.hosts if host in profile.hosts]
         site.equip(*parts)
         site.up(*layout.routers, *(host for host in parts if host not in layout.routers))

@@ -79,7 +79,7 @@ def flown(speed_m_s: NDArray[Any], period_s: float = 0.005) -> Flight:
     count = len(speed_m_s)
     twist = np.zeros((count, 6))
     twist[:, 2] = speed_m_s
-    time_s = np.arange(count) * period_s
+    time_s = np.arange(count, dtype=np.float64) * np.float64(period_s)
     return Flight(time_s, np.zeros((count, 3)), twist, np.zeros((count, 3)))
 
 
