@@ -121,7 +121,7 @@ def _real_time(
     rows: Rows,
     out: Path | None,
 ) -> None:
-    from vla_zenoh.cli.demo_run import own_address
+    from vla_zenoh.cli.own_address import own_address
     from vla_zenoh.nodes.demo import Interrupted
     from vla_zenoh.nodes.process import die_with_parent
 

@@ -217,7 +217,7 @@ def _real_time(
     out: Path | None,
     advance: Callable[[Score], None],
 ) -> None:
-    from vla_zenoh.cli.demo_run import own_address
+    from vla_zenoh.cli.own_address import own_address
     from vla_zenoh.nodes.bench_task import TaskRun
     from vla_zenoh.nodes.demo import Interrupted
     from vla_zenoh.nodes.launch import Host

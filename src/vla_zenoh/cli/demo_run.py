@@ -1,47 +1,29 @@
-"""What ``vla-zenoh demo`` does: nodes, bars, run folder, summary."""
+"""What ``vla-zenoh demo --tour`` does: fixed motions, held against what was asked."""
 
 from __future__ import annotations
 
-import json
-import socket
-import threading
-import time
-from collections import Counter
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from vla_zenoh.cli.options import effective_profile
-from vla_zenoh.cli.output import console, errors
+from vla_zenoh.cli.demo_stage import Stage, prepare, refusals
+from vla_zenoh.cli.output import console
 from vla_zenoh.demo.analysis import Outcome, latencies
 from vla_zenoh.demo.plot import plot_run
 from vla_zenoh.demo.segments import Segment
 from vla_zenoh.demo.tables import write_chunks, write_commands, write_poses
-from vla_zenoh.demo.video import write_video
-from vla_zenoh.errors import SessionError
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.nodes.demo import DemoResult, DemoRun
-from vla_zenoh.nodes.launch import Host
 from vla_zenoh.nodes.listener import Listener
-from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
-from vla_zenoh.nodes.recorder import Recorder
-from vla_zenoh.nodes.session import open_session
-from vla_zenoh.profile import Profile, SessionProfile, override, to_yaml
-from vla_zenoh.recording.run import Run, load_run, pictures
-from vla_zenoh.types import NodeStatus
+from vla_zenoh.profile import Profile
+from vla_zenoh.recording.run import Run
 
-MAX_LOG_LINES = 20
-RECORDING = "run.mcap"
 HOLD = "hold"
 KEPT = 400
 """States that the demo itself looks back on."""
-PICTURE_NS = 60_000_000
-"""Pictures of the video lie at least this far apart: twice as many as it shows."""
 
 
 def run_demo(
@@ -53,128 +35,45 @@ def run_demo(
     out: Path | None,
 ) -> None:
     """See ``vla-zenoh demo``."""
-    stop = stop_on_signals()
-    die_with_parent()
-    loaded = own_address(effective_profile(profile))
-    folder = out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
-    folder.mkdir(parents=True, exist_ok=True)
-    screen = errors()  # progress is no result: stdout stays for the summary
-    screen.print(
-        f"profile {loaded.name}, router at {loaded.session.connect[0]}, run folder {folder}"
-    )
-    screen.print(
-        f"watch it from another terminal: vla-zenoh status --connect {loaded.session.connect[0]}",
-        style="dim",
-    )
-    result = _run(loaded, segments, rate, seconds, folder, stop, screen)
-    run = load_run(folder / RECORDING)
-    summary = _summary(loaded, rate, result, run)
-    _write_folder(folder, loaded, summary, run, screen)
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
-    _show(summary, result, folder)
+    stage = prepare(profile, out)
+    result = _run(stage, segments, rate, seconds)
+    run = stage.recorded()
+    summary = _summary(stage.profile, rate, result, run)
+    stage.write(summary, json_file)
+    _write_tables(stage, run)
+    _show(summary, result, stage.folder)
     if not summary["ok"]:
         raise typer.Exit(130 if result.interrupted else 1)
 
 
-def own_address(profile: Profile) -> Profile:
-    """The profile where nobody answers: a demo must never reach a lab's real robot."""
-    if profile.robot.driver != "sim":
-        raise typer.BadParameter(f"profile {profile.name} is of a real robot; demos are simulated")
-    # It stays on this computer, and needs no certificates.
-    plain = {"security": None, "insecure": False, "separate_links": False}
-    if profile.session.security is not None:
-        local = list(SessionProfile().connect)
-        profile = override(profile, {"session": {**plain, "connect": local, "listen": local}})
-    try:
-        open_session(profile.session).close()
-        port = _free_port()
-        endpoints = (f"tcp/127.0.0.1:{port}",)
-        errors().print("a router answers at the profile's address already; using another port")
-    except SessionError:
-        endpoints = profile.session.connect
-    here = list(endpoints)
-    return override(profile, {"session": {**plain, "connect": here, "listen": here}})
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def _run(
-    profile: Profile,
-    segments: list[Segment],
-    rate_hz: float,
-    seconds: float | None,
-    folder: Path,
-    stop: threading.Event,
-    screen: Console,
+    stage: Stage, segments: list[Segment], rate_hz: float, seconds: float | None
 ) -> DemoResult:
-    lines: list[str] = []
-    with (
-        (folder / "nodes.log").open("w", encoding="utf-8") as log_file,
-        Progress(
-            TextColumn("{task.description:<24}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=screen,
-        ) as bars,
-    ):
-        coming_up = bars.add_task("starting the nodes", total=None)
-
-        def log(node: str, line: str) -> None:
-            log_file.write(f"{node:>16} | {line}\n")
-            lines.append(f"{node}: {line}")
+    profile, stop = stage.profile, stage.stop
+    with stage.nodes("{task.description:<24}") as (running, bars):
+        assert running.session is not None and running.client is not None
+        tasks: list[Any] = []
 
         def progress(index: int, done: int) -> None:
-            bars.update(coming_up, visible=False)
             while len(tasks) <= index:
                 segment = segments[len(tasks)]
                 tasks.append(bars.add_task(segment.prompt, total=segment.steps))
             bars.update(tasks[index], completed=done)
 
-        tasks: list[Any] = []
-        host = Host(profile, None, log=log, tell=log, own_router=True)
+        def watch() -> None:
+            if not running.supervisor.watch():
+                stop.set()
+
+        listener = Listener(running.session, profile.keys, profile.task.worker, keep=KEPT)
         try:
-            with host as running:
-                assert running.session is not None and running.client is not None
-                recorder = Recorder(
-                    profile, running.session, folder / RECORDING, expressions=recorded(profile)
-                ).start()
-                listener = Listener(running.session, profile.keys, profile.task.worker, keep=KEPT)
-
-                def watch() -> None:
-                    if not running.supervisor.watch():
-                        stop.set()
-
-                run = DemoRun(running.client, listener, stop, watch, progress)
-                try:
-                    result = run.run(segments, rate_hz, seconds)
-                finally:
-                    listener.close()
-                    recorder.close()
-        except Exception:
-            screen.print("\n".join(lines[-MAX_LOG_LINES:]), style="dim", markup=False)
-            raise
+            run = DemoRun(running.client, listener, stop, watch, progress)
+            result = run.run(segments, rate_hz, seconds)
+        finally:
+            listener.close()
         for index, task in enumerate(tasks):
             if index < len(result.outcomes):
                 bars.update(task, completed=segments[index].steps)
     return result
-
-
-def _camera(profile: Profile) -> str | None:
-    return "front" if "front" in profile.cameras else next(iter(profile.cameras), None)
-
-
-def recorded(profile: Profile) -> tuple[str, ...]:
-    """Everything, and the pictures of one camera: each more takes its share of the processor."""
-    camera = _camera(profile)
-    keys = profile.keys
-    return (*keys.without_pictures, *([keys.camera_jpeg(camera)] if camera else []))
 
 
 def _summary(profile: Profile, rate_hz: float, result: DemoResult, run: Run) -> dict[str, Any]:
@@ -202,16 +101,6 @@ def _summary(profile: Profile, rate_hz: float, result: DemoResult, run: Run) -> 
     }
 
 
-def refusals(statuses: Mapping[str, NodeStatus]) -> dict[str, int]:
-    """What all nodes refused, by reason."""
-    out: Counter[str] = Counter()
-    for status in statuses.values():
-        for name, count in status.counters.items():
-            if name.startswith("refused."):
-                out[name.removeprefix("refused.")] += count
-    return dict(sorted(out.items()))
-
-
 def _rate(entries: list[Any]) -> float:
     if len(entries) < 2:
         return 0.0
@@ -224,11 +113,8 @@ def _counter(result: DemoResult, node: str, name: str) -> int:
     return int(status.counters.get(name, 0)) if status else 0
 
 
-def _write_folder(
-    folder: Path, profile: Profile, summary: dict[str, Any], run: Run, screen: Console
-) -> None:
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
-    (folder / "profile.yaml").write_text(to_yaml(profile), "utf-8")
+def _write_tables(stage: Stage, run: Run) -> None:
+    folder, profile = stage.folder, stage.profile
     write_commands(folder / "commands.csv", run.commands)
     write_poses(folder / "poses.csv", run.poses)
     spec = make_policy(find_model(profile.task.worker)).spec
@@ -242,40 +128,12 @@ def _write_folder(
     ]
     write_chunks(folder / "chunks.npz", spec, chunks)
     marks = [(at_ns, prompt) for at_ns, prompt in run.prompts() if prompt != HOLD]
-    with Progress(
-        TextColumn("{task.description:<24}"), BarColumn(), TimeElapsedColumn(), console=screen
-    ) as bars:
+    columns = (TextColumn("{task.description:<24}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=stage.screen) as bars:
         plotting = bars.add_task("drawing plot.png", total=1)
         plot_run(folder / "plot.png", profile, run.poses, run.commands, marks, first)
         bars.update(plotting, completed=1)
-    film(folder, run, profile, marks, screen)
-
-
-def film(
-    folder: Path, run: Run, profile: Profile, marks: list[tuple[int, str]], screen: Console
-) -> None:
-    """Write front.mp4, with the prompts in it."""
-    frames = _frames(run, _camera(profile))
-    with Progress(
-        TextColumn("{task.description:<24}"), BarColumn(), TimeElapsedColumn(), console=screen
-    ) as bars:
-        filming = bars.add_task("writing front.mp4", total=max(1, len(frames)))
-        written = write_video(
-            folder / "front.mp4",
-            frames,
-            marks,
-            lambda done, total: bars.update(filming, completed=done, total=total),
-        )
-        if not written:
-            bars.update(filming, description="no pictures, no video", completed=1, total=1)
-
-
-def _frames(run: Run, camera: str | None) -> list[tuple[int, bytes]]:
-    frames: list[tuple[int, bytes]] = []
-    for picture in pictures(run.file, camera) if camera is not None else ():
-        if not frames or picture.heard_ns - frames[-1][0] >= PICTURE_NS:
-            frames.append((picture.heard_ns, picture.jpeg))
-    return frames
+    stage.film(run, marks)
 
 
 def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:

@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-import json
-import threading
 import time
 from pathlib import Path
 from typing import Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from vla_zenoh.bench.task import Ended
 from vla_zenoh.bench.task_sheet import sheet
-from vla_zenoh.cli.demo_run import MAX_LOG_LINES, RECORDING, film, own_address, recorded, refusals
-from vla_zenoh.cli.options import effective_profile
-from vla_zenoh.cli.output import console, errors, printable
+from vla_zenoh.cli.demo_stage import Stage, prepare, refusals
+from vla_zenoh.cli.output import console, printable
 from vla_zenoh.demo.analysis import latencies
 from vla_zenoh.demo.tasks import Tour, judged
 from vla_zenoh.nodes.bench_task import TaskRun
 from vla_zenoh.nodes.demo import Interrupted
-from vla_zenoh.nodes.launch import Host
-from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
-from vla_zenoh.nodes.recorder import Recorder
-from vla_zenoh.profile import Profile, to_yaml
-from vla_zenoh.recording.run import load_run
 from vla_zenoh.tasks import FAILURES, LIMIT_S
 
 ROUNDS = 3
@@ -43,15 +33,8 @@ def run_task_demo(
     out: Path | None,
 ) -> None:
     """See ``vla-zenoh demo``."""
-    stop = stop_on_signals()
-    die_with_parent()
-    loaded = own_address(effective_profile(profile))
-    folder = out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
-    folder.mkdir(parents=True, exist_ok=True)
-    screen = errors()
-    here = loaded.session.connect[0]
-    screen.print(f"profile {loaded.name}, router at {here}, run folder {folder}")
-    screen.print(f"watch it from another terminal: vla-zenoh status --connect {here}", style="dim")
+    stage = prepare(profile, out)
+    loaded, folder = stage.profile, stage.folder
     plan = Tour(
         loaded.task.worker,
         len(prompts) or ROUNDS,
@@ -61,8 +44,8 @@ def run_task_demo(
         limit_s=seconds or LIMIT_S,
     )
     began_ns = time.time_ns()
-    ended, refused = _run(loaded, plan, folder, stop, screen)
-    run = load_run(folder / RECORDING)
+    ended, refused = _run(stage, plan)
+    run = stage.recorded()
     summary = {
         "ok": len(ended) == plan.episodes and all(_well(each) is not False for each in ended),
         "profile": loaded.name,
@@ -73,69 +56,35 @@ def run_task_demo(
         "latency_ms": latencies(run.first_commands()),
         "refusals": refused,
     }
-    (folder / "profile.yaml").write_text(to_yaml(loaded), "utf-8")
-    text = json.dumps(summary, indent=2) + "\n"
-    for path in (folder / "summary.json", json_file):
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, "utf-8")
+    stage.write(summary, json_file)
     picture = sheet(ended)
     if picture is not None:
         (folder / "tasks.jpg").write_bytes(picture)
     marks = [(at_ns, prompt) for at_ns, prompt in run.prompts() if at_ns >= began_ns]
-    film(folder, run, loaded, marks, screen)
+    stage.film(run, marks)
     _show(ended, summary, folder)
-    if stop.is_set():
+    if stage.stop.is_set():
         raise typer.Exit(130)
     if not summary["ok"]:
         raise typer.Exit(1)
 
 
-def _run(
-    profile: Profile, plan: Tour, folder: Path, stop: threading.Event, screen: Console
-) -> tuple[list[Ended], dict[str, int]]:
+def _run(stage: Stage, plan: Tour) -> tuple[list[Ended], dict[str, int]]:
     ended: list[Ended] = []
-    lines: list[str] = []
-    with (
-        (folder / "nodes.log").open("w", encoding="utf-8") as log_file,
-        Progress(
-            TextColumn("{task.description:<52}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=screen,
-        ) as bars,
-    ):
-        bar = bars.add_task("starting the nodes", total=plan.episodes)
-
-        def log(node: str, line: str) -> None:
-            log_file.write(f"{node:>16} | {line}\n")
-            lines.append(f"{node}: {line}")
-
-        host = Host(profile, None, log=log, tell=log, own_router=True)
-        camera = "front" if "front" in profile.cameras else None
+    with stage.nodes("{task.description:<52}") as (running, bars):
+        assert running.client is not None
+        client = running.client
+        bar = bars.add_task("waiting for the first task", total=plan.episodes)
         try:
-            with host as running:
-                assert running.session is not None and running.client is not None
-                client = running.client
-                recorder = Recorder(
-                    profile, running.session, folder / RECORDING, expressions=recorded(profile)
-                ).start()
-                tasks = TaskRun(running, plan, stop, camera)
-                try:
-                    for each in tasks.run():
-                        ended.append(each)
-                        said = f"{printable(each.prompt)[:40]}: {_word(each)}"
-                        bars.update(bar, completed=len(ended), description=said)
-                except Interrupted:
-                    pass
-                finally:
-                    counted = refusals({n: found[0] for n, found in client.snapshot().items()})
-                    client.deactivate()
-                    recorder.close()
-        except Exception:
-            screen.print("\n".join(lines[-MAX_LOG_LINES:]), style="dim", markup=False)
-            raise
+            for each in TaskRun(running, plan, stage.stop, stage.camera).run():
+                ended.append(each)
+                said = f"{printable(each.prompt)[:40]}: {_word(each)}"
+                bars.update(bar, completed=len(ended), description=said)
+        except Interrupted:
+            pass
+        finally:
+            counted = refusals({n: found[0] for n, found in client.snapshot().items()})
+            client.deactivate()
     return ended, counted
 
 
