@@ -35,6 +35,7 @@ FORBIDDEN = {
     "simulation": PURE - {"mujoco"},
     "tasks": PURE,
     "teleop": PURE,
+    "view": PURE,
     "demo": PURE,
     "doctor": PURE,
     "nodes": frozenset({"typer", "torch", "mujoco", "asyncio", "vla_zenoh.cli"}),
@@ -106,7 +107,17 @@ def test_importing_the_package_loads_no_library_at_all() -> None:
     assert loaded_after("vla_zenoh").isdisjoint({*HEAVY, "numpy", "cv2", "pydantic", "pinocchio"})
 
 
-OPTIONAL = ("pinocchio", "ruckig", "mujoco", "matplotlib", "av", "flask", "zmq", "websockets")
+OPTIONAL = (
+    "pinocchio",
+    "ruckig",
+    "mujoco",
+    "matplotlib",
+    "av",
+    "flask",
+    "zmq",
+    "websockets",
+    "rerun",
+)
 
 
 def test_the_command_line_knows_every_command_without_any_optional_library() -> None:

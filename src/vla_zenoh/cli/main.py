@@ -37,6 +37,7 @@ from vla_zenoh.cli import (
     switches,
     teleop,
     up,
+    view,
     worker,
 )
 from vla_zenoh.cli.output import errors, printable
@@ -52,6 +53,7 @@ EXTRA_OF = {
     "plotly": "record",
     "jinja2": "record",
     "rosbags": "record",
+    "rerun": "view",
 }
 """Modules of the extras, for whoever starts a node whose extra is not installed."""
 NODES = frozenset({"up", "router", "sim", "ros2", "camera", "worker", "command"})
@@ -102,6 +104,7 @@ for panel, name, function in (
     (DRIVE, "rate", switches.rate),
     (DRIVE, "stop", switches.stop),
     (DRIVE, "reset", switches.reset),
+    (LOOK, "view", view.view),
     (LOOK, "record", record.record),
     (LOOK, "replay", replay.replay),
     (LOOK, "eval", evaluate.evaluation),

@@ -61,7 +61,7 @@ QOS: dict[str, Any] = {
     "priority": zenoh.Priority.DATA,
     "express": True,
 }
-_BYSTANDERS = ("worker-", "camera", "recorder", "router", "view", NAME)
+_BYSTANDERS = ("worker-", "camera", "recorder", "router", NAME)
 """Names of nodes that neither are a robot nor move one."""
 
 

@@ -3,7 +3,14 @@
 from vla_zenoh.profile.advice import advice
 from vla_zenoh.profile.joint_limits import JointLimits
 from vla_zenoh.profile.limits import REACH_M, REFUSE_FACTOR, Limits, ReachLimits
-from vla_zenoh.profile.load import load_profile, override, profile_file, profile_names, to_yaml
+from vla_zenoh.profile.load import (
+    load_profile,
+    override,
+    profile_file,
+    profile_names,
+    read_profile,
+    to_yaml,
+)
 from vla_zenoh.profile.robot import GripperProfile, RobotProfile
 from vla_zenoh.profile.schema import CameraProfile, Composition, HostProfile, Profile, Timing
 from vla_zenoh.profile.session import SessionProfile
@@ -27,5 +34,6 @@ __all__ = [
     "override",
     "profile_file",
     "profile_names",
+    "read_profile",
     "to_yaml",
 ]

@@ -53,6 +53,20 @@ def load_profile(name: str) -> Profile:
     return _checked(data, lines)
 
 
+def read_profile(text: str, where: str) -> Profile:
+    """The profile that `to_yaml` wrote.
+
+    Args:
+        text: YAML, whole: it extends none.
+        where: it is from, for messages.
+
+    Raises:
+        ProfileError: every fault, each with `where`, line, path and what is allowed.
+    """
+    data, lines = yaml_text.read(text.encode(), where)
+    return _checked(data, lines)
+
+
 def override(profile: Profile, changes: Mapping[str, Any]) -> Profile:
     """`profile` with some values replaced, checked as a whole again.
 

@@ -1,0 +1,195 @@
+"""vla-zenoh view."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    ConnectOption,
+    ProfileOption,
+    effective_profile,
+)
+from vla_zenoh.cli.output import errors, fail, printable
+from vla_zenoh.errors import MissingExtraError, ProfileError, RecordingError
+from vla_zenoh.nodes.process import run_node, stop_on_signals
+from vla_zenoh.nodes.viewer import Viewer, open_server, open_window
+from vla_zenoh.profile import Profile, read_profile
+
+if TYPE_CHECKING:
+    from vla_zenoh.recording.reader import RunFile
+    from vla_zenoh.view.show import Show
+
+POLL_S = 0.03
+FLUSH_S = 5.0
+PAGE_PORT = 9090
+SHOWN_REASONS = 5
+
+
+def view(
+    file: Annotated[
+        Path | None,
+        typer.Argument(help="A file of `vla-zenoh record`; without it, the robot that lives."),
+    ] = None,
+    serve: Annotated[
+        bool, typer.Option("--serve", help="Serve the view for browsers; no screen needed.")
+    ] = False,
+    save: Annotated[
+        Path | None,
+        typer.Option("--save", help="Write it to this file (.rrd), for Rerun; no screen needed."),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", "-s", help="Listen for so long.", min=0.1)
+    ] = None,
+    bind: Annotated[
+        str, typer.Option("--bind", help="With --serve: where to listen; 0.0.0.0 is everywhere.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int,
+        typer.Option(
+            "--port", help="With --serve: of the page; data at the next port.", min=1, max=65534
+        ),
+    ] = PAGE_PORT,
+    profile: ProfileOption = DEFAULT_PROFILE,
+    connect: ConnectOption = None,
+) -> None:
+    """Look at a robot and its model in Rerun, live or from a recording.
+
+    Pictures, what the model sees and answers, the robot, poses with trails, chunks, latencies,
+    bounds, events. Ctrl-C or closing the window ends it.
+    """
+    try:
+        import rerun  # noqa: F401  # before anything is opened
+    except ImportError as error:
+        raise MissingExtraError("rerun", "view") from error
+    if file is None:
+        _live(effective_profile(profile, connect), serve, save, seconds, bind, port)
+    else:
+        _recorded(file, profile, serve, save, bind, port)
+
+
+def _live(
+    profile: Profile, serve: bool, save: Path | None, seconds: float | None, bind: str, port: int
+) -> None:
+    from vla_zenoh.nodes.view import ViewListener
+    from vla_zenoh.view.show import Show
+
+    done: list[Show] = []
+
+    def run(session: Any, stop: threading.Event) -> None:
+        with _sink(profile.robot.name, serve, save, bind, port) as (stream, viewer):
+            show = Show(profile, stream, live=True)
+            listener = ViewListener(session, profile)
+            errors().print(f"looking at robot {profile.robot.name}; Ctrl-C ends it")
+            end_s = None if seconds is None else time.monotonic() + seconds
+            while not stop.is_set() and not (viewer is not None and viewer.closed):
+                if end_s is not None and time.monotonic() >= end_s:
+                    break
+                for sample in listener.take():
+                    show.hear(sample)
+                show.dropped = listener.dropped.total()
+                stop.wait(POLL_S)
+            listener.close()
+            done.append(show)
+
+    run_node(profile, run, identity=None)
+    if not done:  # interrupted before it began
+        raise typer.Exit(130)
+    _tell(done[0], save)
+    if not done[0].shown:
+        fail("nothing was said; is a robot up? (`vla-zenoh up`)")
+
+
+def _recorded(
+    path: Path, profile_name: str, serve: bool, save: Path | None, bind: str, port: int
+) -> None:
+    from vla_zenoh.recording.reader import open_recording
+    from vla_zenoh.view.show import Show
+
+    stop = stop_on_signals()
+    file = open_recording(path)
+    profile = _profile_of(file, profile_name)
+    with _sink(path.stem, serve, save, bind, port) as (stream, viewer):
+        show = Show(profile, stream, keys=file.keys)
+        for entry in file.entries(lambda key: not key.endswith("/raw")):
+            if stop.is_set() or (viewer is not None and viewer.closed):
+                break
+            show.take(entry)
+        _tell(show, save)
+        if file.damage:
+            errors().print(f"[yellow]{escape(printable(f'{path} is {file.damage}'))}[/]")
+        while viewer is not None and not stop.is_set() and not viewer.closed:
+            stop.wait(POLL_S)
+    if not show.shown and not stop.is_set():
+        fail(f"{path} holds nothing that can be shown")
+
+
+def _profile_of(file: RunFile, name: str) -> Profile:
+    try:
+        return read_profile(file.profile_yaml, f"profile in {file.path}")
+    except ProfileError as error:
+        why = escape(printable(f"{error}; --profile {name} says what the robot looks like"))
+        errors().print(f"[yellow]{why}[/]")
+        return effective_profile(name)
+
+
+@contextmanager
+def _sink(
+    name: str, serve: bool, save: Path | None, bind: str, port: int
+) -> Iterator[tuple[Any, Viewer | None]]:
+    """A Rerun stream to a window, to browsers, into a file, and the viewer where there is one."""
+    import rerun as rr
+
+    from vla_zenoh.view.show import APPLICATION
+
+    sinks: list[Any] = []
+    if save is not None:
+        try:
+            save.parent.mkdir(parents=True, exist_ok=True)
+            save.open("wb").close()
+        except OSError as error:
+            raise RecordingError(f"{save} cannot be written: {error.strerror}") from error
+        sinks.append(rr.FileSink(str(save)))
+    viewer = None
+    if serve:
+        viewer = open_server(bind, port)
+        errors().print(f"open in a browser: {viewer.page_url}", soft_wrap=True, markup=False)
+    elif save is None:
+        viewer = open_window()
+    try:
+        if viewer is not None:
+            sinks.append(rr.GrpcSink(viewer.data_url))
+        stream = rr.RecordingStream(APPLICATION)
+        stream.set_sinks(*sinks)
+        stream.send_recording_name(name)
+        yield stream, viewer
+        if viewer is None or not viewer.closed:
+            stream.flush(timeout_sec=FLUSH_S)
+        stream.disconnect()
+    finally:
+        if viewer is not None:
+            viewer.close()
+
+
+def _tell(show: Show, save: Path | None) -> None:
+    screen = errors()
+    where = f" in {save}" if save is not None else ""
+    screen.print(f"{show.shown.total():,} samples of {len(show.shown)} keys{where}", markup=False)
+    for what, counts in (
+        ("not shown", show.refused),
+        ("left out, too slow", Counter(all=show.dropped)),
+    ):
+        if counts.total():
+            worst = ", ".join(
+                f"{why} ({count})" for why, count in counts.most_common(SHOWN_REASONS)
+            )
+            screen.print(f"[yellow]{what}: {escape(printable(worst))}[/]")

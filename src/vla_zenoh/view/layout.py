@@ -1,0 +1,120 @@
+"""How the views stand in Rerun's window."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import rerun.blueprint as rrb
+
+from vla_zenoh.view import paths
+
+WINDOW_S = 20.0
+"""Of plots, up to the time looked at."""
+EYE_M, LOOK_AT_M = (1.55, -1.15, 0.95), (0.32, 0.0, 0.28)
+BACKGROUND = (22, 25, 31)
+GRID_M = 0.1
+
+PLOTS = (
+    ("Latency, ms", paths.LATENCY),
+    ("Speed of the TCP, mm/s", paths.SPEED),
+    ("Gripper, mm", paths.GRIPPER),
+    ("Commanded to measured, mm", paths.TRACKING),
+    ("Speed left by bounds, %", paths.BOUNDS),
+    ("Joints, rad", paths.JOINTS),
+)
+
+
+def blueprint(
+    cameras: Collection[str], seen: Mapping[str, Collection[str]], *, live: bool
+) -> rrb.Blueprint:
+    """The views for these pictures.
+
+    Args:
+        cameras: of the robot.
+        seen: worker to the cameras whose pictures its model is given.
+        live: follow what comes in.
+    """
+    left = rrb.Vertical(_scene(), _words(), row_shares=[3, 1])
+    right = rrb.Vertical(*_pictures(cameras, seen), _plots(), row_shares=_shares(cameras, seen))
+    return rrb.Blueprint(
+        rrb.Horizontal(left, right, column_shares=[1, 1]),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(
+            state="collapsed",
+            timeline=paths.TIMELINE,
+            play_state="following" if live else "playing",
+        ),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _scene() -> Any:
+    return rrb.Spatial3DView(
+        origin=paths.WORLD,
+        name="Robot: goal green, commanded orange, measured blue, chunk pink",
+        background=BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=True, spacing=GRID_M, color=(90, 96, 110, 90)),
+        eye_controls=rrb.EyeControls3D(
+            position=EYE_M, look_target=LOOK_AT_M, eye_up=(0.0, 0.0, 1.0)
+        ),
+    )
+
+
+def _words() -> Any:
+    columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
+    log = rrb.TextLogView(origin=paths.EVENTS, name="Events", columns=columns)
+    now = rrb.TextDocumentView(origin=paths.NOW, name="Now")
+    profile = rrb.TextDocumentView(origin=paths.PROFILE, name="Profile")
+    return rrb.Horizontal(now, rrb.Tabs(log, profile), column_shares=[2, 3])
+
+
+def _pictures(cameras: Collection[str], seen: Mapping[str, Collection[str]]) -> list[Any]:
+    rows: list[Any] = []
+    if cameras:
+        rows.append(
+            rrb.Horizontal(
+                *(
+                    rrb.Spatial2DView(origin=paths.picture(name), name=f"Camera {name}")
+                    for name in sorted(cameras)
+                )
+            )
+        )
+    models = [
+        rrb.Horizontal(
+            *(
+                rrb.Spatial2DView(origin=paths.seen(worker, name), name=f"{worker} sees {name}")
+                for name in sorted(seen[worker])
+            ),
+            rrb.TextDocumentView(origin=paths.said(worker), name=f"{worker} answers"),
+            name=worker,
+        )
+        for worker in sorted(seen)
+    ]
+    if models:
+        rows.append(models[0] if len(models) == 1 else rrb.Tabs(*models))
+    return rows
+
+
+def _shares(cameras: Collection[str], seen: Mapping[str, Collection[str]]) -> list[float]:
+    return [*([5.0] if cameras else []), *([4.0] if seen else []), 7.0]
+
+
+def _plots() -> Any:
+    span = rrb.VisibleTimeRange(
+        paths.TIMELINE,
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-WINDOW_S),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+    views = [
+        rrb.TimeSeriesView(
+            origin=origin,
+            name=name,
+            time_ranges=[span],
+            plot_legend=rrb.PlotLegend(visible=origin != paths.BOUNDS),
+        )
+        for name, origin in PLOTS
+    ]
+    return rrb.Grid(*views, grid_columns=2)
