@@ -7,17 +7,20 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 
 import pytest
+import zenoh
 from camera_rig import await_match, free_endpoint, until
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.nodes.clock import ADOPT_S, Clock
+from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.orphan import is_running
-from vla_zenoh.nodes.session import open_session
-from vla_zenoh.nodes.slots import Mailbox
+from vla_zenoh.nodes.session import MAX_MESSAGE_BYTES, open_session
+from vla_zenoh.nodes.slots import Arrival, Inbox, Latest, Mailbox
 from vla_zenoh.nodes.speaker import Speaker
-from vla_zenoh.profile import SessionProfile
+from vla_zenoh.profile import SessionProfile, load_profile, override
 from vla_zenoh.types import Header
 
 SILENCE_NS = 500_000_000
@@ -91,6 +94,67 @@ def test_a_mailbox_keeps_the_newest_in_order_and_no_more_than_it_holds() -> None
         taken = [arrival.sample.payload.to_string() for arrival in box.take_all()]
         assert taken == ["7", "8", "9"]
         assert box.take_all() == []
+
+
+@pytest.mark.parametrize("make", [Latest, partial(Inbox, 4), partial(Mailbox, 4)])
+def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
+    make: Callable[[int], Latest | Inbox | Mailbox],
+) -> None:
+    endpoint = free_endpoint()
+    profile = override(
+        load_profile("panda_sim"), {"session": {"listen": [endpoint], "connect": [endpoint]}}
+    )
+    limit = 1000
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as reader,
+        open_session(profile.session) as writer,
+    ):
+        node = Node("reader", profile, reader)
+        key = node.keys.prompt
+        slot = node.listen(key, make(limit))
+        events = Inbox(8)
+        writer.declare_subscriber(
+            node.keys.event("reader"), zenoh.handlers.Callback(events, indirect=False)
+        )
+        await_match(writer, key)
+        await_match(reader, node.keys.event("reader"))
+        writer.put(key, bytes(limit + 1))
+        writer.put(key, b"", attachment=bytes(limit + 1))
+        writer.put(key, bytes(limit))
+
+        def take() -> list[Arrival]:
+            if isinstance(slot, Latest):
+                arrival = slot.take()
+                return [] if arrival is None else [arrival]
+            return slot.take_all()
+
+        taken = until("the one that fits", take)
+        assert [len(arrival.sample.payload) for arrival in taken] == [limit]
+        node.report("running", now=True)
+        assert node.counters["refused.oversize"] == 2
+        told = until("the event", events.take_all)
+        words = b"prompt: %d bytes, at most %d are taken" % (limit + 1, limit)
+        assert words in told[-1].sample.payload.to_bytes()
+        node.close()
+
+
+def test_zenoh_itself_passes_over_what_nobody_could_read() -> None:
+    endpoint = free_endpoint()
+    profile = SessionProfile(listen=(endpoint,), connect=(endpoint,), shared_memory=False)
+    with (
+        open_session(profile, mode="router"),
+        open_session(profile) as reader,
+        open_session(profile) as writer,
+    ):
+        box = Mailbox(4, MAX_MESSAGE_BYTES)
+        subscriber = reader.declare_subscriber("test/box", box.channel())
+        box.take_from(subscriber.try_recv)
+        await_match(writer, "test/box")
+        writer.put("test/box", bytes(MAX_MESSAGE_BYTES + 1))
+        writer.put("test/box", b"after")
+        taken = until("the small one", box.take_all)
+        assert [arrival.sample.payload.to_bytes() for arrival in taken] == [b"after"]
 
 
 @pytest.mark.parametrize("step_s", [-1.0, -0.1, 0.1, 3600.0])

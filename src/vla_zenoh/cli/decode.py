@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError
+from vla_zenoh.nodes.bounded import bytes_of, header_of
 
 MAX_TEXT = 400
 
@@ -37,7 +37,15 @@ def encoding_of(sample: zenoh.Sample) -> str:
 
 def content(sample: zenoh.Sample) -> Any:
     """The payload decoded as its encoding says, else as text, else its size."""
-    payload, encoding = sample.payload.to_bytes(), encoding_of(sample)
+    encoding = encoding_of(sample)
+    try:
+        return read(bytes_of(sample.payload, message.MAX_PAYLOAD_BYTES), encoding)
+    except CodecError as error:
+        return f"<{encoding}: {error}>"
+
+
+def read(payload: bytes, encoding: str) -> Any:
+    """Likewise, of bytes and an encoding as text."""
     if encoding.startswith("application/msgpack"):
         try:
             return plain(message.unpack(payload))
@@ -53,9 +61,13 @@ def content(sample: zenoh.Sample) -> Any:
 
 def head(sample: zenoh.Sample) -> dict[str, Any] | None:
     """The header, None where there is none that can be read."""
-    attachment = sample.attachment
     try:
-        header = header_codec.decode(attachment.to_bytes() if attachment is not None else None)
+        header = header_of(sample)
     except CodecError:
         return None
     return dataclasses.asdict(header)
+
+
+def text(payload: zenoh.ZBytes) -> str:
+    """A setting's words, at most `MAX_TEXT` of them; what is no UTF-8 is replaced."""
+    return payload.to_bytes()[:MAX_TEXT].decode("utf-8", "replace")

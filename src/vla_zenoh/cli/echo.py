@@ -19,7 +19,7 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
-from vla_zenoh.cli.output import console, fail
+from vla_zenoh.cli.output import console, fail, printable
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.slots import Inbox
 
@@ -70,6 +70,7 @@ def _show(sample: zenoh.Sample, as_json: bool) -> None:
         print(json.dumps(line), flush=True)
         return
     stamp = f" seq {header['seq']} by {header['source']}" if header else ""
-    console().print(f"[bold cyan]{sample.key_expr}[/][dim]{escape(stamp)}[/]", highlight=False)
+    key, stamp = (escape(printable(part)) for part in (str(sample.key_expr), stamp))
+    console().print(f"[bold cyan]{key}[/][dim]{stamp}[/]", highlight=False)
     text = content if isinstance(content, str) else pretty_repr(content, max_width=console().width)
-    console().print(escape(text))
+    console().print(escape(printable(text)))

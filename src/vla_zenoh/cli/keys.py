@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 import zenoh
 from rich.table import Table
+from rich.text import Text
 
 from vla_zenoh.cli import decode
 from vla_zenoh.cli.options import (
@@ -20,7 +21,8 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     client,
 )
-from vla_zenoh.cli.output import console, fail, print_json
+from vla_zenoh.cli.output import console, fail, print_json, printable
+from vla_zenoh.errors import ProfileError
 from vla_zenoh.nodes.client import Client
 
 SETTINGS = ("prompt", "active", "worker", "rate")
@@ -64,9 +66,9 @@ def keys(
             table.add_column(column, overflow="fold")
         for seen in found:
             table.add_row(
-                seen.key,
-                seen.type,
-                seen.writer,
+                Text(printable(seen.key)),
+                Text(printable(seen.type)),
+                Text(printable(seen.writer)),
                 f"{seen.rate_hz:.1f} Hz" if seen.rate_hz else "",
                 f"{seen.bytes_s:,.0f}" if seen.bytes_s else "",
             )
@@ -120,7 +122,7 @@ def _settings(robot: Client) -> list[_Seen]:
         key = getattr(robot.keys, name)
         for reply in robot.session.get(key, timeout=1.0):
             if reply.ok is not None:
-                value = reply.ok.payload.to_string()
+                value = decode.text(reply.ok.payload)
                 out.append(_Seen(key, f"text, now {value!r}", "anyone; kept by command"))
     return out
 
@@ -131,7 +133,10 @@ def _pictures(robot: Client) -> list[_Seen]:
         cameras = found.detail.get("cameras")
         for camera in cameras if isinstance(cameras, dict) else ():
             rate_hz = round(float(found.rates_hz.get(camera, 0.0)), 2)
-            raw, jpeg = robot.keys.camera_raw(camera), robot.keys.camera_jpeg(camera)
+            try:
+                raw, jpeg = robot.keys.camera_raw(camera), robot.keys.camera_jpeg(camera)
+            except ProfileError:  # no camera of ours: anybody can write a status
+                continue
             out.append(_Seen(raw, "pixels, on demand", name, rate_hz=rate_hz))
             out.append(_Seen(jpeg, "image/jpeg, on demand", name))
     return out

@@ -8,8 +8,10 @@ ways, nothing is ever unpickled, and sizes are checked before memory is taken.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
+from collections.abc import Callable
 from typing import Any
 
 import msgpack
@@ -23,6 +25,8 @@ MAX_DEPTH = 32
 MAX_ITEMS = 10_000
 """Entries of one list or map. msgpack takes memory for as many as a list claims to have, at each of
 its levels, before it sees that they are not there."""
+MAX_CONTAINERS = 50_000
+"""Lists and maps in one payload: an empty one is a byte on the wire and 64 in memory."""
 MAX_DIMENSIONS = 32
 
 _CARRIED_KINDS = "biufSU"
@@ -40,6 +44,10 @@ _SCALARS: dict[str, tuple[type, ...]] = {
     "S": (bytes,),
     "U": (str,),
 }
+
+
+def _malformed(why: str) -> CodecError:
+    return CodecError("malformed", why)
 
 
 def pack(value: Any) -> bytes:
@@ -66,10 +74,12 @@ def unpack(payload: bytes) -> Any:
         raise CodecError(
             "oversize", f"payload of {len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are read"
         )
+    count = count_containers()
     try:
         value = msgpack.unpackb(
             payload,
-            object_hook=_from_map,
+            object_hook=lambda found: _from_map(count(found)),
+            list_hook=count,
             ext_hook=_refuse_extension,
             raw=False,
             strict_map_key=True,
@@ -86,6 +96,22 @@ def unpack(payload: bytes) -> Any:
         raise CodecError("malformed", f"not valid msgpack: {error}") from error
     _check_plain(value, MAX_DEPTH)
     return value
+
+
+def count_containers(error: Callable[[str], Exception] = _malformed) -> Callable[[Any], Any]:
+    """A hook that gives back what it is given, and raises at the one too many of `MAX_CONTAINERS`.
+
+    Args:
+        error: makes the exception of a sentence.
+    """
+    left = itertools.repeat(None, MAX_CONTAINERS)
+
+    def hook(found: Any) -> Any:
+        for _ in left:
+            return found
+        raise error(f"more than {MAX_CONTAINERS} lists and maps")
+
+    return hook
 
 
 def _check_plain(value: Any, depth: int) -> None:

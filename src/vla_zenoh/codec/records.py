@@ -14,6 +14,8 @@ from vla_zenoh.types import Cause, shown
 Record = TypeVar("Record")
 
 MAX_RECORD_BYTES = 4 * 1024 * 1024
+SMALL_BYTES = 1024 * 1024
+"""Any record but chunks, specs and what nodes say of themselves is smaller."""
 
 
 def encode(record: Any) -> bytes:

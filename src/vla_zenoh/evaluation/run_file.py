@@ -58,9 +58,8 @@ def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) ->
     out = Evaluation(name, "mcap", run.path, problems=list(run.problems))
     if run.file.ended is None and not run.file.damage:
         out.problems.append("its recorder was ended before it could finish the file")
-    dropped = sum((run.file.ended or {}).get("dropped", {}).values())
-    if dropped:
-        out.problems.append(f"the recorder dropped {dropped} samples")
+    if run.file.dropped:
+        out.problems.append(f"the recorder dropped {run.file.dropped} samples")
     obeyed = obeyed_chunks(run)
     causes = run.first_commands()
     until_ns = last_ns(run) + 1

@@ -11,10 +11,10 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.keys import Kind, last
+from vla_zenoh.nodes.bounded import bytes_of, header_of
 from vla_zenoh.nodes.session import QOS
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Event, Header, NodeStatus, Task
@@ -65,9 +65,7 @@ class Client:
     @staticmethod
     def _decode(kind: type[Value], sample: zenoh.Sample) -> tuple[Header, Value] | None:
         try:
-            attachment = sample.attachment
-            header = header_codec.decode(attachment.to_bytes() if attachment else None)
-            return header, records.decode(kind, sample.payload.to_bytes())
+            return header_of(sample), records.decode(kind, bytes_of(sample.payload))
         except CodecError:
             return None  # a stranger's bytes; the nodes count and tell them
 

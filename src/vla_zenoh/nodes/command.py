@@ -15,6 +15,7 @@ import zenoh
 
 from vla_zenoh import keys as key_names
 from vla_zenoh.codec import records, settings
+from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.control.arm import make_shadow
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.so3 import quat_from_rotation
@@ -24,6 +25,7 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.clock import FixedRate, Tick, make_this_thread_realtime
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
 from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.session import MAX_MESSAGE_BYTES
 from vla_zenoh.nodes.slots import Arrival, Inbox, Mailbox
 from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.nodes.surroundings import Neighbours
@@ -39,6 +41,9 @@ from vla_zenoh.types import (
 
 STATES = 16
 """States kept between two looks; room for the robot's own beside a stranger's."""
+ANYTHING = MAX_MESSAGE_BYTES
+"""A stop is obeyed whatever it says, and never read."""
+WORDS = settings.MAX_SETTING_BYTES
 MAX_WHY = 2000
 TASK_PERIOD_S = 0.2
 CLOCK_PERIOD_S = 0.1
@@ -76,16 +81,16 @@ class CommandNode:
         keys = node.keys
         self._neighbours = Neighbours(node)
         self._chunks = node.listen(keys.all_deltas, Inbox(64))
-        self._pose_slot = node.listen(keys.state_pose, Inbox(STATES))
-        self._gripper_slot = node.listen(keys.state_gripper, Inbox(STATES))
-        self._joint_slot = node.listen(keys.state_joint, Inbox(STATES))
+        self._pose_slot = node.listen(keys.state_pose, Inbox(STATES, SMALL_BYTES))
+        self._gripper_slot = node.listen(keys.state_gripper, Inbox(STATES, SMALL_BYTES))
+        self._joint_slot = node.listen(keys.state_joint, Inbox(STATES, SMALL_BYTES))
         self._settings: list[tuple[str, Mailbox, Callable[[bytes], Any]]] = [
-            ("stop", node.listen(keys.stop, Mailbox(8)), lambda _: None),
-            ("reset", node.listen(keys.reset, Mailbox(8)), lambda _: None),
-            ("prompt", node.listen(keys.prompt, Mailbox(16)), settings.decode_text),
-            ("worker", node.listen(keys.worker, Mailbox(16)), settings.decode_name),
-            ("rate", node.listen(keys.rate, Mailbox(16)), settings.decode_rate),
-            ("active", node.listen(keys.active, Mailbox(16)), settings.decode_bool),
+            ("stop", node.listen(keys.stop, Mailbox(8, ANYTHING)), lambda _: None),
+            ("reset", node.listen(keys.reset, Mailbox(8, ANYTHING)), lambda _: None),
+            ("prompt", node.listen(keys.prompt, Mailbox(16, WORDS)), settings.decode_text),
+            ("worker", node.listen(keys.worker, Mailbox(16, WORDS)), settings.decode_name),
+            ("rate", node.listen(keys.rate, Mailbox(16, WORDS)), settings.decode_rate),
+            ("active", node.listen(keys.active, Mailbox(16, WORDS)), settings.decode_bool),
         ]
         self._pose_out = node.stream(keys.command_pose, Kind.CONTROL)
         self._joint_out = node.stream(keys.command_joint, Kind.CONTROL)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import zenoh
 
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.control.disagreement import StandingHistory
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Keys
+from vla_zenoh.nodes.bounded import bytes_of, header_of
 from vla_zenoh.nodes.slots import Arrival, Inbox
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import ActionChunk, GripperState, Header, PoseState
@@ -76,7 +76,7 @@ def _spec(session: zenoh.Session, keys: Keys, worker: str) -> ModelSpec:
         for reply in session.get(keys.spec(worker), timeout=SPEC_PATIENCE_S):
             if reply.ok is not None:
                 try:
-                    return records.decode(ModelSpec, reply.ok.payload.to_bytes())
+                    return records.decode(ModelSpec, bytes_of(reply.ok.payload))
                 except CodecError as error:
                     raise NodeError(f"worker {worker!r}: its spec is not one: {error}") from error
         time.sleep(ASK_AGAIN_S)
@@ -85,10 +85,9 @@ def _spec(session: zenoh.Session, keys: Keys, worker: str) -> ModelSpec:
 
 def _read(kind: type[Record], arrivals: Sequence[Arrival]) -> Iterator[tuple[Header, Record]]:
     for arrival in arrivals:
-        attachment: Any = arrival.sample.attachment
         try:
-            header = header_codec.decode(attachment.to_bytes() if attachment else None)
-            record = records.decode(kind, arrival.sample.payload.to_bytes())
+            header = header_of(arrival.sample)
+            record = records.decode(kind, bytes_of(arrival.sample.payload))
         except CodecError:
             continue  # the nodes count and tell what strangers write
         yield header, record

@@ -12,6 +12,8 @@ import zenoh
 
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
+from vla_zenoh.codec.header import MAX_HEADER_BYTES
+from vla_zenoh.codec.records import MAX_RECORD_BYTES
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Keys
 from vla_zenoh.recording.run import Heard
@@ -94,6 +96,8 @@ class Listener:
     def _into(self, name: str) -> Callable[[zenoh.Sample], None]:
         def take(sample: zenoh.Sample) -> None:
             attachment = sample.attachment
+            if len(sample.payload) > MAX_RECORD_BYTES or len(attachment or b"") > MAX_HEADER_BYTES:
+                return
             entry = (
                 name,
                 str(sample.key_expr),

@@ -18,10 +18,11 @@ from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes import offsets
+from vla_zenoh.nodes.bounded import bytes_of, header_of
 from vla_zenoh.nodes.clock import Clock
 from vla_zenoh.nodes.offsets import Clocks
 from vla_zenoh.nodes.session import QOS, open_session
-from vla_zenoh.nodes.slots import Arrival, Inbox, Latest, Mailbox
+from vla_zenoh.nodes.slots import Arrival, Inbox, Latest, Mailbox, Slot
 from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.nodes.traffic import Traffic
 from vla_zenoh.profile import Profile
@@ -34,7 +35,7 @@ EVENT_PERIOD_S = 0.25
 """The same kind of event is written at most this often; what came between is counted in `count`."""
 
 Record = TypeVar("Record")
-Slot = TypeVar("Slot", Latest, Inbox, Mailbox)
+AnySlot = TypeVar("AnySlot", Latest, Inbox, Mailbox)
 
 
 class Stream:
@@ -96,6 +97,7 @@ class Node:
         self.started_wall_ns = time.time_ns()
         self._declared: list[Any] = []
         self._streams: list[Stream] = []
+        self._slots: list[Slot] = []
         self._pictures: zenoh.Session | None = None
         self.traffic = Traffic(session)
         self._last_event: dict[tuple[str, str, str], float] = {}
@@ -189,6 +191,7 @@ class Node:
     ) -> None:
         """Write status when it is time, when `state` changed, or `now`."""
         self.clocks.tick()
+        self._tell_of_oversize()
         clock = time.monotonic()
         if not now and state == self._last_state and clock - self._last_status < STATUS_PERIOD_S:
             return
@@ -231,17 +234,21 @@ class Node:
     def report_due(self, state: str) -> bool:
         """Whether `report` would write now: lets a fast loop skip collecting what to report."""
         self.clocks.tick()
+        self._tell_of_oversize()
         due = time.monotonic() - self._last_status >= STATUS_PERIOD_S
         return due or state != self._last_state
 
     # -- reading ------------------------------------------------------------------------------
-    def listen(self, key: str, slot: Slot, kind: Kind = Kind.STATE) -> Slot:
+    def listen(self, key: str, slot: AnySlot, kind: Kind = Kind.STATE) -> AnySlot:
         """Let samples on `key` fall into `slot`; of `kind` it matters whether they are pictures.
+
+        Those that are larger than the slot takes are counted and told with the next report.
 
         Raises:
             SessionError: the router does not answer at the port of pictures.
         """
         session = self._session_for(kind)
+        self.watch(slot)
         if isinstance(slot, Mailbox):
             subscriber = session.declare_subscriber(key, slot.channel())
             slot.take_from(subscriber.try_recv)
@@ -250,6 +257,21 @@ class Node:
         handler = zenoh.handlers.Callback(slot, indirect=False)
         self._declared.append(session.declare_subscriber(key, handler))
         return slot
+
+    def watch(self, slot: Slot) -> None:
+        """Count and tell what `slot` drops for its size."""
+        self._slots.append(slot)
+
+    def _tell_of_oversize(self) -> None:
+        for slot in self._slots:
+            found = slot.take_oversize()
+            if found is None:
+                continue
+            key = self.keys.short(found.key)
+            self.counters["refused.oversize"] += found.times - 1
+            self.refuse(
+                "oversize", f"{key}: {found.size} bytes, at most {slot.limit} are taken", key
+            )
 
     def on_alive(self, callback: Callable[[str, bool], None]) -> None:
         """Call back with (node name, alive) now and at every change, on Zenoh's thread."""
@@ -293,7 +315,7 @@ class Node:
             header = self.header(arrival)
             if speaker is not None:  # before the payload: who shouts nonsense costs least
                 speaker.check(header, arrival.mono_ns)
-            record = records.decode(kind, sample.payload.to_bytes())
+            record = records.decode(kind, bytes_of(sample.payload))
         except CodecError as error:
             key = self.keys.short(str(sample.key_expr))
             self.refuse(error.reason, f"{key}: {error}", key)
@@ -311,13 +333,12 @@ class Node:
         Raises:
             CodecError: it has no header that can be read.
         """
-        attachment = arrival.sample.attachment
-        return header_codec.decode(attachment.to_bytes() if attachment is not None else None)
+        return header_of(arrival.sample)
 
     def read_text(self, decode: Callable[[bytes], Record], arrival: Arrival) -> Record | None:
         """Decode a plain setting likewise."""
         try:
-            return decode(arrival.sample.payload.to_bytes())
+            return decode(bytes_of(arrival.sample.payload))
         except CodecError as error:
             key = self.keys.short(str(arrival.sample.key_expr))
             self.refuse(error.reason, f"{key}: {error}", key)

@@ -16,6 +16,7 @@ import zenoh
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.keys import Keys, Kind
+from vla_zenoh.nodes.bounded import bytes_of
 from vla_zenoh.nodes.clock import Clock
 from vla_zenoh.nodes.session import QOS
 from vla_zenoh.offset import Exchange, Offset, OffsetFilter
@@ -28,6 +29,7 @@ PATIENCE_S = 2.0
 FORGET_S = 30.0
 """Who has not answered for so long has no clock we know of."""
 MAX_PEERS = 64
+MAX_STAMPS_BYTES = 1024
 _STAMPS_OF_A_CHUNK = (
     "observation_stamp_ns",
     "valid_until_ns",
@@ -107,7 +109,7 @@ class Clocks:
             if reply.ok is None:
                 return
             try:
-                heard_ns, said_ns = decode_stamps(reply.ok.payload.to_bytes())
+                heard_ns, said_ns = decode_stamps(bytes_of(reply.ok.payload, MAX_STAMPS_BYTES))
             except CodecError:
                 return  # whoever answers that has no clock we could use
             with self._lock:

@@ -159,16 +159,21 @@ class Recorder:
 
     # -- in -----------------------------------------------------------------------------------
     def _take(self, sample: zenoh.Sample) -> None:
-        attachment = sample.attachment
+        key, attachment = str(sample.key_expr), sample.attachment
+        size = len(sample.payload) + (len(attachment) if attachment is not None else 0)
+        if size > self._queue_limit:  # copying it costs as much as keeping it
+            with self._change:
+                self.recorded.dropped[key] += 1
+            return
         self._put(
-            str(sample.key_expr),
+            key,
             sample.payload.to_bytes(),
             str(sample.encoding),
             attachment.to_bytes() if attachment is not None else None,
         )
 
     def _put(self, key: str, payload: bytes, encoding: str, attachment: bytes | None) -> None:
-        size = len(payload)
+        size = len(payload) + len(attachment or b"")
         with self._change:
             full = self._queued_bytes + size > self._queue_limit
             if full or len(self._queue) >= QUEUE_SAMPLES:

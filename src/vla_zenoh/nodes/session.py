@@ -17,6 +17,8 @@ from vla_zenoh.profile.session import SecurityProfile, second_link
 from vla_zenoh.security.store import Store
 
 RETRY_S = 0.1
+MAX_MESSAGE_BYTES = 160 * 1024 * 1024
+"""Zenoh itself takes no larger sample from a link; the largest picture we read has 96 MiB."""
 
 _DROP = zenoh.CongestionControl.DROP
 _BLOCK = zenoh.CongestionControl.BLOCK
@@ -80,13 +82,14 @@ def config(
         "transport": {
             "shared_memory": {"enabled": profile.shared_memory},
             "link": {
+                "rx": {"max_message_size": MAX_MESSAGE_BYTES},
                 "tx": {
                     "lease": profile.lease_ms,
                     "keep_alive": 4,
                     "queue": {
                         "congestion_control": {"block": {"wait_before_close": 200_000}},
                     },
-                }
+                },
             },
         },
     }

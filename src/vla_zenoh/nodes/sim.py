@@ -22,12 +22,14 @@ import numpy as np
 import zenoh
 
 from vla_zenoh.codec import message, records, settings
+from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.control.arm_guard import ArmGuard, Measured, make_arm_guard
 from vla_zenoh.control.impedance import ImpedanceGains
 from vla_zenoh.control.joint_impedance import JointGains, JointReference
 from vla_zenoh.control.so3 import Pose
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.bounded import bytes_of
 from vla_zenoh.nodes.clock import make_this_thread_realtime
 from vla_zenoh.nodes.meter import RateMeter
 from vla_zenoh.nodes.node import Node
@@ -49,6 +51,7 @@ from vla_zenoh.types import (
 CATCH_UP_NS = 50_000_000
 SCENE_HZ, OBJECTS_HZ, WATCH_HZ = 60.0, 10.0, 4.0
 MAX_LOCKSTEP_NS = 60_000_000_000
+MAX_STEP_BYTES = 1024
 SWITCH_INTERVAL_S = 1e-4
 
 Command = TypeVar("Command", PoseCommand, JointCommand)
@@ -97,13 +100,13 @@ class SimNode:
         node = self.node = Node("sim", profile, session)
         self.lockstep = lockstep
         keys = node.keys
-        self._poses = node.listen(keys.command_pose, Inbox(64))
-        self._joints = node.listen(keys.command_joint, Inbox(64))
+        self._poses = node.listen(keys.command_pose, Inbox(64, SMALL_BYTES))
+        self._joints = node.listen(keys.command_joint, Inbox(64, SMALL_BYTES))
         self._writer = ""
         self._braking = False
-        self._widths = node.listen(keys.command_gripper, Inbox(16))
+        self._widths = node.listen(keys.command_gripper, Inbox(16, SMALL_BYTES))
         self._last_width: Header | None = None
-        self._resets = node.listen(keys.sim_reset, Inbox(4))
+        self._resets = node.listen(keys.sim_reset, Inbox(4, settings.MAX_SETTING_BYTES))
         self._joint = node.stream(keys.state_joint, Kind.STATE)
         self._pose = node.stream(keys.state_pose, Kind.STATE)
         self._gripper = node.stream(keys.state_gripper, Kind.STATE)
@@ -170,8 +173,8 @@ class SimNode:
         """Advance as asked by a msgpack map ``{"ns": ..}``, reply with the state then."""
         payload = query.payload
         try:
-            asked = message.unpack(payload.to_bytes()) if payload is not None else {}
-            if not isinstance(asked, dict) or not isinstance(asked.get("ns"), int):
+            asked = message.unpack(bytes_of(payload, MAX_STEP_BYTES)) if payload is not None else {}
+            if not isinstance(asked, dict) or type(asked.get("ns")) is not int:
                 raise CodecError("malformed", 'wanted a map {"ns": nanoseconds to advance}')
             duration_ns = asked["ns"]
             if not 0 < duration_ns <= MAX_LOCKSTEP_NS or duration_ns % STEP_NS:

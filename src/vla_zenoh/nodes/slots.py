@@ -1,7 +1,8 @@
 """Where Zenoh's callbacks leave samples. A callback does this and nothing else.
 
 An unbounded queue or a slow callback on a stream makes everything behind it late, control keys
-included, so streams keep the newest sample only and orders a bounded number.
+included, so streams keep the newest sample only and orders a bounded number. A sample with more
+bytes than its slot takes is dropped before any of them is copied or kept, and told.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import zenoh
+
+from vla_zenoh.codec.records import MAX_RECORD_BYTES
 
 
 class Arrival(NamedTuple):
@@ -29,16 +32,60 @@ class Arrival(NamedTuple):
     nth: int = 0
 
 
-class Latest:
+class Oversize(NamedTuple):
+    """Samples that were dropped for their size: key and bytes of the newest, and how many."""
+
+    key: str
+    size: int
+    times: int
+
+
+class Slot:
+    """What all have: a bound.
+
+    Args:
+        limit: bytes of payload and attachment together.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._oversize: Oversize | None = None
+
+    def _takes(self, sample: zenoh.Sample) -> bool:
+        attachment = sample.attachment
+        size = len(sample.payload) + (len(attachment) if attachment is not None else 0)
+        if size <= self._limit:
+            return True
+        known = self._oversize
+        self._oversize = Oversize(str(sample.key_expr), size, known.times + 1 if known else 1)
+        return False
+
+    @property
+    def limit(self) -> int:
+        """Bytes of payload and attachment together that are taken at most."""
+        return self._limit
+
+    def take_oversize(self) -> Oversize | None:
+        """What was dropped for its size since the last call; None: nothing."""
+        found = self._oversize
+        if found is not None:
+            self._oversize = None
+        return found
+
+
+class Latest(Slot):
     """Keeps the newest sample, and can be waited on."""
 
-    def __init__(self) -> None:
+    def __init__(self, limit: int = MAX_RECORD_BYTES) -> None:
+        super().__init__(limit)
         self._changed = threading.Condition()
         self._arrival: Arrival | None = None
         self._count = 0
         self._taken = 0
 
     def __call__(self, sample: zenoh.Sample) -> None:
+        if not self._takes(sample):
+            return
         with self._changed:
             self._count += 1
             self._arrival = Arrival(sample, time.monotonic_ns(), self._count)
@@ -63,16 +110,19 @@ class Latest:
             return self._changed.wait_for(lambda: self._taken != self._count, timeout_s)
 
 
-class Inbox:
+class Inbox(Slot):
     """Keeps the newest `size` samples in order; older ones are dropped and counted."""
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, limit: int = MAX_RECORD_BYTES) -> None:
+        super().__init__(limit)
         self._arrivals: deque[Arrival] = deque(maxlen=size)
         self._size = size
         self._count = 0
         self.dropped = 0
 
     def __call__(self, sample: zenoh.Sample) -> None:
+        if not self._takes(sample):
+            return
         self._count += 1
         if len(self._arrivals) == self._size:
             self.dropped += 1
@@ -88,14 +138,15 @@ class Inbox:
                 return taken
 
 
-class Mailbox:
+class Mailbox(Slot):
     """Like `Inbox`, filled by Zenoh itself without a word of Python for each sample.
 
     A flood of samples that nobody asked for then takes no time from the loop that reads them. The
-    price: the time of arrival is that of `take_all`.
+    price: the time of arrival is that of `take_all`, and what is too large is dropped only there.
     """
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, limit: int = MAX_RECORD_BYTES) -> None:
+        super().__init__(limit)
         self._size = size
         self._receive: Callable[[], zenoh.Sample | None] = lambda: None
 
@@ -110,6 +161,10 @@ class Mailbox:
     def take_all(self) -> list[Arrival]:
         """Everything that arrived, oldest first; no more than it holds, however fast they come."""
         taken: list[Arrival] = []
-        while len(taken) < self._size and (sample := self._receive()) is not None:
-            taken.append(Arrival(sample, time.monotonic_ns()))
+        for _ in range(self._size):
+            sample = self._receive()
+            if sample is None:
+                break
+            if self._takes(sample):
+                taken.append(Arrival(sample, time.monotonic_ns()))
         return taken

@@ -15,10 +15,13 @@ import zenoh
 
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
+from vla_zenoh.codec.image import MAX_PICTURE_BYTES
+from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.committed import Continuation
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import CodecError, PeerError, SpecError
 from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.bounded import bytes_of
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.seen import SeenOutlet
@@ -90,7 +93,7 @@ class WorkerNode:
             keys.spec(name),
             lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
         )
-        self._task_slot = node.listen(keys.task, Latest())
+        self._task_slot = node.listen(keys.task, Latest(SMALL_BYTES))
         self._jpeg = images == "jpeg"
 
         def key_of(camera: CameraSpec) -> str:
@@ -100,11 +103,11 @@ class WorkerNode:
             return (keys.camera_jpeg if self._jpeg else keys.camera_raw)(camera.camera)
 
         self._image_slots = {
-            camera.camera: node.listen(key_of(camera), Latest(), Kind.FRAME)
+            camera.camera: node.listen(key_of(camera), Latest(MAX_PICTURE_BYTES), Kind.FRAME)
             for camera in self.spec.observation.cameras
         }
         self._state_slots = {
-            part: node.listen(self._state_key(part), Inbox(256))
+            part: node.listen(self._state_key(part), Inbox(256, SMALL_BYTES))
             for part in self.spec.observation.state
         }
         self._task_speaker = Speaker(TASK_PATIENCE_S)
@@ -217,7 +220,7 @@ class WorkerNode:
         try:
             header = self.node.header(arrival)
             self._speakers[camera].check(header, arrival.mono_ns)
-            payload = sample.payload.to_bytes()
+            payload = bytes_of(sample.payload, MAX_PICTURE_BYTES)
             if self._jpeg:
                 image = image_codec.decode_jpeg(payload)
             else:

@@ -143,11 +143,14 @@ def read_record(kind: type, data: bytes) -> tuple[Any, dict[str, Any]]:
     """
     found = deserialize(type_name(kind), data)
     fields: dict[str, Any] = {}
-    for field in fields_of(kind):
-        value = getattr(found, field.name)
-        if field.shaped:
-            value = value.reshape(getattr(found, f"{field.name}_shape"))
-        fields[field.name] = field.read(value)
+    try:
+        for field in fields_of(kind):
+            value = getattr(found, field.name)
+            if field.shaped:
+                value = value.reshape(getattr(found, f"{field.name}_shape"))
+            fields[field.name] = field.read(value)
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise CodecError("malformed", f"{kind.__name__}: {str(error)[:200]}") from error
     return found.header, fields
 
 

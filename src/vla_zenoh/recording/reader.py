@@ -23,7 +23,7 @@ from zstandard import ZstdError
 
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
-from vla_zenoh.errors import CodecError, RecordingError
+from vla_zenoh.errors import CodecError, RecordError, RecordingError
 from vla_zenoh.keys import Keys
 from vla_zenoh.recording import cdr
 from vla_zenoh.recording.definitions import SAMPLE_NAME, type_name
@@ -130,7 +130,21 @@ class RunFile:
                     source = _source(record, schemas)
                     channels[record.id] = source if source and wanted(source.key) else None
                 elif isinstance(record, Metadata) and record.name == ENDED:
-                    self.ended = {name: json.loads(v) for name, v in record.metadata.items()}
+                    self.ended = self._facts(record)
+
+    def _facts(self, record: Metadata) -> dict[str, Any] | None:
+        try:
+            return {name: json.loads(value) for name, value in record.metadata.items()}
+        except (ValueError, RecursionError) as error:
+            self.damage = self.damage or f"its last facts are not JSON: {error}"
+            return None
+
+    @property
+    def dropped(self) -> int:
+        """Samples that the recorder heard and could not write, once `entries` has been there."""
+        counts = (self.ended or {}).get("dropped")
+        counted = counts.values() if isinstance(counts, dict) else ()
+        return sum(count for count in counted if type(count) is int)
 
     def _note_damage(self, why: str) -> None:
         self.damage = why
@@ -156,7 +170,10 @@ class _Source:
         kind = _KINDS.get(self.schema)
         header = None
         if self.writer:
-            header = Header(message.publish_time, message.sequence, self.writer)
+            try:
+                header = Header(message.publish_time, message.sequence, self.writer)
+            except RecordError as error:
+                raise CodecError("invalid", str(error)) from error
         if kind is not None:
             _, fields = cdr.read_record(kind, message.data)
             return Entry(self.key, header, message.log_time, self.encoding, kind, fields)
@@ -227,7 +244,9 @@ def open_recording(path: Path) -> RunFile:
                 if isinstance(record, Metadata) and record.name == ABOUT:
                     about = record.metadata
                 elif isinstance(record, Attachment) and about and record.name == PROFILE_FILE:
-                    return RunFile(path, _checked(path, about), record.data.decode())
+                    return RunFile(
+                        path, _checked(path, about), record.data.decode("utf-8", "replace")
+                    )
                 elif isinstance(record, Channel):
                     topics[record.topic] += 1
     except OSError as error:

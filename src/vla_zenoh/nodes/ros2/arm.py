@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.control.arm import make_kinematics
 from vla_zenoh.control.arm_guard import ArmGuard, Measured, make_arm_guard
 from vla_zenoh.control.impedance import Reference
@@ -93,7 +94,7 @@ class Arm:
         self._kind, self._write = output.type, self._writing(output)
         self._orders = node.listen(
             keys.command_joint if profile.robot.command == "joint" else keys.command_pose,
-            Inbox(INBOX),
+            Inbox(INBOX, SMALL_BYTES),
         )
         self._topic = output.topic
         self._writer = link.write(output.topic, output.type, COMMAND)

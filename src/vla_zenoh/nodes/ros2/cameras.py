@@ -9,7 +9,7 @@ from collections.abc import Callable
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.ros2 import table
 from vla_zenoh.interop.ros2.arm_state import Newness
-from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.interop.ros2.messages import MAX_PICTURE_BYTES, Messages
 from vla_zenoh.interop.ros2.qos import SENSOR
 from vla_zenoh.interop.ros2.samples import Picture
 from vla_zenoh.nodes.camera_sources.outlet import OK, Outlet
@@ -69,7 +69,7 @@ class Camera:
         self.outlet.backend = topic.type
         self._newness = Newness()
         self._looked_s = -LOOK_S
-        self._slot = link.read(topic.topic, topic.type, Latest(), SENSOR)
+        self._slot = link.read(topic.topic, topic.type, Latest(MAX_PICTURE_BYTES), SENSOR)
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set."""

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.ros2 import gripper_actions, table
 from vla_zenoh.interop.ros2.goals import Goal, GoalKeeper, Step
@@ -41,7 +42,7 @@ class Gripper:
         self, node: Node, link: Link, messages: Messages, profile: Ros2Gripper | None
     ) -> None:
         self._node, self._messages, self._profile = node, messages, profile
-        self._orders = node.listen(node.keys.command_gripper, Inbox(16))
+        self._orders = node.listen(node.keys.command_gripper, Inbox(16, SMALL_BYTES))
         self._speaker = Speaker(node.profile.timing.command_timeout_s)
         self._keeper = GoalKeeper(GIVE_UP_S)
         self._news: deque[Callable[[], None]] = deque()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import threading
 import time
@@ -16,6 +17,7 @@ from vla_zenoh.interop.ros2.attachment import Attachment
 from vla_zenoh.interop.ros2.keys import Endpoint, RmwZenoh, Role, Ros2Dds, Wire, parts_of
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.qos import DEFAULT, Qos
+from vla_zenoh.nodes.bounded import bytes_of
 from vla_zenoh.nodes.slots import Inbox, Latest
 from vla_zenoh.profile.ros2 import Ros2Profile
 
@@ -67,7 +69,8 @@ class Caller:
 
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                answers.append(reply.ok.payload.to_bytes())
+                with contextlib.suppress(CodecError):  # too large to be an answer
+                    answers.append(bytes_of(reply.ok.payload))
 
         def end() -> None:
             done(answers[0] if answers else None)
@@ -98,7 +101,7 @@ class Request:
     def __init__(self, query: zenoh.Query, key: str, with_attachment: bool) -> None:
         self._query, self._key = query, key
         payload = query.payload
-        self.payload = b"" if payload is None else payload.to_bytes()
+        self.payload = bytes_of(payload)
         self._given: Attachment | None = None
         if with_attachment:
             attachment = query.attachment
@@ -145,6 +148,8 @@ class Link:
         self._lock = threading.Lock()
         self._others: set[str] = set()
         self._declared: list[Any] = []
+        self.slots: list[Latest | Inbox] = []
+        """Of all topics that are read."""
         own = self._wire.node_token()
         self._declared.append(session.liveliness().declare_token(own))
 
@@ -177,6 +182,7 @@ class Link:
     def read(self, name: str, kind: str, slot: Slot, qos: Qos = DEFAULT) -> Slot:
         """Let samples of a topic fall into `slot`."""
         key, _ = self._declare(Endpoint(Role.SUBSCRIBER, name, kind, qos))
+        self.slots.append(slot)
         handler = zenoh.handlers.Callback(slot, indirect=False)
         if qos.transient_local:
             subscriber = zenoh.ext.declare_advanced_subscriber(

@@ -105,6 +105,8 @@ class Ros2Node:
             self._people = People(
                 profile, session, self.link, read_messages(ros2), ros2.services, self._refuse
             )
+        for slot in self.link.slots:
+            node.watch(slot)
         self._rate = RateMeter()
         self._realtime = False
         self._clock_s = 0.0

@@ -1,0 +1,35 @@
+"""Bytes out of Zenoh's hands: their number is looked at before they are copied."""
+
+from __future__ import annotations
+
+import zenoh
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec.records import MAX_RECORD_BYTES
+from vla_zenoh.errors import CodecError
+from vla_zenoh.types import Header
+
+
+def bytes_of(payload: zenoh.ZBytes | None, limit: int = MAX_RECORD_BYTES) -> bytes:
+    """The bytes; none are empty.
+
+    Raises:
+        CodecError: ``oversize``, more than `limit`.
+    """
+    if payload is None:
+        return b""
+    if len(payload) > limit:
+        raise CodecError("oversize", f"{len(payload)} bytes, at most {limit} are taken")
+    return payload.to_bytes()
+
+
+def header_of(sample: zenoh.Sample) -> Header:
+    """What the sample's writer says of it.
+
+    Raises:
+        CodecError: it has no header that can be read.
+    """
+    attachment = sample.attachment
+    if attachment is None:
+        return header_codec.decode(None)
+    return header_codec.decode(bytes_of(attachment, header_codec.MAX_HEADER_BYTES))

@@ -1,0 +1,395 @@
+"""Every reader of bytes that somebody else made, and what it may raise: nothing but our own errors.
+
+`TARGETS` is read by the tests beside this file and by ``fuzz.py``. A reader that is new has one
+line here.
+"""
+
+from __future__ import annotations
+
+import json
+import runpy
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import typer
+
+from vla_zenoh.cli import decode as cli_decode
+from vla_zenoh.cli.options import model_options, number_list
+from vla_zenoh.cli.output import plain_types, printable
+from vla_zenoh.codec import header, image, message, records, settings
+from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
+from vla_zenoh.evaluation.csv_file import evaluate_csv
+from vla_zenoh.evaluation.run_file import evaluate_run
+from vla_zenoh.interop import groot, npy, openpi, openvla_rest, origami
+from vla_zenoh.interop.ros2 import attachment, table
+from vla_zenoh.interop.ros2.definitions import parse
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.motions import parse_hard
+from vla_zenoh.nodes.offsets import decode_stamps
+from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
+from vla_zenoh.profile import load_profile
+from vla_zenoh.recording import cdr
+from vla_zenoh.recording.kinds import RECORDS
+from vla_zenoh.tasks.understand import understand
+
+CORPUS = Path(__file__).parent / "corpus"
+"""Inputs that once broke a reader, or nearly: a folder for each target."""
+
+
+class Target(NamedTuple):
+    """A reader.
+
+    Args:
+        name: of the reader and of its folder in the corpus.
+        read: takes the bytes.
+        raises: what it may raise.
+        seeds: inputs that can be read; fuzzers begin with them.
+    """
+
+    name: str
+    read: Callable[[bytes], Any]
+    raises: tuple[type[Exception], ...]
+    seeds: Callable[[], list[bytes]]
+
+    def try_(self, data: bytes) -> bool:
+        """Read, and tell whether it could be read; what may not be raised comes through."""
+        try:
+            self.read(data)
+        except self.raises as error:
+            if not str(error):
+                raise AssertionError("an error without words") from error
+            return False
+        return True
+
+    def corpus(self) -> list[bytes]:
+        """Seeds, and what is kept in the folder."""
+        folder = CORPUS / self.name
+        kept = sorted(folder.iterdir()) if folder.is_dir() else []
+        return [*self.seeds(), *(path.read_bytes() for path in kept)]
+
+
+# -- what is not one function ---------------------------------------------------------------------
+def _raw(data: bytes) -> Any:
+    words, _, pixels = data.partition(b"\n")
+    return image.decode_raw(pixels, words.decode("latin-1"))
+
+
+@cache
+def _messages() -> Messages:
+    return Messages("jazzy")
+
+
+def _text(data: bytes) -> str:
+    return data.decode("utf-8", "replace")
+
+
+def _in_file(suffix: str, read: Callable[[Path], Any], data: bytes) -> Any:
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
+        path = Path(folder) / f"input{suffix}"
+        path.write_bytes(data)
+        return read(path)
+
+
+def _cli(data: bytes) -> None:
+    """What ``echo`` and ``keys`` do with anybody's payload, for people and for programs."""
+    words, _, payload = data.partition(b"\n")
+    found = cli_decode.read(payload, _text(words))
+    json.dumps(found)
+    json.dumps(plain_types(found))
+    shown = printable(str(found))
+    assert not any(ord(c) < 32 and c not in "\n\t" for c in shown), "it steers the terminal"
+
+
+def _options(data: bytes) -> None:
+    words = _text(data)
+    for read in (lambda: model_options([words]), lambda: number_list("--x", words, 0.0, 1e3)):
+        with suppress(typer.BadParameter):
+            read()
+
+
+def _prompt(data: bytes) -> None:
+    words = settings.decode_text(data)
+    with suppress(SpecError):
+        parse_hard(words)
+    understand(words)
+
+
+def _peer_actions(data: bytes) -> None:
+    for answer in (groot.read_answer, groot.read_actions):
+        answer(data)
+
+
+def _all_of(*reads: Callable[[bytes], Any]) -> Callable[[bytes], None]:
+    """Each of them is tried; the last one's error is raised."""
+
+    def read(data: bytes) -> None:
+        failure: VlaZenohError | None = None
+        for one in reads:
+            try:
+                one(data)
+            except VlaZenohError as error:
+                failure = error
+        if failure is not None:
+            raise failure
+
+    return read
+
+
+# -- seeds ----------------------------------------------------------------------------------------
+def _spec() -> ModelSpec:
+    return ModelSpec(
+        name="m", observation=ObservationSpec(), action=ActionSpec(horizon=2, dt_s=0.1)
+    )
+
+
+@cache
+def examples() -> dict[type, Any]:
+    """One small record of every kind that travels."""
+    from vla_zenoh import types as t
+
+    zeros, down = np.zeros(2), np.array([1.0, 0.0, 0.0, 0.0])
+    cause = t.Cause("w", 1, 2, 3, 4, 5, 6, 7)
+    three, six = np.zeros(3), np.zeros(6)
+    made = (
+        t.JointState(("a", "b"), zeros, zeros, zeros),
+        t.PoseState(three, down, six),
+        t.GripperState(0.08, False, False),
+        t.PoseCommand(three, down, six, six, three, down, "active", cause),
+        t.JointCommand(("a", "b"), zeros, zeros, zeros, "active", cause),
+        t.GripperCommand(0.0, 0.1, 10.0),
+        t.Task(1, True, "HARD: go up", "w", 5.0),
+        t.ActionChunk("w", "0" * 16, 1, 2, 3, 4, np.zeros((2, 7), np.float32), 5, 6, 7),
+        _spec(),
+        t.NodeStatus("n", "active", "h", 1, 2, {"a": 1.0}, {}, {"l": (1.0, 2.0)}, {"c": 1}, {}),
+        t.Event("info", "notice", "loaded", "in 1 s"),
+        t.SceneState("table", np.zeros(9)),
+        t.ObjectPoses(("red",), np.zeros((1, 3)), down[None]),
+        t.Seen("w", 1, "0" * 16, 1, 2, "up", np.zeros((2, 7), np.float32), 1.0, {"a": 1}, False),
+    )
+    return {type(record): record for record in made}
+
+
+def _gray(height: int = 8, width: int = 12) -> Any:
+    from vla_zenoh.types import Image
+
+    return Image(np.full((height, width, 3), 128, np.uint8))
+
+
+def _cdr_seed(kind: str) -> list[bytes]:
+    every = _messages()
+    pixels = np.zeros(12, np.uint8)
+    jpeg = np.frombuffer(image.encode_jpeg(_gray()), np.uint8)
+    fields: dict[str, dict[str, Any]] = {
+        "JointState": {"name": ["a"], "position": np.zeros(1)},
+        "Image": {"height": 2, "width": 2, "step": 6, "encoding": "rgb8", "data": pixels},
+        "CompressedImage": {"format": "jpeg", "data": jpeg},
+    }
+    return [every.encode(every.new(kind, **fields.get(kind.rsplit("/", 1)[-1], {})))]
+
+
+def _bag_seed(kind: type) -> list[bytes]:
+    try:
+        fields = cdr.fields_in(kind, records.encode(examples()[kind]))
+        return [cdr.write_record(kind, fields, 10**18, "base")]
+    except CodecError:
+        return []
+
+
+def _recording() -> list[bytes]:
+    from vla_zenoh.keys import Keys
+    from vla_zenoh.recording.sample import MSGPACK, TEXT, Sample
+    from vla_zenoh.recording.writer import RunWriter
+    from vla_zenoh.types import Header, PoseState
+
+    keys, at_ns = Keys("panda"), 10**18
+    payload = records.encode(examples()[PoseState])
+
+    def write(path: Path) -> bytes:
+        out = RunWriter(path, keys, profile_yaml="a: 1\n", base_frame="base", began_ns=at_ns)
+        for number in range(2):
+            head = Header(at_ns + number, number, "sim#1")
+            out.write(Sample(keys.state_pose, payload, MSGPACK, head, at_ns + number))
+        out.write(Sample(keys.prompt, b"HARD: go up", TEXT, None, at_ns + 9))
+        out.finish({"dropped": {}})
+        return path.read_bytes()
+
+    return [_in_file(".mcap", write, b"")]
+
+
+_CSV = b"""t_client_start,t_publish,t_vla_in,t_vla_out,success,error,x,y,z,qx,qy,qz,gw,prompt
+1,5,2,4,True,,0.1,0.2,0.3,0,0,0,0.08,up
+6,9,7,8,False,late,0.1,0.2,0.4,0,0,0,0.08,up
+"""
+_PROFILE = b"""extends: panda_sim
+cameras:
+  front: {source: "sim:front", width: 64, height: 48}
+limits: {step_m: 0.02}
+task: &a {prompt: hold, rate_hz: 1e1}
+"""
+_STATISTICS = b'{"a": {"action": {"q01": [0,0,0,0,0,0,0], "q99": [1,1,1,1,1,1,1]}}}'
+
+
+@cache
+def _statistics() -> Any:
+    """OpenVLA's statistics, as its worker reads them."""
+    return runpy.run_path(str(find_model("openvla").path.parent / "statistics.py"))
+
+
+def _read_statistics(data: bytes) -> None:
+    module = _statistics()
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError):
+        return
+    if isinstance(content, dict):
+        module["read_range"](content, module["choose"](content, "", "here"))
+
+
+def _replay(path: Path) -> Any:
+    return make_policy(find_model("replay"), {"file": str(path)})
+
+
+def _replay_seed() -> list[bytes]:
+    def write(path: Path) -> bytes:
+        steps = np.zeros((1, 2, 7), np.float32)
+        spec = json.dumps(_spec().to_dict())
+        np.savez(path, spec=spec, steps=steps, length=np.array([2]))
+        return path.read_bytes()
+
+    return [_in_file(".npz", write, b"")]
+
+
+# -- the table ------------------------------------------------------------------------------------
+def _targets() -> Iterator[Target]:
+    codec, peer = (CodecError,), (PeerError,)
+    yield Target(
+        "message",
+        message.unpack,
+        codec,
+        lambda: [message.pack({"a": [1, 2.5, None, "x", b"y"], "b": np.arange(3.0)})],
+    )
+    head = _header_bytes
+    yield Target("header", header.decode, codec, lambda: [head()])
+    for kind in RECORDS:
+        yield Target(
+            f"record-{kind.__name__}",
+            partial(records.decode, kind),
+            codec,
+            lambda kind=kind: [records.encode(examples()[kind])],
+        )
+    for name, words in (
+        ("text", b"put the red brick in the box"),
+        ("bool", b"true"),
+        ("rate", b"1e1"),
+        ("name", b"scripted"),
+        ("seed", b"17"),
+    ):
+        yield Target(
+            f"setting-{name}",
+            getattr(settings, f"decode_{name}"),
+            codec,
+            lambda words=words: [words],
+        )
+    yield Target("prompt", _prompt, codec, lambda: [b"HARD: go up x3", b"put the red brick down"])
+    yield Target("jpeg", image.decode_jpeg, codec, lambda: [image.encode_jpeg(_gray())])
+    yield Target("raw", _raw, codec, lambda: [b"rgb8;2x2\n" + bytes(12)])
+    yield Target(
+        "stamps", decode_stamps, codec, lambda: [message.pack({"heard_ns": 1, "said_ns": 2})]
+    )
+    # -- other systems
+    yield Target(
+        "openpi",
+        _all_of(openpi.read_metadata, openpi.read_answer, openpi.read_observation),
+        peer,
+        lambda: [message.pack({"actions": np.zeros((2, 7), np.float32)})],
+    )
+    yield Target(
+        "groot",
+        _peer_actions,
+        peer,
+        lambda: [groot.pack({"action.arm": np.zeros((2, 7))})],
+    )
+    yield Target("npy", npy.load, peer, lambda: [npy.dump(np.zeros((2, 3)))])
+    yield Target(
+        "openvla-rest",
+        partial(openvla_rest.read_answer, 200),
+        peer,
+        lambda: [openvla_rest.pack(np.zeros(7)).encode(), b"[[1, 2], [3, 4]]"],
+    )
+    yield Target(
+        "origami",
+        lambda data: origami.read_answer(data, "infer", "1"),
+        peer,
+        lambda: [
+            message.pack(
+                {
+                    "protocol_version": origami.PROTOCOL,
+                    "operation": "infer",
+                    "request_id": "1",
+                    "actions": np.zeros((2, 7)),
+                }
+            )
+        ],
+    )
+    # -- ROS 2
+    yield Target(
+        "ros2-attachment", attachment.decode, codec, lambda: [bytes(16) + b"\x10" + bytes(16)]
+    )
+    for reading in table.READINGS:
+        yield Target(
+            f"ros2-{reading.type.rsplit('/', 1)[-1]}",
+            lambda data, kind=reading.type: table.read(_messages(), kind, data),
+            codec,
+            lambda kind=reading.type: _cdr_seed(kind),
+        )
+    yield Target(
+        "ros2-definition",
+        lambda data: parse("a_msgs/msg/A", _text(data)),
+        (ProfileError,),
+        lambda: [b"float64[] a\nstring<=10 b\nint32 C=4\n"],
+    )
+    # -- files
+    for kind in RECORDS:
+        yield Target(
+            f"bag-{kind.__name__}",
+            partial(cdr.read_record, kind),
+            codec,
+            lambda kind=kind: _bag_seed(kind),
+        )
+    own = (VlaZenohError,)
+    yield Target("recording", partial(_in_file, ".mcap", evaluate_run), own, _recording)
+    yield Target("csv", partial(_in_file, ".csv", evaluate_csv), own, lambda: [_CSV])
+    yield Target(
+        "profile",
+        partial(_in_file, ".yaml", lambda path: load_profile(str(path))),
+        (ProfileError,),
+        lambda: [_PROFILE],
+    )
+    yield Target("statistics", _read_statistics, own, lambda: [_STATISTICS])
+    yield Target("replay", partial(_in_file, ".npz", _replay), own, _replay_seed)
+    # -- the command line
+    yield Target(
+        "cli-payload",
+        _cli,
+        codec,
+        lambda: [
+            b"application/msgpack\n" + message.pack({"a": np.zeros((2, 2)), "b": b"x"}),
+            b"text/plain\nwords",
+        ],
+    )
+    yield Target("cli-options", _options, own, lambda: [b"horizon=4", b"1,2.5,3"])
+
+
+def _header_bytes() -> bytes:
+    from vla_zenoh.types import Header
+
+    return header.encode(Header(1, 2, "sim#1"))
+
+
+TARGETS = {target.name: target for target in _targets()}

@@ -1,0 +1,109 @@
+"""Nothing that comes from outside is unpickled, evaluated or built by name: read off the code."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import vla_zenoh
+
+ROOT = Path(__file__).parents[2]
+FOLDERS = (Path(vla_zenoh.__file__).parent, ROOT / "models", ROOT / "scripts", ROOT / "sim")
+SOURCES = sorted(path for folder in FOLDERS for path in folder.rglob("*.py"))
+MODULES = frozenset(
+    {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve", "jsonpickle"}
+)
+CALLS = frozenset({"eval", "exec", "compile", "__import__", "execfile"})
+"""As plain names: ``net.eval()`` and ``re.compile`` are something else."""
+SAFE_LOADERS = frozenset({"SafeLoader", "CSafeLoader", "_Reader"})
+YAML_LOADS = frozenset({"load", "load_all", "unsafe_load", "full_load", "unsafe_load_all"})
+
+
+def called(node: ast.Call) -> str:
+    """``yaml.load`` for ``yaml.load(...)``, ``eval`` for ``eval(...)``."""
+    if isinstance(node.func, ast.Attribute):
+        owner = node.func.value
+        return f"{owner.id if isinstance(owner, ast.Name) else '?'}.{node.func.attr}"
+    return node.func.id if isinstance(node.func, ast.Name) else ""
+
+
+def keyword(node: ast.Call, name: str) -> object:
+    """The constant a keyword is given; None without it."""
+    for given in node.keywords:
+        if given.arg == name and isinstance(given.value, ast.Constant):
+            return given.value.value
+    return None
+
+
+def fault(node: ast.AST) -> str:
+    """What is wrong with a node; empty: nothing."""
+    if isinstance(node, ast.Import):
+        named = {alias.name.split(".")[0] for alias in node.names} & MODULES
+        return f"imports {', '.join(sorted(named))}" if named else ""
+    if isinstance(node, ast.ImportFrom):
+        return f"imports {node.module}" if (node.module or "").split(".")[0] in MODULES else ""
+    if not isinstance(node, ast.Call):
+        return ""
+    name = called(node)
+    owner, _, function = name.rpartition(".")
+    if name in CALLS:
+        return f"calls {name}"
+    if owner in ("np", "numpy") and function in ("load", "save", "savez"):
+        # numpy's own default is the safe one; saying it keeps it so.
+        allowed = keyword(node, "allow_pickle")
+        return f"calls {name} with allow_pickle" if allowed not in (None, False) else ""
+    if name == "torch.load" and keyword(node, "weights_only") is not True:
+        return "calls torch.load without weights_only=True"
+    if owner == "yaml" and function in YAML_LOADS:
+        loader = ast.unparse(node).partition("Loader=")[2].strip(")").split(".")[-1]
+        return "" if loader in SAFE_LOADERS else f"calls {name} with the loader {loader!r}"
+    if name in ("os.system", "os.popen") or keyword(node, "shell") is True:
+        return f"gives words to a shell ({name})"
+    return ""
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.name))
+def test_a_file_neither_unpickles_nor_evaluates(path: Path) -> None:
+    tree = ast.parse(path.read_text("utf-8"))
+    found = [f"line {node.lineno}: {why}" for node in ast.walk(tree) if (why := fault(node))]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import pickle",
+        "from pickle import loads",
+        "import joblib.memory",
+        "eval(words)",
+        "exec(words)",
+        "__import__(name)",
+        "np.load(path, allow_pickle=True)",
+        "torch.load(path)",
+        "torch.load(path, weights_only=False)",
+        "yaml.load(text, Loader=yaml.Loader)",
+        "yaml.unsafe_load(text)",
+        "os.system(words)",
+        "subprocess.run(words, shell=True)",
+    ],
+)
+def test_the_check_sees(text: str) -> None:
+    assert any(fault(node) for node in ast.walk(ast.parse(text)))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Network(weights).eval()",
+        "re.compile(words)",
+        "np.load(path)",
+        "torch.load(path, weights_only=True)",
+        "yaml.compose(text, Loader=_Reader)",
+        "yaml.load(text, Loader=yaml.SafeLoader)",
+        "yaml.safe_load(text)",
+    ],
+)
+def test_the_check_lets_pass(text: str) -> None:
+    assert not any(fault(node) for node in ast.walk(ast.parse(text)))
