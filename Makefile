@@ -3,12 +3,13 @@
 
 PYTHON ?= python3
 ARGS ?=
+SECONDS ?= 60
 BIN := .venv/bin
 READY := .venv/.ready
 SUITE := not slow and not models and not ros2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow test-ros2 test-models check format bench bench-faults bench-ros2 build ros2-bridge clean
+.PHONY: help setup demo test slow fuzz test-ros2 test-models check format bench bench-faults bench-ros2 build ros2-bridge clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -29,6 +30,9 @@ test: $(READY) ## Run the tests
 
 slow: $(READY) ## Run the tests that take long, too
 	$(BIN)/python -m pytest -m "not models" $(ARGS)
+
+fuzz: $(READY) ## Feed every reader of foreign bytes with nonsense; SECONDS=600 for longer
+	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(ARGS)
 
 test-ros2: $(READY) ros2-bridge ## Run the tests with a real ROS 2 bridge and a DDS robot
 	$(BIN)/python -m pytest -m ros2 $(ARGS)
