@@ -14,9 +14,10 @@ from peer_rig import KINDS, free_port, reachable
 
 from vla_zenoh import resources
 from vla_zenoh.check import fit, plausible
-from vla_zenoh.check.examine import Examination, Report
+from vla_zenoh.check.examine import Examination
 from vla_zenoh.check.examples import chart, looks
 from vla_zenoh.check.finding import MEANINGS
+from vla_zenoh.check.report import Report
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.nodes.check_bench import CheckBench
 from vla_zenoh.policy import (

@@ -2,118 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vla_zenoh.check import fit, plausible
+from vla_zenoh.check import fit, judge, plausible
+from vla_zenoh.check.bench import Bench, Failed, Hung
 from vla_zenoh.check.examples import MAX_WIDTH_M, PROMPTS, Look, Maker, looks, noise
-from vla_zenoh.check.finding import Finding, distinct, error, note, warning
+from vla_zenoh.check.finding import distinct, error, note
+from vla_zenoh.check.judge import Steps
+from vla_zenoh.check.report import Report
 from vla_zenoh.committed import Continuation
 from vla_zenoh.errors import SpecError
-from vla_zenoh.policy import ModelSpec, Policy, check_steps
+from vla_zenoh.policy import Policy, check_steps
 from vla_zenoh.profile import Limits, Profile, Timing
 
 DEFAULT_RUNS = 100
 ENOUGH_RUNS = 12
 """With fewer timed runs nothing is said of memory."""
-GROWTH_KIB, GROWTH_TOTAL_KIB = 32.0, 4096.0
-"""Memory that every inference keeps, and in all, before it is taken for a leak."""
-ALIKE = 1e-7
-
-Result = TypeVar("Result")
-Steps = NDArray[np.float32]
-
-
-class Failed(Exception):
-    """The model raised."""
-
-    def __init__(self, error: BaseException) -> None:
-        super().__init__(f"{type(error).__name__}: {error}")
-        self.error = error
-
-
-class Hung(Exception):
-    """The model did not come back in time; nothing more can be asked of it."""
-
-
-class Bench(Protocol):
-    """Where the model runs: who has the clock, the patience, and knows the memory."""
-
-    def call(self, what: Callable[[], Result]) -> tuple[Result, float]:
-        """What `what` returns, and the seconds it took.
-
-        Raises:
-            Failed: it raised.
-            Hung: it did not come back.
-        """
-        ...
-
-    def memory_kib(self) -> float:
-        """Resident memory of the process."""
-        ...
-
-    def spent_s(self) -> float:
-        """Seconds since the examination began."""
-        ...
-
-
-@dataclass(slots=True)
-class Report:
-    """What was found out about a model.
-
-    Args:
-        worker: its name.
-        spec: what it declares; None where it could not be made.
-        findings: all that is wrong or worth knowing.
-        shape: (H, D) of the first answer.
-        load_s: time of ``load()``.
-        first_ms: time of the first inference.
-        latency_ms: ``[p50, p95, max]`` of the later ones.
-        runs: how many those were.
-        memory_mib: resident: before load, after it, after all runs.
-        growth_kib_per_run: resident memory that every inference adds, None: too few runs.
-        deterministic: the same answer to the same observation after ``reset()``.
-        depends_on: pictures, colour order, prompt: whether the answer does; None: cannot be told.
-        step_range: per number of a step ``[smallest, largest]`` over all answers.
-    """
-
-    worker: str
-    spec: ModelSpec | None = None
-    findings: list[Finding] = field(default_factory=list)
-    shape: tuple[int, int] | None = None
-    load_s: float = 0.0
-    first_ms: float | None = None
-    latency_ms: tuple[float, float, float] | None = None
-    runs: int = 0
-    memory_mib: tuple[float, float, float] | None = None
-    growth_kib_per_run: float | None = None
-    deterministic: bool | None = None
-    depends_on: dict[str, bool | None] = field(default_factory=dict)
-    step_range: list[tuple[float, float]] = field(default_factory=list)
-
-    @property
-    def ok(self) -> bool:
-        """Nothing found that forbids giving it the arm."""
-        return not any(finding.level == "error" for finding in self.findings)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain types."""
-        return {
-            "worker": self.worker,
-            "ok": self.ok,
-            "findings": [finding._asdict() for finding in self.findings],
-            "spec": self.spec.to_dict() if self.spec else None,
-            "spec_hash": self.spec.hash if self.spec else None,
-            **{
-                name: getattr(self, name)
-                for name in self.__dataclass_fields__
-                if name not in ("worker", "spec", "findings")
-            },
-        }
 
 
 class Examination:
@@ -241,7 +147,7 @@ class Examination:
         first, again = self._anew(chart), self._anew(chart)
         if first is None or again is None:
             return
-        report.deterministic = _alike(first, again)
+        report.deterministic = judge.alike(first, again)
         if not report.deterministic:
             report.findings.append(
                 note(
@@ -265,7 +171,7 @@ class Examination:
             if name == "colour order" and report.depends_on.get("pictures") is False:
                 continue
             other = self._anew(look)
-            report.depends_on[name] = None if other is None else not _alike(first, other)
+            report.depends_on[name] = None if other is None else not judge.alike(first, other)
 
     def _another_prompt(self) -> str:
         prompts = [look.prompt for look in self._looks if not look.strange]
@@ -283,19 +189,8 @@ class Examination:
         report = self.report
         if len(kib) < ENOUGH_RUNS:
             return
-        third = len(kib) // 3
-        # The first third may still fill caches; from then on nothing should be kept.
-        rest = np.array(kib[third:])
-        report.growth_kib_per_run = float(np.polyfit(np.arange(len(rest)), rest, 1)[0])
-        total_kib = report.growth_kib_per_run * len(rest)
-        steady = rest[-third:].min() > rest[:third].max()
-        if steady and report.growth_kib_per_run > GROWTH_KIB and total_kib > GROWTH_TOTAL_KIB:
-            report.findings.append(
-                error(
-                    "memory_growth",
-                    f"every inference keeps {report.growth_kib_per_run:.0f} KiB",
-                )
-            )
+        report.growth_kib_per_run, leaks = judge.growth(kib)
+        report.findings += leaks
 
     # -- one inference ------------------------------------------------------------------------
     def _anew(self, look: Look) -> Steps | None:
@@ -354,79 +249,19 @@ class Examination:
 
     # -- what it all means --------------------------------------------------------------------
     def _judge(self) -> None:
-        report, spec = self.report, self._policy.spec
+        report, action = self.report, self._policy.spec.action
         report.runs = len(self._took_ms)
         if self._took_ms:
             p50, p95 = np.percentile(self._took_ms, (50, 95))
             report.latency_ms = (float(p50), float(p95), max(self._took_ms))
-            report.findings += self._slowness(p50 / 1e3, p95 / 1e3)
+            report.findings += judge.slowness(
+                action,
+                float(p50) / 1e3,
+                float(p95) / 1e3,
+                oldest_s=self._timing.max_observation_age_s,
+                rate_hz=self._rate_hz,
+            )
         numbers = np.concatenate([steps for _, steps in self._answers])
         low, high = numbers.min(axis=0).tolist(), numbers.max(axis=0).tolist()
         report.step_range = list(zip(low, high, strict=True))
-        report.findings += self._polarity()
-        if spec.action.kind == "delta" and not np.any(np.abs(numbers[:, :3]) > ALIKE):
-            report.findings.append(
-                note("stands_still", "no example made it move; try --prompt with one it knows")
-            )
-        for what, name in (
-            ("pictures", "ignores_pictures"),
-            ("colour order", "ignores_colour_order"),
-            ("prompt", "ignores_prompt"),
-        ):
-            if report.depends_on.get(what) is False:
-                report.findings.append(warning(name, f"the answer does not depend on the {what}"))
-
-    def _slowness(self, p50_s: float, p95_s: float) -> list[Finding]:
-        found: list[Finding] = []
-        action, oldest_s = self._policy.spec.action, self._timing.max_observation_age_s
-        if p50_s > oldest_s:
-            found.append(
-                error(
-                    "too_slow",
-                    f"an inference takes {p50_s:.3g} s; the command node refuses chunks whose "
-                    f"observation is older than {oldest_s:g} s (timing.max_observation_age_s)",
-                )
-            )
-        chunk_s = action.horizon * action.dt_s
-        if p50_s > chunk_s:
-            # One step late is still the goal; of many late ones all but the last are lost.
-            level = error if action.horizon > 1 else warning
-            found.append(
-                level(
-                    "slower_than_chunk",
-                    f"an inference takes {p50_s:.3g} s, its {action.horizon} steps of "
-                    f"{action.dt_s:g} s are over by then",
-                )
-            )
-        if self._rate_hz is not None and p95_s > 1.0 / self._rate_hz:
-            found.append(
-                warning(
-                    "slower_than_rate",
-                    f"an inference takes up to {p95_s:.3g} s (p95), it is asked for "
-                    f"{self._rate_hz:g} times a second",
-                )
-            )
-        return found
-
-    def _polarity(self) -> list[Finding]:
-        """An open, empty gripper that every answer shuts is a sign of the wrong polarity."""
-        action = self._policy.spec.action
-        shares = [
-            opening
-            for look, steps in self._answers
-            if look.width_m == MAX_WIDTH_M
-            and (opening := plausible.opening(action, steps)) is not None
-        ]
-        if not shares or float(np.concatenate(shares).max()) > 0.5:
-            return []
-        return [
-            warning(
-                "gripper_polarity",
-                "every example with an open, empty gripper has it shut at once; is "
-                f"gripper_open_is_high: {action.gripper_open_is_high} right?",
-            )
-        ]
-
-
-def _alike(a: Steps, b: Steps) -> bool:
-    return a.shape == b.shape and bool(np.abs(a - b).max() <= ALIKE)
+        report.findings += judge.behaviour(action, self._answers, report.depends_on)

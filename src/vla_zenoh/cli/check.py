@@ -10,8 +10,9 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from vla_zenoh.check.examine import DEFAULT_RUNS, Examination, Report
+from vla_zenoh.check.examine import DEFAULT_RUNS, Examination
 from vla_zenoh.check.finding import Finding, error
+from vla_zenoh.check.report import Report
 from vla_zenoh.cli.options import JsonOption, model_options
 from vla_zenoh.cli.output import console, print_json, printable
 from vla_zenoh.errors import WorkerError

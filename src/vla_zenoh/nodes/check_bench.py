@@ -10,7 +10,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
-from vla_zenoh.check.examine import Failed, Hung
+from vla_zenoh.check.bench import Failed, Hung
 
 Result = TypeVar("Result")
 
@@ -42,7 +42,7 @@ class CheckBench:
             del what, answer
 
     def call(self, what: Callable[[], Result]) -> tuple[Result, float]:
-        """See `vla_zenoh.check.examine.Bench`."""
+        """See `vla_zenoh.check.bench.Bench`."""
         answer: Future[tuple[Result, float]] = Future()
         self._calls.put((what, answer))
         if not self._wait(answer):
