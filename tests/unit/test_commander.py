@@ -129,6 +129,20 @@ def test_steps_are_neither_lost_nor_counted_twice_whatever_rate_latency_and_jitt
     rig.assert_smooth()
 
 
+def test_of_a_chunk_that_lasts_too_long_only_the_beginning_is_followed() -> None:
+    rig = Rig(profile(timing={"max_open_loop_s": 0.5}), horizon=50, dt_s=0.1)
+    rig.activate()
+    out = rig.send([UP] * 50, done=True)
+    assert out.accepted is not None
+    (event,) = [event for event in rig.events if event.what == "open_loop"]
+    assert (event.value, event.limit) == (pytest.approx(5.0), 0.5)
+    rig.run(3.0)
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, 5 * STEP_M], atol=AT_GOAL_M)
+    assert not rig.commander.policy_done
+    assert rig.state == "holding"
+
+
 def test_a_chunk_whose_observation_does_not_show_the_last_chunk_replaces_it() -> None:
     rig = Rig()
     rig.activate()

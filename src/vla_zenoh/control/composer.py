@@ -14,6 +14,7 @@ from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import REFUSE_FACTOR, Profile
 from vla_zenoh.types import ActionChunk, Cause, FloatArray, Stamped
 
+ROUNDING_S = 1e-6
 BOUND_AHEAD = 8
 """Steps of a chunk that are checked against the arm at once; the rest when they come due."""
 
@@ -29,19 +30,29 @@ class Composer:
     def __init__(self, profile: Profile, reach: Shadow | None) -> None:
         self._limits = profile.limits
         self._refusing = profile.limits.out_of_bounds == "refuse"
+        self._open_loop_s = profile.timing.max_open_loop_s
         self._max_width_m = profile.robot.gripper.max_width_m
         self._reach = reach
 
     def compose(
         self, chunk: Stamped[ActionChunk], action: ActionSpec, timeline: GoalTimeline, out: Outputs
     ) -> Plan | Refusal:
-        """The plan of `chunk` on top of what was asked for when its observation was taken."""
+        """The plan of `chunk` on top of what was asked for when its observation was taken.
+
+        Steps later than ``timing.max_open_loop_s`` are left out: whoever made them saw nothing of
+        what the arm will have met by then.
+        """
         record = chunk.record
+        steps, lasts_s = record.steps, len(record.steps) * action.dt_s
+        hits: list[LimitHit] = []
+        if lasts_s > self._open_loop_s + ROUNDING_S:
+            steps = steps[: max(1, int((self._open_loop_s + ROUNDING_S) / action.dt_s))]
+            hits.append(LimitHit("open_loop", lasts_s, self._open_loop_s))
+        done = record.done and len(steps) == len(record.steps)
         standing_on = timeline.in_force(record.observation_stamp_ns)
         before = standing_on.asked_until(record.observation_stamp_ns)
         goals: list[Goal] = []
-        hits: list[LimitHit] = []
-        for step in record.steps:
+        for step in steps:
             try:
                 asked = step_pose(action, step, before.pose)
                 width_m = step_width(action, step, before.width_m, self._max_width_m)
@@ -80,11 +91,11 @@ class Composer:
             _cause(chunk),
             len(goals) if self._reach is None or self._refusing else min(len(goals), BOUND_AHEAD),
             record.episode,
-            done=record.done,
+            done=done,
         )
         if standing_on.episode == record.episode:
             plan.begun = standing_on.steps_asked_until(record.observation_stamp_ns)
-            if record.done and standing_on.done:  # it only says the last of its steps again
+            if done and standing_on.done:  # it only says the last of its steps again
                 plan.most = min(standing_on.begun + len(standing_on.goals), standing_on.most)
         return plan
 

@@ -63,6 +63,7 @@ class Timing(Section):
         state_timeout_s: robot state older than this: brake, and activation is needed again.
         command_timeout_s: pose stream silent for this long: the robot side brakes by itself.
         max_observation_age_s: a chunk made from an older observation is refused.
+        max_open_loop_s: of a chunk no more is followed without a newer one; then as when it ran out.
         max_clock_step_s: the wall clock jumped by more: brake, and activation is needed again.
         max_clock_offset_s: another host's clock may differ by this much, which is then reckoned
             with; beyond it activation is refused.
@@ -74,6 +75,7 @@ class Timing(Section):
     state_timeout_s: float = Field(default=0.15, ge=0.02, le=2)
     command_timeout_s: float = Field(default=0.1, ge=0.01, le=1)
     max_observation_age_s: float = Field(default=1.0, gt=0, le=10)
+    max_open_loop_s: float = Field(default=2.5, ge=0.05, le=60)
     max_clock_step_s: float = Field(default=0.05, gt=0, le=1)
     max_clock_offset_s: float = Field(default=0.1, gt=0, le=1)
 
