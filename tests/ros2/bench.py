@@ -42,7 +42,7 @@ from ros_node import Listener, RosNode, free_domain
 from vla_zenoh.bench.picture import noisy_picture
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
-from vla_zenoh.nodes.bench_process import cpu_s
+from vla_zenoh.nodes.bench.process import cpu_s
 from vla_zenoh.types import PoseCommand
 
 FRONT = CAMERAS["front"]

@@ -8,7 +8,7 @@ import pytest
 
 from vla_zenoh.bench.task import BASELINES, Ended, Plan
 from vla_zenoh.cli.bench_task import _with_bricks
-from vla_zenoh.nodes.bench_task_lockstep import run_in_lockstep
+from vla_zenoh.nodes.bench.task_lockstep import run_in_lockstep
 from vla_zenoh.profile import load_profile, override
 
 SEED = 1_000_000

@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from vla_zenoh.bench.motion import PROTOCOL, Conditions
-from vla_zenoh.nodes.bench_motion_lockstep import lockstep_row, run_in_lockstep
+from vla_zenoh.nodes.bench.motion_lockstep import lockstep_row, run_in_lockstep
 from vla_zenoh.profile import load_profile, override
 
 NAMES = {trial.name: trial for trial in PROTOCOL}

@@ -22,8 +22,8 @@ from vla_zenoh.bench.report import CHUNK, LINES, POSE, ROUND_TRIP, STAGES, TICK_
 from vla_zenoh.bench.statistics import Slot, summarise
 from vla_zenoh.bench.ways import REFERENCE, WAYS, Way
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.bench_chain import bench_profile
-from vla_zenoh.nodes.bench_process import Server, cpu_s, free_port
+from vla_zenoh.nodes.bench.chain import bench_profile
+from vla_zenoh.nodes.bench.process import Server, cpu_s, free_port
 
 SIGMA_TOLERANCE = 0.2  # grey levels
 PNG_BYTES = (300_000, 700_000)  # what a camera's picture of this size has

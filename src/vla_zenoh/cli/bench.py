@@ -55,7 +55,7 @@ def chain(
 
     from vla_zenoh.bench import report
     from vla_zenoh.bench.ways import WAYS, Way
-    from vla_zenoh.nodes.bench_run import run
+    from vla_zenoh.nodes.bench.run import run
 
     names = [way.name for way in WAYS]
     unknown = [name for name in only or () if name not in names]

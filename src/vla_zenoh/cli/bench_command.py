@@ -37,7 +37,7 @@ def command(
     The real chain is started once for every rate.
     """
     from vla_zenoh.cli.own_address import own_address
-    from vla_zenoh.nodes.bench_command import measure_command
+    from vla_zenoh.nodes.bench.command import measure_command
     from vla_zenoh.nodes.demo import Interrupted
     from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
 

@@ -105,7 +105,7 @@ def _lockstep(
     rows: Rows,
     out: Path | None,
 ) -> None:
-    from vla_zenoh.nodes.bench_motion_lockstep import run_in_lockstep
+    from vla_zenoh.nodes.bench.motion_lockstep import run_in_lockstep
 
     bar = bars.add_task("all rows", total=len(trials) * len(conditions))
     done: Callable[[Any], None] = lambda _: bars.update(bar, advance=1)  # noqa: E731
@@ -149,7 +149,7 @@ def _with_one_worker(
     out: Path | None,
 ) -> None:
     from vla_zenoh.demo.plot import plot_run
-    from vla_zenoh.nodes.bench_motion import run_in_real_time
+    from vla_zenoh.nodes.bench.motion import run_in_real_time
     from vla_zenoh.nodes.demo import Interrupted
     from vla_zenoh.nodes.launch import Host
 

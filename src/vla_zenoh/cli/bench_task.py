@@ -191,7 +191,7 @@ def _lockstep(
     processes: int | None,
     advance: Callable[[Score], None],
 ) -> None:
-    from vla_zenoh.nodes.bench_task_lockstep import run_in_lockstep
+    from vla_zenoh.nodes.bench.task_lockstep import run_in_lockstep
 
     for ended, latency_ms in run_in_lockstep(
         profile,
@@ -218,7 +218,7 @@ def _real_time(
     advance: Callable[[Score], None],
 ) -> None:
     from vla_zenoh.cli.own_address import own_address
-    from vla_zenoh.nodes.bench_task import TaskRun
+    from vla_zenoh.nodes.bench.task import TaskRun
     from vla_zenoh.nodes.demo import Interrupted
     from vla_zenoh.nodes.launch import Host
     from vla_zenoh.nodes.process import die_with_parent

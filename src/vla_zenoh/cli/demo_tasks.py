@@ -15,7 +15,7 @@ from vla_zenoh.cli.demo_stage import Stage, prepare, refusals
 from vla_zenoh.cli.output import console, printable
 from vla_zenoh.demo.analysis import latencies
 from vla_zenoh.demo.tasks import Tour, judged
-from vla_zenoh.nodes.bench_task import TaskRun
+from vla_zenoh.nodes.bench.task import TaskRun
 from vla_zenoh.nodes.demo import Interrupted
 from vla_zenoh.tasks import FAILURES, LIMIT_S
 

@@ -17,6 +17,13 @@ from vla_zenoh.profile.session import SecurityProfile, second_link
 from vla_zenoh.security.store import Store
 
 RETRY_S = 0.1
+CLIENT, LINKED, FIRST = 1, 2, 3
+"""Leases that a client, a router that connects to others, and one that does not announce: so long
+the other side waits. Who connects has to wait longer than who is connected to. For who comes back
+while the other still holds its old transport is taken for a second link of that, and its keys are
+mixed up (Zenoh 1.10; eclipse-zenoh/zenoh#2806)."""
+ROUTER_BLOCKS_US = 200_000
+"""A router waits so long for a link that does not take what must arrive, then closes it."""
 MAX_MESSAGE_BYTES = 160 * 1024 * 1024
 """Zenoh itself takes no larger sample from a link; the largest picture we read has 96 MiB."""
 
@@ -64,6 +71,8 @@ def config(
     mode = mode or profile.mode
     routes = mode == "router"
     targets = (connect or ()) if routes else (connect or profile.connect)
+    leases = (LINKED if targets else FIRST) if routes else CLIENT
+    blocks_us = ROUTER_BLOCKS_US if routes else FIRST * profile.lease_ms * 1000
     settings: dict[str, Any] = {
         "mode": mode,
         "listen": {"endpoints": _listening(profile) if routes else []},
@@ -84,10 +93,10 @@ def config(
             "link": {
                 "rx": {"max_message_size": MAX_MESSAGE_BYTES},
                 "tx": {
-                    "lease": profile.lease_ms,
+                    "lease": leases * profile.lease_ms,
                     "keep_alive": 4,
                     "queue": {
-                        "congestion_control": {"block": {"wait_before_close": 200_000}},
+                        "congestion_control": {"block": {"wait_before_close": blocks_us}},
                     },
                 },
             },

@@ -74,11 +74,18 @@ class Slot:
 
 
 class Latest(Slot):
-    """Keeps the newest sample, and can be waited on."""
+    """Keeps the newest sample, and can be waited on.
 
-    def __init__(self, limit: int = MAX_RECORD_BYTES) -> None:
+    Args:
+        limit: bytes of payload and attachment together.
+        changed: is notified at every sample; several may share one, to be waited on together.
+    """
+
+    def __init__(
+        self, limit: int = MAX_RECORD_BYTES, changed: threading.Condition | None = None
+    ) -> None:
         super().__init__(limit)
-        self._changed = threading.Condition()
+        self._changed = changed or threading.Condition()
         self._arrival: Arrival | None = None
         self._count = 0
         self._taken = 0
@@ -95,6 +102,11 @@ class Latest(Slot):
     def count(self) -> int:
         """Samples that ever arrived."""
         return self._count
+
+    @property
+    def full(self) -> bool:
+        """Whether something untaken is there."""
+        return self._taken != self._count
 
     def take(self) -> Arrival | None:
         """The newest sample, once."""

@@ -3,59 +3,32 @@
 Inference never runs in a Zenoh callback and nothing is queued: each inference takes the newest
 observation that was captured after the worker's last chunk was published. The worker infers whether
 or not it is obeyed, so that it can be looked at, compared and checked before it gets the arm.
+
+It may serve several robots, each from a seat of its own (`vla_zenoh.nodes.seat`). A model that has
+``infer_batch`` is asked for all of them that are ready at once; who is not ready is not waited for.
 """
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import zenoh
 
-from vla_zenoh.codec import image as image_codec
-from vla_zenoh.codec import records
-from vla_zenoh.codec.image import MAX_PICTURE_BYTES
-from vla_zenoh.codec.records import SMALL_BYTES
-from vla_zenoh.committed import Continuation
-from vla_zenoh.control.names import worker_node
-from vla_zenoh.errors import CodecError, PeerError, SpecError
-from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.bounded import bytes_of
-from vla_zenoh.nodes.meter import Percentiles, RateMeter
-from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.seen import SeenOutlet
-from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
-from vla_zenoh.nodes.speaker import Speaker
-from vla_zenoh.observe import History, NotYet, assemble, form_of
-from vla_zenoh.policy import CameraSpec, Observation, Policy, check_steps
-from vla_zenoh.profile import Profile
-from vla_zenoh.types import (
-    ActionChunk,
-    Event,
-    GripperState,
-    Image,
-    JointState,
-    PoseState,
-    Stamped,
-    Task,
-)
+from vla_zenoh.errors import SpecError, WorkerError
+from vla_zenoh.nodes.seat import Seat, wants_robot
+from vla_zenoh.policy import ActionSteps, Observation, Policy
+from vla_zenoh.profile import Profile, override
+from vla_zenoh.types import Event
 
-SPEC_PERIOD_S = 1.0
-TASK_PATIENCE_S = 1.5
-STREAM_PATIENCE_S = 0.5
-"""Another camera or robot is believed when the one before it was silent for so long."""
 LOOK_PERIOD_S = 0.25
-AFTER_A_FAILURE_S = 0.5
-FRESH_PATIENCE_S = 0.05
-MAX_COMPLAINT = 500
 NAP_S, NAPS = 0.004, 5
-FRESH_TOLERANCE_S = 0.005
-STATE_KINDS: dict[str, type[Any]] = {
-    "joint": JointState,
-    "pose": PoseState,
-    "gripper": GripperState,
-}
+BLIND_NAP_S, IDLE_NAP_S = 0.002, 0.02
+
+Ready = tuple[Seat, Observation, int]
+"""A robot, what it shows, and when that was at hand (wall ns)."""
 
 
 class WorkerNode:
@@ -69,6 +42,12 @@ class WorkerNode:
         images: which form of pictures to listen to. Between processes of one host raw ones travel
             through shared memory and cost least; between hosts JPEG is a tenth of the bytes.
         delay_s: let every inference take so much longer: what a slower computer would do.
+        robots: names of the robots to serve, all as the profile describes; none: the profile's.
+        another: makes the model once more, for every further robot, where it cannot batch.
+
+    Raises:
+        NodeError: a worker of this name serves one of the robots already.
+        WorkerError: the model cannot serve several robots, says why.
     """
 
     def __init__(
@@ -80,259 +59,150 @@ class WorkerNode:
         *,
         images: Literal["raw", "jpeg"] = "raw",
         delay_s: float = 0.0,
+        robots: Sequence[str] = (),
+        another: Callable[[], Policy] | None = None,
     ) -> None:
-        self._delay_s = delay_s
-        node = self.node = Node(worker_node(name), profile, session)
+        self._delay_s, self._changed = delay_s, threading.Condition()
+        self._infer_batch: Callable[..., Any] | None = getattr(policy, "infer_batch", None)
+        self._most = getattr(policy, "max_batch", None) or max(len(robots), 1)
+        policies = [policy]
+        if len(robots) > 1:
+            policies = self._one_for_each(policy, len(robots), another)
+        profiles = [override(profile, {"robot": {"name": robot}}) for robot in robots] or [profile]
         self.policy, self.name, self.spec = policy, name, policy.spec
-        self._continuation = Continuation(policy)
-        keys = node.keys
-        self._chunk_out = node.stream(keys.delta(name), Kind.ORDER)
-        self._spec_out = node.stream(keys.spec(name), Kind.NEWS)
-        self._seen = SeenOutlet(node, name, self.spec)
-        node.answer(
-            keys.spec(name),
-            lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
-        )
-        self._task_slot = node.listen(keys.task, Latest(SMALL_BYTES))
-        self._jpeg = images == "jpeg"
+        self._policies = policies
+        self.seats: list[Seat] = []
+        try:
+            for number, part in enumerate(profiles):
+                mind = policies[number % len(policies)]
+                seat = Seat(part, session, mind, name, images=images, changed=self._changed)
+                self.seats.append(seat)
+        except BaseException:
+            for seat in self.seats:
+                seat.close()
+            raise
+        self.node = self.seats[0].node
 
-        def key_of(camera: CameraSpec) -> str:
-            settings, form = profile.cameras.get(camera.camera), form_of(camera)
-            if self._jpeg and settings is not None and settings.fit_for_workers and form:
-                return keys.camera_fitted(camera.camera, form)
-            return (keys.camera_jpeg if self._jpeg else keys.camera_raw)(camera.camera)
-
-        self._image_slots = {
-            camera.camera: node.listen(key_of(camera), Latest(MAX_PICTURE_BYTES), Kind.FRAME)
-            for camera in self.spec.observation.cameras
-        }
-        self._state_slots = {
-            part: node.listen(self._state_key(part), Inbox(256, SMALL_BYTES))
-            for part in self.spec.observation.state
-        }
-        self._task_speaker = Speaker(TASK_PATIENCE_S)
-        self._speakers = {
-            name: Speaker(STREAM_PATIENCE_S) for name in (*self._image_slots, *self._state_slots)
-        }
-        self._images: dict[str, Stamped[Image]] = {}
-        self._pictures_s: dict[str, float] = {}
-        self._states = {part: History() for part in self.spec.observation.state}
-        self._task: Task | None = None
-        self._task_heard_s = -1e9
-        self._episode = -1
-        self._not_before_ns = 0
-        self._rate = RateMeter(window_s=10.0)
-        self._inference_ms = Percentiles(128)
-        self._last_spec_s = -1e9
-        self._complaint = "loading"
-
-    def _state_key(self, part: str) -> str:
-        keys = self.node.keys
-        return {"joint": keys.state_joint, "pose": keys.state_pose, "gripper": keys.state_gripper}[
-            part
-        ]
+    def _one_for_each(
+        self, policy: Policy, count: int, another: Callable[[], Policy] | None
+    ) -> list[Policy]:
+        if self._infer_batch is not None:
+            if callable(getattr(policy, "reset", None)) and not wants_robot(policy):
+                raise WorkerError(
+                    f"model {policy.spec.name!r} serves several robots together, but its reset() "
+                    "does not say whose episode begins: give it the robot's name, reset(robot)"
+                )
+            return [policy]
+        if another is None:
+            raise WorkerError(f"model {policy.spec.name!r} serves one robot: it has no infer_batch")
+        return [policy, *(another() for _ in range(count - 1))]
 
     # -- running ------------------------------------------------------------------------------
     def run(self, stop: threading.Event) -> None:
         """Load the model, then infer until `stop` is set."""
-        self._report(now=True)
-        load = getattr(self.policy, "load", None)
-        if callable(load):
-            began = time.monotonic()
-            load()
-            took_s = time.monotonic() - began
-            self.node.tell(Event("info", "notice", "loaded", f"in {took_s:.1f} s"))
-        self._complaint = ""
-        next_s = time.monotonic()
+        for seat in self.seats:
+            seat.report(now=True)
+        began = time.monotonic()
+        for policy in self._policies:
+            load = getattr(policy, "load", None)
+            if callable(load):
+                load()
+        took_s = time.monotonic() - began
+        for seat in self.seats:
+            if callable(getattr(self.policy, "load", None)):
+                seat.node.tell(Event("info", "notice", "loaded", f"in {took_s:.1f} s"))
+            seat.complaint, seat.due_s = "", time.monotonic()
         while not stop.is_set():
-            now_s = time.monotonic()
-            if now_s < next_s:
-                self._listen()
-                stop.wait(min(next_s - now_s, LOOK_PERIOD_S))
-                self._report()
-                continue
-            observed = self._observe(next_s)
-            if observed is None:
-                self._report()
-                self._wait_for_news(stop)
-                continue
-            period_s = 1.0 / observed.rate_hz
-            next_s = max(next_s + period_s, now_s)
-            if not self._infer(observed):
-                next_s = time.monotonic() + AFTER_A_FAILURE_S
-            self._report()
-        self.node.report("stopped", now=True)
-        self.node.close()
-        close = getattr(self.policy, "close", None)
-        if callable(close):
-            close()
+            self._turn(stop)
+        for seat in self.seats:
+            seat.close()
+        for policy in self._policies:
+            close = getattr(policy, "close", None)
+            if callable(close):
+                close()
 
-    def _wait_for_news(self, stop: threading.Event) -> None:
-        """Sleep until the slowest input brings something, or a little while."""
-        if self._image_slots:
-            slot = next(iter(self._image_slots.values()))
+    def _turn(self, stop: threading.Event) -> None:
+        now_s = time.monotonic()
+        due = sorted(
+            (seat for seat in self.seats if seat.due_s <= now_s), key=lambda seat: seat.due_s
+        )
+        for seat in self.seats:
+            if seat not in due:
+                seat.listen()
+        ready = self._look(due)
+        if ready:
+            self._infer(ready)
+        for seat in self.seats:
+            seat.report()
+        if not ready:
+            self._rest(due, stop)
+
+    def _look(self, due: Sequence[Seat]) -> list[Ready]:
+        """Who is due and has something to show: all of them for a batch, else the first."""
+        most = self._most if self._infer_batch is not None else 1
+        ready: list[Ready] = []
+        for seat in due:
+            if len(ready) == most:
+                seat.listen()
+                continue
+            observation = seat.observe()
+            if observation is not None:
+                ready.append((seat, observation, seat.node.clock.wall_ns()))
+        return ready
+
+    def _rest(self, due: Sequence[Seat], stop: threading.Event) -> None:
+        """Sleep until somebody is due, or brings news, or a little while."""
+        now_s = time.monotonic()
+        others_s = [seat.due_s - now_s for seat in self.seats if seat not in due]
+        if not due:
+            stop.wait(max(0.0, min(*others_s, LOOK_PERIOD_S)))
+        elif all(seat.sees for seat in due):
             for _ in range(NAPS):
-                if slot.wait(NAP_S):
-                    return
+                with self._changed:
+                    if self._changed.wait_for(lambda: any(seat.news for seat in due), NAP_S):
+                        return
                 # States that are decoded while nothing else is to do need no time afterwards.
-                self._listen_to_states()
+                for seat in self.seats:
+                    seat.listen_to_states()
+                if others_s and min(others_s) <= time.monotonic() - now_s:
+                    return
         else:
-            stop.wait(0.002 if self._task is not None else 0.02)
+            idle = all(seat.task is None for seat in due)
+            stop.wait(IDLE_NAP_S if idle else BLIND_NAP_S)
 
-    # -- in -----------------------------------------------------------------------------------
-    def _listen(self) -> None:
-        arrival = self._task_slot.take()
-        if arrival is not None:
-            task = self.node.read(Task, arrival, self._task_speaker)
-            if task is not None:
-                self._take_task(task)
-        for camera, slot in self._image_slots.items():
-            arrival = slot.take()
-            image = self._read_image(camera, arrival) if arrival is not None else None
-            if arrival is not None and image is not None:
-                self._images[camera] = image
-                self._pictures_s[camera] = arrival.mono_ns / 1e9
-        self._listen_to_states()
-
-    def _listen_to_states(self) -> None:
-        for part, inbox in self._state_slots.items():
-            for arrival in inbox.take_all():
-                state = self.node.read(STATE_KINDS[part], arrival, self._speakers[part])
-                if state is not None:
-                    self._states[part].add(state)
-
-    def _take_task(self, task: Stamped[Task]) -> None:
-        self._task, self._task_heard_s = task.record, time.monotonic()
-        if task.record.episode == self._episode:
-            return
-        self._episode = task.record.episode
-        # What was seen before the episode began does not belong to it.
-        self._not_before_ns = task.header.stamp_wall_ns
-        reset = getattr(self.policy, "reset", None)
-        if callable(reset):
-            try:
-                reset()
-            except Exception as error:
-                self._failed("reset_failed", f"{type(error).__name__}: {error}")
-
-    def _read_image(self, camera: str, arrival: Arrival) -> Stamped[Image] | None:
-        sample = arrival.sample
-        try:
-            header = self.node.header(arrival)
-            self._speakers[camera].check(header, arrival.mono_ns)
-            payload = bytes_of(sample.payload, MAX_PICTURE_BYTES)
-            if self._jpeg:
-                image = image_codec.decode_jpeg(payload)
-            else:
-                _, _, schema = str(sample.encoding).partition(";")
-                image = image_codec.decode_raw(payload, schema)
-        except CodecError as error:
-            self.node.refuse(error.reason, f"camera {camera}: {error}")
-            return None
-        self._speakers[camera].heard(header, arrival.mono_ns)
-        self.node.traffic.heard(str(sample.key_expr), header, arrival.nth)
-        header, image = self.node.clocks.here(header, image)
-        return Stamped(header, image, self.node.wall_of(arrival))
-
-    def _observe(self, due_s: float) -> Observation | None:
-        """An observation, None when there is none yet.
-
-        A picture that arrives after the request is due is worth a little patience: the one at hand
-        is already half a camera period old on average, and all that time would be latency.
-        """
-        self._listen()
-        self.node.clock.follow()
-        if self._task is None or time.monotonic() - self._task_heard_s > TASK_PATIENCE_S:
-            self._complaint = "no command node is heard"
-            return None
-        try:
-            observation = assemble(
-                self.spec,
-                self._task,
-                self._images,
-                self._states,
-                not_before_ns=self._not_before_ns,
-                now_ns=self.node.clock.wall_ns(),
-            )
-        except ValueError as error:
-            self._complaint = str(error)
-            return None
-        if isinstance(observation, NotYet):
-            if not observation.waiting:
-                self._complaint = observation.why
-            return None
-        self._complaint = ""
-        if self._pictures_s and time.monotonic() - due_s < FRESH_PATIENCE_S:
-            tolerance_s = min(FRESH_TOLERANCE_S, 0.25 / observation.rate_hz)
-            if min(self._pictures_s.values()) < due_s - tolerance_s:
-                return None
-        return observation
-
-    # -- out ----------------------------------------------------------------------------------
-    def _infer(self, observation: Observation) -> bool:
-        observed_ns = self.node.clock.wall_ns()
-        start_ns = self.node.clock.wall_ns()
-        try:
-            answer = self._continuation.infer(observation)
-            steps, done = check_steps(self.spec.action, answer.steps), bool(answer.done)
-        except SpecError as error:
-            return self._failed("contract", str(error))
-        except PeerError as error:  # no chunk now, and the model says why
-            return self._failed(error.reason, str(error))
-        except Exception as error:
-            return self._failed("inference_failed", f"{type(error).__name__}: {error}")
+    # -- inference ----------------------------------------------------------------------------
+    def _infer(self, ready: Sequence[Ready]) -> None:
+        began_s = time.monotonic()
+        start_ns = {seat.robot: seat.node.clock.wall_ns() for seat, _, _ in ready}
+        answers = self._answers(ready)
         if self._delay_s:
             time.sleep(self._delay_s)
-        end_ns = self.node.clock.wall_ns()
-        self._inference_ms.add((end_ns - start_ns) / 1e6)
-        horizon_ns = int(len(steps) * self.spec.action.dt_s * 1e9)
-        patience_ns = int(self.node.profile.timing.max_observation_age_s * 1e9)
-        header = self._chunk_out.put(
-            ActionChunk(
-                worker=self.name,
-                spec_hash=self.spec.hash,
-                episode=observation.task.episode,
-                observation_stamp_ns=observation.stamp_wall_ns,
-                observation_seq=observation.seq,
-                valid_until_ns=observation.stamp_wall_ns + horizon_ns + patience_ns,
-                steps=steps,
-                observed_ns=observed_ns,
-                inference_start_ns=start_ns,
-                inference_end_ns=end_ns,
-                done=done,
-            )
-        )
-        self._not_before_ns = header.stamp_wall_ns
-        self._rate.tick()
-        obeyed = observation.task.active and observation.task.worker == self.name
-        self._continuation.published(observation, steps, header.stamp_wall_ns, obeyed=obeyed)
-        self._seen.show(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
-        return True
+        for (seat, observation, observed_ns), answer in zip(ready, answers, strict=True):
+            seat.due_s = max(seat.due_s + 1.0 / observation.rate_hz, began_s)
+            if isinstance(answer, Exception):
+                seat.failed(answer)
+                continue
+            end_ns = seat.node.clock.wall_ns()
+            seat.publish(observation, answer, observed_ns, start_ns[seat.robot], end_ns, len(ready))
 
-    def _failed(self, reason: str, why: str) -> bool:
-        self._complaint = f"{reason}: {why}"
-        self.node.refuse(reason, why)
-        return False
+    def _answers(self, ready: Sequence[Ready]) -> list[ActionSteps | Exception]:
+        try:
+            if self._infer_batch is None or len(ready) == 1:
+                seat, observation, _ = ready[0]
+                return [seat.continuation.infer(observation)]
+            return self._together(ready)
+        except Exception as error:
+            if len(ready) == 1:
+                return [error]
+            # Whose observation it was is not known: the others shall not suffer for it.
+            return [answer for one in ready for answer in self._answers([one])]
 
-    def _report(self, *, now: bool = False) -> None:
-        if now or time.monotonic() - self._last_spec_s > SPEC_PERIOD_S:
-            self._last_spec_s = time.monotonic()
-            self._spec_out.put(self.spec)
-        state = "waiting" if self._complaint else "inferring"
-        if not now and not self.node.report_due(state):
-            return
-        task = self._task
-        inference = self._inference_ms.summary()
-        self.node.report(
-            state,
-            detail={
-                "complaint": self._complaint[:MAX_COMPLAINT].encode("utf-8", "replace").decode(),
-                "spec": self.spec.hash,
-                "episode": self._episode,
-                "prompt": task.prompt if task else "",
-                "obeyed": bool(task and task.active and task.worker == self.name),
-            },
-            rates_hz={"chunks": self._rate.rate_hz},
-            latency_ms={"inference": inference} if inference else {},
-            now=now,
-        )
+    def _together(self, ready: Sequence[Ready]) -> list[ActionSteps | Exception]:
+        assert self._infer_batch is not None
+        extra: dict[str, Any] = {}
+        if getattr(self.policy, "takes_committed", False):
+            extra["committed"] = [seat.continuation.committed(seen) for seat, seen, _ in ready]
+        found = list(self._infer_batch([observation for _, observation, _ in ready], **extra))
+        if len(found) != len(ready):
+            raise SpecError(f"infer_batch gave {len(found)} answers to {len(ready)} observations")
+        return [one if isinstance(one, ActionSteps) else ActionSteps(one) for one in found]

@@ -23,9 +23,9 @@ from vla_zenoh.bench.statistics import Slot
 from vla_zenoh.bench.ways import Way
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.bench_chain import WORKER, Chain
-from vla_zenoh.nodes.bench_echo import EchoClient
-from vla_zenoh.nodes.bench_process import START_PATIENCE_S, Server, cpu_s, free_port
+from vla_zenoh.nodes.bench.chain import WORKER, Chain
+from vla_zenoh.nodes.bench.echo import EchoClient
+from vla_zenoh.nodes.bench.process import START_PATIENCE_S, Server, cpu_s, free_port
 
 PERIOD_S = (0.012, 0.020)
 """From one request to the next, evenly drawn: two ticks of 250 Hz wide, so that every phase of the

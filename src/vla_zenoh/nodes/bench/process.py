@@ -124,17 +124,17 @@ def main(arguments: list[str]) -> None:
     stop = stop_on_signals()
     die_with_parent()
     if role == "router":
-        from vla_zenoh.nodes.bench_echo import session_at
+        from vla_zenoh.nodes.bench.echo import session_at
 
         with session_at(rest[0], listen=True):
             stop.wait()
     elif role == "echo":
-        from vla_zenoh.nodes.bench_echo import serve
+        from vla_zenoh.nodes.bench.echo import serve
 
         endpoint, how = rest
         serve(endpoint, listen=how == "listen", stop=stop)
     elif role == "robot":
-        from vla_zenoh.nodes.bench_robot import stand
+        from vla_zenoh.nodes.bench.robot import stand
 
         stand(rest[0], stop)
     else:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.bench import report
 from vla_zenoh.errors import NodeError, SessionError
-from vla_zenoh.nodes.bench_process import Server, cpu_s, free_port
+from vla_zenoh.nodes.bench.process import Server, cpu_s, free_port
 from vla_zenoh.nodes.camera_sources.outlet import OK, Outlet
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.launch import Host

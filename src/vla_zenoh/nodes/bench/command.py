@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.bench_process import cpu_s
+from vla_zenoh.nodes.bench.process import cpu_s
 from vla_zenoh.nodes.command import SPREAD_S
 from vla_zenoh.nodes.demo import DemoRun, Interrupted
 from vla_zenoh.nodes.launch import Host

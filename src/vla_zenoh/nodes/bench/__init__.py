@@ -1,0 +1,1 @@
+"""What `vla-zenoh bench` measures with: nodes, robots and chains of its own."""
