@@ -60,6 +60,7 @@ def assemble(
     *,
     not_before_ns: int,
     now_ns: int,
+    robot: str = "",
 ) -> Observation | NotYet:
     """The newest observation that fits the spec, or why there is none.
 
@@ -71,6 +72,7 @@ def assemble(
         not_before_ns: an observation from before this time is not wanted: it cannot show what the
             last chunk did.
         now_ns: wall clock.
+        robot: whose observation it is.
 
     Raises:
         SpecError: a picture does not have the size the spec wants, see `prepare`.
@@ -115,6 +117,7 @@ def assemble(
         stamp_wall_ns=stamp_ns,
         seq=seq,
         task=task,
+        robot=robot,
         images={c.camera: prepare(images[c.camera].record, c) for c in wanted.cameras},
         **parts,
     )

@@ -223,6 +223,7 @@ class Observation:
         pose: TCP pose, where asked for.
         gripper: gripper state, where asked for.
         task: prompt, episode and rate.
+        robot: whose it is, for a model that serves several and remembers something of each.
     """
 
     stamp_wall_ns: int
@@ -232,6 +233,7 @@ class Observation:
     joint: JointState | None = None
     pose: PoseState | None = None
     gripper: GripperState | None = None
+    robot: str = ""
 
     @property
     def prompt(self) -> str:
@@ -253,6 +255,10 @@ class Policy(Protocol):
     ``example_prompts`` likewise names prompts it knows, the first of which makes it move.
     ``takes_committed = True``: it is called as ``infer(observation, committed=...)`` and told what
     of its last chunk is under way, see `vla_zenoh.committed`.
+    ``infer_batch(observations)`` answers several robots at once, one answer for each in their
+    order, at most ``max_batch`` of them where that is given. `Observation.robot` says whose each
+    is; ``reset`` takes that name then. With ``takes_committed`` it is called as
+    ``infer_batch(observations, committed=[...])``.
     """
 
     @property

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from vla_zenoh import keys
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
@@ -16,6 +17,7 @@ from vla_zenoh.cli.options import (
     model_options,
 )
 from vla_zenoh.control.names import worker_node
+from vla_zenoh.errors import ProfileError
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.nodes.environment import run_in_own_environment
 from vla_zenoh.nodes.process import run_node
@@ -41,6 +43,10 @@ def worker(
     delay_ms: Annotated[
         float, typer.Option("--delay", min=0, help="Let every inference take so many ms longer.")
     ] = 0.0,
+    robots: Annotated[
+        str | None,
+        typer.Option(help="Serve these robots, names with commas; else the profile's alone."),
+    ] = None,
     host: HostOption = None,
     python: Annotated[
         str | None, typer.Option("--python", help="Interpreter of a prepared environment.")
@@ -50,6 +56,7 @@ def worker(
     loaded = effective_profile(profile, connect, host=host)
     found = find_model(model)
     chosen = model_options(options or [])
+    served = robot_names(robots)
     # Comes back only where this environment has what the model's header asks for.
     run_in_own_environment(found, python)
     policy = make_policy(found, chosen, profile=profile)
@@ -57,7 +64,14 @@ def worker(
     run_node(
         loaded,
         lambda session, stop: WorkerNode(
-            loaded, session, policy, name or found.name, images=form, delay_s=delay_ms / 1e3
+            loaded,
+            session,
+            policy,
+            name or found.name,
+            images=form,
+            delay_s=delay_ms / 1e3,
+            robots=served,
+            another=lambda: make_policy(found, chosen, profile=profile),
         ).run(stop),
         identity=worker_node(name or found.name),
     )
@@ -70,3 +84,20 @@ def _image_form(profile: Profile, host: str | None) -> Literal["raw", "jpeg"]:
     if host is None or host not in profile.hosts:
         return "raw"
     return "raw" if "camera" in profile.hosts[host].nodes else "jpeg"
+
+
+def robot_names(text: str | None) -> list[str]:
+    """Names separated by commas; none of None.
+
+    Raises:
+        BadParameter: one cannot be part of a key, or is there twice.
+    """
+    names = [part.strip() for part in text.split(",")] if text is not None else []
+    try:
+        for name in names:
+            keys.chunk(name, "robot name")
+    except ProfileError as error:
+        raise typer.BadParameter(f"--robots: {error}") from error
+    if len(set(names)) != len(names):
+        raise typer.BadParameter(f"--robots names one twice: {text}")
+    return names

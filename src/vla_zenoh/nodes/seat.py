@@ -1,0 +1,339 @@
+"""One robot's side of a worker: what is heard of it, and what is said to it.
+
+A worker has a seat for every robot it serves. Each has its own node on the robot's keys, and its
+own prompt, episode, activation and rate.
+"""
+
+from __future__ import annotations
+
+import inspect
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import zenoh
+
+from vla_zenoh.codec import image as image_codec
+from vla_zenoh.codec import records
+from vla_zenoh.codec.image import MAX_PICTURE_BYTES
+from vla_zenoh.codec.records import SMALL_BYTES
+from vla_zenoh.committed import Continuation
+from vla_zenoh.control.names import worker_node
+from vla_zenoh.errors import CodecError, PeerError, SpecError
+from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.bounded import bytes_of
+from vla_zenoh.nodes.meter import Percentiles, RateMeter
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.seen import SeenOutlet
+from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
+from vla_zenoh.nodes.speaker import Speaker
+from vla_zenoh.observe import History, NotYet, assemble, form_of
+from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import (
+    ActionChunk,
+    GripperState,
+    Image,
+    JointState,
+    PoseState,
+    Stamped,
+    Task,
+)
+
+SPEC_PERIOD_S = 1.0
+TASK_PATIENCE_S = 1.5
+STREAM_PATIENCE_S = 0.5
+"""Another camera or robot is believed when the one before it was silent for so long."""
+AFTER_A_FAILURE_S = 0.5
+FRESH_PATIENCE_S = 0.05
+FRESH_TOLERANCE_S = 0.005
+MAX_COMPLAINT = 500
+STATE_KINDS: dict[str, type[Any]] = {
+    "joint": JointState,
+    "pose": PoseState,
+    "gripper": GripperState,
+}
+
+
+class Seat:
+    """See the module.
+
+    Args:
+        profile: the robot's: its name, cameras, timing.
+        session: open session.
+        policy: the model, not loaded yet; several seats may share it.
+        name: of the worker.
+        images: which form of pictures to listen to.
+        changed: is notified when a picture arrives.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        session: zenoh.Session,
+        policy: Policy,
+        name: str,
+        *,
+        images: Literal["raw", "jpeg"],
+        changed: threading.Condition,
+    ) -> None:
+        self.robot = profile.robot.name
+        node = self.node = Node(worker_node(name), profile, session)
+        self.policy, self.name, self.spec = policy, name, policy.spec
+        self.continuation = Continuation(policy)
+        keys = node.keys
+        self._chunk_out = node.stream(keys.delta(name), Kind.ORDER)
+        self._spec_out = node.stream(keys.spec(name), Kind.NEWS)
+        self._seen = SeenOutlet(node, name, self.spec)
+        node.answer(
+            keys.spec(name),
+            lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
+        )
+        self._task_slot = node.listen(keys.task, Latest(SMALL_BYTES))
+        self._jpeg = images == "jpeg"
+
+        def key_of(camera: CameraSpec) -> str:
+            settings, form = profile.cameras.get(camera.camera), form_of(camera)
+            if self._jpeg and settings is not None and settings.fit_for_workers and form:
+                return keys.camera_fitted(camera.camera, form)
+            return (keys.camera_jpeg if self._jpeg else keys.camera_raw)(camera.camera)
+
+        self._image_slots = {
+            camera.camera: node.listen(
+                key_of(camera), Latest(MAX_PICTURE_BYTES, changed), Kind.FRAME
+            )
+            for camera in self.spec.observation.cameras
+        }
+        self._state_slots = {
+            part: node.listen(self._state_key(part), Inbox(256, SMALL_BYTES))
+            for part in self.spec.observation.state
+        }
+        self._task_speaker = Speaker(TASK_PATIENCE_S)
+        self._speakers = {
+            name: Speaker(STREAM_PATIENCE_S) for name in (*self._image_slots, *self._state_slots)
+        }
+        self._images: dict[str, Stamped[Image]] = {}
+        self._pictures_s: dict[str, float] = {}
+        self._states = {part: History() for part in self.spec.observation.state}
+        self.task: Task | None = None
+        self._task_heard_s = -1e9
+        self._episode = -1
+        self._not_before_ns = 0
+        self._rate = RateMeter(window_s=10.0)
+        self._inference_ms = Percentiles(128)
+        self._batch = 0
+        self._last_spec_s = -1e9
+        self.complaint = "loading"
+        self.due_s = 0.0
+        """When the next inference is wanted, monotonic clock."""
+
+    def _state_key(self, part: str) -> str:
+        keys = self.node.keys
+        return {"joint": keys.state_joint, "pose": keys.state_pose, "gripper": keys.state_gripper}[
+            part
+        ]
+
+    # -- in -----------------------------------------------------------------------------------
+    @property
+    def news(self) -> bool:
+        """Whether the slowest input has something that was not looked at."""
+        slot = next(iter(self._image_slots.values()), None)
+        return slot is not None and slot.full
+
+    @property
+    def sees(self) -> bool:
+        """Whether the model wants pictures."""
+        return bool(self._image_slots)
+
+    def listen(self) -> None:
+        """Take in what came."""
+        arrival = self._task_slot.take()
+        if arrival is not None:
+            task = self.node.read(Task, arrival, self._task_speaker)
+            if task is not None:
+                self._take_task(task)
+        for camera, slot in self._image_slots.items():
+            arrival = slot.take()
+            image = self._read_image(camera, arrival) if arrival is not None else None
+            if arrival is not None and image is not None:
+                self._images[camera] = image
+                self._pictures_s[camera] = arrival.mono_ns / 1e9
+        self.listen_to_states()
+
+    def listen_to_states(self) -> None:
+        """Take in states; while nothing else is to do it costs no time afterwards."""
+        for part, inbox in self._state_slots.items():
+            for arrival in inbox.take_all():
+                state = self.node.read(STATE_KINDS[part], arrival, self._speakers[part])
+                if state is not None:
+                    self._states[part].add(state)
+
+    def _take_task(self, task: Stamped[Task]) -> None:
+        self.task, self._task_heard_s = task.record, time.monotonic()
+        if task.record.episode == self._episode:
+            return
+        self._episode = task.record.episode
+        # What was seen before the episode began does not belong to it.
+        self._not_before_ns = task.header.stamp_wall_ns
+        reset = getattr(self.policy, "reset", None)
+        if callable(reset):
+            try:
+                reset(*((self.robot,) if wants_robot(self.policy) else ()))
+            except Exception as error:
+                self.failed(error, "reset_failed")
+
+    def _read_image(self, camera: str, arrival: Arrival) -> Stamped[Image] | None:
+        sample = arrival.sample
+        try:
+            header = self.node.header(arrival)
+            self._speakers[camera].check(header, arrival.mono_ns)
+            payload = bytes_of(sample.payload, MAX_PICTURE_BYTES)
+            if self._jpeg:
+                image = image_codec.decode_jpeg(payload)
+            else:
+                _, _, schema = str(sample.encoding).partition(";")
+                image = image_codec.decode_raw(payload, schema)
+        except CodecError as error:
+            self.node.refuse(error.reason, f"camera {camera}: {error}")
+            return None
+        self._speakers[camera].heard(header, arrival.mono_ns)
+        self.node.traffic.heard(str(sample.key_expr), header, arrival.nth)
+        header, image = self.node.clocks.here(header, image)
+        return Stamped(header, image, self.node.wall_of(arrival))
+
+    def observe(self) -> Observation | None:
+        """An observation, None when there is none yet.
+
+        A picture that arrives after the request is due is worth a little patience: the one at hand
+        is already half a camera period old on average, and all that time would be latency.
+        """
+        self.listen()
+        self.node.clock.follow()
+        if self.task is None or time.monotonic() - self._task_heard_s > TASK_PATIENCE_S:
+            self.complaint = "no command node is heard"
+            return None
+        try:
+            observation = assemble(
+                self.spec,
+                self.task,
+                self._images,
+                self._states,
+                not_before_ns=self._not_before_ns,
+                now_ns=self.node.clock.wall_ns(),
+                robot=self.robot,
+            )
+        except ValueError as error:
+            self.complaint = str(error)
+            return None
+        if isinstance(observation, NotYet):
+            if not observation.waiting:
+                self.complaint = observation.why
+            return None
+        self.complaint = ""
+        if self._pictures_s and time.monotonic() - self.due_s < FRESH_PATIENCE_S:
+            tolerance_s = min(FRESH_TOLERANCE_S, 0.25 / observation.rate_hz)
+            if min(self._pictures_s.values()) < self.due_s - tolerance_s:
+                return None
+        return observation
+
+    # -- out ----------------------------------------------------------------------------------
+    def publish(
+        self,
+        observation: Observation,
+        answer: ActionSteps,
+        observed_ns: int,
+        start_ns: int,
+        end_ns: int,
+        batch: int,
+    ) -> bool:
+        """Check an answer and send it.
+
+        Args:
+            observation: what it was made of.
+            answer: the model's.
+            observed_ns: when the observation was at hand, wall clock.
+            start_ns: when inference began.
+            end_ns: when it ended.
+            batch: robots that were answered together.
+        """
+        try:
+            steps, done = check_steps(self.spec.action, answer.steps), bool(answer.done)
+        except Exception as error:
+            return self.failed(error)
+        self._batch = batch
+        self._inference_ms.add((end_ns - start_ns) / 1e6)
+        horizon_ns = int(len(steps) * self.spec.action.dt_s * 1e9)
+        patience_ns = int(self.node.profile.timing.max_observation_age_s * 1e9)
+        header = self._chunk_out.put(
+            ActionChunk(
+                worker=self.name,
+                spec_hash=self.spec.hash,
+                episode=observation.task.episode,
+                observation_stamp_ns=observation.stamp_wall_ns,
+                observation_seq=observation.seq,
+                valid_until_ns=observation.stamp_wall_ns + horizon_ns + patience_ns,
+                steps=steps,
+                observed_ns=observed_ns,
+                inference_start_ns=start_ns,
+                inference_end_ns=end_ns,
+                done=done,
+            )
+        )
+        self._not_before_ns = header.stamp_wall_ns
+        self._rate.tick()
+        obeyed = observation.task.active and observation.task.worker == self.name
+        self.continuation.published(observation, steps, header.stamp_wall_ns, obeyed=obeyed)
+        self._seen.show(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
+        return True
+
+    def failed(self, error: Exception, reason: str = "") -> Literal[False]:
+        """Count and tell that the model gave no answer, and ask it again a little later."""
+        if not reason:
+            if isinstance(error, SpecError):
+                reason = "contract"
+            else:  # a PeerError says by itself what it is
+                reason = error.reason if isinstance(error, PeerError) else "inference_failed"
+        expected = isinstance(error, (SpecError, PeerError))
+        why = str(error) if expected else f"{type(error).__name__}: {error}"
+        self.complaint = f"{reason}: {why}"
+        self.node.refuse(reason, why)
+        self.due_s = time.monotonic() + AFTER_A_FAILURE_S
+        return False
+
+    def report(self, *, now: bool = False) -> None:
+        """Tell spec and status when it is time, or `now`."""
+        if now or time.monotonic() - self._last_spec_s > SPEC_PERIOD_S:
+            self._last_spec_s = time.monotonic()
+            self._spec_out.put(self.spec)
+        state = "waiting" if self.complaint else "inferring"
+        if not now and not self.node.report_due(state):
+            return
+        task = self.task
+        inference = self._inference_ms.summary()
+        detail: Mapping[str, Any] = {
+            "complaint": self.complaint[:MAX_COMPLAINT].encode("utf-8", "replace").decode(),
+            "spec": self.spec.hash,
+            "episode": self._episode,
+            "prompt": task.prompt if task else "",
+            "obeyed": bool(task and task.active and task.worker == self.name),
+            "batch": self._batch,
+        }
+        self.node.report(
+            state,
+            detail=detail,
+            rates_hz={"chunks": self._rate.rate_hz},
+            latency_ms={"inference": inference} if inference else {},
+            now=now,
+        )
+
+    def close(self) -> None:
+        """Say goodbye to the robot."""
+        self.node.report("stopped", now=True)
+        self.node.close()
+
+
+def wants_robot(policy: Policy) -> bool:
+    """Whether the model's ``reset`` takes the name of the robot whose episode begins."""
+    reset = getattr(policy, "reset", None)
+    return callable(reset) and len(inspect.signature(reset).parameters) > 0

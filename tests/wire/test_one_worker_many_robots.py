@@ -1,0 +1,293 @@
+"""One worker, three robots: each its own prompt, rate and episode, and none waits for another.
+
+The robots here are what a worker knows of one: a task, states, and who reads its chunks.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from camera_rig import await_match, free_endpoint, until
+
+from vla_zenoh.cli.worker import robot_names
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
+from vla_zenoh.errors import CodecError, WorkerError
+from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.nodes.bounded import bytes_of, header_of
+from vla_zenoh.nodes.client import Client
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.nodes.worker import WorkerNode
+from vla_zenoh.policy import (
+    ActionSpec,
+    ActionSteps,
+    ModelSpec,
+    Observation,
+    ObservationSpec,
+    Policy,
+)
+from vla_zenoh.profile import Profile, load_profile, override
+from vla_zenoh.types import ActionChunk, GripperState, Header, PoseState, Task
+
+ROBOTS = ("a", "b", "c")
+STATE_HZ = 50.0
+RATE_HZ = 10.0
+SLOW_S = 0.15
+"""One inference of a slow model: longer than a request's period, so that requests meet."""
+LEAST_SHARE = 0.3
+"""Of its rate that a robot must be given on a busy computer; a held-up one gets nothing."""
+DOWN = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+class Robot:
+    """Task and states of one robot, sent until `stop`; keeps the chunks it is sent."""
+
+    def __init__(self, profile: Profile, session: zenoh.Session, worker: str) -> None:
+        self.keys = profile.keys
+        self.task = Task(1, True, "HARD: go up", worker, RATE_HZ)
+        self.silent = False
+        self.chunks: list[ActionChunk] = []
+        self._session, self._seq = session, 0
+        self._subscriber = session.declare_subscriber(
+            self.keys.delta(worker), zenoh.handlers.Callback(self._take, indirect=False)
+        )
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        with suppress(CodecError):
+            header_of(sample)
+            self.chunks.append(records.decode(ActionChunk, bytes_of(sample.payload)))
+
+    def say(self) -> None:
+        """Everything once, stamped now."""
+        if self.silent:
+            return
+        self._seq += 1
+        z_m = 0.3 + 0.001 * (self._seq % 100)
+        for key, source, record in (
+            (self.keys.task, "command#1", self.task),
+            (self.keys.state_pose, "sim#1", PoseState(np.array([0.4, 0, z_m]), DOWN, np.zeros(6))),
+            (self.keys.state_gripper, "sim#1", GripperState(0.08, False, False)),
+        ):
+            header = header_codec.encode(Header(time.time_ns(), self._seq, source))
+            self._session.put(key, records.encode(record), attachment=header)
+
+    def asked(self, **changes: Any) -> None:
+        """Another task, of the next episode."""
+        self.task = replace(self.task, episode=self.task.episode + 1, **changes)
+
+    def more(self, count: int) -> Callable[[], bool]:
+        """Whether so many chunks came since this was asked for."""
+        had = len(self.chunks)
+        return lambda: len(self.chunks) >= had + count
+
+
+class Together:
+    """A model for many at once: what it gives a robot says whose turn it was.
+
+    Args:
+        slow_s: one inference, of one robot or of all.
+    """
+
+    def __init__(self, slow_s: float = 0.0) -> None:
+        self.spec = ModelSpec(
+            name="together",
+            observation=ObservationSpec(cameras=(), state=("pose", "gripper"), prompt=True),
+            action=ActionSpec(horizon=1, dt_s=0.1, gripper="none"),
+        )
+        self.batches: list[tuple[str, ...]] = []
+        self.resets: list[str] = []
+        self._slow_s = slow_s
+
+    def reset(self, robot: str) -> None:
+        self.resets.append(robot)
+
+    def infer(self, observation: Observation) -> ActionSteps:
+        return self.infer_batch([observation])[0]
+
+    def infer_batch(self, observations: Sequence[Observation]) -> list[ActionSteps]:
+        time.sleep(self._slow_s)
+        self.batches.append(tuple(seen.robot for seen in observations))
+        return [self._one(seen) for seen in observations]
+
+    def _one(self, seen: Observation) -> ActionSteps:
+        if seen.prompt == "fail":
+            raise ValueError("cannot")
+        steps = np.zeros((1, 6))
+        steps[0, 0] = float(seen.prompt)
+        return ActionSteps(np.full((1, 6), np.nan) if seen.prompt == "0" else steps)
+
+
+@pytest.fixture(scope="module")
+def profile() -> Profile:
+    endpoint = free_endpoint()
+    session = {"listen": [endpoint], "connect": [endpoint]}
+    return override(load_profile("panda_sim"), {"session": session})
+
+
+@pytest.fixture(scope="module")
+def router(profile: Profile) -> Iterator[None]:
+    with open_session(profile.session, mode="router"):
+        yield
+
+
+@contextmanager
+def served(
+    profile: Profile, policy: Policy, another: Callable[[], Policy] | None = None
+) -> Iterator[dict[str, Robot]]:
+    """Three robots that speak, and one worker that serves them."""
+    name = policy.spec.name
+    with open_session(profile.session) as own, open_session(profile.session) as theirs:
+        robots = {
+            robot: Robot(override(profile, {"robot": {"name": robot}}), theirs, name)
+            for robot in ROBOTS
+        }
+        node = WorkerNode(profile, own, policy, name, robots=ROBOTS, another=another)
+        stop = threading.Event()
+        threads = [threading.Thread(target=node.run, args=(stop,))]
+        for robot in robots.values():
+            await_match(theirs, robot.keys.state_pose)
+
+        def speak() -> None:
+            while not stop.wait(1.0 / STATE_HZ):
+                for robot in robots.values():
+                    robot.say()
+
+        threads.append(threading.Thread(target=speak))
+        for thread in threads:
+            thread.start()
+        try:
+            yield robots
+        finally:
+            stop.set()
+            for thread in threads:
+                thread.join(5.0)
+            assert not any(thread.is_alive() for thread in threads)
+
+
+def test_robots_that_are_ready_at_once_are_answered_in_one_batch(
+    profile: Profile, router: None
+) -> None:
+    model = Together(SLOW_S)
+    with served(profile, model) as robots:
+        for number, robot in enumerate(robots.values(), 1):
+            robot.asked(prompt=str(number))
+        until("a batch of all", lambda: set(ROBOTS) in map(set, model.batches))
+        began, counts = time.monotonic(), [robot.more(5) for robot in robots.values()]
+        until("chunks for all", lambda: all(count() for count in counts))
+        took_s = time.monotonic() - began
+        for number, robot in enumerate(robots.values(), 1):
+            assert {float(chunk.steps[0, 0]) for chunk in robot.chunks[-3:]} == {float(number)}
+            assert robot.chunks[-1].episode == robot.task.episode
+        # One by one it would have been three inferences for each round.
+        assert took_s < 5 * len(ROBOTS) * SLOW_S / LEAST_SHARE
+        assert max(map(len, model.batches)) == len(ROBOTS)
+    assert set(ROBOTS) <= set(model.resets)
+
+
+def test_a_robot_that_falls_silent_or_fails_holds_up_no_other(
+    profile: Profile, router: None
+) -> None:
+    model = Together()
+    with served(profile, model) as robots:
+        a, b, c = robots.values()
+        a.asked(prompt="1"), b.asked(prompt="2"), c.asked(prompt="3")
+        until("chunks for all", lambda: all(robot.chunks for robot in robots.values()))
+        a.silent = True
+        until("the others go on", b.more(10))
+        until("both of them", c.more(3))
+        until("nobody asks for the silent one", lambda: "a" not in model.batches[-1])
+
+        with open_session(profile.session) as session:
+            looker = Client(override(profile, {"robot": {"name": "b"}}), session).follow()
+            b.asked(prompt="fail")
+            until("c goes on", c.more(10))
+            counters = until("its status", lambda: looker.status("worker-together")).counters
+            until(
+                "b is told",
+                lambda: looker.snapshot()["worker-together"][0].counters.get(
+                    "refused.inference_failed"
+                ),
+            )
+            b.asked(prompt="0")  # an answer that is no number
+            until("c goes on again", c.more(10))
+            until(
+                "b is told why",
+                lambda: looker.snapshot()["worker-together"][0].counters.get("refused.contract"),
+            )
+            assert counters is not None
+        a.silent = False
+        b.asked(prompt="5")
+        for robot in robots.values():
+            until("all again", robot.more(3))
+        assert b.chunks[-1].steps[0, 0] == 5.0
+
+
+def test_each_robot_has_its_own_rate(profile: Profile, router: None) -> None:
+    with served(profile, Together()) as robots:
+        a, b, c = robots.values()
+        a.asked(prompt="1", rate_hz=20.0), b.asked(prompt="1", rate_hz=2.0)
+        c.asked(prompt="1", rate_hz=5.0)
+        until("chunks for the slowest", b.more(2))
+        began = [len(robot.chunks) for robot in (a, b, c)]
+        until("some of the slowest", b.more(6), 30.0)
+        fast, slow, middle = (
+            len(robot.chunks) - had for robot, had in zip((a, b, c), began, strict=True)
+        )
+        assert fast > middle > slow
+
+
+def test_a_model_that_cannot_batch_is_there_once_for_each_robot(
+    profile: Profile, router: None
+) -> None:
+    made: list[Policy] = []
+
+    def make() -> Policy:
+        made.append(make_policy(find_model("scripted"), {"camera": ""}))
+        return made[-1]
+
+    with served(profile, make(), make) as robots:
+        for robot, direction in zip(robots.values(), ("up", "down", "forward"), strict=True):
+            robot.asked(prompt=f"HARD: go {direction} x4")
+        assert len(made) == len(ROBOTS)
+        for robot in robots.values():
+            until(
+                "its count is complete", lambda robot=robot: robot.chunks and robot.chunks[-1].done
+            )
+        axes = {
+            name: int(np.abs(robot.chunks[0].steps[0]).argmax()) for name, robot in robots.items()
+        }
+        assert axes == {"a": 2, "b": 2, "c": 0}
+
+
+def test_a_model_that_cannot_say_whose_episode_begins_is_refused(
+    profile: Profile, router: None
+) -> None:
+    class Forgetful(Together):
+        def reset(self) -> None:  # pyright: ignore
+            pass
+
+    with (
+        open_session(profile.session) as session,
+        pytest.raises(WorkerError, match=r"reset\(robot\)"),
+    ):
+        WorkerNode(profile, session, Forgetful(), "forgetful", robots=ROBOTS)
+
+
+@pytest.mark.parametrize("text", ["a,b,a", "a/b", "a,,b", ""])
+def test_names_of_robots_that_cannot_be_are_refused(text: str) -> None:
+    with pytest.raises(Exception, match=r"--robots"):
+        robot_names(text)
+
+
+def test_names_of_robots_are_separated_by_commas(tmp_path: Path) -> None:
+    assert robot_names("a, b,c") == ["a", "b", "c"]
+    assert robot_names(None) == []
