@@ -11,8 +11,7 @@ import datetime as dt
 import json
 import socket
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,8 @@ import zenoh
 
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import Keys, covers
+from vla_zenoh.nodes import rehearsal_acts
+from vla_zenoh.nodes.rehearsal_acts import WITNESS
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import SecurityProfile
@@ -29,12 +30,6 @@ from vla_zenoh.security.identity import Identity, Role, identities
 from vla_zenoh.security.roles import TABLE, Act, Right, expressions, rights
 from vla_zenoh.security.rules import access_control, allowing, missing, passages
 from vla_zenoh.security.store import Store
-
-SETTLE_S = 0.4
-"""From a declaration until everybody who is concerned knows of it, on one computer."""
-ANSWER_S = 2.0
-WITNESS = Identity(Role.ROUTER, "witness", "rehearsal")
-"""Hears and says everything, as routers do."""
 
 Tried = frozenset[tuple[str, Act, str]]
 """(common name, act, key) of what went through."""
@@ -74,12 +69,12 @@ def rehearse(profile: Profile, access: Mapping[str, Any] | None = None) -> list[
     cast = probes(profile, lab)
     with _stage(profile, lab, _with_witness(rules)) as (witness, sessions):
         went: Tried = frozenset().union(
-            _puts(witness, sessions, cast[Act.PUT]),
-            _subscriptions(witness, sessions, cast[Act.SUBSCRIBE]),
-            _questions(witness, sessions, cast[Act.ASK]),
-            _answers(witness, sessions, cast[Act.ANSWER]),
-            _tokens(witness, sessions, cast[Act.ANNOUNCE], profile.keys),
-            _watching(witness, sessions, profile.keys),
+            rehearsal_acts.puts(witness, sessions, cast[Act.PUT]),
+            rehearsal_acts.subscriptions(witness, sessions, cast[Act.SUBSCRIBE]),
+            rehearsal_acts.questions(witness, sessions, cast[Act.ASK]),
+            rehearsal_acts.answers(witness, sessions, cast[Act.ANSWER]),
+            rehearsal_acts.tokens(witness, sessions, cast[Act.ANNOUNCE], profile.keys),
+            rehearsal_acts.watching(witness, sessions, profile.keys),
         )
     return [_judge(profile.keys, one, cast, rules, went) for one in lab]
 
@@ -166,149 +161,6 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-# -- the acts -------------------------------------------------------------------------------------
-def _listen(session: zenoh.Session, keys: Sequence[str], take: Callable[[Any], None]) -> list[Any]:
-    handler = zenoh.handlers.Callback(take, indirect=False)
-    return [session.declare_subscriber(key, handler) for key in keys]
-
-
-def _end(declared: Sequence[Any]) -> None:
-    for one in declared:
-        one.undeclare()
-
-
-def _puts(
-    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
-) -> set[tuple[str, Act, str]]:
-    heard: set[tuple[str, Act, str]] = set()
-    listening = _listen(
-        witness,
-        keys,
-        lambda sample: heard.add((sample.payload.to_string(), Act.PUT, str(sample.key_expr))),
-    )
-    # As nodes write: a publisher that is never told of a listener sends nothing.
-    writing = [
-        (name, session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK))
-        for name, session in sessions.items()
-        for key in keys
-    ]
-    time.sleep(SETTLE_S)
-    for name, publisher in writing:
-        publisher.put(name)
-    time.sleep(SETTLE_S)
-    matching = {
-        (name, Act.PUT, str(publisher.key_expr))
-        for name, publisher in writing
-        if publisher.matching_status.matching  # pyright: ignore  # stub says bool
-    }
-    _end([*listening, *(publisher for _, publisher in writing)])
-    return heard & matching
-
-
-def _subscriptions(
-    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
-) -> set[tuple[str, Act, str]]:
-    heard: set[tuple[str, Act, str]] = set()
-
-    def hear(name: str) -> Callable[[zenoh.Sample], None]:
-        return lambda sample: heard.add((name, Act.SUBSCRIBE, str(sample.key_expr)))
-
-    listening = [
-        one for name, session in sessions.items() for one in _listen(session, keys, hear(name))
-    ]
-    time.sleep(SETTLE_S)
-    for key in keys:
-        witness.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
-    time.sleep(SETTLE_S)
-    _end(listening)
-    return set(heard)
-
-
-def _serve(session: zenoh.Session, keys: Sequence[str], name: str) -> list[Any]:
-    def reply(key: str) -> Callable[[zenoh.Query], None]:
-        def handle(query: zenoh.Query) -> None:
-            with query:
-                query.reply(key, name)
-
-        return handle
-
-    return [
-        session.declare_queryable(
-            key, zenoh.handlers.Callback(reply(key), indirect=False), complete=True
-        )
-        for key in keys
-    ]
-
-
-def _questions(
-    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
-) -> set[tuple[str, Act, str]]:
-    serving = _serve(witness, keys, "witness")
-    time.sleep(SETTLE_S)
-    found = {
-        (name, Act.ASK, key)
-        for name, session in sessions.items()
-        for key in keys
-        if any(reply.ok is not None for reply in session.get(key, timeout=ANSWER_S))
-    }
-    _end(serving)
-    return found
-
-
-def _answers(
-    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
-) -> set[tuple[str, Act, str]]:
-    serving = [one for name, session in sessions.items() for one in _serve(session, keys, name)]
-    time.sleep(SETTLE_S)
-    found: set[tuple[str, Act, str]] = set()
-    for key in keys:
-        replies = witness.get(
-            key,
-            timeout=ANSWER_S,
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-        )
-        heard = [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
-        found |= {(name, Act.ANSWER, key) for name in heard}
-    _end(serving)
-    return found
-
-
-def _tokens(
-    witness: zenoh.Session,
-    sessions: Mapping[str, zenoh.Session],
-    keys: Sequence[str],
-    of: Keys,
-) -> set[tuple[str, Act, str]]:
-    found: set[tuple[str, Act, str]] = set()
-    for name, session in sessions.items():
-        tokens = [session.liveliness().declare_token(key) for key in keys]
-        time.sleep(SETTLE_S)
-        found |= {(name, Act.ANNOUNCE, key) for key in _alive(witness, of)}
-        _end(tokens)
-        time.sleep(SETTLE_S)
-    return found
-
-
-def _watching(
-    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], of: Keys
-) -> set[tuple[str, Act, str]]:
-    token = witness.liveliness().declare_token(of.alive(WITNESS.node))
-    time.sleep(SETTLE_S)
-    found = {
-        (name, Act.WATCH, of.all_alive)
-        for name, session in sessions.items()
-        if of.alive(WITNESS.node) in _alive(session, of)
-    }
-    token.undeclare()
-    return found
-
-
-def _alive(session: zenoh.Session, keys: Keys) -> set[str]:
-    replies = session.liveliness().get(keys.all_alive, timeout=ANSWER_S)
-    return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
-
-
 # -- the verdict ----------------------------------------------------------------------------------
 def _judge(
     keys: Keys,
@@ -361,7 +213,7 @@ def try_identity(profile: Profile, node: str | None) -> str:
         SecurityError: the certificate is not there.
     """
     with open_session(profile.session, identity=node) as session:
-        if _alive(session, profile.keys):
+        if rehearsal_acts.alive(session, profile.keys):
             return ""
     return (
         "the router takes the certificate and gives it nothing: it does not know this name. "
