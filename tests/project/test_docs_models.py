@@ -1,19 +1,27 @@
-"""docs/models.md tells what works: its model is taken out of the text and run."""
+"""docs/models.md tells what works: its model and its adapter are taken out of the text and run."""
 
 from __future__ import annotations
 
+import json
 import re
+import socketserver
 import subprocess
 import sys
+import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from camera_rig import until
 
+from vla_zenoh.errors import PeerError
 from vla_zenoh.interop.options import DEFAULTS
 from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, ORIGAMI
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.lockstep import Lockstep
 from vla_zenoh.nodes.sim import build_world
+from vla_zenoh.policy import example_observation
 from vla_zenoh.profile import load_profile
 
 TEXT = (Path(__file__).parents[2] / "docs" / "models.md").read_text("utf-8")
@@ -21,15 +29,19 @@ LINES = 10
 STEP_M, SECONDS, RATE_HZ = 0.01, 1.0, 10.0
 WAY_M = STEP_M * RATE_HZ * SECONDS
 LAG_M, STILL_M = 0.04, 1e-3
+PATIENCE_S = 10.0
+
+
+def written(folder: Path, name: str, number: int) -> Path:
+    """A block of Python, as the file that the text says."""
+    path = folder / name
+    path.write_text(re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)[number], "utf-8")
+    return path
 
 
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
-    """The first block of Python, as the file that the text says."""
-    (code, *_) = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
-    path = tmp_path / "lift.py"
-    path.write_text(code, "utf-8")
-    return path
+    return written(tmp_path, "lift.py", 0)
 
 
 def test_the_model_is_ten_lines(model: Path) -> None:
@@ -76,3 +88,44 @@ def test_every_preset_and_option_is_told() -> None:
             assert f"`{preset}`" in TEXT, preset
     for option in DEFAULTS:
         assert f"`{option}`" in TEXT, option
+
+
+class Up(socketserver.StreamRequestHandler):
+    """Two steps up for a state and a text, until the text is another."""
+
+    def handle(self) -> None:
+        for line in self.rfile:
+            asked = json.loads(line)
+            assert len(asked["state"]) == 7
+            assert isinstance(asked["first"], bool)
+            if asked["text"] == "leave":
+                return
+            self.wfile.write(json.dumps({"steps": [[0, 0, STEP_M, 0, 0, 0, 0.04]] * 2}).encode())
+            self.wfile.write(b"\n")
+
+
+def test_the_adapter_asks_its_server_and_finds_it_again(tmp_path: Path) -> None:
+    with socketserver.TCPServer(("127.0.0.1", 0), Up) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        options = {"port": str(server.server_address[1])}
+        policy: Any = make_policy(find_model(str(written(tmp_path, "lines.py", 1))), options)
+
+        def asked(prompt: str) -> Any:
+            return policy.infer(example_observation(policy.spec, prompt=prompt)).steps
+
+        assert asked("up")[:, 2].tolist() == [STEP_M, STEP_M]
+        with pytest.raises(PeerError, match="no connection to") as raised:
+            asked("leave")
+        assert raised.value.reason == "peer_gone"
+        with pytest.raises(PeerError, match="tried again in"):
+            asked("up")
+        until("it answers again", lambda: answers(asked), PATIENCE_S)
+        policy.close()
+        server.shutdown()
+
+
+def answers(asked: Callable[[str], Any]) -> bool:
+    try:
+        return len(asked("up")) == 2
+    except PeerError:
+        return False
