@@ -7,7 +7,6 @@ holds what it was sent last.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -20,27 +19,22 @@ from vla_zenoh.control.arm_guard import ArmGuard, Measured, make_arm_guard
 from vla_zenoh.control.impedance import Reference
 from vla_zenoh.control.joint_impedance import JointReference
 from vla_zenoh.control.so3 import Pose, quat_from_rotation
-from vla_zenoh.errors import CodecError, ProfileError
+from vla_zenoh.errors import ProfileError
 from vla_zenoh.interop.ros2 import table
-from vla_zenoh.interop.ros2.arm_state import ArmState, pose_state
-from vla_zenoh.interop.ros2.frames import Frames
+from vla_zenoh.interop.ros2.arm_state import pose_state
 from vla_zenoh.interop.ros2.hold import Hold
 from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.qos import COMMAND, SENSOR, STATIC_TRANSFORMS
-from vla_zenoh.interop.ros2.robot_clock import RobotClock
-from vla_zenoh.interop.ros2.samples import Stamp, Wrench
-from vla_zenoh.interop.ros2.topics import joint_state, pose, transforms, wrench
+from vla_zenoh.interop.ros2.qos import COMMAND
+from vla_zenoh.interop.ros2.samples import Stamp
+from vla_zenoh.interop.ros2.topics import pose
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.meter import RateMeter
 from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.ros2.hearing import INBOX, Hearing
 from vla_zenoh.nodes.ros2.link import Link
-from vla_zenoh.nodes.slots import Arrival, Inbox
+from vla_zenoh.nodes.slots import Inbox
 from vla_zenoh.profile.ros2 import Ros2Output, Ros2Profile
-from vla_zenoh.types import Event, FloatArray, JointCommand, PoseCommand
+from vla_zenoh.types import Event, JointCommand, PoseCommand
 
-TF, TF_STATIC = "/tf", "/tf_static"
-INBOX = 64
-WRENCH_PATIENCE_NS = 200_000_000
 FINGER_PATIENCE_NS = 1_000_000_000
 """Gripper nodes publish more slowly than arms."""
 LEAD_PERIODS = 2
@@ -57,6 +51,9 @@ class Arm:
         messages: of the robot's distribution.
         ros2: the profile's section.
         gripper: (busy, width asked for last, holding) of the gripper.
+
+    Attributes:
+        heard: what the robot's topics say.
     """
 
     def __init__(
@@ -70,21 +67,16 @@ class Arm:
         profile = self._profile = node.profile
         self._node, self._messages, self._ros2, self._ask_gripper = node, messages, ros2, gripper
         self._kinematics = make_kinematics(profile)
-        self._state = ArmState(profile, self._kinematics)
-        self.clock = RobotClock()
-        self.rate = RateMeter()
+        self.heard = Hearing(node, link, messages, ros2, self._kinematics)
+        self._state, self._clock = self.heard.state, self.heard.clock
         self._guard: ArmGuard | None = None
         self._hold = Hold()
         self._deaf = False
         self._was = ""
         self._tcp: Pose | None = None
-        self._wrench: Wrench | None = None
-        self._frames = Frames() if ros2.tcp == "tf" else None
-        self._heard_ns: int | None = None
         self._published_ns = 0
         self._clock_told = False
         self._fingers_lost = False
-        self._listen(link)
         keys = node.keys
         self._joint_out = node.stream(keys.state_joint, Kind.STATE)
         self._pose_out = node.stream(keys.state_pose, Kind.STATE)
@@ -100,22 +92,6 @@ class Arm:
         self._writer = link.write(output.topic, output.type, COMMAND)
 
     # -- setting up ---------------------------------------------------------------------------
-    def _listen(self, link: Link) -> None:
-        ros2 = self._ros2
-        topics = dict.fromkeys((ros2.joint_states, ros2.finger_states or ros2.joint_states))
-        self._joint_slots = [
-            link.read(topic, joint_state.TYPE, Inbox(INBOX), SENSOR) for topic in topics
-        ]
-        self._tf_slots = []
-        if self._frames is not None:
-            self._tf_slots = [
-                (link.read(TF, transforms.TYPE, Inbox(INBOX), SENSOR), False),
-                (link.read(TF_STATIC, transforms.TYPE, Inbox(INBOX), STATIC_TRANSFORMS), True),
-            ]
-        self._wrench_slot = None
-        if ros2.wrench is not None:
-            self._wrench_slot = link.read(ros2.wrench.topic, wrench.TYPE, Inbox(4), SENSOR)
-
     def _output(self) -> Ros2Output:
         ros2 = self._ros2
         joints = self._profile.robot.command == "joint"
@@ -144,65 +120,11 @@ class Arm:
     # -- one turn -----------------------------------------------------------------------------
     def turn(self, now_ns: int) -> None:
         """Take what arrived, publish the state, and send what the arm has to follow."""
-        self._take_transforms()
-        self._take_wrench()
-        if self._take_joints():
+        if self.heard.take():
             self._publish(now_ns)
         self._take_orders(now_ns)
         self._follow(now_ns)
         self._tell()
-
-    def _refuse(self, topic: str, error: CodecError) -> None:
-        self._node.refuse(error.reason, f"{topic}: {error}", topic)
-
-    def _take_joints(self) -> bool:
-        """Whether the arm's joints are known anew."""
-        fresh = False
-        for slot in self._joint_slots:
-            for arrival in slot.take_all():
-                topic = str(arrival.sample.key_expr)
-                try:
-                    joints = self._read(joint_state.TYPE, arrival)
-                    arrived_ns = self._node.wall_of(arrival)
-                    if self._state.take(joints, joints.stamp_ns or arrived_ns) is None:
-                        continue  # of the fingers alone, or another robot's
-                except CodecError as error:
-                    self._refuse(topic, error)
-                    continue
-                fresh = True
-                self.clock.take(joints.stamp_ns, arrived_ns)
-                self._heard_ns = arrival.mono_ns
-                self.rate.tick()
-        return fresh
-
-    def _read(self, kind: str, arrival: Arrival) -> Any:
-        return table.read(self._messages, kind, arrival.sample.payload.to_bytes())
-
-    def _take_transforms(self) -> None:
-        for slot, static in self._tf_slots:
-            for arrival in slot.take_all():
-                assert self._frames is not None
-                try:
-                    self._frames.take(self._read(transforms.TYPE, arrival), static=static)
-                except CodecError as error:
-                    self._refuse(TF_STATIC if static else TF, error)
-
-    def _take_wrench(self) -> None:
-        if self._wrench_slot is None or self._ros2.wrench is None:
-            return
-        frame = self._ros2.wrench.frame or self._profile.robot.base_frame
-        for arrival in self._wrench_slot.take_all():
-            try:
-                found: Wrench = self._read(wrench.TYPE, arrival)
-                if found.frame != frame:
-                    raise CodecError("frame", f"in frame {found.frame[:60]!r}, wanted {frame!r}")
-                if not np.isfinite(found.wrench).all():
-                    raise CodecError("invalid", "a wrench that is NaN or infinite")
-            except CodecError as error:
-                self._refuse(self._ros2.wrench.topic, error)
-            else:
-                stamp_ns = found.stamp_ns or self._node.wall_of(arrival)
-                self._wrench = found._replace(stamp_ns=stamp_ns)
 
     # -- state out ----------------------------------------------------------------------------
     def _publish(self, now_ns: int) -> None:
@@ -211,12 +133,9 @@ class Arm:
         if now_ns - self._published_ns < 0.9e9 / self._profile.timing.state_hz:
             return
         self._published_ns = now_ns
-        tcp, twist = self._state.tcp()
-        if self._frames is not None:
-            found = self._tcp_of_frames(stamp_ns)
-            if found is None:
-                return
-            tcp = found
+        tcp, twist = self.heard.tcp(stamp_ns)
+        if tcp is None:
+            return
         self._tcp = tcp
         if self._guard is None:
             self._guard = self._make_guard()
@@ -225,29 +144,9 @@ class Arm:
         if isinstance(reference, JointReference):
             joints = replace(joints, reference_rad=reference.position_rad)
         self._joint_out.put(joints, stamp_wall_ns=stamp_ns, seq=seq)
-        record = pose_state(tcp, twist, self._external_wrench(stamp_ns), _pose_of(reference))
+        record = pose_state(tcp, twist, self.heard.wrench(stamp_ns), _pose_of(reference))
         self._pose_out.put(record, stamp_wall_ns=stamp_ns, seq=seq)
         self._publish_gripper(stamp_ns, seq)
-
-    def _tcp_of_frames(self, stamp_ns: int) -> Pose | None:
-        assert self._frames is not None
-        robot = self._profile.robot
-        found = self._frames.find(robot.base_frame, robot.tcp_frame)
-        if found is None:
-            way = f"{robot.base_frame} -> {robot.tcp_frame}"
-            self._refuse(TF, CodecError("no_transform", f"{way} is not known"))
-            return None
-        late_s = (stamp_ns - found[1]) / 1e9
-        if late_s > self._profile.timing.state_timeout_s:
-            self._refuse(TF, CodecError("stale", f"the TCP is {late_s:.3f} s behind the joints"))
-            return None
-        return found[0]
-
-    def _external_wrench(self, stamp_ns: int) -> FloatArray | None:
-        found = self._wrench
-        if found is None or abs(stamp_ns - found.stamp_ns) > WRENCH_PATIENCE_NS:
-            return None
-        return found.wrench
 
     def _publish_gripper(self, stamp_ns: int, seq: int) -> None:
         busy, wanted_m, held = self._ask_gripper()
@@ -348,17 +247,12 @@ class Arm:
     @property
     def state(self) -> str:
         """One word."""
-        age_s = self.age_s
+        age_s = self.heard.age_s
         if age_s is None:
             return "waiting"
         if age_s > self._profile.timing.state_timeout_s:
             return "silent"
         return "braking" if self._guard is not None and self._guard.braking else "running"
-
-    @property
-    def age_s(self) -> float | None:
-        """Of the newest joint state, None before the first."""
-        return None if self._heard_ns is None else (time.monotonic_ns() - self._heard_ns) / 1e9
 
     def _tell(self) -> None:
         state = self.state
@@ -369,11 +263,11 @@ class Arm:
                 change = f"{self._was}->{state}"
                 self._node.tell(Event(level, "transition", change, self._why(state)))
             self._was = state
-        if self.clock.differs != self._clock_told and self.clock.offset_s is not None:
-            self._clock_told = self.clock.differs
+        if self._clock.differs != self._clock_told and self._clock.offset_s is not None:
+            self._clock_told = self._clock.differs
             if self._clock_told:
                 why = (
-                    f"the robot's stamps are {self.clock.offset_s:+.3f} s behind this clock; "
+                    f"the robot's stamps are {self._clock.offset_s:+.3f} s behind this clock; "
                     "synchronise both (chrony or ptp)"
                 )
                 self._node.tell(Event("warning", "notice", "robot_clock", why))
@@ -388,14 +282,14 @@ class Arm:
     def detail(self) -> dict[str, Any]:
         """For status."""
         guard = self._guard
-        self._node.counters["ros2.unstamped"] = self.clock.unstamped
+        self._node.counters["ros2.unstamped"] = self._clock.unstamped
         self._node.counters["ros2.efforts_missing"] = self._state.efforts_missing
         if guard is not None:
             self._node.counters["ros2.stream_silences"] = guard.silences
         return {
             "following": guard is not None and guard.following,
             "held": self._hold.held,
-            "robot_clock_behind_s": self.clock.offset_s,
+            "robot_clock_behind_s": self._clock.offset_s,
             "width_m": self._state.width_m,
         }
 

@@ -184,10 +184,10 @@ class Ros2Node:
         for camera in self._cameras:
             for what, count in camera.outlet.counters().items():
                 self.node.counters[what] = count
-        age_s = None if self._arm is None else self._arm.age_s
+        age_s = None if self._arm is None else self._arm.heard.age_s
         rates_hz = {"loop": self._rate.rate_hz}
         if self._arm is not None:
-            rates_hz["joint_states"] = self._arm.rate.rate_hz
+            rates_hz["joint_states"] = self._arm.heard.rate.rate_hz
         self.node.report(
             state,
             detail={
