@@ -4,12 +4,13 @@
 PYTHON ?= python3
 ARGS ?=
 SECONDS ?= 60
+MINUTES ?= 60
 BIN := .venv/bin
 READY := .venv/.ready
 SUITE := not slow and not models and not ros2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow fuzz test-ros2 test-models check format bench bench-faults bench-ros2 build ros2-bridge clean
+.PHONY: help setup demo test slow fuzz soak test-ros2 test-models check format bench bench-faults bench-ros2 build ros2-bridge clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -33,6 +34,9 @@ slow: $(READY) ## Run the tests that take long, too
 
 fuzz: $(READY) ## Feed every reader of foreign bytes with nonsense; SECONDS=600 for longer
 	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(ARGS)
+
+soak: $(READY) ## Run the whole chain with random faults; MINUTES=3 for a short one
+	$(BIN)/python tests/soak/soak.py --minutes $(MINUTES) $(ARGS)
 
 test-ros2: $(READY) ros2-bridge ## Run the tests with a real ROS 2 bridge and a DDS robot
 	$(BIN)/python -m pytest -m ros2 $(ARGS)

@@ -10,6 +10,7 @@ import typer
 
 from vla_zenoh.cli.bench_codec import codec
 from vla_zenoh.cli.bench_command import command
+from vla_zenoh.cli.bench_load import load
 from vla_zenoh.cli.bench_motion import motion
 from vla_zenoh.cli.bench_openvla import openvla
 from vla_zenoh.cli.bench_task import task
@@ -19,6 +20,7 @@ bench_app = typer.Typer(help="Measure this computer.", no_args_is_help=True)
 
 
 bench_app.command("motion")(motion)
+bench_app.command("load")(load)
 bench_app.command("codec")(codec)
 bench_app.command("command")(command)
 bench_app.command("task")(task)

@@ -1,7 +1,8 @@
 """Processes of a benchmark: how its servers are started, watched, timed and ended.
 
 Run as a module it is such a process: ``peer NAME PORT``, ``router ENDPOINT``,
-``echo ENDPOINT listen|connect``, or ``robot PROFILE_FILE``.
+``echo ENDPOINT listen|connect``, ``robot PROFILE_FILE`` or
+``follower PROFILE_FILE``.
 """
 
 from __future__ import annotations
@@ -137,6 +138,10 @@ def main(arguments: list[str]) -> None:
         from vla_zenoh.nodes.bench.robot import stand
 
         stand(rest[0], stop)
+    elif role == "follower":
+        from vla_zenoh.nodes.bench.follower import follow
+
+        follow(rest[0], stop)
     else:
         raise NodeError(f"{role!r} is no part of a benchmark")
 

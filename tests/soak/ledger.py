@@ -1,0 +1,139 @@
+"""What processes hold: memory, file handles, threads, shared memory; and whether it grows."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+SHARED_MEMORY = Path("/dev/shm")
+PERIOD_S = 5.0
+WARM_S = 20.0
+"""A process that is younger still loads, and fills what it keeps anyway."""
+COMPARED_S = 15.0
+"""So much of the beginning and of the end of its life is compared."""
+GROWTH_MIB, GROWTH_HANDLES, GROWTH_THREADS = 16.0, 6, 4
+
+
+class Held(NamedTuple):
+    """What one process holds at a moment of its life."""
+
+    age_s: float
+    rss_mib: float
+    pss_mib: float
+    handles: int
+    threads: int
+
+
+class Growth(NamedTuple):
+    """What a process had gained by its end, and over how long."""
+
+    node: str
+    pid: int
+    life_s: float
+    first: Held
+    last: Held
+
+    @property
+    def leaks(self) -> list[str]:
+        """What grew by more than it may, in words."""
+        out: list[str] = []
+        for name, most in (
+            ("pss_mib", GROWTH_MIB),
+            ("handles", GROWTH_HANDLES),
+            ("threads", GROWTH_THREADS),
+        ):
+            before, after = getattr(self.first, name), getattr(self.last, name)
+            if after - before > most:
+                out.append(
+                    f"{self.node} (pid {self.pid}): {name} {before:g} -> {after:g} in "
+                    f"{self.life_s:.0f} s"
+                )
+        return out
+
+
+def look(pid: int, age_s: float) -> Held:
+    """What a process holds now.
+
+    Raises:
+        OSError: it has ended.
+    """
+    folder = Path(f"/proc/{pid}")
+    found: dict[str, int] = {}
+    for line in (folder / "smaps_rollup").read_text().splitlines()[1:]:
+        name, _, rest = line.partition(":")
+        found[name] = int(rest.split()[0])
+    return Held(
+        round(age_s, 1),
+        round(found["Rss"] / 1024, 1),
+        round(found["Pss"] / 1024, 1),
+        len(os.listdir(folder / "fd")),
+        len(os.listdir(folder / "task")),
+    )
+
+
+def segments() -> tuple[int, float]:
+    """Zenoh's shared-memory segments on this computer: how many, MiB in all."""
+    sizes = []
+    for path in SHARED_MEMORY.glob("*.zenoh"):
+        with suppress(OSError):
+            sizes.append(path.stat().st_size)
+    return len(sizes), round(sum(sizes) / 1024**2, 1)
+
+
+class Ledger:
+    """Looks at processes every few seconds, in a thread, until `close`.
+
+    Args:
+        pids: gives node -> process number of those that run now.
+    """
+
+    def __init__(self, pids: Callable[[], Mapping[str, int]]) -> None:
+        self._pids = pids
+        self._seen: dict[tuple[str, int], list[Held]] = {}
+        self._born_s: dict[tuple[str, int], float] = {}
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="ledger", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.wait(PERIOD_S):
+            for who in dict(self._pids()).items():
+                born_s = self._born_s.setdefault(who, time.monotonic())
+                with suppress(OSError, KeyError, ValueError):
+                    self._seen.setdefault(who, []).append(look(who[1], time.monotonic() - born_s))
+
+    def newest(self) -> dict[str, Held]:
+        """Node -> what its present process holds."""
+        out: dict[str, Held] = {}
+        for node, pid in self._pids().items():
+            with suppress(OSError, KeyError, ValueError):
+                out[node] = look(pid, 0.0)
+        return out
+
+    def growth(self) -> list[Growth]:
+        """Of every process that lived for long enough to tell."""
+        out: list[Growth] = []
+        for (node, pid), entries in list(self._seen.items()):
+            life_s = entries[-1].age_s
+            first = [e for e in entries if WARM_S <= e.age_s < WARM_S + COMPARED_S]
+            last = [e for e in entries if e.age_s > life_s - COMPARED_S]
+            if first and last and life_s > WARM_S + 2 * COMPARED_S:
+                out.append(Growth(node, pid, life_s, _middle(first), _middle(last)))
+        return out
+
+    def close(self) -> None:
+        """Look no more."""
+        self._stop.set()
+        self._thread.join(2 * PERIOD_S)
+
+
+def _middle(entries: list[Held]) -> Held:
+    columns = zip(*entries, strict=True)
+    age_s, rss, pss, handles, threads = (median(column) for column in columns)
+    return Held(age_s, rss, pss, int(handles), int(threads))
