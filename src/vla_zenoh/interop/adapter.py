@@ -131,17 +131,21 @@ class Adapter(ABC):
             raise PeerError("peer_gone", f"{self.where} was lost; tried again in {wait_s:.1f} s")
         try:
             return self.layout.read(self._answer(observation), observation, self._forward)
-        except PeerError as error:
-            self._drop(answers=error.reason in ANSWERED)
-            raise
-        except TimeoutError as error:
-            self._drop()
+        except Exception as error:  # whatever it was: what is left on the wire is never read
+            self._drop(answers=isinstance(error, PeerError) and error.reason in ANSWERED)
+            told = self._told(error)
+            if told is error:
+                raise
+            raise told from error
+
+    def _told(self, error: Exception) -> Exception:
+        if isinstance(error, TimeoutError):
             why = f"{self.where} did not answer within {self.timeout_s:g} s"
-            raise PeerError("peer_timeout", why) from error
-        except self.lost as error:
-            self._drop()
-            why = f"no connection to {self.where}: {error or type(error).__name__}"
-            raise PeerError("peer_gone", why) from error
+            return PeerError("peer_timeout", why)
+        if isinstance(error, self.lost):
+            why = f"no connection to {self.where}: {str(error) or type(error).__name__}"
+            return PeerError("peer_gone", why)
+        return error
 
     def _answer(self, observation: Observation) -> Any:
         wrong = self._connect()
