@@ -6,7 +6,6 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rerun.chunk import RrdReader
 
 
@@ -21,10 +20,11 @@ class Shown:
         self._rows: defaultdict[str, list[tuple[int | None, dict[str, Any]]]] = defaultdict(list)
         for chunk in RrdReader(str(path)).stream():
             batch = chunk.to_record_batch()
-            for row in batch.to_pylist():
-                stamp = row.pop("time", None)
-                row.pop("rerun.controls.RowId", None)
-                at_ns = None if stamp is None else int(np.datetime64(stamp, "ns").astype("int64"))
+            timed = "time" in batch.schema.names
+            stamps = batch.column("time").cast("int64").to_pylist() if timed else []
+            columns = [name for name in batch.schema.names if ":" in name]
+            for index, row in enumerate(batch.select(columns).to_pylist()):
+                at_ns = stamps[index] if timed else None
                 values = {name: value for name, value in row.items() if value is not None}
                 self._rows[chunk.entity_path.removeprefix("/")].append((at_ns, values))
 

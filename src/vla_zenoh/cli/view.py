@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -183,13 +182,14 @@ def _sink(
 def _tell(show: Show, save: Path | None) -> None:
     screen = errors()
     where = f" in {save}" if save is not None else ""
-    screen.print(f"{show.shown.total():,} samples of {len(show.shown)} keys{where}", markup=False)
-    for what, counts in (
-        ("not shown", show.refused),
-        ("left out, too slow", Counter(all=show.dropped)),
-    ):
-        if counts.total():
-            worst = ", ".join(
-                f"{why} ({count})" for why, count in counts.most_common(SHOWN_REASONS)
-            )
-            screen.print(f"[yellow]{what}: {escape(printable(worst))}[/]")
+    screen.print(
+        f"{show.shown.total():,} samples of {len(show.shown)} keys{where}",
+        markup=False,
+        soft_wrap=True,
+    )
+    if show.refused:
+        worst = show.refused.most_common(SHOWN_REASONS)
+        reasons = ", ".join(f"{why} ({count})" for why, count in worst)
+        screen.print(f"[yellow]not shown: {escape(printable(reasons))}[/]")
+    if show.dropped:
+        screen.print(f"[yellow]left out, because this was too slow: {show.dropped} samples[/]")

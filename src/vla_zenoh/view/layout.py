@@ -15,28 +15,27 @@ EYE_M, LOOK_AT_M = (1.55, -1.15, 0.95), (0.32, 0.0, 0.28)
 BACKGROUND = (22, 25, 31)
 GRID_M = 0.1
 
-PLOTS = (
-    ("Latency, ms", paths.LATENCY),
-    ("Speed of the TCP, mm/s", paths.SPEED),
-    ("Gripper, mm", paths.GRIPPER),
-    ("Commanded to measured, mm", paths.TRACKING),
-    ("Speed left by bounds, %", paths.BOUNDS),
-    ("Joints, rad", paths.JOINTS),
-)
+SHARE_RANGE = (0.0, 105.0)
 
 
 def blueprint(
-    cameras: Collection[str], seen: Mapping[str, Collection[str]], *, live: bool
+    cameras: Collection[str],
+    seen: Mapping[str, Collection[str]],
+    *,
+    widest_mm: float,
+    live: bool,
 ) -> rrb.Blueprint:
     """The views for these pictures.
 
     Args:
         cameras: of the robot.
         seen: worker to the cameras whose pictures its model is given.
+        widest_mm: opening of the gripper.
         live: follow what comes in.
     """
     left = rrb.Vertical(_scene(), _words(), row_shares=[3, 1])
-    right = rrb.Vertical(*_pictures(cameras, seen), _plots(), row_shares=_shares(cameras, seen))
+    pictures, plots = _pictures(cameras, seen), _plots(widest_mm)
+    right = rrb.Vertical(*pictures, plots, row_shares=_shares(cameras, seen))
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[1, 1]),
         rrb.BlueprintPanel(state="collapsed"),
@@ -99,22 +98,35 @@ def _pictures(cameras: Collection[str], seen: Mapping[str, Collection[str]]) -> 
 
 
 def _shares(cameras: Collection[str], seen: Mapping[str, Collection[str]]) -> list[float]:
-    return [*([5.0] if cameras else []), *([4.0] if seen else []), 7.0]
+    of_models = 4.0 if any(seen.values()) else 2.0
+    return [*([5.0] if cameras else []), *([of_models] if seen else []), 7.0]
 
 
-def _plots() -> Any:
-    span = rrb.VisibleTimeRange(
+def _plots(widest_mm: float) -> Any:
+    wide = (-0.05 * widest_mm, 1.05 * widest_mm)
+    return rrb.Grid(
+        _plot("Latency, ms", paths.LATENCY),
+        _plot("Speed of the TCP, mm/s", paths.SPEED),
+        _plot("Gripper, mm", paths.GRIPPER, span=wide),
+        _plot("Commanded to measured, mm", paths.TRACKING, legend=False),
+        _plot("Speed left by bounds, %", paths.BOUNDS, span=SHARE_RANGE, legend=False),
+        _plot("Joints, rad", paths.JOINTS, legend=False),
+        grid_columns=2,
+    )
+
+
+def _plot(
+    name: str, origin: str, *, span: tuple[float, float] | None = None, legend: bool = True
+) -> Any:
+    window = rrb.VisibleTimeRange(
         paths.TIMELINE,
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-WINDOW_S),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
-    views = [
-        rrb.TimeSeriesView(
-            origin=origin,
-            name=name,
-            time_ranges=[span],
-            plot_legend=rrb.PlotLegend(visible=origin != paths.BOUNDS),
-        )
-        for name, origin in PLOTS
-    ]
-    return rrb.Grid(*views, grid_columns=2)
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=name,
+        time_ranges=[window],
+        axis_y=None if span is None else rrb.ScalarAxis(range=span, zoom_lock=True),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+    )

@@ -83,7 +83,8 @@ class Show:
         self._specs: dict[str, ModelSpec] = {}
         self._obeyed = profile.task.worker
         self._commanded: PoseCommand | None = None
-        self._cameras = set(profile.cameras)
+        self._widest_mm = profile.robot.gripper.max_width_m * 1e3
+        self._cameras: set[str] = set()
         self._seen: defaultdict[str, set[str]] = defaultdict(set)
         self._layout()
         self.shown: Counter[str] = Counter()
@@ -110,7 +111,9 @@ class Show:
         self._often = (PoseState, JointState, GripperState, ObjectPoses)
 
     def _layout(self) -> None:
-        self._stream.send_blueprint(blueprint(self._cameras, self._seen, live=self._live))
+        self._stream.send_blueprint(
+            blueprint(self._cameras, self._seen, widest_mm=self._widest_mm, live=self._live)
+        )
 
     # -- in -----------------------------------------------------------------------------------
     def hear(self, sample: Sample) -> None:
@@ -152,7 +155,7 @@ class Show:
         return True
 
     def _record(self, said: Said, stamp_ns: int) -> None:
-        if said.header is None:
+        if said.header is None and said.kind is not ModelSpec:  # an answer to a question has none
             raise CodecError("no_header", f"{said.key} has no header")
         if said.kind in self._often and not self._due(said.key, stamp_ns):
             return
@@ -244,6 +247,9 @@ class Show:
             self._charts.shadow(chunk)
 
     def _on_seen(self, _: Said, stamp_ns: int, seen: Seen) -> None:
+        if seen.worker not in self._seen:
+            self._seen[seen.worker] = set()
+            self._layout()
         self._words.answer(seen)
 
     # -- words --------------------------------------------------------------------------------
