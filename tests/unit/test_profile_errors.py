@@ -117,6 +117,10 @@ def told(path: str) -> list[str]:
             "limits.step_rad: is 0.7, longer than the leash lead_rad (0.6)",
         ),
         (
+            "limits: {reach: {collision_slow_m: 0.01}}",
+            "limits.reach.collision_stop_m: is 0.02, which must not be above collision_slow_m",
+        ),
+        (
             "timing:\n  command_hz: 50\n  command_timeout_s: 0.05",
             "lab.yaml:4: timing.command_timeout_s: is 0.05, less than 3 periods of command_hz (50)",
         ),
