@@ -1,0 +1,74 @@
+"""What a soak judges by: counters across restarts, causes, and growth."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+
+from ledger import GROWTH_HANDLES, GROWTH_MIB, Growth, Held, Ledger, look
+from refusals import EXPLAINS, STALL_S, Refusals, Witness, unexplained
+
+from vla_zenoh.types import NodeStatus
+
+HELD_S = 0.5
+"""For so long the interpreter is held, as a busy computer would."""
+
+
+def status(pid: int, **refused: int) -> NodeStatus:
+    counters = {f"refused.{name}": count for name, count in refused.items()}
+    return NodeStatus("sim", "running", "h", pid, 0, {}, {}, {}, counters | {"other": 9}, {})
+
+
+def test_refusals_are_counted_from_look_to_look_and_anew_after_a_restart() -> None:
+    refusals = Refusals()
+    assert refusals.since({"sim": status(1, stale=2)}) == {"sim.stale": 2}
+    assert refusals.since({"sim": status(1, stale=2)}) == {}
+    assert refusals.since({"sim": status(1, stale=5)}) == {"sim.stale": 3}
+    assert refusals.since({"sim": status(2, stale=1)}) == {"sim.stale": 1}
+
+
+def test_a_refusal_needs_a_cause() -> None:
+    found = {"command.stale": 1, "worker-a.malformed": 2}
+    assert unexplained(found, "prompt", 0.0) == found
+    assert unexplained(found, "kill", 0.0) == {"worker-a.malformed": 2}
+    assert unexplained(found, "prompt", 2 * STALL_S) == {"worker-a.malformed": 2}
+    assert unexplained(found, "junk", 0.0) == {}
+    assert all("malformed" not in reasons for name, reasons in EXPLAINS.items() if name != "junk")
+
+
+def test_growth_beyond_its_bound_is_a_leak() -> None:
+    first = Held(20.0, 100.0, 90.0, 30, 20)
+    little = first._replace(pss_mib=90.0 + GROWTH_MIB, handles=30 + GROWTH_HANDLES)
+    much = little._replace(pss_mib=little.pss_mib + 1)
+    assert Growth("sim", 1, 60.0, first, little).leaks == []
+    (words,) = Growth("sim", 1, 60.0, first, much).leaks
+    assert "pss_mib" in words
+
+
+def test_what_this_process_holds_is_seen() -> None:
+    before = look(os.getpid(), 0.0)
+    with open(os.devnull):
+        assert look(os.getpid(), 0.0).handles == before.handles + 1
+    assert before.pss_mib <= before.rss_mib
+    ledger = Ledger(lambda: {"me": os.getpid()})
+    assert set(ledger.newest()) == {"me"}
+    assert ledger.growth() == []
+    ledger.close()
+
+
+def test_a_witness_sees_a_stall_once() -> None:
+    witness, usual_s = Witness(), sys.getswitchinterval()
+    sys.setswitchinterval(10 * HELD_S)  # nobody else runs until this thread lets go
+    try:
+        time.sleep(0.05)
+        witness.worst_s()
+        end_s = time.perf_counter() + HELD_S
+        while time.perf_counter() < end_s:
+            pass
+        time.sleep(0.05)
+    finally:
+        sys.setswitchinterval(usual_s)
+    assert witness.worst_s() > 0.8 * HELD_S
+    assert witness.worst_s() < HELD_S
+    witness.close()
