@@ -14,7 +14,7 @@ from vla_zenoh.profile import Profile
 
 FloatArray = NDArray[np.float64]
 
-COLUMNS = 13
+COLUMNS = 14
 STILL_M_S = 0.005
 """A measured arm that is slower stands: the impedance controller still settles."""
 STOOD_S = 0.1
@@ -34,12 +34,14 @@ class Flight:
         twist: (n, 6) likewise.
         last: (n, 3) of the simulator: the position its controller follows, m; of the command node:
             the commanded acceleration, m/s^2.
+        asked_s: (n,) of the command node: when the chunk that it carries out arrived, else NaN.
     """
 
     time_s: FloatArray
     position_m: FloatArray
     twist: FloatArray
     last: FloatArray
+    asked_s: FloatArray
 
     @property
     def speed_m_s(self) -> FloatArray:
@@ -47,9 +49,13 @@ class Flight:
 
     def between(self, since_s: float, until_s: float = np.inf) -> Flight:
         chosen = (self.time_s >= since_s) & (self.time_s < until_s)
-        return Flight(
-            self.time_s[chosen], self.position_m[chosen], self.twist[chosen], self.last[chosen]
-        )
+        return Flight(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+    def last_asked_s(self, until_s: float) -> float | None:
+        """When the last chunk arrived that was carried out before `until_s`."""
+        asked_s = self.between(-np.inf, until_s).asked_s
+        known = asked_s[np.isfinite(asked_s)]
+        return float(known[-1]) if len(known) else None
 
     def stood_at_s(self, since_s: float, until_s: float = np.inf) -> float | None:
         """When the arm first stood after `since_s`, for at least `STOOD_S`; None: it never did."""
@@ -98,7 +104,7 @@ def read_flight(path: Path) -> Flight:
     numbers = np.frombuffer(path.read_bytes()[: path.stat().st_size // (8 * COLUMNS) * 8 * COLUMNS])
     rows = numbers.reshape(-1, COLUMNS)
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    return Flight(rows[:, 0], rows[:, 1:4], rows[:, 4:10], rows[:, 10:13])
+    return Flight(rows[:, 0], rows[:, 1:4], rows[:, 4:10], rows[:, 10:13], rows[:, 13])
 
 
 def brake_s(profile: Profile, velocity_m_s: FloatArray, acceleration_m_s2: FloatArray) -> float:

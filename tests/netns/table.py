@@ -10,9 +10,9 @@ from netns.stage import Row
 
 BEGIN, END = "<!-- faults: made by make bench-faults -->", "<!-- faults end -->"
 HEAD = (
-    "| fault | what the arm did | stood after (allowed), way | peak acceleration, jerk "
-    "| moved again after | records lost | refused |",
-    "|---|---|---|---|---|---|---|",
+    "| fault | what the arm did | stood after, way | braked within (allowed) "
+    "| peak acceleration, jerk | moved again after | records lost | refused |",
+    "|---|---|---|---|---|---|---|---|",
 )
 SHOWN = 3
 """Keys and reasons in a cell; the others are summed up."""
@@ -24,6 +24,7 @@ def line(row: Row) -> str:
         f"`{row.name}` {row.about}",
         row.did + "".join(f"; **{fault}**" for fault in row.wrong),
         _stood(row),
+        _braked(row),
         f"{row.acceleration:.2f}, {row.jerk:.2f}",
         _recovered(row),
         _counts(row.lost),
@@ -35,8 +36,13 @@ def line(row: Row) -> str:
 def _stood(row: Row) -> str:
     if row.stood_s is None:
         return "-"
-    allowed = f" ({row.stood_bound_s:.2f})" if row.stood_bound_s is not None else ""
-    return f"{row.stood_s:.2f} s{allowed}, {row.way_mm or 0.0:.0f} mm"
+    return f"{row.stood_s:.2f} s, {row.way_mm or 0.0:.0f} mm"
+
+
+def _braked(row: Row) -> str:
+    if row.braked_s is None or row.braked_bound_s is None:
+        return "-"
+    return f"{row.braked_s:.2f} s ({row.braked_bound_s:.2f})"
 
 
 def _recovered(row: Row) -> str:

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.session import config, open_session
+from vla_zenoh.nodes.sockets import Impatience
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.fit import node_name
 from vla_zenoh.profile.session import is_loopback
@@ -52,7 +53,9 @@ def run_router(
     ) as session:
         node = Node(name, profile, session)
         detail = {"listen": list(profile.session.listen), "security": security_of(profile)}
+        impatience = Impatience(profile.session.lease_ms / 1e3)
         while not stop.wait(POLL_S):
+            impatience.look()
             links_now = len(list(session.info.links()))
             node.report("routing", detail={**detail, "links": links_now})
         node.close()

@@ -28,12 +28,16 @@ def _install(key_end: str, path: str) -> None:
         if self.key.endswith(key_end):
             if key_end == RECORDED["sim"]:
                 reference = record.reference_position_m
-                parts = (record.position_m, record.twist, reference)
+                parts, asked_ns = (record.position_m, record.twist, reference), None
             else:
                 parts = (record.position_m, record.twist, record.acceleration[:3])
+                asked_ns = None if record.cause is None else record.cause.received_ns
             # The computer's own clock, which nobody sets.
-            at_s = (header.stamp_wall_ns - self._clock.offset_ns) / 1e9
-            file.write(np.concatenate([[at_s], *parts]).tobytes())
+            at_s, asked_s = (
+                np.nan if stamp_ns is None else (stamp_ns - self._clock.offset_ns) / 1e9
+                for stamp_ns in (header.stamp_wall_ns, asked_ns)
+            )
+            file.write(np.concatenate([[at_s], *parts, [asked_s]]).tobytes())
         return header
 
     Stream.put = put_and_keep
