@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ class RobotShapes:
             name: self._index(name) for name in (*robot.arm_joints, *robot.finger_joints)
         }
         self._fingers = robot.finger_joints
-        self.meshes = tuple(_meshes(self._model, self.kinematics.urdf))
+        self.meshes = link_meshes(self.kinematics.urdf)
         self._frames = {mesh.link: self._model.getFrameId(mesh.link) for mesh in self.meshes}
 
     def _index(self, joint: str) -> int:
@@ -90,6 +91,16 @@ class RobotShapes:
         for link, frame in self._frames.items():
             placement = base.actInv(pin.updateFramePlacement(self._model, self._data, frame))
             yield link, Pose(placement.translation.copy(), placement.rotation.copy())
+
+
+@cache
+def link_meshes(urdf: Path) -> tuple[LinkMesh, ...]:
+    """The surface of every link that has one.
+
+    Raises:
+        ResourceError: no shape can be loaded.
+    """
+    return tuple(_meshes(pin.buildModelFromUrdf(str(urdf)), urdf))
 
 
 def _meshes(model: Any, urdf: Path) -> Iterator[LinkMesh]:
