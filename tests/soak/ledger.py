@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -21,11 +22,21 @@ GROWTH_MIB, GROWTH_HANDLES, GROWTH_THREADS = 16.0, 6, 4
 
 
 class Held(NamedTuple):
-    """What one process holds at a moment of its life."""
+    """What one process holds at a moment of its life.
+
+    Args:
+        age_s: since it was seen first.
+        rss_mib: all its pages.
+        pss_mib: those that it shares counted by its share, which grows when others end.
+        private_mib: those that it has to itself: what a leak is told by.
+        handles: open files, sockets and the like.
+        threads: all of them.
+    """
 
     age_s: float
     rss_mib: float
     pss_mib: float
+    private_mib: float
     handles: int
     threads: int
 
@@ -44,7 +55,7 @@ class Growth(NamedTuple):
         """What grew by more than it may, in words."""
         out: list[str] = []
         for name, most in (
-            ("pss_mib", GROWTH_MIB),
+            ("private_mib", GROWTH_MIB),
             ("handles", GROWTH_HANDLES),
             ("threads", GROWTH_THREADS),
         ):
@@ -72,18 +83,35 @@ def look(pid: int, age_s: float) -> Held:
         round(age_s, 1),
         round(found["Rss"] / 1024, 1),
         round(found["Pss"] / 1024, 1),
+        round((found["Private_Clean"] + found["Private_Dirty"]) / 1024, 1),
         len(os.listdir(folder / "fd")),
         len(os.listdir(folder / "task")),
     )
 
 
-def segments() -> tuple[int, float]:
-    """Zenoh's shared-memory segments on this computer: how many, MiB in all."""
-    sizes = []
+class Segments(NamedTuple):
+    """Zenoh's shared memory on this computer: files, MiB, and files that no process maps."""
+
+    count: int
+    size_mib: float
+    orphans: int
+
+
+def segments() -> Segments:
+    """Those there are now."""
+    sizes: dict[str, int] = {}
     for path in SHARED_MEMORY.glob("*.zenoh"):
         with suppress(OSError):
-            sizes.append(path.stat().st_size)
-    return len(sizes), round(sum(sizes) / 1024**2, 1)
+            sizes[path.name] = path.stat().st_size
+    mapped: set[str] = set()
+    for maps in Path("/proc").glob("[0-9]*/maps"):
+        with suppress(OSError):
+            mapped |= {Path(name).name for name in _SEGMENT.findall(maps.read_text())}
+    orphans = len(sizes.keys() - mapped)
+    return Segments(len(sizes), round(sum(sizes.values()) / 1024**2, 1), orphans)
+
+
+_SEGMENT = re.compile(rf"{SHARED_MEMORY}/\S+\.zenoh")
 
 
 class Ledger:
@@ -135,5 +163,5 @@ class Ledger:
 
 def _middle(entries: list[Held]) -> Held:
     columns = zip(*entries, strict=True)
-    age_s, rss, pss, handles, threads = (median(column) for column in columns)
-    return Held(age_s, rss, pss, int(handles), int(threads))
+    age_s, rss, pss, private, handles, threads = (median(column) for column in columns)
+    return Held(age_s, rss, pss, private, int(handles), int(threads))

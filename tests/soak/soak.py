@@ -82,6 +82,7 @@ BOX_TOLERANCE_M = 0.005
 EXACT_M = 0.0015
 MORE_SEGMENTS = 4
 """What a kill -9 leaves stands until the next Zenoh process cleans up."""
+MEASURER = "soak"
 
 
 @dataclass(slots=True)
@@ -138,7 +139,7 @@ class Soak:
         }
         self._born_s: dict[str, tuple[int, float]] = {}
         self._refusals, self._witness = Refusals(), Witness()
-        self._ledger = Ledger(lambda: {**chain.host.supervisor.pids(), "soak": os.getpid()})
+        self._ledger = Ledger(lambda: {**chain.host.supervisor.pids(), MEASURER: os.getpid()})
 
     # -- all of it ----------------------------------------------------------------------------
     def run(self, minutes: float) -> Found:
@@ -181,18 +182,21 @@ class Soak:
         if abs(way_m + 0.05) > EXACT_M:
             found.violations.append(f"at the end 5 steps down went {way_m * 1e3:.2f} mm")
         for growth in self._ledger.growth():
-            found.leaks += growth.leaks
+            # The program that measures keeps samples: it is shown and not judged.
+            found.leaks += growth.leaks if growth.node != MEASURER else []
         found.held["lives"] = [
             {
                 "node": g.node,
                 "life_s": round(g.life_s),
-                "pss_mib": [g.first.pss_mib, g.last.pss_mib],
+                "private_mib": [g.first.private_mib, g.last.private_mib],
             }
             for g in self._ledger.growth()
         ]
         before, after = found.held["start"]["segments"], found.held["end"]["segments"]
-        if after[0] > before[0] + MORE_SEGMENTS:
-            found.leaks.append(f"shared memory: {before[0]} -> {after[0]} segments")
+        if after.orphans > before.orphans + MORE_SEGMENTS:
+            found.leaks.append(
+                f"shared memory: {before.orphans} -> {after.orphans} segments that nobody maps"
+            )
 
     def _note(self, when: str) -> None:
         status = self.chain.client.status("command")
@@ -376,7 +380,7 @@ def table(found: Found) -> Table:
     for name in sorted(start["nodes"]) if start and end else ():
         if name in end["nodes"]:
             pair = [
-                "{pss_mib:g} MiB PSS, {rss_mib:g} RSS, {handles} handles, {threads} threads".format(
+                "MiB {private_mib:g}, {pss_mib:g}, {rss_mib:g}; {handles}; {threads}".format(
                     **held["nodes"][name]
                 )
                 for held in (start, end)
@@ -384,7 +388,11 @@ def table(found: Found) -> Table:
             out.add_row(name, *pair)
     if start and end:
         out.add_row(
-            "/dev/shm", *("{} segments, {} MiB".format(*held["segments"]) for held in (start, end))
+            "/dev/shm",
+            *(
+                "{} segments, {} MiB, {} that nobody maps".format(*held["segments"])
+                for held in (start, end)
+            ),
         )
     before, after = found.latency.get("start"), found.latency.get("end")
     for name in before["stages_ms"] if before and after else ():
@@ -434,6 +442,7 @@ def main() -> int:
 
 def _print(found: Found) -> None:
     screen = Console(highlight=False, width=130)
+    screen.print("nodes: private, PSS, RSS; handles; threads")
     screen.print(table(found))
     for name, count in found.actions.most_common():
         times = sorted(found.recovery_s[name])
