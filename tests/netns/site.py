@@ -76,7 +76,8 @@ class Site:
     def impostor(self, host: str, name: str) -> None:
         """Let a computer call itself `name`, and start the part of that host with its papers."""
         words = (sys.executable, "-m", "vla_zenoh", "up", str(self.profile(name)), "--host", name)
-        self.hosts[host].start("sh", "-c", f'hostname {name} && exec "$@"', "sh", *words)
+        renamed = ("sh", "-c", f'hostname {name} && exec "$@"', "sh", *words)
+        self.hosts[host].start(*renamed, output=self.folder / "impostor.log")
 
     def fake_clock(self, host: str) -> None:
         """Give a host a wall clock of its own, before anything is started there."""
