@@ -157,15 +157,15 @@ def latencies(first_commands: Sequence[tuple[Cause, int]]) -> dict[str, Any]:
     """Latency from the camera's stamp to the pose command that first carries a chunk out, in ms.
 
     Args:
-        first_commands: for each chunk, its cause and when that command was heard (wall ns).
+        first_commands: for each chunk, its cause and that command's stamp (wall ns).
     """
     stages: dict[str, list[float]] = {
         "camera_to_worker": [c.observed_ns - c.observation_stamp_ns for c, _ in first_commands],
         "inference": [c.inference_end_ns - c.inference_start_ns for c, _ in first_commands],
         "worker_to_command": [c.received_ns - c.inference_end_ns for c, _ in first_commands],
-        "command_to_pose": [heard - c.received_ns for c, heard in first_commands],
+        "command_to_pose": [stamp - c.received_ns for c, stamp in first_commands],
     }
-    total = [heard - c.observation_stamp_ns for c, heard in first_commands]
+    total = [stamp - c.observation_stamp_ns for c, stamp in first_commands]
     return {
         **percentiles([ns / 1e6 for ns in total]),
         "chunks": len(total),

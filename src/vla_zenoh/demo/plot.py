@@ -166,9 +166,9 @@ def _draw_latency(axes: Any, first_commands: Sequence[tuple[Cause, int]]) -> Non
                 cause.observed_ns - cause.observation_stamp_ns,
                 cause.inference_end_ns - cause.observed_ns,
                 cause.received_ns - cause.inference_end_ns,
-                heard_ns - cause.received_ns,
+                stamp_ns - cause.received_ns,
             )
-            for cause, heard_ns in first_commands
+            for cause, stamp_ns in first_commands
         ]
     )
     names = ("picture waits for worker", "inference", "worker to command", "command to pose")

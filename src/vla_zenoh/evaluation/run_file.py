@@ -104,15 +104,15 @@ def _requests(
         first, last = obeyed[0].header, obeyed[-1].header
         out.seconds = (last.stamp_wall_ns - first.stamp_wall_ns) / 1e9
     stages = {
-        "end_to_end": [heard - cause.observation_stamp_ns for cause, heard in causes],
+        "end_to_end": [stamp - cause.observation_stamp_ns for cause, stamp in causes],
         "outbound": [c.observed_ns - c.observation_stamp_ns for c, _ in causes],
         "inference": [c.inference_end_ns - c.inference_start_ns for c, _ in causes],
-        "inbound": [heard - cause.inference_end_ns for cause, heard in causes],
+        "inbound": [stamp - cause.inference_end_ns for cause, stamp in causes],
         "worker_to_command": [c.received_ns - c.inference_end_ns for c, _ in causes],
-        "command_to_pose": [heard - cause.received_ns for cause, heard in causes],
+        "command_to_pose": [stamp - cause.received_ns for cause, stamp in causes],
     }
     out.stages_ms = {stage: np.array(ns, np.float64) / 1e6 for stage, ns in stages.items()}
-    out.request_t_s = np.array([(heard - zero_ns) / 1e9 for _, heard in causes])
+    out.request_t_s = np.array([(stamp - zero_ns) / 1e9 for _, stamp in causes])
 
 
 # -- motion ---------------------------------------------------------------------------------------

@@ -114,19 +114,22 @@ class Run:
         return [(put.heard_ns, put.text) for put in self.settings if put.name == "prompt"]
 
     def first_commands(self) -> list[tuple[Cause, int]]:
-        """For each chunk the first command that carries it out, and when it was heard."""
+        """For each chunk its cause, and the stamp of the first command that carries it out."""
         return first_commands(self.commands or self.joint_commands)
 
 
 def first_commands(commands: Sequence[Heard]) -> list[tuple[Cause, int]]:
-    """For each chunk the first of `commands` that carries it out, and when it was heard."""
+    """For each chunk its cause, and the stamp of the first of `commands` that carries it out.
+
+    The stamp, because whoever records may hear late what a robot heard in time.
+    """
     out: list[tuple[Cause, int]] = []
     newest: tuple[str, int] | None = None
     for entry in commands:
         cause = entry.record.cause
         if cause is not None and (cause.worker, cause.chunk_seq) != newest:
             newest = (cause.worker, cause.chunk_seq)
-            out.append((cause, entry.heard_ns))
+            out.append((cause, entry.header.stamp_wall_ns))
     return out
 
 

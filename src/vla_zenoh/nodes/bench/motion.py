@@ -139,7 +139,9 @@ def stream_of(
         ),
         default=0.0,
     )
-    mine = [(cause, heard) for cause, heard in first if cause.observation_stamp_ns >= since_ns]
+    mine = [
+        (cause, stamp_ns) for cause, stamp_ns in first if cause.observation_stamp_ns >= since_ns
+    ]
     return Stream(
         np.array([entry.header.stamp_wall_ns - since_ns for entry in commands]) / 1e9,
         np.array([entry.record.twist for entry in commands]).reshape(-1, 6),
@@ -147,6 +149,6 @@ def stream_of(
         np.array([cause.chunk_seq if cause else -1 for cause in causes]),
         *way_of([pose_of(pose) for pose in poses[:: round(state_hz / WAY_HZ)]]),
         tracking_m,
-        [(heard - cause.observation_stamp_ns) / 1e6 for cause, heard in mine],
+        [(stamp_ns - cause.observation_stamp_ns) / 1e6 for cause, stamp_ns in mine],
         [(cause.received_ns - cause.observation_stamp_ns) / 1e6 for cause, _ in mine],
     )
