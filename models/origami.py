@@ -15,7 +15,8 @@ import uuid
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from vla_zenoh.errors import PeerError, SpecError
+from vla_zenoh.codec.message import MAX_PAYLOAD_BYTES
+from vla_zenoh.errors import CodecError, PeerError, SpecError
 from vla_zenoh.interop import origami
 from vla_zenoh.interop.adapter import Adapter
 from vla_zenoh.interop.presets import ORIGAMI
@@ -79,6 +80,8 @@ class Origami(Adapter):
     def _query(self, operation: origami.Operation, fields: dict[str, Any] | None = None) -> Any:
         import zenoh
 
+        from vla_zenoh.nodes.bounded import bytes_of
+
         request_id = uuid.uuid4().hex
         try:
             session = self._opened()
@@ -92,10 +95,12 @@ class Origami(Adapter):
             )
             for reply in replies:
                 found = reply.ok or reply.err
-                payload = found.payload.to_bytes() if found is not None else b""
+                payload = bytes_of(found.payload, MAX_PAYLOAD_BYTES) if found is not None else b""
                 if reply.ok is None and payload == b"Timeout":
                     break
                 return origami.read_answer(payload, operation, request_id)
+        except CodecError as error:
+            raise PeerError("peer_reply", f"the answer is too large: {error}") from error
         except zenoh.ZError as error:
             self.close()
             raise PeerError("peer_gone", f"no router at {self._url}: {error}") from error

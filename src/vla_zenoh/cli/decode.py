@@ -70,4 +70,4 @@ def head(sample: zenoh.Sample) -> dict[str, Any] | None:
 
 def text(payload: zenoh.ZBytes) -> str:
     """A setting's words, at most `MAX_TEXT` of them; what is no UTF-8 is replaced."""
-    return payload.to_bytes()[:MAX_TEXT].decode("utf-8", "replace")
+    return bytes_of(payload)[:MAX_TEXT].decode("utf-8", "replace")

@@ -20,6 +20,7 @@ from vla_zenoh.cli.options import (
     effective_profile,
 )
 from vla_zenoh.cli.output import console, fail, printable
+from vla_zenoh.codec.image import MAX_PICTURE_BYTES
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.slots import Inbox
 
@@ -42,7 +43,7 @@ def echo(
     """Print what is written on a key, decoded."""
     loaded = effective_profile(profile, connect)
     whole = key if key.startswith(f"{loaded.root}/") else f"{loaded.root}/{loaded.robot.name}/{key}"
-    inbox, seen = Inbox(256), 0
+    inbox, seen = Inbox(256, MAX_PICTURE_BYTES), 0
     with open_session(loaded.session) as session:
         try:
             subscriber = session.declare_subscriber(

@@ -23,6 +23,25 @@ def bytes_of(payload: zenoh.ZBytes | None, limit: int = MAX_RECORD_BYTES) -> byt
     return payload.to_bytes()
 
 
+def size_of(sample: zenoh.Sample) -> int:
+    """Bytes of payload and attachment together."""
+    attachment = sample.attachment
+    return len(sample.payload) + (len(attachment) if attachment is not None else 0)
+
+
+def whole(sample: zenoh.Sample, limit: int) -> tuple[bytes, bytes | None]:
+    """Payload and attachment.
+
+    Raises:
+        CodecError: ``oversize``, both together are more than `limit`.
+    """
+    size = size_of(sample)
+    if size > limit:
+        raise CodecError("oversize", f"{size} bytes, at most {limit} are taken")
+    attachment = sample.attachment
+    return sample.payload.to_bytes(), attachment.to_bytes() if attachment is not None else None
+
+
 def header_of(sample: zenoh.Sample) -> Header:
     """What the sample's writer says of it.
 

@@ -12,10 +12,10 @@ import zenoh
 
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
-from vla_zenoh.codec.header import MAX_HEADER_BYTES
 from vla_zenoh.codec.records import MAX_RECORD_BYTES
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Keys
+from vla_zenoh.nodes.bounded import whole
 from vla_zenoh.recording.run import Heard
 from vla_zenoh.types import (
     ActionChunk,
@@ -95,16 +95,11 @@ class Listener:
 
     def _into(self, name: str) -> Callable[[zenoh.Sample], None]:
         def take(sample: zenoh.Sample) -> None:
-            attachment = sample.attachment
-            if len(sample.payload) > MAX_RECORD_BYTES or len(attachment or b"") > MAX_HEADER_BYTES:
+            try:
+                payload, head = whole(sample, MAX_RECORD_BYTES)
+            except CodecError:
                 return
-            entry = (
-                name,
-                str(sample.key_expr),
-                sample.payload.to_bytes(),
-                attachment.to_bytes() if attachment is not None else None,
-                time.time_ns(),
-            )
+            entry = (name, str(sample.key_expr), payload, head, time.time_ns())
             with self._ready:
                 self._queue.append(entry)
 

@@ -17,7 +17,8 @@ from typing import Any
 
 import zenoh
 
-from vla_zenoh.errors import RecordingError
+from vla_zenoh.errors import CodecError, RecordingError
+from vla_zenoh.nodes.bounded import bytes_of, whole
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.recording.sample import TEXT, heard
@@ -133,7 +134,7 @@ class Recorder:
                 continue
             for reply in self.node.session.get(key, timeout=ANSWER_S):
                 if reply.ok is not None:
-                    self._put(key, reply.ok.payload.to_bytes(), TEXT, None)
+                    self._put(key, bytes_of(reply.ok.payload), TEXT, None)
 
     def run(self, stop: threading.Event, seconds: float | None = None) -> Recorded:
         """Record until `stop` is set, `seconds` have passed, or the disk is full."""
@@ -159,18 +160,14 @@ class Recorder:
 
     # -- in -----------------------------------------------------------------------------------
     def _take(self, sample: zenoh.Sample) -> None:
-        key, attachment = str(sample.key_expr), sample.attachment
-        size = len(sample.payload) + (len(attachment) if attachment is not None else 0)
-        if size > self._queue_limit:  # copying it costs as much as keeping it
+        key = str(sample.key_expr)
+        try:
+            payload, attachment = whole(sample, self._queue_limit)
+        except CodecError:  # copying it costs as much as keeping it
             with self._change:
                 self.recorded.dropped[key] += 1
             return
-        self._put(
-            key,
-            sample.payload.to_bytes(),
-            str(sample.encoding),
-            attachment.to_bytes() if attachment is not None else None,
-        )
+        self._put(key, payload, str(sample.encoding), attachment)
 
     def _put(self, key: str, payload: bytes, encoding: str, attachment: bytes | None) -> None:
         size = len(payload) + len(attachment or b"")

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import zenoh
 
 from vla_zenoh.codec.records import MAX_RECORD_BYTES
+from vla_zenoh.nodes.bounded import size_of
 
 
 class Arrival(NamedTuple):
@@ -52,8 +53,7 @@ class Slot:
         self._oversize: Oversize | None = None
 
     def _takes(self, sample: zenoh.Sample) -> bool:
-        attachment = sample.attachment
-        size = len(sample.payload) + (len(attachment) if attachment is not None else 0)
+        size = size_of(sample)
         if size <= self._limit:
             return True
         known = self._oversize

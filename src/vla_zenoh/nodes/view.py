@@ -8,6 +8,8 @@ from typing import Any
 
 import zenoh
 
+from vla_zenoh.errors import CodecError
+from vla_zenoh.nodes.bounded import whole
 from vla_zenoh.nodes.clock import Clock
 from vla_zenoh.profile import Profile
 from vla_zenoh.recording.sample import Sample, heard
@@ -49,9 +51,13 @@ class ViewListener:
                 self._take(reply.ok)
 
     def _take(self, sample: zenoh.Sample) -> None:
-        key, payload = str(sample.key_expr), sample.payload.to_bytes()
-        attachment = sample.attachment
-        header = attachment.to_bytes() if attachment is not None else None
+        key = str(sample.key_expr)
+        try:
+            payload, header = whole(sample, self._queue_limit)
+        except CodecError:
+            with self._lock:
+                self.dropped[key] += 1
+            return
         with self._lock:
             full = self._queued_bytes + len(payload) > self._queue_limit
             if full or len(self._queue) >= QUEUE_SAMPLES:

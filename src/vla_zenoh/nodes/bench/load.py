@@ -24,7 +24,7 @@ from vla_zenoh.codec.image import MAX_PICTURE_BYTES
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.nodes.bench.process import Server, cpu_s
-from vla_zenoh.nodes.bounded import header_of
+from vla_zenoh.nodes.bounded import bytes_of, header_of
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.meter import Percentiles
 from vla_zenoh.nodes.process import ROUTER_PATIENCE_S
@@ -275,12 +275,11 @@ class _Pictures:
         now_ns = time.time_ns()
         try:
             header = header_of(sample)
+            bytes_of(sample.payload, MAX_PICTURE_BYTES)  # a reader copies it, as a worker does
         except CodecError:
             return
-        if len(sample.payload) <= MAX_PICTURE_BYTES:
-            sample.payload.to_bytes()  # a reader copies it, as a worker does
-            self.count += 1
-            self.ages_ms.add((now_ns - header.stamp_wall_ns) / 1e6)
+        self.count += 1
+        self.ages_ms.add((now_ns - header.stamp_wall_ns) / 1e6)
 
 
 def _least(values: Sequence[float]) -> float:

@@ -22,10 +22,10 @@ from vla_zenoh.bench.task import (
     Ended,
     Plan,
 )
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import CodecError, NodeError, SessionError
+from vla_zenoh.nodes.bounded import header_of
 from vla_zenoh.nodes.demo import Interrupted
 from vla_zenoh.nodes.launch import Host
 from vla_zenoh.nodes.slots import Latest
@@ -251,9 +251,7 @@ class Slot(Latest):
         """
         if self._arrival is None:
             raise NodeError(f"no {kind.__name__} was heard")
-        attachment = self._arrival.sample.attachment
         try:
-            header = header_codec.decode(attachment.to_bytes() if attachment else None)
-            return header, records.decode(kind, self.payload())
+            return header_of(self._arrival.sample), records.decode(kind, self.payload())
         except CodecError as error:
             raise NodeError(f"{kind.__name__}: {error}") from error

@@ -35,6 +35,7 @@ _COMMANDS: dict[str, Any] = {
     "priority": zenoh.Priority.REAL_TIME,
     "express": True,
 }
+MAX_ATTACHMENT_BYTES = 1024
 _CDR = zenoh.Encoding("application/cdr")
 
 
@@ -105,7 +106,9 @@ class Request:
         self._given: Attachment | None = None
         if with_attachment:
             attachment = query.attachment
-            self._given = attachments.decode(None if attachment is None else attachment.to_bytes())
+            self._given = attachments.decode(
+                None if attachment is None else bytes_of(attachment, MAX_ATTACHMENT_BYTES)
+            )
 
     def answer(self, response: bytes) -> None:
         """Reply with CDR bytes; number and gid of the request go back with them."""
