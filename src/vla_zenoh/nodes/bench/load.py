@@ -88,7 +88,8 @@ class Load:
         for count in sorted(counts):
             for name in names[len(self._clients) : count]:
                 self._add(name)
-            refused = [name for name in names[:count] if not self._activate(name)]
+            give_up_s = time.monotonic() + READY_S
+            refused = [name for name in names[:count] if not self._activate(name, give_up_s)]
             row = self._measure_robots(names[:count], seconds)
             yield {"robots": count, "cameras": 0, "not_activated": refused, **row}
 
@@ -99,10 +100,10 @@ class Load:
         self._start(f"command {name}", ("command", "--profile", str(file)))
         self._clients[name] = Client(profile, self._session).follow()
 
-    def _activate(self, name: str) -> bool:
-        """Whether a robot can be had to move in the end."""
-        client, give_up = self._clients[name], time.monotonic() + READY_S
-        while time.monotonic() < give_up:
+    def _activate(self, name: str, give_up_s: float) -> bool:
+        """Whether a robot can be had to move by then."""
+        client = self._clients[name]
+        while time.monotonic() < give_up_s:
             self._wait(POLL_S)
             status = client.status("command")
             if status is None:
