@@ -22,7 +22,7 @@ from vla_zenoh.errors import RecordingError
 from vla_zenoh.evaluation import numbers
 from vla_zenoh.evaluation.result import Evaluation, Trace
 from vla_zenoh.evaluation.segments import segment
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, shown
 
 TIMES = ("t_client_start", "t_publish", "t_vla_in", "t_vla_out")
 POSITION, ORIENTATION = ("x", "y", "z"), ("qx", "qy", "qz")
@@ -59,8 +59,8 @@ def evaluate_csv(path: Path, first: int | None = None) -> Evaluation:
     missing = [name for name in COLUMNS if name not in header]
     if len(missing) == len(COLUMNS):
         raise RecordingError(
-            f"{path} has none of the columns {', '.join(COLUMNS)}; its own are: "
-            + ", ".join(header)[:300]
+            f"{path} has none of the columns {', '.join(COLUMNS)}; it begins with "
+            f"{shown(', '.join(header))}"
         )
     run = Evaluation(path.stem, "csv", path)
     if missing:

@@ -58,14 +58,15 @@ class ViewListener:
             with self._lock:
                 self.dropped[key] += 1
             return
+        size = len(payload) + len(header or b"")
         with self._lock:
-            full = self._queued_bytes + len(payload) > self._queue_limit
+            full = self._queued_bytes + size > self._queue_limit
             if full or len(self._queue) >= QUEUE_SAMPLES:
                 self.dropped[key] += 1
                 return
             now_ns = self._clock.wall_ns()
             self._queue.append((key, payload, str(sample.encoding), header, now_ns))
-            self._queued_bytes += len(payload)
+            self._queued_bytes += size
 
     def take(self) -> list[Sample]:
         """All that came since the last call, in the order heard."""

@@ -67,6 +67,19 @@ def open_window() -> Viewer:
     return Viewer(_data_url(HERE, port), "", _start(words, HERE, port))
 
 
+def open_headless(width_px: int, height_px: int) -> Viewer:
+    """Open Rerun's viewer without a window, for pictures of it.
+
+    Raises:
+        NodeError: the viewer does not start; it needs a Vulkan driver.
+        MissingExtraError: rerun-sdk is not installed.
+    """
+    port = _free_port()
+    words = ("--headless", "--bind", HERE, "--port", str(port))
+    size = ("--window-size", f"{width_px}x{height_px}")
+    return Viewer(_data_url(HERE, port), "", _start((*words, *size), HERE, port))
+
+
 def open_server(address: str, port: int) -> Viewer:
     """Serve Rerun's viewer for browsers.
 
