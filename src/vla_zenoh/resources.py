@@ -7,8 +7,8 @@ Looked through in this order, first hit wins: an explicit path, each folder in `
 from __future__ import annotations
 
 import difflib
+import importlib.metadata
 import os
-import sysconfig
 from pathlib import Path
 
 from vla_zenoh.errors import MissingExtraError, ResourceError
@@ -85,8 +85,8 @@ def robot_urdf(description: str) -> Path:
         if not path.is_file():
             raise ResourceError(f"robot description {description!r} is not a file")
         return path.resolve()
-    root = Path(sysconfig.get_path("purelib")) / "cmeel.prefix/share/example-robot-data/robots"
-    if not root.is_dir():
+    root = _robot_data()
+    if root is None:
         raise MissingExtraError("example-robot-data", "control")
     path = root / description.removeprefix(ROBOT_DATA_PREFIX)
     if not path.is_file():
@@ -95,6 +95,16 @@ def robot_urdf(description: str) -> Path:
             f"robots there: {', '.join(sorted(entry.name for entry in root.iterdir()))}"
         )
     return path
+
+
+def _robot_data() -> Path | None:
+    """Where the robots are: beside the package, which in a layered environment is in any layer."""
+    try:
+        package = importlib.metadata.distribution("example-robot-data")
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    root = Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))
+    return root if root.is_dir() else None
 
 
 def meshes_of(urdf: Path) -> Path:

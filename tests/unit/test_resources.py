@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -112,10 +113,21 @@ def test_a_robot_that_is_not_in_the_collection_gets_the_list() -> None:
         resources.robot_urdf("example-robot-data:no_robot/urdf/no_robot.urdf")
 
 
-def test_without_the_collection_the_extra_is_named(
+def test_robots_are_found_in_whichever_layer_of_an_environment_their_package_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(resources.sysconfig, "get_path", lambda _name: str(tmp_path))
+    about = tmp_path / "example_robot_data-9.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: example-robot-data\nVersion: 9\n")
+    urdf = tmp_path / "cmeel.prefix/share/example-robot-data/robots/arm/arm.urdf"
+    urdf.parent.mkdir(parents=True)
+    urdf.write_text("<robot name='arm'/>")
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    assert resources.robot_urdf("example-robot-data:arm/arm.urdf") == urdf
+
+
+def test_without_the_collection_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [])
     with pytest.raises(MissingExtraError, match=r"pip install 'vla-zenoh\[control\]'"):
         resources.robot_urdf(PANDA)
 
