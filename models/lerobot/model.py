@@ -1,6 +1,12 @@
 # /// script
 # requires-python = ">=3.12,<3.14"
-# dependencies = ["lerobot[pi,smolvla]==0.6.1", "numpy>=1.26", "safetensors==0.8.0"]
+# dependencies = [
+#     "example-robot-data>=6",
+#     "lerobot[pi,smolvla]==0.6.1",
+#     "numpy>=1.26",
+#     "pin>=4",
+#     "safetensors==0.8.0",
+# ]
 # ///
 """Any policy that LeRobot saved (ACT, SmolVLA, pi0, ...), run by LeRobot itself.
 
@@ -17,6 +23,7 @@ from collections.abc import Mapping
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from vla_zenoh_model_lerobot.mapping import (
     ACTION,
     PIPELINES,
@@ -33,6 +40,8 @@ from vla_zenoh_model_lerobot.mapping import (
 )
 
 from vla_zenoh.errors import SpecError, WorkerError
+from vla_zenoh.interop.joints import Forward, make_forward, poses_of
+from vla_zenoh.interop.layout import Action
 from vla_zenoh.model_options import checkpoint_folder, number, one_of, yes_no
 from vla_zenoh.policy import (
     ActionSpec,
@@ -41,12 +50,12 @@ from vla_zenoh.policy import (
     Frame,
     GripperMeaning,
     ModelSpec,
-    MotionKind,
     Observation,
     ObservationSpec,
     Resize,
     Rotation,
 )
+from vla_zenoh.profile import load_profile
 from vla_zenoh.state_vector import parts_of, state_vector
 
 
@@ -55,20 +64,22 @@ class LeRobot:
 
     Args:
         checkpoint: directory with ``config.json``, ``model.safetensors`` and the two pipelines.
-        kind: an action is a ``delta`` or an ``absolute`` pose of the TCP.
-        rotation: form of its rotation: ``rpy``, ``rotvec`` or ``quaternion``.
+        kind: an action is a ``delta`` or an ``absolute`` pose of the TCP, a ``joint_position``, or
+            a ``joint_delta`` on the step before. Joints become poses by the arm's kinematics.
+        rotation: form of a pose's rotation: ``rpy``, ``rotvec`` or ``quaternion``.
         gripper: meaning of its last number, see `vla_zenoh.policy.ActionSpec`.
         dt_s: duration of a step: 1 / fps of the data.
         frame: axes of a delta, ``base`` or ``tcp``.
         open_is_high: ``yes``: a large gripper number means open.
         scale_m: metres of one unit of position.
+        joint_scale_rad: radians of one unit of a joint; 0.0174533 for degrees.
         state: what the numbers of ``observation.state`` are, in order, see `state_vector`.
         cameras: ``camera=feature`` where the names differ, separated by commas; a feature without
             one takes the camera of its own last name.
         resize: how a picture of another size becomes the one of the config.
-        max_width_m: of the gripper, for ``gripper_open`` and ``gripper_closed``.
         steps: of each chunk that are sent; by default as many as the policy was made to carry out.
         device: as torch names it; ``auto``: a GPU where there is one.
+        profile: of the robot: its gripper and, where actions are joints, its arm.
     """
 
     def __init__(
@@ -81,18 +92,22 @@ class LeRobot:
         frame: str = "base",
         open_is_high: str = "yes",
         scale_m: str = "1",
+        joint_scale_rad: str = "1",
         state: str = "",
         cameras: str = "",
         resize: str = "none",
-        max_width_m: str = "0.08",
         steps: str = "",
         device: str = "auto",
+        profile: str = "panda_sim",
     ) -> None:
         self._folder = checkpoint_folder(checkpoint)
         config = read_config(self._folder)
+        one_of("kind", kind, get_args(Action))
+        self._joints = kind in ("joint_position", "joint_delta")
+        self._deltas = kind == "joint_delta"
+        self._joint_scale_rad = number("joint_scale_rad", joint_scale_rad)
         for name, value, allowed in (
-            ("kind", kind, get_args(MotionKind)),
-            ("rotation", rotation, get_args(Rotation)),
+            ("rotation", "quaternion" if self._joints else rotation, get_args(Rotation)),
             ("gripper", gripper, get_args(GripperMeaning)),
             ("frame", frame, get_args(Frame)),
             ("resize", resize, get_args(Resize)),
@@ -103,10 +118,12 @@ class LeRobot:
         inputs = features(self._folder, config, "input_features")
         self._pictures = pictures(inputs, cameras)
         self._state = state_parts(inputs, state)
-        self._max_width_m = number("max_width_m", max_width_m)
+        self._profile = load_profile(profile)
+        self._max_width_m = self._profile.robot.gripper.max_width_m
         self._one_by_one = one_by_one(config)
         most = 1 if self._one_by_one else horizon(config, steps)
         self._device = device
+        seen = (*parts_of(self._state), *(("joint",) if self._joints else ()))
         self.spec = ModelSpec(
             name="lerobot",
             observation=ObservationSpec(
@@ -119,33 +136,37 @@ class LeRobot:
                     )
                     for camera, (_, shape) in self._pictures.items()
                 ),
-                state=parts_of(self._state),
+                state=tuple(dict.fromkeys(seen)),
                 prompt=config["type"] not in WITHOUT_WORDS,
             ),
             action=ActionSpec(
                 horizon=most,
                 dt_s=number("dt_s", dt_s),
-                kind=kind,
-                frame=frame,
-                rotation=rotation,
+                kind="delta" if kind == "delta" else "absolute",
+                frame="base" if self._joints else frame,
+                rotation="quaternion" if self._joints else rotation,
                 position_scale_m=number("scale_m", scale_m),
                 gripper=gripper,
                 gripper_open_is_high=yes_no("open_is_high", open_is_high),
             ),
         )
         self._check_action(config)
+        self._forward: Forward | None = None
         self.policy: Any = None
         self._before: Any = None
         self._after: Any = None
 
     def _check_action(self, config: Mapping[str, Any]) -> None:
         shape = features(self._folder, config, "output_features").get(ACTION)
-        wanted = self.spec.action.dimension
+        action, wanted = self.spec.action, self.spec.action.dimension
+        arm = f"position and {action.rotation}"
+        if self._joints:
+            names = self._profile.robot.arm_joints
+            arm, wanted = f"{len(names)} joints", len(names) + (action.gripper != "none")
         if shape != (wanted,):
             raise WorkerError(
-                f"{self._folder}: its actions have shape {shape}; position, "
-                f"{self.spec.action.rotation} and gripper {self.spec.action.gripper!r} are "
-                f"({wanted},). A policy whose actions are joint angles cannot be carried out here"
+                f"{self._folder}: its actions have shape {shape}; {arm} with gripper "
+                f"{action.gripper!r} are ({wanted},). Is it one arm, and is kind= what they are?"
             )
 
     def load(self) -> None:
@@ -187,6 +208,8 @@ class LeRobot:
             raise WorkerError(
                 f"LeRobot cannot load {self._folder}: {type(error).__name__}: {str(error)[:500]}"
             ) from error
+        if self._joints:
+            self._forward = make_forward(self._profile)
         bad = [n for n, w in self.policy.named_parameters() if not torch.isfinite(w).all()]
         if bad:
             raise WorkerError(f"weight {bad[0]} in {self._folder} holds NaN or infinity")
@@ -229,4 +252,13 @@ class LeRobot:
             # Step by step, as LeRobot does: some pipelines know no chunks.
             steps = torch.cat([self._after(step) for step in wanted.unbind(1)])
         raw = {"normalised": wanted[0].float().cpu().tolist()}
-        return ActionSteps(steps.float().cpu().numpy(), raw=raw)
+        return ActionSteps(self._meant(steps.double().cpu().numpy(), observation), raw=raw)
+
+    def _meant(self, steps: NDArray[np.float64], observation: Observation) -> NDArray[np.float64]:
+        """(H, D) in the meaning of the spec."""
+        if self._forward is None or observation.joint is None:
+            return steps
+        count = len(self._profile.robot.arm_joints)
+        arm, gripper = self._joint_scale_rad * steps[:, :count], steps[:, count:]
+        poses = poses_of(arm, observation.joint, self._forward, deltas=self._deltas)
+        return np.concatenate([poses, gripper], axis=1)

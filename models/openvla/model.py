@@ -46,6 +46,7 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
 )
+from vla_zenoh.profile import load_profile
 from vla_zenoh.state_vector import parts_of, read_state, state_vector
 
 Device = str
@@ -84,7 +85,7 @@ class OpenVLA:
         quantise: ``int8`` or ``nf4``: Llama's layers in less memory.
         chunk: OFT: steps of a chunk; known for LIBERO and Bridge.
         state: OFT: what the numbers of the robot's state are, see `vla_zenoh.state_vector`.
-        max_width_m: OFT: of the open gripper, for parts of the state that are fractions of it.
+        profile: of the robot; OFT: its gripper, for parts of the state that are fractions of it.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class OpenVLA:
         quantise: str = "none",
         chunk: str = "auto",
         state: str = "",
-        max_width_m: str = "0.08",
+        profile: str = "panda_sim",
     ) -> None:
         folder = checkpoint_folder(checkpoint)
         one_of("dtype", dtype, get_args(Dtype))
@@ -123,7 +124,7 @@ class OpenVLA:
         steps = 1 if self._files is None else chunk_steps(chunk, self._key)
         self._state_range: Range | None = None
         self._state: tuple[str, ...] = ()
-        self._max_width_m = number("max_width_m", max_width_m)
+        self._max_width_m = load_profile(profile).robot.gripper.max_width_m
         if self._files is None and (len(self._cameras) > 1 or state):
             raise WorkerError("plain OpenVLA sees one camera and no state; camera= names one")
         if self._files is not None and self._files.state is not None:

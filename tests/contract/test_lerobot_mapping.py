@@ -65,7 +65,7 @@ def test_a_policy_that_plans_by_itself_gives_one_step(
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"kind": ""}, r"kind is '', allowed: delta, absolute"),
+        ({"kind": ""}, r"kind is '', allowed: delta, absolute, joint_delta, joint_position"),
         ({"rotation": "euler"}, r"rotation is 'euler', allowed: rpy, rotvec, quaternion"),
         ({"gripper": ""}, r"gripper is '', allowed: .* open_fraction"),
         ({"resize": "squash"}, r"resize is 'squash'"),
@@ -89,9 +89,21 @@ def test_an_option_that_does_not_fit_is_named(
         make(tmp_path, **options)
 
 
-def test_joint_actions_are_refused_with_the_reason(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["joint_position", "joint_delta"])
+def test_joint_actions_become_poses_by_the_joints_that_are_measured(
+    tmp_path: Path, kind: str
+) -> None:
+    joints = {**CONFIG, "output_features": {"action": {"type": "ACTION", "shape": [8]}}}
+    spec = make(tmp_path, joints, kind=kind, rotation="").spec
+    assert (spec.action.kind, spec.action.rotation) == ("absolute", "quaternion")
+    assert spec.observation.state == ("joint", "gripper")
+
+
+def test_joints_of_another_arm_are_refused_with_the_reason(tmp_path: Path) -> None:
     joints = {**CONFIG, "output_features": {"action": {"type": "ACTION", "shape": [14]}}}
-    with pytest.raises(WorkerError, match="joint angles cannot be carried out here"):
+    with pytest.raises(WorkerError, match=r"7 joints with gripper 'open_fraction' are \(8,\)"):
+        make(tmp_path, joints, kind="joint_position")
+    with pytest.raises(WorkerError, match=r"position and rpy with gripper .* are \(7,\)"):
         make(tmp_path, joints)
 
 

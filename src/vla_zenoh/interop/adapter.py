@@ -13,8 +13,7 @@ from typing import Any, ClassVar
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop.backoff import Backoff
-from vla_zenoh.interop.joints import make_forward
-from vla_zenoh.interop.layout import Forward
+from vla_zenoh.interop.joints import Forward, make_forward
 from vla_zenoh.interop.options import read_layout, read_timeout
 from vla_zenoh.interop.presets import Presets
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import PeerError
+from vla_zenoh.interop.joints import Forward, poses_of
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
 from vla_zenoh.state_vector import state_vector
-from vla_zenoh.types import JointState, shown
+from vla_zenoh.types import shown
 
 Action = Literal["delta", "absolute", "joint_delta", "joint_position"]
 TheirRotation = Literal["rpy", "rotvec", "quat_xyzw", "quat_wxyz"]
-Forward = Callable[[JointState, NDArray[np.float64]], NDArray[np.float64]]
-"""Measured joints and (H, n) joint positions in their order -> (H, 7) position and quat_xyzw."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,10 +190,9 @@ class Layout:
                 f"the answer has {arm.shape[1]} joints, the arm has {len(measured.names)}; "
                 "choose them with columns=",
             )
-        joints = arm * self.scales[2]
-        if self.action == "joint_delta":
-            joints = measured.position_rad + np.cumsum(joints, axis=0)
-        return forward(measured, joints)
+        return poses_of(
+            arm * self.scales[2], measured, forward, deltas=self.action == "joint_delta"
+        )
 
 
 def _matrix(name: str, value: Any, named: bool) -> NDArray[np.float64]:

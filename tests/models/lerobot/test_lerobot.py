@@ -22,9 +22,11 @@ from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from vla_zenoh.errors import WorkerError
+from vla_zenoh.interop.joints import make_forward
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.policy import check_steps, example_observation
-from vla_zenoh.types import GripperState, PoseState
+from vla_zenoh.profile import load_profile
+from vla_zenoh.types import GripperState, JointState, PoseState
 
 pytestmark = pytest.mark.models
 
@@ -129,6 +131,21 @@ def test_actions_are_in_the_units_of_the_data(whole: Path) -> None:
     raw = np.asarray(answer.raw["normalised"])
     wanted = raw * scale["std"].numpy() + scale["mean"].numpy()
     np.testing.assert_allclose(np.asarray(answer.steps), wanted, atol=1e-5)
+
+
+def test_joints_become_the_poses_they_lead_to(tmp_path: Path) -> None:
+    profile = load_profile("panda_sim")
+    home_rad = profile.robot.home_rad
+    mean = torch.tensor([*home_rad, 0.5])
+    tiny_act.write(tmp_path / "act", {"mean": mean, "std": torch.full((8,), 0.05)})
+    policy = loaded(tmp_path / "act", kind="joint_position", rotation="")
+    none = np.zeros(7)
+    joint = JointState(profile.robot.arm_joints, np.array(home_rad), none, none)
+    seen = replace(looking(policy, 0), joint=joint)
+    steps = check_steps(policy.spec.action, policy.infer(seen).steps)
+    own = lerobots_own(tmp_path / "act", seen, tiny_act.STEPS)
+    wanted = make_forward(profile)(joint, own[:, :7].astype(float))
+    np.testing.assert_allclose(steps, np.hstack([wanted, own[:, 7:]]), atol=ATOL)
 
 
 def test_picture_and_state_both_matter(whole: Path) -> None:

@@ -31,8 +31,18 @@ STATISTICS: dict[str, dict[str, torch.Tensor]] = {
 }
 
 
-def write(folder: Path, **changes: Any) -> ACTPolicy:
-    """Save a policy with its pipelines; `changes` are of its config."""
+def write(
+    folder: Path,
+    action: Mapping[str, torch.Tensor] = STATISTICS["action"],
+    **changes: Any,
+) -> ACTPolicy:
+    """Save a policy with its pipelines.
+
+    Args:
+        folder: is made.
+        action: statistics of its actions.
+        changes: of its config.
+    """
     torch.manual_seed(0)
     features: Mapping[str, PolicyFeature] = {
         "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, HEIGHT, WIDTH)),
@@ -41,7 +51,9 @@ def write(folder: Path, **changes: Any) -> ACTPolicy:
     config = ACTConfig(
         **{
             "input_features": dict(features),
-            "output_features": {"action": PolicyFeature(FeatureType.ACTION, (ACTION_SIZE,))},
+            "output_features": {
+                "action": PolicyFeature(FeatureType.ACTION, tuple(action["mean"].shape))
+            },
             "device": "cpu",
             "chunk_size": CHUNK,
             "n_action_steps": STEPS,
@@ -56,7 +68,9 @@ def write(folder: Path, **changes: Any) -> ACTPolicy:
         }
     )
     policy = ACTPolicy(config).eval()
-    before, after = make_pre_post_processors(config, dataset_stats=STATISTICS)
+    before, after = make_pre_post_processors(
+        config, dataset_stats={**STATISTICS, "action": dict(action)}
+    )
     # As after a real training: the file names weights that would be fetched.
     config.pretrained_backbone_weights = "ResNet18_Weights.IMAGENET1K_V1"
     policy.save_pretrained(folder)
