@@ -63,7 +63,7 @@ class Timing(Section):
         state_timeout_s: robot state older than this: brake, and activation is needed again.
         command_timeout_s: pose stream silent for this long: the robot side brakes by itself.
         max_observation_age_s: a chunk made from an older observation is refused.
-        max_open_loop_s: of a chunk no more is followed without a newer one; then as when it ran out.
+        max_open_loop_s: of a chunk no more is followed; then it counts as run out.
         max_clock_step_s: the wall clock jumped by more: brake, and activation is needed again.
         max_clock_offset_s: another host's clock may differ by this much, which is then reckoned
             with; beyond it activation is refused.
