@@ -8,10 +8,11 @@ that steps are never read with another meaning than the one agreed at activation
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -265,6 +266,20 @@ class Policy(Protocol):
     def spec(self) -> ModelSpec: ...
 
     def infer(self, observation: Observation) -> ActionSteps: ...
+
+
+def reset_of(policy: Policy, robot: str = "") -> Callable[[], Any] | None:
+    """What begins an episode of `robot`; None: the model has no ``reset``."""
+    reset = getattr(policy, "reset", None)
+    if not callable(reset):
+        return None
+    return partial(reset, robot) if takes_robot(policy) else reset
+
+
+def takes_robot(policy: Policy) -> bool:
+    """Whether the model's ``reset`` takes the name of the robot whose episode begins."""
+    reset = getattr(policy, "reset", None)
+    return callable(reset) and len(inspect.signature(reset).parameters) > 0
 
 
 def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:

@@ -56,6 +56,8 @@ class Worker:
             observation=ObservationSpec(cameras=(camera,)),
             action=ActionSpec(**action),
         )
+        if fault in ("mixed", "lost"):
+            self.infer_batch = self._infer_batch
         self._kept: list[Observation] = []
         self._noise = np.random.default_rng(0)
 
@@ -111,6 +113,10 @@ class Worker:
         if fault == "objects":
             return ActionSteps([[{"x": 0.0}] * 7])  # pyright: ignore[reportArgumentType]
         return ActionSteps(steps)
+
+    def _infer_batch(self, observations: list[Observation]) -> list[ActionSteps]:
+        answers = [self.infer(observation) for observation in observations]
+        return answers[::-1] if self.fault == "mixed" else answers[:-1]
 
     def _seen(self, picture: np.ndarray) -> np.ndarray:
         if self.fault == "blind":

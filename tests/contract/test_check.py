@@ -36,6 +36,8 @@ PATIENCE_S = 5.0
 
 ERRORS = {
     # fault: (name of the finding, what is said of it)
+    "mixed": ("batch", "is not that of infer"),
+    "lost": ("batch", "gave 1 answers to 2 observations"),
     "load": ("load_failed", "weights.safetensors"),
     "spec": ("spec_changed", "declare it in __init__"),
     "key": ("normalisation", "'bridge', the weights came with: libero_goal, libero_spatial"),

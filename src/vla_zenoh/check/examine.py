@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vla_zenoh.check import fit, judge, plausible
+from vla_zenoh.check import batch, fit, judge, plausible
 from vla_zenoh.check.bench import Bench, Failed, Hung
 from vla_zenoh.check.examples import MAX_WIDTH_M, PROMPTS, Look, Maker, looks, noise
 from vla_zenoh.check.finding import distinct, error, note
@@ -14,7 +14,7 @@ from vla_zenoh.check.judge import Steps
 from vla_zenoh.check.report import Report
 from vla_zenoh.committed import Continuation
 from vla_zenoh.errors import SpecError
-from vla_zenoh.policy import Policy, check_steps
+from vla_zenoh.policy import Policy, check_steps, reset_of
 from vla_zenoh.profile import Limits, Profile, Timing
 
 DEFAULT_RUNS = 100
@@ -87,6 +87,7 @@ class Examination:
             return
         loaded_kib = self._bench.memory_kib()
         self._compare()
+        self._together()
         for look in self._looks[1:]:
             if not self._in_budget():
                 break
@@ -173,6 +174,24 @@ class Examination:
             other = self._anew(look)
             report.depends_on[name] = None if other is None else not judge.alike(first, other)
 
+    def _together(self) -> None:
+        """Whether two observations that are asked about at once are answered as each alone."""
+        if not batch.can(self._policy) or not self.report.deterministic:
+            return
+        chart = self._looks[0]
+        pair = (chart, Look(chart.name, picture=noise, prompt=self._another_prompt()))
+        alone = [self._anew(look) for look in pair]
+        if any(steps is None for steps in alone):
+            return
+        self._reset()
+        seen = [self._maker.make(look, again=True) for look in pair]
+        try:
+            found, _ = self._bench.call(lambda: batch.ask(self._policy, seen))
+        except Failed as failed:
+            self.report.findings.append(error("batch", f"infer_batch: {failed}"))
+            return
+        self.report.findings += batch.findings(self._policy.spec.action, found, alone)
+
     def _another_prompt(self) -> str:
         prompts = [look.prompt for look in self._looks if not look.strange]
         return next((text for text in prompts if text != prompts[0]), PROMPTS[1])
@@ -199,8 +218,8 @@ class Examination:
 
     def _reset(self) -> None:
         self._continuation = Continuation(self._policy)
-        reset = getattr(self._policy, "reset", None)
-        if not callable(reset):
+        reset = reset_of(self._policy)
+        if reset is None:
             return
         try:
             self._bench.call(reset)

@@ -15,6 +15,7 @@ MEANINGS: Mapping[str, str] = {
     "normalisation": "the spec's normalisation is not among the keys the weights came with",
     "reset_failed": "reset() raised",
     "inference_failed": "infer() raised",
+    "batch": "infer_batch() answers otherwise than infer() does for each alone",
     "close_failed": "close() raised",
     "horizon": "more steps than the spec declares, or none",
     "shape": "steps of another width than the spec declares",

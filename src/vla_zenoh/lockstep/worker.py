@@ -9,7 +9,7 @@ from vla_zenoh.committed import Continuation
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.lockstep.records import Delays
 from vla_zenoh.observe import History, NotYet, assemble
-from vla_zenoh.policy import Policy, check_steps
+from vla_zenoh.policy import Policy, check_steps, reset_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
@@ -53,8 +53,8 @@ class LockstepWorker:
         known, self.task = self.task, task.record
         if known is None or known.episode != self.task.episode:
             self._not_before_ns = task.header.stamp_wall_ns
-            reset = getattr(self.policy, "reset", None)
-            if callable(reset):
+            reset = reset_of(self.policy)
+            if reset is not None:
                 reset()
 
     def take_state(self, state: Stamped[Any]) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 from vla_zenoh.errors import MissingExtraError, PeerError, SpecError
 from vla_zenoh.interop import openpi
 from vla_zenoh.interop.offer import Offer
-from vla_zenoh.policy import ActionSteps, Policy, check_steps
+from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
 
 try:
     from websockets.datastructures import Headers
@@ -102,7 +102,7 @@ class OpenPiServer:
                 observation = self._offer.observe(given, time.time_ns(), self._seq)
                 if observation.prompt != prompt:
                     prompt = observation.prompt
-                    getattr(self._policy, "reset", lambda: None)()
+                    (reset_of(self._policy) or (lambda: None))()
                 result: Any = self._policy.infer(observation)
                 steps = result.steps if isinstance(result, ActionSteps) else result
                 actions = check_steps(self._policy.spec.action, steps)

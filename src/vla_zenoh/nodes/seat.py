@@ -6,7 +6,6 @@ own prompt, episode, activation and rate.
 
 from __future__ import annotations
 
-import inspect
 import threading
 import time
 from collections.abc import Mapping
@@ -29,7 +28,7 @@ from vla_zenoh.nodes.seen import SeenOutlet
 from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
 from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.observe import History, NotYet, assemble, form_of
-from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps
+from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps, reset_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
@@ -176,10 +175,10 @@ class Seat:
         self._episode = task.record.episode
         # What was seen before the episode began does not belong to it.
         self._not_before_ns = task.header.stamp_wall_ns
-        reset = getattr(self.policy, "reset", None)
-        if callable(reset):
+        reset = reset_of(self.policy, self.robot)
+        if reset is not None:
             try:
-                reset(*((self.robot,) if wants_robot(self.policy) else ()))
+                reset()
             except Exception as error:
                 self.failed(error, "reset_failed")
 
@@ -331,9 +330,3 @@ class Seat:
         """Say goodbye to the robot."""
         self.node.report("stopped", now=True)
         self.node.close()
-
-
-def wants_robot(policy: Policy) -> bool:
-    """Whether the model's ``reset`` takes the name of the robot whose episode begins."""
-    reset = getattr(policy, "reset", None)
-    return callable(reset) and len(inspect.signature(reset).parameters) > 0

@@ -18,8 +18,8 @@ from typing import Any, Literal
 import zenoh
 
 from vla_zenoh.errors import SpecError, WorkerError
-from vla_zenoh.nodes.seat import Seat, wants_robot
-from vla_zenoh.policy import ActionSteps, Observation, Policy
+from vla_zenoh.nodes.seat import Seat
+from vla_zenoh.policy import ActionSteps, Observation, Policy, reset_of, takes_robot
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.types import Event
 
@@ -87,7 +87,7 @@ class WorkerNode:
         self, policy: Policy, count: int, another: Callable[[], Policy] | None
     ) -> list[Policy]:
         if self._infer_batch is not None:
-            if callable(getattr(policy, "reset", None)) and not wants_robot(policy):
+            if reset_of(policy) is not None and not takes_robot(policy):
                 raise WorkerError(
                     f"model {policy.spec.name!r} serves several robots together, but its reset() "
                     "does not say whose episode begins: give it the robot's name, reset(robot)"
