@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -34,12 +33,19 @@ class Charts:
             self._style(paths.below(paths.LATENCY, stage), stage, colour)
         for origin in (paths.SPEED, paths.GRIPPER):
             for name in (paths.COMMANDED, paths.MEASURED):
-                self._style(f"{origin}/{name}", name, paths.COLOURS[name])
+                # An order holds until the next one.
+                held = origin == paths.GRIPPER and name == paths.COMMANDED
+                self._style(f"{origin}/{name}", name, paths.COLOURS[name], held=held)
         self._style(f"{paths.TRACKING}/distance", "distance", STAGES["end to end"])
         self._style(f"{paths.BOUNDS}/share", "share", paths.COLOURS[paths.COMMANDED])
 
-    def _style(self, path: str, name: str, colour: tuple[int, int, int]) -> None:
-        lines: Any = rr.SeriesLines(colors=[colour], names=[name], widths=[1.5])
+    def _style(
+        self, path: str, name: str, colour: tuple[int, int, int], *, held: bool = False
+    ) -> None:
+        between = "StepAfter" if held else "Linear"
+        lines = rr.SeriesLines(
+            colors=[colour], names=[name], widths=[1.5], interpolation_mode=between
+        )
         self._stream.log(path, lines, static=True)
 
     def _put(self, path: str, value: float) -> None:

@@ -11,7 +11,7 @@ from vla_zenoh.view import paths
 
 WINDOW_S = 20.0
 """Of plots, up to the time looked at."""
-EYE_M, LOOK_AT_M = (1.55, -1.15, 0.95), (0.32, 0.0, 0.28)
+EYE_M, LOOK_AT_M = (1.4, -0.98, 0.86), (0.34, 0.0, 0.3)
 BACKGROUND = (22, 25, 31)
 GRID_M = 0.1
 
