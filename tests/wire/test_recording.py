@@ -237,11 +237,11 @@ def test_only_pictures_may_be_replayed_beside_a_live_robot(run_file: Path, chain
 # -- what goes wrong ------------------------------------------------------------------------------
 def test_what_the_queue_cannot_take_is_counted_and_said(chain: Chain, tmp_path: Path) -> None:
     ghost, path = ghost_of(chain, "fast"), tmp_path / "a.mcap"
-    recorder = Recorder(ghost, chain.session, path, queue_bytes=100).start()
+    recorder = Recorder(ghost, chain.session, path, queue_bytes=200).start()
     key = ghost.keys.event("camera")
     stream = Stream(chain.session, key, Kind.ORDER, "camera#1", recorder.node.clock)
     small = Event("info", "notice", "x")
-    for event in (small, Event("info", "notice", "x", "y" * 200), small):
+    for event in (small, Event("info", "notice", "x", "y" * 400), small):
         stream.put(event)
         time.sleep(0.4)
     recorded = recorder.close()
