@@ -4,8 +4,9 @@
                                             [-- PYTEST OPTIONS]
 
 tests/models/NAME/ runs in the environment of the model NAME, with what its ``requirements.txt``
-adds; the files beside those folders run in ./.venv, with workers that have theirs. An environment
-that cannot be had is skipped with uv's reason; ``--require`` makes that a failure.
+adds; the files beside those folders run in ./.venv, with workers that have theirs. Without a name
+all models are tested, and the adapters. An environment that cannot be had is skipped with uv's
+reason; ``--require`` makes that a failure.
 """
 
 from __future__ import annotations
@@ -96,10 +97,13 @@ def main() -> int:
     ready = [name for name, (verdict, _) in verdicts.items() if verdict == "passed"]
     chains = [str(TESTS / f"test_{name}_chain.py") for name in ready]
     chains = [path for path in chains if Path(path).is_file()]
-    if chains:
+    adapters = [] if asked.models else [str(TESTS / "test_adapters_alone.py")]
+    for name, files in (("chains", chains), ("adapters", adapters)):
+        if not files:
+            continue
         began_s = time.monotonic()
-        verdict, why = run_tests([sys.executable], chains, options, environ)
-        verdicts["chains"] = verdict, why or f"in {time.monotonic() - began_s:.0f} s"
+        verdict, why = run_tests([sys.executable], files, options, environ)
+        verdicts[name] = verdict, why or f"in {time.monotonic() - began_s:.0f} s"
     print()
     for name, (verdict, why) in verdicts.items():
         print(f"{name}: {verdict} {why}")
