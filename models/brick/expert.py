@@ -25,10 +25,14 @@ HOVER_M = 0.085
 CARRY_M, RELEASE_M = 0.125, 0.082
 PUSH_LOW_M, PUSH_HOVER_M = 0.016, 0.085
 PUSH_START_M, PUSH_WAY_M = 0.058, 0.105
+PUSH_RAMP_M = 0.010
+"""Within this height, a little above that of a push, the way on begins."""
 CONTACT_M = 0.027
 """From the middle of the shut fingers to that of a brick they push."""
 LOW_M = 0.035
 """Under this height the way of the hand is counted as a push, see `Hand.swept_m`."""
+UP_M = 0.05
+"""Over this height a push that was broken off begins anew."""
 
 
 class Point(NamedTuple):
@@ -50,8 +54,8 @@ class Hand:
         z_m: likewise.
         yaw_rad: turn about the vertical, 0 at home.
         width_m: opening.
-        swept_m: how far the hand has got from where it came down, below `LOW_M`: the greatest of
-            the episode. It is what tells a push that was made from one that is to come.
+        swept_m: how far the hand has got from where it came down, below `LOW_M`. It is what tells a
+            push that was made from one that is to come: above `UP_M` less than a push is forgotten.
         down: where it came down; None while it is above.
     """
 
@@ -66,7 +70,8 @@ class Hand:
     def swept(self) -> Hand:
         """The same with its sweep brought up to date."""
         if self.z_m >= LOW_M:
-            return replace(self, down=None)
+            again = self.z_m > UP_M and self.swept_m < PUSH_WAY_M
+            return replace(self, down=None, swept_m=0.0 if again else self.swept_m)
         down = self.down or (self.x_m, self.y_m)
         way_m = math.hypot(self.x_m - down[0], self.y_m - down[1])
         return replace(self, down=down, swept_m=max(self.swept_m, way_m))
@@ -182,10 +187,12 @@ def _push(hand: Hand, target: Point, u_x: float, u_y: float) -> Wish:
     along, beside = rel_x * u_x + rel_y * u_y, -rel_x * u_y + rel_y * u_x
     if hand.z_m < LOW_M:
         if abs(beside) < 0.022 and along < -0.012 and hand.width_m < 0.02:
-            # On along the line through the brick.
+            # On along the line through the brick; an arm that lags would else slide over it.
+            over = hand.z_m - PUSH_LOW_M - 0.4 * PUSH_RAMP_M
+            ahead = PUSH_STEP_M * clip(1.0 - over / PUSH_RAMP_M, 0.0, 1.0)
             return Wish(
-                hand.x_m + 0.2 * u_x + beside * u_y,
-                hand.y_m + 0.2 * u_y - beside * u_x,
+                hand.x_m + ahead * u_x + beside * u_y,
+                hand.y_m + ahead * u_y - beside * u_x,
                 PUSH_LOW_M,
                 turn,
                 False,
@@ -204,6 +211,7 @@ def _push(hand: Hand, target: Point, u_x: float, u_y: float) -> Wish:
         height,
         turn * free,
         False,
+        clip(0.4 * (hand.z_m - PUSH_LOW_M), 0.5 * PUSH_STEP_M, STEP_M),
     )
 
 

@@ -43,7 +43,8 @@ FRONT, WRIST = (128, 96), (96, 72)
 STEP_M, STEP_RAD = 0.045, 0.18
 """A waypoint further from the one before is approached in several steps."""
 WIDTH_STEP_M = 0.08
-LOW_M = 0.035
+LOW_M, UP_M, PUSH_WAY_M = 0.035, 0.05, 0.105
+"""See `expert`."""
 AT_REST_M_S = 0.004
 MAX_WORDS = 24
 PAD, UNKNOWN = 0, 1
@@ -219,6 +220,8 @@ class Brick:
             hand.down_m = hand.position_m[:2] if down_m is None else down_m
             way_m = float(np.linalg.norm(hand.position_m[:2] - hand.down_m))
             hand.swept_m = max(hand.swept_m, way_m)
+        elif hand.position_m[2] > UP_M and hand.swept_m < PUSH_WAY_M:
+            hand.swept_m = 0.0
         return hand
 
     def _goal(self, observation: Observation, hand: Hand) -> FloatArray:

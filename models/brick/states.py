@@ -258,7 +258,7 @@ def _grip(random: np.random.Generator, bricks: dict[str, Point], box: Point, ord
 
 def _with_past(random: np.random.Generator, hand: Hand) -> Hand:
     """It has swept over the table before, as hands that grip do without meaning to."""
-    few = random.uniform() < 0.7
+    few = random.uniform() < 0.75
     swept = abs(random.normal()) * 0.006 if few else random.uniform(0.0, 0.15)
     x, y = random.normal(size=2) * 0.003
     down = (hand.x_m + float(x), hand.y_m + float(y)) if hand.z_m < LOW_M else None

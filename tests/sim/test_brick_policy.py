@@ -7,7 +7,7 @@ import json
 import shutil
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -43,11 +43,9 @@ CAMERA_SIZE = (320, 240)
 MAX_WEIGHTS_BYTES = 5_000_000
 SEED = 5
 STILL_M = 1e-4
+WALK_STEPS, WALK_STEP_M = 300, 0.02
 MANY = 12
 ENOUGH = 11
-YOUNG = pytest.mark.xfail(
-    reason="the shipped weights were trained too briefly: models/brick/README.md", strict=False
-)
 
 
 @dataclass(slots=True)
@@ -114,7 +112,6 @@ def test_each_family_of_tasks_is_done(stage: Stage, family: str) -> None:
 
 
 @pytest.mark.slow
-@YOUNG
 def test_another_prompt_in_the_same_scene_fetches_another_brick(stage: Stage) -> None:
     for colour in ("red", "yellow"):
         episode = drawn(stage, SEED + 1, "put", colour)
@@ -131,7 +128,6 @@ def test_a_prompt_without_sense_makes_it_stay(stage: Stage) -> None:
 
 
 @pytest.mark.slow
-@YOUNG
 @pytest.mark.parametrize("family", ["put", "stack", "push"])
 def test_tasks_are_done_in_many_layouts(stage: Stage, family: str) -> None:
     verdicts = [carry_out(stage, drawn(stage, 900 + seed, family)) for seed in range(MANY)]
@@ -175,6 +171,48 @@ def test_every_wording_is_understood(policy: Policy, wordings: dict) -> None:
 )
 def test_odd_prompts_make_it_stay(policy: Policy, prompt: str) -> None:
     assert not understood(policy, prompt)
+
+
+# -- what it remembers ---------------------------------------------------------------------------
+
+
+def test_worker_and_teacher_remember_the_same_of_a_hand(
+    policy: Policy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.delitem(sys.modules, "expert", raising=False)
+    from expert import Hand  # pyright: ignore[reportMissingImports]
+
+    random = np.random.default_rng(SEED)
+    policy.reset()  # pyright: ignore[reportAttributeAccessIssue]
+    observation = example_observation(policy.spec, prompt="")
+    assert observation.pose is not None
+    place, swept_m, down = np.array([0.45, 0.0, 0.1]), 0.0, None
+    greatest_m = 0.0
+    for _ in range(WALK_STEPS):
+        place = place + random.normal(size=3) * WALK_STEP_M
+        place[2] = min(max(place[2], 0.01), 0.12)
+        pose = replace(observation.pose, position_m=place)
+        policy.infer(replace(observation, pose=pose))
+        taught = Hand(*place.tolist(), 0.0, 0.08, swept_m, down).swept()
+        swept_m, down = taught.swept_m, taught.down
+        remembered = policy._hand  # pyright: ignore[reportAttributeAccessIssue]
+        assert remembered.swept_m == pytest.approx(swept_m)
+        assert (remembered.down_m is None) == (down is None)
+        greatest_m = max(greatest_m, swept_m)
+    assert greatest_m > WALK_STEP_M
+
+
+def test_a_push_that_was_made_is_forgotten_with_another_prompt(policy: Policy) -> None:
+    policy.reset()  # pyright: ignore[reportAttributeAccessIssue]
+    low = [np.array([x, 0.0, 0.016]) for x in (0.4, 0.55)]
+    for prompt, swept_m in (("push the red brick away", 0.15), ("push the blue brick away", 0.0)):
+        observation = example_observation(policy.spec, prompt=prompt)
+        assert observation.pose is not None
+        for place in low:
+            policy.infer(replace(observation, pose=replace(observation.pose, position_m=place)))
+            low = [low[-1]]
+        assert policy._hand.swept_m == pytest.approx(swept_m)  # pyright: ignore
 
 
 # -- what it is made of --------------------------------------------------------------------------
