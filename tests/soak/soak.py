@@ -26,6 +26,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -75,6 +76,7 @@ SETTLED_S = 1.2
 """Two reports: the counters of what just happened have been told."""
 FRESH_S = 1.5
 PATIENCE_S, RECOVER_S = 60.0, 90.0
+POLL_S = 0.1
 WARM_S = 15.0
 SPEED_TOLERANCE, ARM_TOLERANCE, COMMAND_TOLERANCE = 1.15, 2.7, 1.1
 """As in tests/fault/test_dead_nodes.py."""
@@ -227,15 +229,17 @@ class Soak:
         self.found.recovery_s.setdefault(action, []).append(round(took_s, 2))
 
     def _recover(self) -> None:
-        """Until all nodes speak and the arm obeys."""
-        chain = self.chain
-        chain.until("all nodes speak again", self._all_fresh, RECOVER_S)
-        if chain.state() in ("stopped", "fault"):
-            chain.client.put(chain.client.keys.reset, "")
-            chain.until("reset", lambda: chain.state() == "inactive", PATIENCE_S)
-        if chain.state() not in ("active", "holding"):
-            chain.activate_when_ready(RECOVER_S)
-        chain.until("it is active", lambda: chain.state() == "active", RECOVER_S)
+        """Until all nodes speak and the arm obeys; a busy computer may take it away again."""
+        chain, give_up_s = self.chain, time.monotonic() + RECOVER_S
+        while chain.state() != "active" or not self._all_fresh():
+            if time.monotonic() > give_up_s:
+                raise NodeError(f"the arm does not obey again in {RECOVER_S:g} s")
+            if chain.state() in ("stopped", "fault"):
+                chain.client.put(chain.client.keys.reset, "")
+            elif chain.state() not in ("active", "holding") and self._all_fresh():
+                with suppress(SessionError):  # preflight says what is missing
+                    chain.client.activate()
+            time.sleep(POLL_S)
 
     def _all_fresh(self) -> bool:
         names = {"sim", "command", "camera", *(f"worker-{name}" for name in WORKERS)}
