@@ -15,7 +15,7 @@ STALL_S = 0.04
 LATE = frozenset(
     {
         *("stale", "expired", "future", "replayed", "foreign", "clock_step", "activate_refused"),
-        *("pose_stale", "pose_gap", "pose_jump", "pose_replayed", "pose_foreign", "seen"),
+        *("pose_braking", "pose_jump", "pose_replayed", "pose_foreign"),
     }
 )
 """What being late, or having been away, can lead to."""
@@ -27,7 +27,7 @@ EXPLAINS: dict[str, frozenset[str]] = {
     "rate": frozenset(),
     "toggle": frozenset({"activate_refused"}),
     "stop": frozenset({"activate_refused"}),
-    "kill": LATE | {"spec_mismatch", "foreign_spec", "foreign_status", "step_m", "no_owner"},
+    "kill": LATE | {"spec_mismatch", "foreign_spec", "foreign_status"},
     "freeze": LATE,
     "junk": ANYTHING,
 }
