@@ -27,7 +27,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +39,8 @@ import zenoh  # noqa: E402
 from chain import Chain, running_chain  # noqa: E402
 from ledger import Ledger, segments  # noqa: E402
 from refusals import EXPLAINS, STALL_S, Refusals, Witness, unexplained  # noqa: E402
+from report import Found, show  # noqa: E402
 from rich.console import Console  # noqa: E402
-from rich.table import Table  # noqa: E402
 from test_strangers import all_junk, all_keys, samples_of  # noqa: E402
 
 from vla_zenoh.errors import NodeError, SessionError  # noqa: E402
@@ -85,35 +85,6 @@ EXACT_M = 0.0015
 MORE_SEGMENTS = 4
 """What a kill -9 leaves stands until the next Zenoh process cleans up."""
 MEASURER = "soak"
-
-
-@dataclass(slots=True)
-class Found:
-    """What a soak found out."""
-
-    seed: int
-    minutes: float = 0.0
-    actions: Counter[str] = field(default_factory=Counter)
-    killed: Counter[str] = field(default_factory=Counter)
-    refused: dict[str, Counter[str]] = field(default_factory=dict)
-    unexplained: list[str] = field(default_factory=list)
-    violations: list[str] = field(default_factory=list)
-    leaks: list[str] = field(default_factory=list)
-    recovery_s: dict[str, list[float]] = field(default_factory=dict)
-    fastest_m_s: float = 0.0
-    hardest_m_s2: float = 0.0
-    stalls: int = 0
-    worst_stall_s: float = 0.0
-    held: dict[str, Any] = field(default_factory=dict)
-    latency: dict[str, Any] = field(default_factory=dict)
-    failure: str = ""
-
-    @property
-    def code(self) -> int:
-        """The exit code."""
-        if self.failure:
-            return 2
-        return 1 if self.unexplained or self.violations or self.leaks else 0
 
 
 class Soak:
@@ -377,39 +348,6 @@ class Soak:
         return f"{JUNK} pieces of junk"
 
 
-def table(found: Found) -> Table:
-    """The result for people."""
-    out = Table("what", "start", "end", title=f"{found.minutes:g} minutes, seed {found.seed}")
-    start, end = found.held.get("start"), found.held.get("end")
-    for name in sorted(start["nodes"]) if start and end else ():
-        if name in end["nodes"]:
-            pair = [
-                "MiB {private_mib:g}, {pss_mib:g}, {rss_mib:g}; {handles}; {threads}".format(
-                    **held["nodes"][name]
-                )
-                for held in (start, end)
-            ]
-            out.add_row(name, *pair)
-    if start and end:
-        out.add_row(
-            "/dev/shm",
-            *(
-                "{} segments, {} MiB, {} that nobody maps".format(*held["segments"])
-                for held in (start, end)
-            ),
-        )
-    before, after = found.latency.get("start"), found.latency.get("end")
-    for name in before["stages_ms"] if before and after else ():
-        pair = [when["stages_ms"].get(name, [0.0, 0.0]) for when in (before, after)]
-        out.add_row(f"{name} p50, p95", *(f"{low:.1f}, {high:.1f} ms" for low, high in pair))
-    for name in ("tick_us", "late_us") if before and after else ():
-        pair = [when[name] or {} for when in (before, after)]
-        out.add_row(
-            f"{name} p50, p99", *(f"{each.get('p50')}, {each.get('p99')} us" for each in pair)
-        )
-    return out
-
-
 def main() -> int:
     """Soak, and tell what was found."""
     parser = argparse.ArgumentParser(description="Soak the whole chain.")
@@ -438,40 +376,10 @@ def main() -> int:
     if asked.json:
         print(json.dumps({**asdict(found), "code": found.code}, indent=2))
     else:
-        _print(found)
+        show(found)
     if story:
         screen.print(story, markup=False)
     return found.code
-
-
-def _print(found: Found) -> None:
-    screen = Console(highlight=False, width=130)
-    screen.print("nodes: private, PSS, RSS; handles; threads")
-    screen.print(table(found))
-    for name, count in found.actions.most_common():
-        times = sorted(found.recovery_s[name])
-        middle, worst = times[len(times) // 2], times[-1]
-        refused = found.refused.get(name, Counter())
-        screen.print(
-            f"{name:<8}{count:>5} times, back after {middle:.1f} s, at most {worst:.1f} s; "
-            f"refusals {refused.total()}, of {len(refused)} kinds",
-            markup=False,
-        )
-    screen.print(f"killed: {dict(found.killed)}", markup=False)
-    screen.print(
-        f"fastest {found.fastest_m_s:.3f} m/s, hardest {found.hardest_m_s2:.2f} m/s^2; the "
-        f"computer stalled in {found.stalls} windows, {found.worst_stall_s * 1e3:.0f} ms at worst"
-    )
-    for title, lines in (
-        ("refusals without a cause", found.unexplained),
-        ("limits broken", found.violations),
-        ("leaks", found.leaks),
-    ):
-        screen.print(f"{title}: {len(lines)}")
-        for line in lines[:20]:
-            screen.print(f"  {line}", markup=False)
-    if found.failure:
-        screen.print(f"it could not go on: {found.failure}", markup=False)
 
 
 if __name__ == "__main__":
