@@ -17,7 +17,7 @@ FloatArray = NDArray[np.float64]
 COLUMNS = 14
 STILL_M_S = 0.005
 """A measured arm that is slower stands: the impedance controller still settles."""
-STOOD_S = 0.1
+STOOD_S = 0.2
 """Slow for so long is standing; less is a turn."""
 WINDOW_S = 0.02
 """The measured velocity's change is taken over so long."""

@@ -32,6 +32,8 @@ POLL_S = 0.005
 TRY_S, SETTLE_S = 0.1, 0.6
 FRESH_S = 0.2
 LOW_M, HIGH_M = 0.25, 0.62
+AND_BACK = " within 0.25"
+"""Without an end, and without reaching one of the arm's."""
 EARLY = "refused.activate_refused"
 """What tells the person at the keyboard to wait is no refusal of the system's."""
 
@@ -69,7 +71,7 @@ class Probe:
         """Go where there is room, so many steps or without end."""
         up = self._height_m() < (LOW_M + HIGH_M) / 2
         start_m = self._reference()
-        self._client.set_prompt(f"HARD: go {'up' if up else 'down'}{f' x{count}' if count else ''}")
+        self._client.set_prompt(self._motion() + (f" x{count}" if count else AND_BACK))
         moving = self._until(lambda: self._speed_m_s() > MOVING_M_S, patience_s)
         return {
             "moving": moving,
@@ -105,23 +107,15 @@ class Probe:
                 return {"moves": True, "activated_s": activated_s, "why": self._why}
             try:
                 state = self._state()
-                if state in ("inactive", "") or activated_s is not None:
+                if state in ("inactive", ""):
                     self._client.activate(timeout_s=1.0)
                     activated_s = activated_s or time.monotonic()
-                    self._away()
-                elif state == "holding" or self._prompt() == "hold":
-                    self._away()
+                if self._prompt() == "hold" or activated_s is not None:
+                    self._client.set_prompt(self._motion() + AND_BACK)
             except (SessionError, zenoh.ZError) as error:
                 self._why = str(error)
             self._until(lambda: self._speed_m_s() > MOVING_M_S, TRY_S)
         return {"moves": False, "activated_s": activated_s, "why": self._why}
-
-    def _away(self) -> None:
-        """Towards the farther end; nothing is put where the arm is told so already."""
-        up = self._height_m() < (LOW_M + HIGH_M) / 2
-        room = LOW_M < self._height_m() < HIGH_M and self._prompt().startswith("HARD: go")
-        if not room:
-            self._client.set_prompt("HARD: go up" if up else "HARD: go down")
 
     def rest(self) -> dict[str, Any]:
         """Deactivate, and wait until it stands."""
@@ -148,6 +142,10 @@ class Probe:
     def _state(self) -> str:
         status = self._client.status("command")
         return status.state if status else ""
+
+    def _motion(self) -> str:
+        """Towards where there is more room."""
+        return f"HARD: go {'up' if self._height_m() < (LOW_M + HIGH_M) / 2 else 'down'}"
 
     def _saying(self) -> str:
         status = self._client.status("command")
