@@ -17,7 +17,14 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Keys
 from vla_zenoh.policy import ActionSpec, ModelSpec
-from vla_zenoh.profile import Profile, load_profile, override
+from vla_zenoh.profile import (
+    Profile,
+    load_profile,
+    override,
+    profile_names,
+    read_profile,
+    to_yaml,
+)
 from vla_zenoh.recording.reader import open_recording
 from vla_zenoh.recording.sample import JPEG, MSGPACK, TEXT, Sample
 from vla_zenoh.recording.writer import RunWriter
@@ -333,6 +340,12 @@ def test_pictures_and_the_models_view_are_there(shown: Shown) -> None:
     (answer,) = shown.texts("seen/scripted/answer")
     assert "30.0 ms, 3 steps" in answer
     assert '{"a": 1.5}' in answer
+
+
+@pytest.mark.parametrize("name", profile_names())
+def test_the_profile_in_a_recording_is_read_as_it_was(name: str) -> None:
+    profile = load_profile(name)
+    assert read_profile(to_yaml(profile), "run.mcap") == profile
 
 
 # -- what cannot be shown -------------------------------------------------------------------------
