@@ -33,6 +33,8 @@ STAGES_NS = {
     "inference": ("t_vla_in", "t_vla_out"),
     "inbound": ("t_vla_out", "t_publish"),
 }
+MAX_DIGITS = 19
+"""Of nanoseconds in 64 bits."""
 _TRUE, _FALSE = TRUE_WORDS | {"1.0"}, FALSE_WORDS | {"0.0"}
 
 
@@ -110,7 +112,7 @@ class _Table:
     def zero(self, name: str) -> int:
         """The first whole number in a column, 0 without one."""
         words = self.words(name) if self.has(name) else []
-        return next((int(word) for word in words if word.isdecimal()), 0)
+        return next((int(word) for word in words if _is_whole(word)), 0)
 
     def column(self, name: str, zero: int = 0) -> FloatArray:
         """Numbers less `zero`: nanoseconds of a wall clock are more than a float can tell apart."""
@@ -118,7 +120,7 @@ class _Table:
         wrong: list[tuple[int, str]] = []
         for index, word in enumerate(self.words(name)):
             try:
-                values[index] = int(word) - zero if word.isdecimal() else float(word) - zero
+                values[index] = int(word) - zero if _is_whole(word) else float(word) - zero
             except (ValueError, OverflowError):
                 wrong.append((index, word))
         wrong += [(int(i), "inf") for i in np.flatnonzero(np.isinf(values))]
@@ -133,6 +135,10 @@ class _Table:
 
     def columns(self, names: Sequence[str]) -> FloatArray:
         return np.column_stack([self.column(name) for name in names])
+
+
+def _is_whole(word: str) -> bool:
+    return word.isdecimal() and len(word) <= MAX_DIGITS
 
 
 def _latency(run: Evaluation, table: _Table) -> None:
