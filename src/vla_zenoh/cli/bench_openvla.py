@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from vla_zenoh.cli.options import model_options
 from vla_zenoh.cli.output import console
 from vla_zenoh.errors import WorkerError
 from vla_zenoh.loader import find_model, import_model, make_policy, module_name
@@ -39,7 +40,7 @@ def openvla(
 
     Runs in OpenVLA's environment, without robot, camera or Zenoh.
     """
-    chosen = dict(_pair(option) for option in options or [])
+    chosen = model_options(options or [])
     if full_size == ("checkpoint" in chosen):
         raise typer.BadParameter("give either --set checkpoint=DIR or --full-size")
     model = find_model(NAME)
@@ -55,13 +56,6 @@ def openvla(
     out.print(
         f"both ways gave the same tokens: {'yes' if report['same_tokens'] else '[bold]no[/bold]'}"
     )
-
-
-def _pair(option: str) -> tuple[str, str]:
-    name, equals, value = option.partition("=")
-    if not equals or not name.isidentifier():
-        raise typer.BadParameter(f"--set wants name=value, not {option!r}")
-    return name, value
 
 
 def _part(name: str) -> Any:
