@@ -69,6 +69,7 @@ def test_a_lab_has_one_identity_for_each_node_and_for_its_people(lab: Profile) -
         "sim@robot": Role.ROBOT,
         "command@robot": Role.COMMAND,
         "operator@robot": Role.OPERATOR,
+        "worker-teleop@robot": Role.WORKER,
         "camera-eyes@eyes": Role.CAMERA,
         "viewer@eyes": Role.VIEWER,
         "worker-scripted@gpu": Role.WORKER,
@@ -76,6 +77,7 @@ def test_a_lab_has_one_identity_for_each_node_and_for_its_people(lab: Profile) -
         "camera-gpu@gpu": Role.CAMERA,
         "viewer@gpu": Role.VIEWER,
         "operator@desk": Role.OPERATOR,
+        "worker-teleop@desk": Role.WORKER,
         "viewer@wall": Role.VIEWER,
     }
 
@@ -100,6 +102,28 @@ def test_a_worker_writes_its_own_keys_only(lab: Profile) -> None:
         "status/worker-scripted",
         "event/worker-scripted",
     }
+
+
+def test_an_operator_who_drives_by_hand_is_a_worker_like_any_other(lab: Profile) -> None:
+    assert may(lab, "worker-teleop@desk", Act.PUT) == {
+        "delta/teleop",
+        "spec/teleop",
+        "seen/teleop",
+        "seen/teleop/*",
+        "status/worker-teleop",
+        "event/worker-teleop",
+    }
+    assert may(lab, "worker-teleop@desk", Act.ANNOUNCE) == {"alive/worker-teleop"}
+
+
+def test_a_replay_says_what_a_recording_holds_and_is_no_node_but_itself(lab: Profile) -> None:
+    stage = override(lab, {"session": {"security": {"people": {"stage": "replay"}}}})
+    said = may(stage, "replay@stage", Act.PUT)
+    assert {"state/pose", "camera/*/jpeg", "delta/*", "prompt", "status/*", "task"} <= said
+    assert may(stage, "replay@stage", Act.ANNOUNCE) == {"alive/replay"}
+    assert may(stage, "replay@stage", Act.ANSWER) == {"clock/replay"}
+    assert may(stage, "replay@stage", Act.SUBSCRIBE) == set()
+    assert may(stage, "replay@stage", Act.WATCH) == {"alive/*"}
 
 
 def test_a_camera_host_writes_its_own_cameras_only(lab: Profile) -> None:

@@ -17,7 +17,7 @@ from vla_zenoh.errors import SecurityError, VlaZenohError
 from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.profile.session import DEFAULT_FOLDER
 from vla_zenoh.security.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
-from vla_zenoh.security.identity import Identity, Role, identities, identities_of
+from vla_zenoh.security.identity import PEOPLE, Role, identities, identities_of, people_at
 from vla_zenoh.security.store import Entry, Store
 from vla_zenoh.security.written import (
     moved,
@@ -97,7 +97,7 @@ def add(
     host: Annotated[str, typer.Argument(help="Host of the profile, or another computer.")],
     profile: ProfileOption = DEFAULT_PROFILE,
     role: Annotated[
-        Literal["operator", "viewer"] | None,
+        Literal["operator", "viewer", "replay"] | None,
         typer.Option("--role", help="What people at that computer may do."),
     ] = None,
     address: AddressOption = None,
@@ -118,10 +118,11 @@ def add(
             new = with_person(path.read_text("utf-8"), host, Role(role))
         except SecurityError as error:
             raise SecurityError(f"{path} {error}") from error
-        chosen = [Identity(Role(role), role, host)]
-        if host in loaded.hosts:
-            nodes = identities_of(loaded, host)[:-1]
-            chosen = [*nodes, *chosen] if renew else chosen
+        chosen = people_at(host, Role(role))
+        if host in loaded.hosts and renew:
+            names = {one.node for one in chosen}
+            nodes = [one for one in identities_of(loaded, host) if one.role not in PEOPLE]
+            chosen = [*(one for one in nodes if one.node not in names), *chosen]
     else:
         chosen = identities_of(loaded, host)
     store = Store(security.folder)

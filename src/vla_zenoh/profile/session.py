@@ -118,12 +118,13 @@ class SecurityProfile(Section):
             ``HOST/NODE.pem`` and ``HOST/NODE.key``.
         host: which host this computer is; None: the only one in the folder.
         people: computer -> what a person there may do. A host that runs the command node may
-            drive the robot, the others of the profile may look.
+            drive the robot, the others of the profile may look. Who may replay may say all that
+            a recording holds, commands too.
     """
 
     folder: Word = DEFAULT_FOLDER
     host: Name | None = None
-    people: dict[Name, Literal["operator", "viewer"]] = Field(default_factory=dict)
+    people: dict[Name, Literal["operator", "viewer", "replay"]] = Field(default_factory=dict)
 
 
 class SessionProfile(Section):

@@ -24,6 +24,7 @@ class Role(Enum):
     COMMAND = "command"
     OPERATOR = "operator"  # a person who drives the robot
     VIEWER = "viewer"  # a person or screen that looks on, without pictures
+    REPLAY = "replay"  # plays a recording: the part of everybody, where no robot lives
 
 
 ROLE_OF_KIND = {
@@ -35,7 +36,9 @@ ROLE_OF_KIND = {
     "command": Role.COMMAND,
 }
 """Kind of node in a profile -> its role."""
-PEOPLE = (Role.OPERATOR, Role.VIEWER)
+PEOPLE = (Role.OPERATOR, Role.VIEWER, Role.REPLAY)
+TELEOP = "teleop"
+"""The worker that an operator is, who drives by hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +47,7 @@ class Identity:
 
     Args:
         role: what for.
-        node: its name on the bus; of people ``operator`` or ``viewer``.
+        node: its name on the bus; of people ``operator``, ``viewer`` or ``replay``.
         host: where.
         worker: the worker it is, if it is one.
         cameras: the cameras it serves.
@@ -95,7 +98,16 @@ def identities_of(profile: Profile, host: str) -> list[Identity]:
             "from which people look or drive, say --role viewer or --role operator"
         )
     found = [*_nodes(profile, host)] if host in profile.hosts else []
-    return [*found, Identity(role, role.value, host)]
+    names = {identity.node for identity in found}
+    return [*found, *(one for one in people_at(host, role) if one.node not in names)]
+
+
+def people_at(host: str, role: Role) -> list[Identity]:
+    """Who people at a computer are: themselves, and an operator the worker that drives by hand."""
+    people = Identity(role, role.value, host)
+    if role is not Role.OPERATOR:
+        return [people]
+    return [people, Identity(Role.WORKER, worker_node(TELEOP), host, worker=TELEOP)]
 
 
 def identities(profile: Profile) -> list[Identity]:

@@ -14,17 +14,18 @@ from itertools import product
 from vla_zenoh.keys import Keys
 from vla_zenoh.security.identity import Identity, Role
 
-ROBOT, CAMERA, WORKER, COMMAND, OPERATOR, VIEWER = (
+ROBOT, CAMERA, WORKER, COMMAND, OPERATOR, VIEWER, REPLAY = (
     Role.ROBOT,
     Role.CAMERA,
     Role.WORKER,
     Role.COMMAND,
     Role.OPERATOR,
     Role.VIEWER,
+    Role.REPLAY,
 )
 NODES = frozenset({ROBOT, CAMERA, WORKER, COMMAND})
 LOOKERS = frozenset({OPERATOR, VIEWER})
-SPEAKERS = NODES | {OPERATOR}
+SPEAKERS = NODES | {OPERATOR, REPLAY}
 RECORDER = "recorder"
 """The node that an operator may run: it only reads, and says how it goes."""
 NOBODY: frozenset[Role] = frozenset()
@@ -49,7 +50,7 @@ class Row:
     """Who may do what on one member of `Keys`.
 
     Where a key has parameters, a node that writes fills in itself: its own name, worker, cameras.
-    Who reads may read all of them.
+    Who reads may read all of them, and a replay writes what others wrote.
     """
 
     member: str
@@ -69,7 +70,7 @@ def _setting(member: str) -> Row:
     """Said by the operator, kept by the command node, which tells those who look."""
     return Row(
         member,
-        put=frozenset({OPERATOR}),
+        put=frozenset({OPERATOR, REPLAY}),
         subscribe=frozenset({COMMAND}) | LOOKERS,
         answer=frozenset({COMMAND}),
         ask=LOOKERS,
@@ -77,7 +78,7 @@ def _setting(member: str) -> Row:
 
 
 def _stream(member: str, writers: set[Role], readers: set[Role]) -> Row:
-    return Row(member, put=frozenset(writers), subscribe=frozenset(readers))
+    return Row(member, put=frozenset(writers) | {REPLAY}, subscribe=frozenset(readers))
 
 
 TABLE = (
@@ -98,7 +99,7 @@ TABLE = (
     _stream("reset", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
     Row(
         "task",
-        put=frozenset({COMMAND}),
+        put=frozenset({COMMAND, REPLAY}),
         subscribe=frozenset({ROBOT, WORKER}) | LOOKERS,
         answer=frozenset({COMMAND}),
         ask=frozenset({WORKER}) | LOOKERS,
@@ -106,7 +107,7 @@ TABLE = (
     _stream("delta", {WORKER}, {COMMAND, OPERATOR, VIEWER}),
     Row(
         "spec",
-        put=frozenset({WORKER}),
+        put=frozenset({WORKER, REPLAY}),
         subscribe=frozenset({CAMERA, COMMAND, OPERATOR, VIEWER}),
         answer=frozenset({WORKER}),
         ask=frozenset({COMMAND, OPERATOR, VIEWER}),
@@ -116,8 +117,8 @@ TABLE = (
     _stream("command_gripper", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
     Row("status", put=SPEAKERS, subscribe=frozenset({COMMAND}) | LOOKERS),
     Row("event", put=SPEAKERS, subscribe=frozenset({COMMAND}) | LOOKERS),
-    Row("alive", announce=SPEAKERS, watch=NODES | LOOKERS),
-    Row("clock", answer=SPEAKERS, ask=NODES | LOOKERS),
+    Row("alive", announce=SPEAKERS, watch=NODES | LOOKERS | {REPLAY}),
+    Row("clock", answer=SPEAKERS, ask=NODES | LOOKERS | {REPLAY}),
     _stream("sim_scene", {ROBOT}, {CAMERA, OPERATOR}),
     _stream("sim_objects", {ROBOT}, {OPERATOR, VIEWER}),
     _stream("sim_reset", {OPERATOR}, {ROBOT, OPERATOR}),
@@ -162,7 +163,7 @@ def expressions(keys: Keys, member: str, identity: Identity, act: Act) -> Iterat
 
 
 def _choices(parameter: str, identity: Identity, act: Act) -> tuple[str, ...]:
-    if act not in OWN:
+    if act not in OWN or (identity.role is REPLAY and act is Act.PUT):
         return ("*",)
     if parameter == "node":
         return (RECORDER if identity.role is OPERATOR else identity.node,)
