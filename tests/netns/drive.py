@@ -19,7 +19,10 @@ from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import load_profile
 
 STILL_M_S = 0.005
-ATTEMPTS = 3
+ATTEMPTS = 2
+STALLS = ("the command loop stood still", "robot state lost", "robot state comes late")
+"""Why an arm brakes on a computer that gives its processes no time: right, and no fault of the lab.
+Whatever else ends a motion is one."""
 EARLY = "refused.activate_refused"
 """While nodes are still starting."""
 
@@ -54,14 +57,17 @@ def main(name: str, direction: str, count: int) -> None:
         def done() -> bool:
             command, now = client.status("command"), recorder.newest_state()
             assert now is not None
-            if command is not None and command.state == "inactive" and len(starts_m) < ATTEMPTS:
-                # A busy machine let the arm brake; that is right, and the motion begins anew.
+            if command is not None and command.state == "inactive":
+                why = str(command.detail.get("why"))
+                anew.append(why)
+                assert why.startswith(STALLS), f"the motion was ended: {why}"
+                assert len(anew) < ATTEMPTS, f"ended again and again: {anew}"
                 starts_m.append(begin())
                 return False
             still = float(np.abs(now.twist[:3]).max()) < STILL_M_S
             return bool(command and command.detail.get("policy_done") and still)
 
-        starts_m = [begin()]
+        starts_m, anew = [begin()], list[str]()
         try:
             until("the motion", done, ATTEMPTS * (10.0 + count))
         except AssertionError as error:
@@ -83,6 +89,7 @@ def main(name: str, direction: str, count: int) -> None:
                     "way_m": (np.array(end.reference_position_m) - starts_m[-1]).tolist(),
                     "jpeg": camera.counters.get("front.jpeg", 0) if camera else 0,
                     "raw": camera.counters.get("front.raw", 0) if camera else 0,
+                    "begun_anew": anew,
                     "refused": {node: found for node, found in refused.items() if found},
                 }
             )

@@ -102,9 +102,17 @@ class Site:
 
     def drive(self, host: str, direction: str, count: int) -> Any:
         """Drive the arm from a host; what came of it."""
-        words = (str(self.profile(host)), direction, str(count))
+        return self.ask(host, "drive.py", direction, str(count), timeout_s=DRIVE_S)
+
+    def ask(self, host: str, program: str, *arguments: str, timeout_s: float) -> Any:
+        """Run one of the programs here on a host, with its profile; what it says.
+
+        Raises:
+            AssertionError: it fails; with the last lines of every host.
+        """
+        words = (str(self.profile(host)), *arguments)
         try:
-            return self.hosts[host].ask(HERE / "drive.py", *words, timeout_s=DRIVE_S)
+            return self.hosts[host].ask(HERE / program, *words, timeout_s=timeout_s)
         except AssertionError as error:
             raise AssertionError(f"{error}\n{self.logs()}") from None
 
