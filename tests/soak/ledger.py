@@ -18,7 +18,8 @@ WARM_S = 20.0
 """A process that is younger still loads, and fills what it keeps anyway."""
 COMPARED_S = 15.0
 """So much of the beginning and of the end of its life is compared."""
-GROWTH_MIB, GROWTH_HANDLES, GROWTH_THREADS = 16.0, 6, 4
+GROWTH_MIB, GROWTH_HANDLES, GROWTH_THREADS = 16.0, 6, 40
+"""A process may gain so much. Zenoh's pools begin threads when links are stuck, up to a bound."""
 
 
 class Held(NamedTuple):
