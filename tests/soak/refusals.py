@@ -19,6 +19,8 @@ LATE = frozenset(
     }
 )
 """What being late, or having been away, can lead to."""
+AWAY = frozenset({"foreign_spec", "foreign_status"})
+"""Who was away hears of others before it knows again that they live."""
 ANYTHING = frozenset({"*"})
 EXPLAINS: dict[str, frozenset[str]] = {
     # what is done -> the refusals that follow from it
@@ -27,8 +29,8 @@ EXPLAINS: dict[str, frozenset[str]] = {
     "rate": frozenset(),
     "toggle": frozenset({"activate_refused"}),
     "stop": frozenset({"activate_refused"}),
-    "kill": LATE | {"spec_mismatch", "foreign_spec", "foreign_status"},
-    "freeze": LATE,
+    "kill": LATE | AWAY | {"spec_mismatch"},
+    "freeze": LATE | AWAY,
     "junk": ANYTHING,
 }
 
