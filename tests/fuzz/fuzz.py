@@ -34,7 +34,7 @@ with atheris.instrument_imports(
     from targets import CORPUS, TARGETS, Target
 
 LEAST_S = 2
-PATIENCE_S, MEMORY_MIB, ALLOC_MIB = 10, 1536, 768
+PATIENCE_S, MEMORY_MIB, ALLOC_MIB = 30, 1536, 768
 MAX_INPUT_BYTES = 4096
 _DONE = re.compile(r"Done (\d+) runs in (\d+) second")
 _COVERED = re.compile(r"cov: (\d+) ft: (\d+)")
