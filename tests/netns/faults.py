@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-from netns.site import faketime
+from netns.site import compiler
 from netns.stage import Fault, Stage
 from netns.wire import CUT, GOOD, Shape
 
@@ -109,7 +109,7 @@ def catalogue() -> Iterator[Fault]:
                 partial(_step_clock, host, sign * CLOCK_STEP_S),
                 partial(_step_clock, host, 0.0),
                 layout="clocks",
-                needs="" if faketime() else "libfaketime is not installed",
+                needs="" if compiler() else "there is no C compiler",
                 seconds=4.0,
             )
     yield Fault(

@@ -75,7 +75,7 @@ LAYOUTS = {
         ("robot", "eyes", "gpu"),
         ("robot",),
     ),
-    # The same with wall clocks of their own: reading one then takes longer.
+    # The same with wall clocks of their own.
     "clocks": Layout(
         _profile("panda_sim_lab"), ("robot", "gpu"), ("robot",), clocks=("robot", "gpu")
     ),
@@ -353,7 +353,7 @@ def stage(name: str) -> Iterator[Stage]:
         robot.environment["FLIGHT_FOLDER"] = str(site.folder)
         robot.python_folders.append(str(HERE / "flight"))
         for host in layout.clocks:
-            site.fake_clock(host)
+            site.own_clock(host)
         parts = [host for host in layout.hosts if host in profile.hosts]
         site.equip(*parts)
         site.up(*layout.routers, *(host for host in parts if host not in layout.routers))
