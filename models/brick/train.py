@@ -46,7 +46,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--reader-steps", type=int, default=1500)
     parser.add_argument("--turn-steps", type=int, default=2500)
-    parser.add_argument("--eyes-steps", type=int, default=3000)
+    parser.add_argument("--eyes-steps", type=int, default=2000)
     parser.add_argument("--will-steps", type=int, default=12_000)
     parser.add_argument("--situations", type=int, default=150_000, help="without pictures")
     parser.add_argument("--rate", type=float, default=1.5e-3, help="greatest, of the eyes")

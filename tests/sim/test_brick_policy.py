@@ -128,6 +128,7 @@ def test_a_prompt_without_sense_makes_it_stay(stage: Stage) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("family", ["put", "stack", "push"])
 def test_tasks_are_done_in_many_layouts(stage: Stage, family: str) -> None:
     verdicts = [carry_out(stage, drawn(stage, 900 + seed, family)) for seed in range(MANY)]
