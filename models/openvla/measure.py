@@ -105,8 +105,12 @@ def random_network(
     """A network of a checkpoint's sizes with random weights.
 
     Raises:
-        WorkerError: there is not memory enough.
+        WorkerError: the device cannot be used, or has not memory enough.
     """
+    try:
+        torch.zeros(1, device=device)
+    except Exception as error:  # torch raises RuntimeError or AssertionError
+        raise WorkerError(f"device {device!r} cannot be used: {error}") from error
     network = empty_network(checkpoint)
     numbers = sum(weight.numel() for weight in network.state_dict().values())
     need = numbers * dtype.itemsize * SPARE

@@ -14,9 +14,11 @@ from vla_zenoh.cli.options import model_options
 from vla_zenoh.cli.output import console
 from vla_zenoh.errors import WorkerError
 from vla_zenoh.loader import find_model, import_model, make_policy, module_name
+from vla_zenoh.model_options import one_of
 from vla_zenoh.nodes.environment import run_in_own_environment
 
 NAME = "openvla"
+DTYPES = ("bfloat16", "float16", "float32")
 
 
 def openvla(
@@ -72,8 +74,8 @@ def _full_size(rounds: int, options: dict[str, str]) -> dict[str, Any]:
     network = measure.random_network(
         measure.full_size(),
         device=device,
-        dtype=getattr(torch, options.get("dtype", "bfloat16")),
-        kind=options.get("quantise", "none"),
+        dtype=getattr(torch, one_of("dtype", options.get("dtype", "bfloat16"), DTYPES)),
+        kind=one_of("quantise", options.get("quantise", "none"), ("none", "int8", "nf4")),
     )
     return measure.measure(network, "published size, random weights", rounds).to_dict()
 
