@@ -29,7 +29,7 @@ except ImportError:
 
 # What is imported here counts which of its branches are taken: that is what guides the fuzzer.
 with atheris.instrument_imports(
-    include=["vla_zenoh", "mcap", "rosbags", "yaml"], exclude=["vla_zenoh.simulation"]
+    include=["vla_zenoh", "mcap", "rosbags"], exclude=["vla_zenoh.simulation"]
 ):
     from targets import CORPUS, TARGETS, Target
 
@@ -66,6 +66,7 @@ class Run:
             f"-seed={seed}",
             f"-max_len={longest}",
             f"-timeout={PATIENCE_S}",
+            f"-report_slow_units={PATIENCE_S}",
             f"-rss_limit_mb={MEMORY_MIB}",
             f"-malloc_limit_mb={ALLOC_MIB}",
             f"-artifact_prefix={self._found}/",
