@@ -21,7 +21,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.nodes.camera import CameraNode
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile, SessionProfile, load_profile
-from vla_zenoh.profile.schema import CameraProfile
+from vla_zenoh.profile.schema import CameraProfile, HostProfile
 from vla_zenoh.types import Event, Header, NodeStatus
 
 PATIENCE_S = 10.0
@@ -121,14 +121,20 @@ class Rig:
 
 @contextmanager
 def camera_rig(
-    described: Mapping[str, CameraProfile], /, *, renderer: str = "raycast", **node_arguments: Any
+    described: Mapping[str, CameraProfile],
+    /,
+    *,
+    renderer: str = "raycast",
+    hosts: Mapping[str, HostProfile] | None = None,
+    **node_arguments: Any,
 ) -> Iterator[Rig]:
-    """Serve these cameras until the block ends."""
+    """Serve these cameras until the block ends; `hosts` beside the one they are on."""
     endpoint = free_endpoint()
     shipped = load_profile("panda_sim")
     profile = shipped.model_copy(
         update={
             "cameras": dict(described),
+            "hosts": {**shipped.hosts, **(hosts or {})},
             "session": SessionProfile(listen=(endpoint,), connect=(endpoint,)),
             "sim": shipped.sim.model_copy(update={"renderer": renderer}),
         }

@@ -134,6 +134,11 @@ def form_of(spec: CameraSpec) -> str | None:
     return f"{spec.width}x{spec.height}-{spec.resize}"
 
 
+def form_for(host: str, form: str | None = None) -> str:
+    """Name of what travels to a host with a say in it, in a model's size or as it comes."""
+    return f"{form or 'whole'}-for-{host}"
+
+
 def prepare(image: Image, spec: CameraSpec) -> NDArray[np.uint8]:
     """A picture in the size and channel order the model declared.
 

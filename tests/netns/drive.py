@@ -45,6 +45,7 @@ def main(name: str, direction: str, count: int) -> None:
 
         def begin() -> FloatArray:
             client.set_prompt("hold")
+            client.set_rate(profile.task.rate_hz)
             try:
                 until("an active arm", activated, READY_PATIENCE_S)
             except AssertionError as error:

@@ -219,7 +219,7 @@ def told(path: str) -> list[str]:
         ),
         (
             "session: {security: {people: {desk: boss}}, listen: [tls/a:1], connect: [tls/a:1]}",
-            "session.security.people.desk: wants 'operator' or 'viewer'",
+            "session.security.people.desk: wants 'operator', 'viewer' or 'replay'",
         ),
         (
             "session: {separate_links: true, connect: [tcp/127.0.0.1:65535]}",

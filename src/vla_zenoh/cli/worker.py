@@ -69,6 +69,7 @@ def worker(
             policy,
             name or found.name,
             images=form,
+            host=host,
             delay_s=delay_ms / 1e3,
             robots=served,
             another=lambda: make_policy(found, chosen, profile=profile),

@@ -27,7 +27,7 @@ from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.seen import SeenOutlet
 from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
 from vla_zenoh.nodes.speaker import Speaker
-from vla_zenoh.observe import History, NotYet, assemble, form_of
+from vla_zenoh.observe import History, NotYet, assemble, form_for, form_of
 from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps, reset_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
@@ -64,6 +64,7 @@ class Seat:
         policy: the model, not loaded yet; several seats may share it.
         name: of the worker.
         images: which form of pictures to listen to.
+        host: of the profile, on which this runs: some have a say in what travels there.
         changed: is notified when a picture arrives.
     """
 
@@ -75,6 +76,7 @@ class Seat:
         name: str,
         *,
         images: Literal["raw", "jpeg"],
+        host: str | None,
         changed: threading.Condition,
     ) -> None:
         self.robot = profile.robot.name
@@ -93,8 +95,11 @@ class Seat:
         self._jpeg = images == "jpeg"
 
         def key_of(camera: CameraSpec) -> str:
-            settings, form = profile.cameras.get(camera.camera), form_of(camera)
-            if self._jpeg and settings is not None and settings.fit_for_workers and form:
+            settings, part = profile.cameras.get(camera.camera), profile.hosts.get(host or "")
+            form = form_of(camera) if settings is not None and settings.fit_for_workers else None
+            if self._jpeg and host is not None and part is not None and part.pictures is not None:
+                form = form_for(host, form)
+            if self._jpeg and form is not None:
                 return keys.camera_fitted(camera.camera, form)
             return (keys.camera_jpeg if self._jpeg else keys.camera_raw)(camera.camera)
 

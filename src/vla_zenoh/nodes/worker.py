@@ -41,6 +41,7 @@ class WorkerNode:
         name: of the worker.
         images: which form of pictures to listen to. Between processes of one host raw ones travel
             through shared memory and cost least; between hosts JPEG is a tenth of the bytes.
+        host: of the profile, on which this runs.
         delay_s: let every inference take so much longer: what a slower computer would do.
         robots: names of the robots to serve, all as the profile describes; none: the profile's.
         another: makes the model once more, for every further robot, where it cannot batch.
@@ -58,6 +59,7 @@ class WorkerNode:
         name: str,
         *,
         images: Literal["raw", "jpeg"] = "raw",
+        host: str | None = None,
         delay_s: float = 0.0,
         robots: Sequence[str] = (),
         another: Callable[[], Policy] | None = None,
@@ -75,7 +77,9 @@ class WorkerNode:
         try:
             for number, part in enumerate(profiles):
                 mind = policies[number % len(policies)]
-                seat = Seat(part, session, mind, name, images=images, changed=self._changed)
+                seat = Seat(
+                    part, session, mind, name, images=images, host=host, changed=self._changed
+                )
                 self.seats.append(seat)
         except BaseException:
             for seat in self.seats:

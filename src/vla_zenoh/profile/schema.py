@@ -172,6 +172,21 @@ class TaskProfile(Section):
     worker: Name = "scripted"
 
 
+class PicturesProfile(Section):
+    """What of every camera travels to the workers of a host that has no cameras.
+
+    Args:
+        quality: of JPEG, 1 to 100.
+        rate_hz: of each camera at most; None: as many as there are.
+        width: wider ones are made smaller; None: as they are. With ``fit_for_workers`` of a camera
+            a model that declares a size gets that instead.
+    """
+
+    quality: int = Field(default=80, ge=1, le=100)
+    rate_hz: float | None = Field(default=None, gt=0, le=240)
+    width: int | None = Field(default=None, ge=16, le=8192)
+
+
 class HostProfile(Section):
     """One computer: which nodes run there, and how it reaches the router from there.
 
@@ -183,6 +198,8 @@ class HostProfile(Section):
             host goes on with the second one when the first is gone.
         cameras: those of its camera node; None: all.
         workers: those it runs; None: all.
+        pictures: what its workers get of cameras elsewhere; None: what the cameras' own settings
+            for JPEG say.
     """
 
     nodes: Annotated[tuple[NodeKind, ...], Field(strict=False, min_length=1), Distinct]
@@ -191,6 +208,7 @@ class HostProfile(Section):
     link: Endpoints | None = None
     cameras: Names | None = None
     workers: Names | None = None
+    pictures: PicturesProfile | None = None
 
 
 class Profile(Section):
