@@ -7,8 +7,9 @@
     python train.py DATA OUT [--processes 2]
 
 Reads words, sees how bricks are turned, sees where everything is, learns what to do of all that:
-each is a stage, and ``OUT/<stage>.safetensors`` has all weights after it. The last one's are
-``OUT/policy.safetensors``. With several processes the eyes are taught with one thread in each.
+each is a stage, ``OUT/<stage>.safetensors`` has all weights after it, and it goes on after the last
+one that is there. ``OUT/policy.safetensors`` has the weights after all. With several processes the
+eyes are taught with one thread in each.
 """
 
 from __future__ import annotations
@@ -53,23 +54,20 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=48, help="pictures per process and step")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--begin", type=Path, help="weights to begin with, for stages not done")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(args.seed)
     net = Policy(len(vocabulary()) + 2)
-    if args.begin:
-        net.load_state_dict(load_file(args.begin))
-    for stage in STAGES:
-        path = args.out / f"{stage}.safetensors"
-        if path.exists():
-            net.load_state_dict(load_file(path))
-            continue
+    paths = [args.out / f"{stage}.safetensors" for stage in STAGES]
+    done = [index for index, path in enumerate(paths) if path.exists()]
+    if done:
+        net.load_state_dict(load_file(paths[done[-1]]))
+    for stage, path in list(zip(STAGES, paths, strict=True))[done[-1] + 1 if done else 0 :]:
         teach(net, stage, args)
         part = path.with_suffix(".part")
         save_file({name: value.contiguous() for name, value in net.state_dict().items()}, part)
         part.rename(path)
-    (args.out / "policy.safetensors").write_bytes(path.read_bytes())
+    (args.out / "policy.safetensors").write_bytes(paths[-1].read_bytes())
 
 
 if __name__ == "__main__":
