@@ -131,6 +131,10 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
             yield (*place, "nodes"), f"has sim, and robot.driver is {profile.robot.driver}"
         if "ros2" in host.nodes and profile.ros2 is None:
             yield (*place, "nodes"), "has ros2, which needs a section ros2"
+        if host.pictures is not None and not workers_of(profile, host):
+            yield (*place, "pictures"), "is for workers, and this host runs none"
+        elif host.pictures is not None and "camera" in host.nodes:
+            yield (*place, "pictures"), "is for cameras elsewhere, and this host has its own"
         for kind in host.nodes:
             if kind in ONLY_ONE:
                 runs["nodes", kind].append(name)
