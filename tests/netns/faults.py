@@ -33,8 +33,8 @@ def _bad_link(name: str, about: str, shape: Shape, *, goes_on: bool = True) -> F
     return Fault(name, about, partial(_shape, shape), _good, goes_on=goes_on)
 
 
-def _kill_router(stage: Stage) -> None:
-    stage.site.hosts["robot"].kill("router")
+def _kill_router(stage: Stage) -> float:
+    return stage.site.hosts["robot"].kill("router")
 
 
 def _crash_hub(stage: Stage) -> None:

@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -129,12 +130,14 @@ class Host:
         """What runs here."""
         return list(map(int, _ip("netns", "pids", self.namespace).split()))
 
-    def kill(self, node: str) -> None:
-        """Kill a node of this kind, as nothing that it could notice."""
+    def kill(self, node: str) -> float:
+        """Kill a node of this kind without its notice; when, on the monotonic clock."""
         found = [pid for pid in self.pids() if _arguments(pid)[1:4] == ["-m", "vla_zenoh", node]]
         assert found, f"no {node} runs on {self.name}"
+        killed_s = time.monotonic()
         for pid in found:
             os.kill(pid, signal.SIGKILL)
+        return killed_s
 
     def run(self, *words: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
         """Run a command here to its end."""

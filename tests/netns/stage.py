@@ -110,7 +110,7 @@ class Fault:
     Args:
         name: for ``--only``.
         about: a sentence for people.
-        inject: makes it happen.
+        inject: makes it happen, and may say when that was, on the monotonic clock.
         clear: ends it.
         layout: of `LAYOUTS`.
         needs: why it cannot be done here; empty: it can.
@@ -122,7 +122,7 @@ class Fault:
 
     name: str
     about: str
-    inject: Callable[[Stage], None]
+    inject: Callable[[Stage], float | None]
     clear: Callable[[Stage], None]
     layout: str = "lab"
     needs: str = ""
@@ -222,7 +222,7 @@ class Stage:
         time.sleep(UNDER_WAY_S)
         self.ask("count")  # what happened until now is no news
         began_s = time.monotonic()
-        fault.inject(self)
+        began_s = fault.inject(self) or began_s
         if fault.seconds is None:
             finished = self.ask("finish", patience_s=3.0 * STEPS / RATE_HZ)
             ended_s = time.monotonic()
