@@ -117,7 +117,7 @@ def catalogue() -> Iterator[Fault]:
         "the only router is killed (SIGKILL); its supervisor starts it again",
         _kill_router,
         _nothing,
-        seconds=0.0,
+        seconds=1.0,
         from_fault=True,
         alone=True,
     )

@@ -240,7 +240,9 @@ class Stage:
         time.sleep(1.2)  # status comes twice a second
         after = self.ask("count")
         self._measure_motion(row, fault, began_s)
-        self._measure_recovery(row, fault, recovered, began_s if fault.from_fault else ended_s)
+        stood_s = began_s + (row.stood_s or 0.0)
+        since_s = began_s if fault.from_fault else ended_s
+        self._measure_recovery(row, fault, recovered, since_s, stood_s)
         self._measure_goal(row, moving, finished)
         self._count(row, before, after)
         self._tell(row, fault, finished, recovered, after["news"])
@@ -277,14 +279,19 @@ class Stage:
         return STEP_S + 1.0 / RATE_HZ + timing.watchdog_s + brake
 
     def _measure_recovery(
-        self, row: Row, fault: Fault, recovered: dict[str, Any], since_s: float
+        self,
+        row: Row,
+        fault: Fault,
+        recovered: dict[str, Any],
+        since_s: float,
+        stood_s: float,
     ) -> None:
         if fault.seconds is None and not recovered:
             return
         measured = self.flight("sim")
         row.activated = recovered.get("activated_s") is not None
         begun_s = recovered.get("activated_s") or since_s
-        moved_s = measured.moved_at_s(max(begun_s, since_s), MOVING_M_S)
+        moved_s = measured.moved_at_s(max(begun_s, since_s, stood_s), MOVING_M_S)
         if recovered.get("moves") and moved_s is not None:
             row.recovered_s = moved_s - since_s
 
