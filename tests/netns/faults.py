@@ -37,8 +37,8 @@ def _kill_router(stage: Stage) -> float:
     return stage.site.hosts["robot"].kill("router")
 
 
-def _crash_hub(stage: Stage) -> None:
-    stage.site.hosts["hub"].crash()
+def _crash_hub(stage: Stage) -> float:
+    return stage.site.hosts["hub"].crash()
 
 
 def _hub_again(stage: Stage) -> None:
@@ -127,8 +127,9 @@ def catalogue() -> Iterator[Fault]:
         _crash_hub,
         _hub_again,
         layout="routers",
-        seconds=5.0,
+        seconds=1.0,
         from_fault=True,
+        alone=True,
     )
     yield Fault(
         "camera-pulled",

@@ -156,11 +156,14 @@ class Host:
         assert done.returncode == 0, f"{program.name} {arguments}: {done.stdout}\n{done.stderr}"
         return json.loads(done.stdout.strip().splitlines()[-1])
 
-    def crash(self) -> None:
-        """Kill everything that runs here at once, as if the power went."""
-        for pid in self.pids():
+    def crash(self) -> float:
+        """Kill everything that runs here at once, as if the power went; when that was."""
+        found = self.pids()
+        killed_s = time.monotonic()
+        for pid in found:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
+        return killed_s
 
     def end(self, process: subprocess.Popen[str], number: int = signal.SIGINT) -> int:
         """End a process of this host, as Ctrl-C would."""

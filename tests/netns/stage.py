@@ -325,7 +325,8 @@ class Stage:
         elif recovered.get("moves") and not row.activated:
             row.did = "stood, then went on by itself"
         elif recovered.get("moves"):
-            why = next((why for _, what, why in news if what.endswith("->inactive")), "")
+            ended = (why for _, what, why in news if what.endswith("->inactive"))
+            why = next((why for why in ended if why != "deactivated"), "")  # that was we
             row.did = "stood until it was activated" + (f" ({why})" if why else "")
         else:
             row.did = f"did not come back: {recovered.get('why', '')[:300]}"
