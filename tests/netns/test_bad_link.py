@@ -11,6 +11,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from camera_rig import until
+from chain import READY_PATIENCE_S
 from netns.flight_log import Flight, read_flight
 from netns.lab import needs_namespaces
 from netns.site import HERE, Site, secured_site
@@ -33,6 +35,8 @@ def site() -> Iterator[Site]:
         made.hosts["robot"].python_folders.append(str(HERE / "flight"))
         made.equip(*HOSTS)
         made.up("robot", "gpu")
+        log = made.folder / "sim.flight"
+        until("the simulator", lambda: log.exists() and log.stat().st_size, READY_PATIENCE_S)
         yield made
 
 
