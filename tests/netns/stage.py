@@ -28,6 +28,8 @@ STEPS = 40
 """Of a motion that is to reach its goal: 0.4 m."""
 MOVING_M_S = 0.05
 UNDER_WAY_S = 0.8
+SEEN_S = 1.0
+"""An arm that moves again is looked at for so long: it may stop once more."""
 ANSWER_S = 200.0
 RECOVERY_S = 60.0
 GOAL_M = 0.001
@@ -235,11 +237,12 @@ class Stage:
         recovered: dict[str, Any] = {}
         if not finished.get("done"):
             recovered = self.ask("recover", patience_s=RECOVERY_S)
-        time.sleep(0.3)
+        time.sleep(SEEN_S)
+        rest_s = time.monotonic()
         self.ask("rest")
         time.sleep(1.2)  # status comes twice a second
         after = self.ask("count")
-        self._measure_motion(row, fault, began_s)
+        self._measure_motion(row, fault, began_s, rest_s)
         stood_s = began_s + (row.stood_s or 0.0)
         since_s = began_s if fault.from_fault else ended_s
         self._measure_recovery(row, fault, recovered, since_s, stood_s)
@@ -249,11 +252,11 @@ class Stage:
         self._judge(row, fault, finished, recovered)
         return row
 
-    def _measure_motion(self, row: Row, fault: Fault, began_s: float) -> None:
+    def _measure_motion(self, row: Row, fault: Fault, began_s: float, rest_s: float) -> None:
         profile, limits = self.profile, self.profile.limits.translation
         measured, commanded = self.flight("sim"), self.flight("command")
         # A motion that comes to its goal stands there, too: only who stops on the way was braked.
-        stood_s = measured.stood_at_s(began_s, began_s + (fault.seconds or 0.0) + 5.0)
+        stood_s = measured.stood_at_s(began_s, rest_s)
         if stood_s is not None and fault.seconds is not None:
             row.stood_s = stood_s - began_s
             way = measured.between(began_s, stood_s).position_m
