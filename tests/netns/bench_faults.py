@@ -22,7 +22,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from netns import table
 from netns.faults import catalogue
 from netns.lab import why_not
-from netns.stage import Fault, Row, stage
+from netns.rows import Fault, Row
+from netns.stage import stage
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 

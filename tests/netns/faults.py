@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
+from netns.rows import Fault
 from netns.site import compiler
-from netns.stage import Fault, Stage
+from netns.stage import Stage
 from netns.wire import CUT, GOOD, Shape
 
 LOSSES = (0.0, 0.01, 0.02, 0.05, 0.10)

@@ -11,13 +11,15 @@ import json
 import select
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from netns.flight_log import Flight, brake_s, read_flight
+from netns.layouts import LAYOUTS, Layout
+from netns.rows import Fault, Row
 from netns.site import HERE, Site, secured_site
 
 from vla_zenoh.profile import Profile, load_profile
@@ -36,144 +38,6 @@ GOAL_M = 0.001
 MEASURED_SLACK, OWN_BRAKE_SLACK = 1.15, 2.0
 """Share of the acceleration limit that the measured arm may take; where the robot brakes alone."""
 COMMANDED_SLACK = 1.001
-FRONT = '{source: "sim:front", width: 160, height: 120, rate_hz: 20}'
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Hosts of a lab.
-
-    Args:
-        plain: its profile on loopback.
-        hosts: names.
-        routers: those that run one, the first one first.
-        shaped: whose link can be made bad.
-        clocks: whose wall clock can be set.
-    """
-
-    plain: str
-    hosts: tuple[str, ...]
-    routers: tuple[str, ...]
-    shaped: tuple[str, ...] = ()
-    clocks: tuple[str, ...] = ()
-
-
-def _profile(extends: str, more: str = "") -> str:
-    return f"extends: {extends}\ncameras:\n  front: {FRONT}\n  wrist: null\n{more}"
-
-
-LAYOUTS = {
-    # The robot's computer, one for models, and a desk.
-    "lab": Layout(_profile("panda_sim_lab"), ("robot", "gpu", "desk"), ("robot",), ("gpu",)),
-    # The cameras have a computer of their own.
-    "eyes": Layout(
-        _profile(
-            "panda_sim_lab",
-            "hosts:\n"
-            "  robot: {nodes: [router, sim, command]}\n"
-            "  eyes: {nodes: [camera], connect: [tcp/127.0.0.1:7447]}\n"
-            "  gpu: {nodes: [worker], connect: [tcp/127.0.0.1:7447]}\n",
-        ),
-        ("robot", "eyes", "gpu"),
-        ("robot",),
-    ),
-    # The same with wall clocks of their own.
-    "clocks": Layout(
-        _profile("panda_sim_lab"), ("robot", "gpu"), ("robot",), clocks=("robot", "gpu")
-    ),
-    # Two routers that are nobody else's computer.
-    "routers": Layout(
-        _profile(
-            "panda_sim",
-            "session:\n"
-            "  listen: [tcp/127.0.0.1:7447]\n"
-            "  connect: [tcp/127.0.0.1:7447, tcp/127.0.0.1:7457]\n"
-            "  separate_links: true\n"
-            "hosts:\n"
-            "  hub: {nodes: [router], connect: [tcp/127.0.0.1:7447]}\n"
-            "  spare:\n"
-            "    nodes: [router]\n"
-            "    listen: [tcp/127.0.0.1:7457]\n"
-            "    link: [tcp/127.0.0.1:7447]\n"
-            "    connect: [tcp/127.0.0.1:7457]\n"
-            "  robot: {nodes: [sim, camera, command]}\n"
-            "  gpu: {nodes: [worker]}\n",
-        ),
-        ("hub", "spare", "robot", "gpu"),
-        ("hub", "spare"),
-    ),
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """Something that goes wrong while the arm moves.
-
-    Args:
-        name: for ``--only``.
-        about: a sentence for people.
-        inject: makes it happen, and may say when that was, on the monotonic clock.
-        clear: ends it.
-        layout: of `LAYOUTS`.
-        needs: why it cannot be done here; empty: it can.
-        seconds: how long it lasts; None: until the motion has come to its end.
-        goes_on: the arm is to reach its goal all the same.
-        from_fault: recovery counts from the fault itself, which ends without us.
-        alone: the robot's side notices by itself, and brakes.
-    """
-
-    name: str
-    about: str
-    inject: Callable[[Stage], float | None]
-    clear: Callable[[Stage], None]
-    layout: str = "lab"
-    needs: str = ""
-    seconds: float | None = None
-    goes_on: bool = False
-    from_fault: bool = False
-    alone: bool = False
-
-
-@dataclass
-class Row:
-    """What a fault did. Times are in seconds, None where there is none.
-
-    Args:
-        name: of the fault.
-        about: likewise.
-        did: what the arm did, in words.
-        stood_s: from the fault until the arm stood.
-        braked_s: from the last chunk that came, if that was later, until the arm stood.
-        braked_bound_s: what the watchdog and one Ruckig brake allow of that.
-        way_mm: how far it went meanwhile.
-        acceleration: largest measured, as a share of the limit.
-        jerk: largest commanded, likewise.
-        recovered_s: from the end of the fault until the arm moved again.
-        activated: a person had to activate it.
-        off_mm: beside the goal in the end, where it reached one.
-        lost: records that were written and never arrived, by reader and key.
-        refused: by node and reason.
-        wrong: what of our promises it broke.
-    """
-
-    name: str
-    about: str
-    did: str = ""
-    stood_s: float | None = None
-    braked_s: float | None = None
-    braked_bound_s: float | None = None
-    way_mm: float | None = None
-    acceleration: float = 0.0
-    jerk: float = 0.0
-    recovered_s: float | None = None
-    activated: bool = False
-    off_mm: float | None = None
-    lost: dict[str, int] = field(default_factory=dict)
-    refused: dict[str, int] = field(default_factory=dict)
-    wrong: list[str] = field(default_factory=list)
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @dataclass

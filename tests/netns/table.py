@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from netns.stage import Row
+from netns.rows import Row
 
 BEGIN, END = "<!-- faults: made by make bench-faults -->", "<!-- faults end -->"
 HEAD = (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from netns import table
 from netns.flight_log import COLUMNS, STOOD_S, Flight, brake_s, read_flight
-from netns.stage import Row
+from netns.rows import Row
 from netns.wire import CUT, GOOD, QUEUE_BYTES, Shape, Way
 from numpy.typing import NDArray
 

@@ -1,0 +1,73 @@
+"""The labs in which faults happen: their hosts, and what runs where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+FRONT = '{source: "sim:front", width: 160, height: 120, rate_hz: 20}'
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Hosts of a lab.
+
+    Args:
+        plain: its profile on loopback.
+        hosts: names.
+        routers: those that run one, the first one first.
+        shaped: whose link can be made bad.
+        clocks: whose wall clock can be set.
+    """
+
+    plain: str
+    hosts: tuple[str, ...]
+    routers: tuple[str, ...]
+    shaped: tuple[str, ...] = ()
+    clocks: tuple[str, ...] = ()
+
+
+def _profile(extends: str, more: str = "") -> str:
+    return f"extends: {extends}\ncameras:\n  front: {FRONT}\n  wrist: null\n{more}"
+
+
+LAYOUTS = {
+    # The robot's computer, one for models, and a desk.
+    "lab": Layout(_profile("panda_sim_lab"), ("robot", "gpu", "desk"), ("robot",), ("gpu",)),
+    # The cameras have a computer of their own.
+    "eyes": Layout(
+        _profile(
+            "panda_sim_lab",
+            "hosts:\n"
+            "  robot: {nodes: [router, sim, command]}\n"
+            "  eyes: {nodes: [camera], connect: [tcp/127.0.0.1:7447]}\n"
+            "  gpu: {nodes: [worker], connect: [tcp/127.0.0.1:7447]}\n",
+        ),
+        ("robot", "eyes", "gpu"),
+        ("robot",),
+    ),
+    # The same with wall clocks of their own.
+    "clocks": Layout(
+        _profile("panda_sim_lab"), ("robot", "gpu"), ("robot",), clocks=("robot", "gpu")
+    ),
+    # Two routers that are nobody else's computer.
+    "routers": Layout(
+        _profile(
+            "panda_sim",
+            "session:\n"
+            "  listen: [tcp/127.0.0.1:7447]\n"
+            "  connect: [tcp/127.0.0.1:7447, tcp/127.0.0.1:7457]\n"
+            "  separate_links: true\n"
+            "hosts:\n"
+            "  hub: {nodes: [router], connect: [tcp/127.0.0.1:7447]}\n"
+            "  spare:\n"
+            "    nodes: [router]\n"
+            "    listen: [tcp/127.0.0.1:7457]\n"
+            "    link: [tcp/127.0.0.1:7447]\n"
+            "    connect: [tcp/127.0.0.1:7457]\n"
+            "  robot: {nodes: [sim, camera, command]}\n"
+            "  gpu: {nodes: [worker]}\n",
+        ),
+        ("hub", "spare", "robot", "gpu"),
+        ("hub", "spare"),
+    ),
+}

@@ -1,0 +1,81 @@
+"""A fault, and the row that is made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from netns.stage import Stage
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something that goes wrong while the arm moves.
+
+    Args:
+        name: for ``--only``.
+        about: a sentence for people.
+        inject: makes it happen, and may say when that was, on the monotonic clock.
+        clear: ends it.
+        layout: of `LAYOUTS`.
+        needs: why it cannot be done here; empty: it can.
+        seconds: how long it lasts; None: until the motion has come to its end.
+        goes_on: the arm is to reach its goal all the same.
+        from_fault: recovery counts from the fault itself, which ends without us.
+        alone: the robot's side notices by itself, and brakes.
+    """
+
+    name: str
+    about: str
+    inject: Callable[[Stage], float | None]
+    clear: Callable[[Stage], None]
+    layout: str = "lab"
+    needs: str = ""
+    seconds: float | None = None
+    goes_on: bool = False
+    from_fault: bool = False
+    alone: bool = False
+
+
+@dataclass
+class Row:
+    """What a fault did. Times are in seconds, None where there is none.
+
+    Args:
+        name: of the fault.
+        about: likewise.
+        did: what the arm did, in words.
+        stood_s: from the fault until the arm stood.
+        braked_s: from the last chunk that came, if that was later, until the arm stood.
+        braked_bound_s: what the watchdog and one Ruckig brake allow of that.
+        way_mm: how far it went meanwhile.
+        acceleration: largest measured, as a share of the limit.
+        jerk: largest commanded, likewise.
+        recovered_s: from the end of the fault until the arm moved again.
+        activated: a person had to activate it.
+        off_mm: beside the goal in the end, where it reached one.
+        lost: records that were written and never arrived, by reader and key.
+        refused: by node and reason.
+        wrong: what of our promises it broke.
+    """
+
+    name: str
+    about: str
+    did: str = ""
+    stood_s: float | None = None
+    braked_s: float | None = None
+    braked_bound_s: float | None = None
+    way_mm: float | None = None
+    acceleration: float = 0.0
+    jerk: float = 0.0
+    recovered_s: float | None = None
+    activated: bool = False
+    off_mm: float | None = None
+    lost: dict[str, int] = field(default_factory=dict)
+    refused: dict[str, int] = field(default_factory=dict)
+    wrong: list[str] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
