@@ -450,7 +450,7 @@ def running_chain(
 
 
 def command_line(
-    *arguments: str, profile: Path | None = None, timeout_s: float = 30.0
+    *arguments: str, profile: Path | None = None, timeout_s: float = 90.0
 ) -> subprocess.CompletedProcess[str]:
     """Run ``vla-zenoh`` as a person would; its output in plain text, 200 columns wide."""
     words = [sys.executable, "-m", "vla_zenoh", *arguments]
