@@ -27,6 +27,7 @@ STEPS, STEP_M, WAY_TOLERANCE_M = 5, 0.01, 0.001
 JUMP_M = 0.003
 """Between two references, 5 ms apart: 0.5 m/s would be 0.0025."""
 RUN_S = 0.5
+STEPS_BEFORE_NS = 300_000_000
 
 
 class Death(NamedTuple):
@@ -116,7 +117,7 @@ def test_a_killed_node_brakes_the_arm_and_needs_a_new_activation(
     assert_restarted(chain, death.node, pid)
 
     track = chain.recorder.track()
-    before = track.between(killed_ns - 100_000_000, killed_ns)
+    before = track.between(killed_ns - STEPS_BEFORE_NS, killed_ns)  # the speed goes with the steps
     assert before.speed_m_s.mean() > MOVING_M_S
     stood_s = track.time_to_stand_s(killed_ns)
     watchdog_s = chain.profile.timing.watchdog_s

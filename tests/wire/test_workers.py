@@ -220,6 +220,7 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
         assert abs(found["cosine"]) == pytest.approx(1.0)
         assert found["mean"][0] == pytest.approx(0.0, abs=1e-6)
         assert found["gripper"] is None
+        chain.client.set_prompt("hold")  # before the arm is at the end of its reach
         # The shadow's deltas are on their key like those of the one that is obeyed.
         said = command_line(
             "echo", "delta/*", "--seconds", "2", "--json", profile=chain.profile_file
@@ -227,7 +228,7 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
         keys = {json.loads(line)["key"].rsplit("/", 1)[-1] for line in said.stdout.splitlines()}
         assert keys == {"scripted", "riser"}
         said = command_line("status", "--once", profile=chain.profile_file)
-        assert "obeyed" in said.stdout
+        assert "obeyed" in said.stdout, f"{said.stdout}\n{chain.story()}"
         assert "in the shadow" in said.stdout
 
 
