@@ -47,7 +47,7 @@ def test_a_stream_is_shown_as_it_comes_and_survives_a_stall_and_a_restart(video:
             frames, _ = rig.listen(rig.profile.keys.camera_raw("net"))
             until("two seconds of it", lambda: len(frames) > 2 * RATE_HZ)
             stamps = np.array([frame.header.stamp_wall_ns for frame in frames])
-            # The server sends bytes evenly, so small pictures come in bursts, of which some are left out.
+            # Bytes come evenly, so small pictures come in bursts, of which some are left out.
             assert 0.8 / RATE_HZ < np.mean(np.diff(stamps)) / 1e9 < 2.0 / RATE_HZ
             difference = frames[-1].rgb[60, 40].astype(int) - ORANGE_RGB
             assert abs(difference).max() <= COLOUR_TOLERANCE
