@@ -221,6 +221,8 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
         assert found["mean"][0] == pytest.approx(0.0, abs=1e-6)
         assert found["gripper"] is None
         chain.client.set_prompt("hold")  # before the arm is at the end of its reach
+        # A command loop that stood still meanwhile has given the arm up: docs/design.md, section 9.
+        chain.activate_when_ready()
         # The shadow's deltas are on their key like those of the one that is obeyed.
         said = command_line(
             "echo", "delta/*", "--seconds", "2", "--json", profile=chain.profile_file
