@@ -221,17 +221,21 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
         assert found["mean"][0] == pytest.approx(0.0, abs=1e-6)
         assert found["gripper"] is None
         chain.client.set_prompt("hold")  # before the arm is at the end of its reach
-        # A command loop that stood still meanwhile has given the arm up: docs/design.md, section 9.
-        chain.activate_when_ready()
         # The shadow's deltas are on their key like those of the one that is obeyed.
         said = command_line(
             "echo", "delta/*", "--seconds", "2", "--json", profile=chain.profile_file
         )
         keys = {json.loads(line)["key"].rsplit("/", 1)[-1] for line in said.stdout.splitlines()}
         assert keys == {"scripted", "riser"}
-        said = command_line("status", "--once", profile=chain.profile_file)
-        assert "obeyed" in said.stdout, f"{said.stdout}\n{chain.story()}"
-        assert "in the shadow" in said.stdout
+
+        def who_is_obeyed() -> str:
+            # A command loop that stood still has given the arm up: docs/design.md, section 9.
+            chain.activate_when_ready()
+            shown = command_line("status", "--once", profile=chain.profile_file).stdout
+            return shown if "obeyed" in shown else ""
+
+        shown = chain.until("status says who is obeyed", who_is_obeyed, READY_PATIENCE_S)
+        assert "in the shadow" in shown
 
 
 def test_a_worker_that_is_not_there_cannot_be_compared(chain: Chain) -> None:
