@@ -148,3 +148,9 @@ def test_an_old_python_is_told_what_to_do(bootstrap: ModuleType) -> None:
     assert done.returncode == 1
     assert "Python 3.11 or newer is needed, this is 3.9" in done.stderr
     assert "make setup PYTHON=" in done.stderr
+
+
+def test_the_graph_of_the_policy_does_not_tell_on_whose_computer_it_was_made() -> None:
+    graph = (ROOT / "models" / "brick" / "brick.onnx").read_bytes()
+    assert b"site-packages" not in graph
+    assert b'.py"' not in graph
