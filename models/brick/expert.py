@@ -147,7 +147,7 @@ def _carry(family: str, hand: Hand, target: Point, goal: Point, off: float) -> W
         height = least + clip((off - 0.004) * 3.0, 0.0, most - least)
         let_go = False
     # Over what may be in the way first: sideways only near the height that belongs to the place.
-    free = clip((hand.z_m - height + 0.035) / 0.02, 0.0, 1.0)
+    free = clip((hand.z_m - height + 0.015) / 0.012, 0.0, 1.0)
     if let_go:
         return Wish(hand.x_m, hand.y_m, hand.z_m, 0.0, True)
     return Wish(
