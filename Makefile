@@ -32,8 +32,8 @@ test: $(READY) ## Run the tests
 	$(BIN)/python -m pytest -n auto --dist loadfile -m "$(SUITE) and not realtime" $(ARGS) || [ $$? = 5 ]
 	$(BIN)/python -m pytest $(AGAIN) -m "$(SUITE) and realtime" $(ARGS) || [ $$? = 5 ]
 
-slow: $(READY) ## Run the tests that take long, too
-	$(BIN)/python -m pytest -m "not models" $(ARGS)
+slow: $(READY) ## Run the tests that take long, too, and search for new examples
+	HYPOTHESIS_PROFILE=searching $(BIN)/python -m pytest -m "not models" $(ARGS)
 
 fuzz: $(READY) ## Feed every reader of foreign bytes with nonsense; SECONDS=600 for longer
 	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(ARGS)

@@ -29,6 +29,8 @@ RETURNED_M = 1e-6
 RETURNED_RAD = 1e-6
 DISTANCE_NOISE_M = 1e-5
 ROUNDING = 1e-9
+ROUNDING_M = 1e-12
+"""Of two positions in float64, which are less than a metre from the origin, and then some."""
 NAMES = {
     "reach",
     "joint_limit",
@@ -223,10 +225,11 @@ def test_no_sequence_of_bounded_steps_leaves_the_bounds(
         for before, after, hits in zip(steps.poses, steps.poses[1:], steps.hits, strict=False):
             gone_m = after.position_m - before.position_m
             asked_m = 0.05 * np.array(translation)
-            share = float(gone_m @ asked_m) / max(float(asked_m @ asked_m), 1e-300)
-            assert -1e-9 <= share <= 1 + 1e-9
-            assert np.linalg.norm(gone_m - share * asked_m) < 1e-8  # never aside
-            assert hits or share == pytest.approx(1, abs=1e-6) or np.linalg.norm(asked_m) < 1e-6
+            far_m = float(np.linalg.norm(asked_m))
+            along_m = float(gone_m @ asked_m) / far_m if far_m else 0.0
+            assert -ROUNDING_M <= along_m <= far_m + ROUNDING_M
+            assert np.linalg.norm(gone_m - along_m * asked_m / (far_m or 1.0)) < 1e-8  # never aside
+            assert hits or along_m == pytest.approx(far_m, rel=1e-6, abs=ROUNDING_M)
 
 
 @settings(max_examples=25)
