@@ -123,9 +123,22 @@ OPTIONAL = (
 def test_the_command_line_knows_every_command_without_any_optional_library() -> None:
     """A model's environment has what the package itself needs, and no more."""
     code = (
-        f"import sys\nfor name in {OPTIONAL!r}: sys.modules[name] = None\nimport vla_zenoh.cli.main"
+        f"import sys\nfor name in {OPTIONAL!r}: sys.modules[name] = None\n"
+        "import typer, vla_zenoh.cli.main as main\n"
+        "for name, found in typer.main.get_command(main.app).commands.items():\n"
+        "    assert found.name == name and found.help, name"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_a_command_that_is_not_called_is_not_imported() -> None:
+    """Every node and every word of a person waits for the import of the command line."""
+    loaded = loaded_after("vla_zenoh.cli.main")
+    assert {name for name in loaded if name.startswith("vla_zenoh.cli.")} == {
+        "vla_zenoh.cli.lazy",
+        "vla_zenoh.cli.main",
+    }
+    assert loaded.isdisjoint({"numpy", "pydantic", "vla_zenoh.nodes"})

@@ -1,4 +1,4 @@
-"""``vla-zenoh``: puts the commands together. One file a command."""
+"""``vla-zenoh``: puts the commands together. One file a command, imported when it is called."""
 
 from __future__ import annotations
 
@@ -7,40 +7,9 @@ from typing import NoReturn
 
 import typer
 import zenoh
-from rich.text import Text
 
 from vla_zenoh import __version__
-from vla_zenoh.cli import (
-    bench,
-    camera,
-    check,
-    command,
-    compare,
-    dataset,
-    demo,
-    doctor,
-    echo,
-    evaluate,
-    keys,
-    net,
-    profile,
-    record,
-    replay,
-    ros2,
-    router,
-    secure,
-    seen,
-    serve,
-    set_prompt,
-    sim,
-    status,
-    switches,
-    teleop,
-    up,
-    view,
-    worker,
-)
-from vla_zenoh.cli.output import errors, printable
+from vla_zenoh.cli.lazy import Part, commands_of
 from vla_zenoh.errors import VlaZenohError
 
 EXTRA_OF = {
@@ -60,8 +29,45 @@ NODES = frozenset({"up", "router", "sim", "ros2", "camera", "worker", "command"}
 """Commands whose output is a log: that of Zenoh belongs to it."""
 RUN, DRIVE, LOOK = "Run", "Drive the robot", "Look"
 
+PARTS = (
+    Part(RUN, "demo", "demo:demo"),
+    Part(RUN, "up", "up:up"),
+    Part(RUN, "router", "router:router"),
+    Part(RUN, "sim", "sim:sim"),
+    Part(RUN, "ros2", "ros2:ros2"),
+    Part(RUN, "camera", "camera:camera"),
+    Part(RUN, "worker", "worker:worker"),
+    Part(RUN, "command", "command:command"),
+    Part(RUN, "teleop", "teleop:teleop"),
+    Part(DRIVE, "prompt", "set_prompt:prompt"),
+    Part(DRIVE, "activate", "switches:activate"),
+    Part(DRIVE, "deactivate", "switches:deactivate"),
+    Part(DRIVE, "use", "switches:use"),
+    Part(DRIVE, "rate", "switches:rate"),
+    Part(DRIVE, "stop", "switches:stop"),
+    Part(DRIVE, "reset", "switches:reset"),
+    Part(LOOK, "view", "view:view"),
+    Part(LOOK, "record", "record:record"),
+    Part(LOOK, "replay", "replay:replay"),
+    Part(LOOK, "eval", "evaluate:evaluation"),
+    Part(LOOK, "status", "status:status"),
+    Part(LOOK, "echo", "echo:echo"),
+    Part(LOOK, "keys", "keys:keys"),
+    Part(LOOK, "seen", "seen:seen"),
+    Part(LOOK, "compare", "compare:compare"),
+    Part(LOOK, "check", "check:check"),
+    Part(LOOK, "net", "net:net"),
+    Part(LOOK, "doctor", "doctor:doctor"),
+    Part(LOOK, "bench", "bench:bench_app"),
+    Part(LOOK, "dataset", "dataset:dataset_app"),
+    Part(LOOK, "profile", "profile:profile_app"),
+    Part(RUN, "serve", "serve:serve_app"),
+    Part(RUN, "secure", "secure:secure_app"),
+)
+
 app = typer.Typer(
     name="vla-zenoh",
+    cls=commands_of(PARTS),
     help="Connects vision-language-action models to robots over Zenoh.",
     no_args_is_help=True,
     rich_markup_mode="rich",
@@ -87,45 +93,6 @@ def _main(
     zenoh.init_log_from_env_or("error" if context.invoked_subcommand in NODES else "off")
 
 
-for panel, name, function in (
-    (RUN, "demo", demo.demo),
-    (RUN, "up", up.up),
-    (RUN, "router", router.router),
-    (RUN, "sim", sim.sim),
-    (RUN, "ros2", ros2.ros2),
-    (RUN, "camera", camera.camera),
-    (RUN, "worker", worker.worker),
-    (RUN, "command", command.command),
-    (RUN, "teleop", teleop.teleop),
-    (DRIVE, "prompt", set_prompt.prompt),
-    (DRIVE, "activate", switches.activate),
-    (DRIVE, "deactivate", switches.deactivate),
-    (DRIVE, "use", switches.use),
-    (DRIVE, "rate", switches.rate),
-    (DRIVE, "stop", switches.stop),
-    (DRIVE, "reset", switches.reset),
-    (LOOK, "view", view.view),
-    (LOOK, "record", record.record),
-    (LOOK, "replay", replay.replay),
-    (LOOK, "eval", evaluate.evaluation),
-    (LOOK, "status", status.status),
-    (LOOK, "echo", echo.echo),
-    (LOOK, "keys", keys.keys),
-    (LOOK, "seen", seen.seen),
-    (LOOK, "compare", compare.compare),
-    (LOOK, "check", check.check),
-    (LOOK, "net", net.net),
-    (LOOK, "doctor", doctor.doctor),
-):
-    app.command(name, rich_help_panel=panel)(function)
-
-app.add_typer(bench.bench_app, name="bench", rich_help_panel=LOOK)
-app.add_typer(dataset.dataset_app, name="dataset", rich_help_panel=LOOK)
-app.add_typer(profile.profile_app, name="profile", rich_help_panel=LOOK)
-app.add_typer(serve.serve_app, name="serve", rich_help_panel=RUN)
-app.add_typer(secure.secure_app, name="secure", rich_help_panel=RUN)
-
-
 def app_entry() -> None:
     """Run the command line. Our own errors become one clear line and exit code 1."""
     try:
@@ -146,6 +113,10 @@ def app_entry() -> None:
 
 
 def _complain(message: str) -> NoReturn:
+    from rich.text import Text
+
+    from vla_zenoh.cli.output import errors, printable
+
     text = Text("error: ", style="bold red").append(printable(message), style="not bold default")
     errors().print(text, soft_wrap=True)
     sys.exit(1)
