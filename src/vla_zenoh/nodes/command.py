@@ -22,7 +22,7 @@ from vla_zenoh.control.so3 import quat_from_rotation
 from vla_zenoh.control.states import State
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.clock import FixedRate, Tick, make_this_thread_realtime
+from vla_zenoh.nodes.clock import FixedRate, Tick, realtime_thread
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.session import MAX_MESSAGE_BYTES
@@ -129,9 +129,14 @@ class CommandNode:
     def run(self, stop: threading.Event) -> None:
         """Command until `stop` is set, then brake, then end."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        self._realtime = make_this_thread_realtime()
         gc.collect()
         gc.freeze()
+        with realtime_thread() as self._realtime:
+            self._loop(stop)
+        self.node.report("stopped", now=True)
+        self.node.close()
+
+    def _loop(self, stop: threading.Event) -> None:
         loop = FixedRate(self.node.profile.timing.command_hz)
         give_up = 0.0
         while True:
@@ -147,8 +152,6 @@ class CommandNode:
                 if not self.commander.streaming or time.monotonic() > give_up:
                     break
             self._turn(extra, tick.periods, tick.nominal_ns)
-        self.node.report("stopped", now=True)
-        self.node.close()
 
     def _after_a_stall(self, tick: Tick) -> list[Setting]:
         if tick.stall_s <= self.node.profile.timing.command_timeout_s:

@@ -19,7 +19,7 @@ import zenoh
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import CodecError, NodeError, RecordingError
 from vla_zenoh.keys import Keys
-from vla_zenoh.nodes.clock import make_this_thread_realtime
+from vla_zenoh.nodes.clock import realtime_thread
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.profile import Profile
 from vla_zenoh.recording.reader import Entry, RunFile
@@ -151,16 +151,10 @@ class Replay:
         """Replay until the end, or until `stop` is set."""
         # Else this thread may wait 5 ms for the one that reads ahead.
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        make_this_thread_realtime()
         began_s = time.monotonic()
         try:
-            while not stop.is_set():
-                if not self._one_pass(stop):
-                    self.replayed.failure = self.replayed.failure or "nothing of it is to be put"
-                    break
-                self.replayed.passes += 1
-                if not self._loop:
-                    break
+            with realtime_thread():
+                self._all_passes(stop)
         except NodeError as error:
             self.replayed.failure = str(error)
         self.replayed.seconds = time.monotonic() - began_s
@@ -170,6 +164,15 @@ class Replay:
         self.node.report("stopped", now=True)
         self.node.close()
         return self.replayed
+
+    def _all_passes(self, stop: threading.Event) -> None:
+        while not stop.is_set():
+            if not self._one_pass(stop):
+                self.replayed.failure = self.replayed.failure or "nothing of it is to be put"
+                return
+            self.replayed.passes += 1
+            if not self._loop:
+                return
 
     def _one_pass(self, stop: threading.Event) -> bool:
         ready: queue.Queue[tuple[int, Sample] | None] = queue.Queue(AHEAD)

@@ -30,7 +30,7 @@ from vla_zenoh.control.so3 import Pose
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.bounded import bytes_of
-from vla_zenoh.nodes.clock import make_this_thread_realtime
+from vla_zenoh.nodes.clock import realtime_thread
 from vla_zenoh.nodes.meter import RateMeter
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.slots import Inbox
@@ -137,16 +137,16 @@ class SimNode:
         if self.lockstep:
             self._run_lockstep(stop)
         else:
-            self._run_in_real_time(stop)
+            # Nothing else of ours runs in this process; what Zenoh calls back must not wait long.
+            sys.setswitchinterval(SWITCH_INTERVAL_S)
+            gc.collect()
+            gc.freeze()
+            with realtime_thread() as self._realtime:
+                self._run_in_real_time(stop)
         self.node.report("stopped", now=True)
         self.node.close()
 
     def _run_in_real_time(self, stop: threading.Event) -> None:
-        # Nothing else of ours runs in this process; what Zenoh calls back must not wait long.
-        sys.setswitchinterval(SWITCH_INTERVAL_S)
-        self._realtime = make_this_thread_realtime()
-        gc.collect()
-        gc.freeze()
         next_ns = time.monotonic_ns()
         while not stop.is_set():
             next_ns += STEP_NS

@@ -18,7 +18,7 @@ import zenoh
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.nodes.clock import FixedRate, make_this_thread_realtime
+from vla_zenoh.nodes.clock import FixedRate, realtime_thread
 from vla_zenoh.nodes.meter import RateMeter
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.process import ROUTER_PATIENCE_S
@@ -131,11 +131,11 @@ class Ros2Node:
         ]
         for thread in threads:
             thread.start()
-        self._realtime = make_this_thread_realtime()
         gc.collect()
         gc.freeze()
         try:
-            self._loop(stop)
+            with realtime_thread() as self._realtime:
+                self._loop(stop)
         finally:
             self._halt.set()
             give_up = time.monotonic() + GOODBYE_S
