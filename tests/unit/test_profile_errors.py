@@ -18,6 +18,7 @@ from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import (
     CameraProfile,
     SessionProfile,
+    as_robot,
     load_profile,
     override,
     profile_names,
@@ -87,6 +88,20 @@ def told(path: str) -> list[str]:
         ("workers: scripted", "lab.yaml:2: workers: wants a list (given: 'scripted')"),
         ("workers: [scripted, a, a]", "lab.yaml:2: workers: a: given more than once"),
         ("workers: [scripted, 'a b']", "lab.yaml:2: workers.1: name 'a b' cannot be part of a key"),
+        (
+            "serves: {scriptd: [panda]}",
+            "lab.yaml:2: serves: 'scriptd' is not among workers; did you mean 'scripted'? Known: "
+            "scripted",
+        ),
+        (
+            "serves:\n  scripted: [left, right]",
+            "lab.yaml:3: serves.scripted: lacks panda, the robot of this profile: name all that",
+        ),
+        ("serves: {scripted: panda}", "lab.yaml:2: serves.scripted: wants a list (given: 'panda')"),
+        ("serves: {scripted: []}", "lab.yaml:2: serves.scripted: "),
+        ("serves: {scripted: [panda, b, b]}", "serves.scripted: b: given more than once"),
+        ("serves: {scripted: [panda, b/c]}", "serves.scripted.1: name 'b/c' cannot be part of a"),
+        ("serves: [panda]", "lab.yaml:2: serves: wants a map"),
         ("about: 5", "lab.yaml:2: about: wants text; put it in quotes (given: 5)"),
         ('about: "\\ud800"', "lab.yaml:2: about: holds half a character (a surrogate)"),
         (
@@ -432,6 +447,22 @@ def test_null_takes_an_inherited_camera_away(write: Write) -> None:
         "cameras.side: wants a map of: fit_for_workers, height"
         in told(write("cameras: {side: null}"))[0]
     )
+
+
+def test_null_ends_that_a_worker_serves_several_robots(write: Write) -> None:
+    several = load_profile(write("serves: {scripted: [panda, left]}", "several.yaml"))
+    assert several.serves == {"scripted": ("panda", "left")}
+    alone = write("serves: {scripted: null}", begin="extends: several\n")
+    assert load_profile(alone).serves == {}
+
+
+def test_a_robot_called_otherwise_is_served_by_those_who_name_it() -> None:
+    served = {"workers": ["scripted", "twin"], "serves": {"scripted": ["panda", "left"]}}
+    several = override(SIM, served | {"task": {"worker": "twin"}})
+    assert as_robot(several, "left").serves == several.serves
+    assert as_robot(several, "other").serves == {}
+    with pytest.raises(ProfileError, match="name 'a b' cannot"):
+        as_robot(several, "a b")
 
 
 def test_values_given_otherwise_are_checked_as_a_whole() -> None:

@@ -25,6 +25,7 @@ from vla_zenoh.errors import CodecError, WorkerError
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.nodes.bounded import bytes_of, header_of
 from vla_zenoh.nodes.client import Client
+from vla_zenoh.nodes.launch import Host
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.worker import WorkerNode
 from vla_zenoh.policy import (
@@ -35,7 +36,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
     Policy,
 )
-from vla_zenoh.profile import Profile, load_profile, override
+from vla_zenoh.profile import Profile, as_robot, load_profile, override
 from vla_zenoh.types import ActionChunk, GripperState, Header, PoseState, Task
 
 ROBOTS = ("a", "b", "c")
@@ -45,6 +46,8 @@ SLOW_S = 0.12
 """One inference of a slow model: longer than a request's period, so that requests meet."""
 LEAST_SHARE = 0.3
 """Of its rate that a robot must be given on a busy computer; a held-up one gets nothing."""
+START_S = 40.0
+"""From nothing to a worker that answers, on a busy computer."""
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -266,6 +269,38 @@ def test_a_model_that_cannot_batch_is_there_once_for_each_robot(
             name: int(np.abs(robot.chunks[0].steps[0]).argmax()) for name, robot in robots.items()
         }
         assert axes == {"a": 2, "b": 2, "c": 5}
+
+
+def test_up_starts_a_worker_for_all_robots_that_the_profile_names() -> None:
+    endpoint = free_endpoint()
+    changes = {
+        "robot": {"name": "b"},
+        "serves": {"scripted": ROBOTS},
+        "session": {"listen": [endpoint], "connect": [endpoint]},
+        "hosts": {"gpu": {"nodes": ["router", "worker"]}},
+    }
+    profile = override(load_profile("panda_sim"), changes)
+    lines: list[str] = []
+
+    def log(node: str, line: str) -> None:
+        lines.append(f"{node}: {line}")
+
+    host = Host(profile, None, log=log, tell=log, worker_options={"scripted": ["camera="]})
+    with host, open_session(host.profile.session) as session:
+        robots = [Robot(as_robot(profile, name), session, "scripted") for name in ROBOTS]
+        for number, robot in enumerate(robots, 2):
+            robot.asked(prompt=f"HARD: go up x{number}")
+
+        def told() -> bool:
+            for robot in robots:
+                robot.say()
+            time.sleep(1 / STATE_HZ)
+            return all(robot.chunks and robot.chunks[-1].done for robot in robots)
+
+        until(f"the counts of all are complete: {lines}", told, START_S)
+        assert host.supervisor.pids().keys() == {"router", "worker-scripted"}
+    moving = [sum(chunk.steps.any() for chunk in robot.chunks) for robot in robots]
+    assert moving == [2, 3, 4]
 
 
 def test_a_model_that_cannot_say_whose_episode_begins_is_refused(

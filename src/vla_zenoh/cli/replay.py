@@ -16,7 +16,7 @@ from vla_zenoh.cli.options import (
 )
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.nodes.process import run_node
-from vla_zenoh.profile import override
+from vla_zenoh.profile import as_robot
 
 
 def replay(
@@ -49,7 +49,7 @@ def replay(
     groups = chosen_groups(only or ())
     run_file = open_recording(file)
     loaded = effective_profile(profile, connect)
-    loaded = override(loaded, {"robot": {"name": robot or run_file.keys.robot}})
+    loaded = as_robot(loaded, robot or run_file.keys.robot)
     done: list[Replayed] = []
 
     def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them

@@ -45,7 +45,7 @@ def worker(
     ] = 0.0,
     robots: Annotated[
         str | None,
-        typer.Option(help="Serve these robots, names with commas; else the profile's alone."),
+        typer.Option(help="Serve these robots, names with commas; else those of the profile."),
     ] = None,
     host: HostOption = None,
     python: Annotated[
@@ -56,7 +56,7 @@ def worker(
     loaded = effective_profile(profile, connect, host=host)
     found = find_model(model)
     chosen = model_options(options or [])
-    served = robot_names(robots)
+    served = robot_names(robots) or loaded.serves.get(name or found.name, ())
     # Comes back only where this environment has what the model's header asks for.
     run_in_own_environment(found, python)
     policy = make_policy(found, chosen, profile=profile)

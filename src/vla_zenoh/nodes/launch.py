@@ -19,7 +19,7 @@ from vla_zenoh.nodes.hang import Said, hanging
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.supervisor import NodeCommand, Supervisor
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
-from vla_zenoh.profile.fit import node_name
+from vla_zenoh.profile.fit import node_name, workers_of
 from vla_zenoh.security.identity import Role, person
 
 START_ORDER = ("router", "sim", "ros2", "command", "camera", "worker")
@@ -62,7 +62,7 @@ def node_commands(
     for kind in sorted(part.nodes, key=START_ORDER.index):
         name = node_name(profile, host, kind)
         if kind == "worker":
-            for worker in part.workers or profile.workers:
+            for worker in workers_of(profile, part):
                 arguments = ["worker", worker, *common, "--host", host, *worker_arguments]
                 for option in (worker_options or {}).get(worker, ()):
                     arguments += ["--set", option]

@@ -20,7 +20,7 @@ import zenoh
 from vla_zenoh.errors import SpecError, WorkerError
 from vla_zenoh.nodes.seat import Seat
 from vla_zenoh.policy import ActionSteps, Observation, Policy, reset_of, takes_robot
-from vla_zenoh.profile import Profile, override
+from vla_zenoh.profile import Profile, as_robot
 from vla_zenoh.types import Event
 
 LOOK_PERIOD_S = 0.25
@@ -70,7 +70,7 @@ class WorkerNode:
         policies = [policy]
         if len(robots) > 1:
             policies = self._one_for_each(policy, len(robots), another)
-        profiles = [override(profile, {"robot": {"name": robot}}) for robot in robots] or [profile]
+        profiles = [as_robot(profile, robot) for robot in robots] or [profile]
         self.policy, self.name, self.spec = policy, name, policy.spec
         self._policies = policies
         self.seats: list[Seat] = []

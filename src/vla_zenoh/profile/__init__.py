@@ -4,6 +4,7 @@ from vla_zenoh.profile.advice import advice
 from vla_zenoh.profile.joint_limits import JointLimits
 from vla_zenoh.profile.limits import REACH_M, REFUSE_FACTOR, Limits, ReachLimits
 from vla_zenoh.profile.load import (
+    as_robot,
     load_profile,
     override,
     profile_file,
@@ -30,6 +31,7 @@ __all__ = [
     "SessionProfile",
     "Timing",
     "advice",
+    "as_robot",
     "load_profile",
     "override",
     "profile_file",

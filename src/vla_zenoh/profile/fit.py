@@ -30,6 +30,7 @@ def faults(profile: Profile) -> list[Fault]:
         *_cameras(profile),
         *_ros2(profile),
         *_task(profile),
+        *_serves(profile),
         *_hosts(profile),
     ]
 
@@ -117,6 +118,17 @@ def _task(profile: Profile) -> Iterator[Fault]:
             f"{nearest(profile.task.worker, profile.workers)} "
             f"Known: {', '.join(profile.workers) or 'none'}",
         )
+
+
+def _serves(profile: Profile) -> Iterator[Fault]:
+    yield from _unknown(("serves",), profile.serves, "workers", profile.workers)
+    for worker, robots in profile.serves.items():
+        if profile.robot.name not in robots:
+            yield (
+                ("serves", worker),
+                f"lacks {profile.robot.name}, the robot of this profile: name all that the worker "
+                "serves, or leave it out",
+            )
 
 
 def _hosts(profile: Profile) -> Iterator[Fault]:

@@ -19,7 +19,7 @@ from vla_zenoh.profile.yaml_text import Lines
 MAX_EXTENDS = 8
 SUFFIXES = (".yaml", ".yml")
 REPLACED_WHOLE = {("hosts",)}
-WITH_REMOVABLE = {("cameras",), ("ros2", "cameras")}
+WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("serves",)}
 
 
 def profile_names() -> list[str]:
@@ -79,6 +79,18 @@ def override(profile: Profile, changes: Mapping[str, Any]) -> Profile:
     """
     data, _ = _merge(profile.model_dump(), {}, changes, {}, ())
     return _checked(data, {})
+
+
+def as_robot(profile: Profile, name: str) -> Profile:
+    """The profile of a robot that is like this one and called otherwise.
+
+    A worker that serves several robots serves that one only where its list names it.
+
+    Raises:
+        ProfileError: the name cannot be one.
+    """
+    others = [worker for worker, robots in profile.serves.items() if name not in robots]
+    return override(profile, {"robot": {"name": name}, "serves": dict.fromkeys(others)})
 
 
 def to_yaml(profile: Profile) -> str:
@@ -158,7 +170,7 @@ def _next(path: Path, name: str) -> Path:
 def _merge(
     base: Mapping[str, Any], base_lines: Lines, over: Mapping[str, Any], lines: Lines, at: Place
 ) -> tuple[dict[str, Any], Lines]:
-    """`over` wins. Sections are merged, lists and hosts replaced whole; null removes a camera."""
+    """`over` wins. Sections are merged, lists and hosts replaced whole; null takes away."""
     out, out_lines = dict(base), {**base_lines}
     if at in lines:
         out_lines[at] = lines[at]

@@ -212,7 +212,13 @@ class HostProfile(Section):
 
 
 class Profile(Section):
-    """Everything about one robot and its lab."""
+    """Everything about one robot and its lab.
+
+    Args:
+        workers: models by their names.
+        serves: worker -> the robots it serves, this one among them, all like this one; a worker
+            that is not named here serves this one alone.
+    """
 
     name: Name
     about: Text = ""
@@ -224,6 +230,7 @@ class Profile(Section):
     cameras: dict[Name, CameraProfile] = Field(default_factory=dict)
     sim: SimProfile = SimProfile()
     workers: Names = ("scripted",)
+    serves: dict[Name, Annotated[Names, Field(min_length=1)]] = Field(default_factory=dict)
     task: TaskProfile = TaskProfile()
     session: SessionProfile = SessionProfile()
     hosts: dict[Name, HostProfile] = Field(

@@ -30,7 +30,7 @@ from vla_zenoh.nodes.meter import Percentiles
 from vla_zenoh.nodes.process import ROUTER_PATIENCE_S
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.supervisor import NodeCommand, Supervisor
-from vla_zenoh.profile import Profile, override, to_yaml
+from vla_zenoh.profile import Profile, as_robot, override, to_yaml
 
 WORKER, RATE_HZ, CAMERA_HZ = "scripted", 10.0, 30.0
 PROMPT = "HARD: go up within 0.1"
@@ -94,7 +94,7 @@ class Load:
             yield {"robots": count, "cameras": 0, "not_activated": refused, **row}
 
     def _add(self, name: str) -> None:
-        profile = override(self._profile, {"robot": {"name": name}})
+        profile = as_robot(self._profile, name)
         file = self._file(profile)
         self._servers[name] = self._stack.enter_context(Server("follower", str(file)))
         self._start(f"command {name}", ("command", "--profile", str(file)))
@@ -179,11 +179,10 @@ class Load:
             names = [f"c{number}" for number in range(1, count + 1)]
             more = {name: {**camera, "rate_hz": CAMERA_HZ} for name in names}
             changes = {
-                "robot": {"name": f"cameras{count}"},
                 "cameras": {**removed, **more},
                 "hosts": {"here": {"nodes": ["camera"]}},
             }
-            profile = override(self._profile, changes)
+            profile = override(as_robot(self._profile, f"cameras{count}"), changes)
             self._start("camera", ("camera", "--profile", str(self._file(profile))))
             row = self._measure_cameras(profile, names, seconds)
             self._supervisors.pop("camera").kill()
