@@ -9,7 +9,7 @@ from typing import Any
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes.bench.process import cpu_s
-from vla_zenoh.nodes.command import SPREAD_S
+from vla_zenoh.nodes.command_status import SPREAD_S
 from vla_zenoh.nodes.demo import DemoRun, Interrupted
 from vla_zenoh.nodes.launch import Host
 from vla_zenoh.nodes.listener import Listener
