@@ -11,6 +11,8 @@ SUITE := not slow and not models and not ros2
 # Real arms brake when their computer stands still for a tenth of a second, and so do those of the tests: one that
 # fails in real time is tried once more, and told in the summary.
 AGAIN := --reruns 1 -r fEsR
+# Where a container forbids Python to keep what it has compiled, every process of every test would compile it anew.
+export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test slow fuzz soak test-ros2 test-models check format bench bench-faults bench-ros2 build ros2-bridge clean
