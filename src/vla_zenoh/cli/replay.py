@@ -16,7 +16,9 @@ from vla_zenoh.cli.options import (
 )
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.nodes.process import run_node
-from vla_zenoh.profile import as_robot
+from vla_zenoh.profile import Profile, as_robot
+from vla_zenoh.security.identity import Role
+from vla_zenoh.security.store import Store
 
 
 def replay(
@@ -50,6 +52,7 @@ def replay(
     run_file = open_recording(file)
     loaded = effective_profile(profile, connect)
     loaded = as_robot(loaded, robot or run_file.keys.robot)
+    _refuse_without_the_right(loaded)
     done: list[Replayed] = []
 
     def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
@@ -76,3 +79,17 @@ def replay(
         errors().print(f"[yellow]{file} is {replayed.damage}[/]")
     if replayed.failure:
         fail(replayed.failure)
+
+
+def _refuse_without_the_right(profile: Profile) -> None:
+    """The router would drop what this computer's people may not say, and tell nobody."""
+    security = profile.session.security
+    if security is None:
+        return
+    who = Store(security.folder).identity_files(security.host, None).certificate.stem
+    if who != Role.REPLAY.value:
+        fail(
+            f"this computer has the certificate of the role {who}, which may not play the part of "
+            f"others: `vla-zenoh secure add HOST --role {Role.REPLAY.value}` makes one that may, "
+            "for a computer of its own"
+        )
