@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -15,7 +14,7 @@ import zenoh
 from camera_rig import await_match, free_endpoint, until
 
 from vla_zenoh.errors import CodecError
-from vla_zenoh.nodes.clock import ADOPT_S, Clock, realtime_thread
+from vla_zenoh.nodes.clock import ADOPT_S, Clock
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.orphan import is_running
 from vla_zenoh.nodes.session import MAX_MESSAGE_BYTES, open_session
@@ -189,20 +188,3 @@ def test_a_dead_process_is_not_running_even_before_it_is_buried() -> None:
         process.wait()
     assert not is_running(pid)
     assert is_running(os.getpid())
-
-
-def test_what_a_control_loop_starts_does_not_run_at_its_priority() -> None:
-    before = os.sched_getscheduler(0)
-    inside: list[int] = []
-    with realtime_thread() as granted:
-        if not granted:
-            pytest.skip("no real-time priority for this user: `vla-zenoh doctor`")
-        assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
-        thread = threading.Thread(target=lambda: inside.append(os.sched_getscheduler(0)))
-        thread.start()
-        thread.join()
-        tell = "import os; print(os.sched_getscheduler(0))"
-        told = subprocess.run([sys.executable, "-c", tell], capture_output=True, check=True)
-    assert inside == [os.SCHED_OTHER]
-    assert int(told.stdout) == os.SCHED_OTHER
-    assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == before

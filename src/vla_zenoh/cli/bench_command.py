@@ -14,7 +14,7 @@ from rich.table import Table
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
 from vla_zenoh.cli.output import console, errors
 
-WIDTH = 132
+WIDTH = 160
 SHARES = ("p50", "p95", "p99", "max")
 
 
@@ -25,6 +25,10 @@ def command(
     seconds: Annotated[
         float, typer.Option("--seconds", min=8, max=600, help="How long at each rate.")
     ] = 10.0,
+    busy: Annotated[
+        int,
+        typer.Option("--busy", min=0, max=64, help="Programs that only compute, beside it."),
+    ] = 0,
     profile: Annotated[
         str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
     ] = DEFAULT_PROFILE,
@@ -56,6 +60,7 @@ def command(
                     seconds,
                     stop,
                     lambda node, line: lines.append(f"{node:>16} | {line}"),
+                    busy,
                 )
             )
     except Interrupted:
@@ -70,9 +75,9 @@ def command(
     table = Table(box=SIMPLE, pad_edge=False)
     for column in ("asked Hz", "held Hz", "missed", "core share"):
         table.add_column(column, justify="right", no_wrap=True)
-    for name in ("tick", "late"):
+    for name in ("tick us", "late us", "pose ms"):
         for share in SHARES:
-            table.add_column(f"{name} us {share}", justify="right", no_wrap=True)
+            table.add_column(f"{name}\n{share}", justify="right", no_wrap=True)
     for row in rows:
         table.add_row(
             f"{row['command_hz']:g}",
@@ -81,8 +86,9 @@ def command(
             f"{row['core_share']:.2f}",
             *(f"{row['tick_us'][share]:.0f}" for share in SHARES),
             *(f"{row['late_us'][share]:.0f}" for share in SHARES),
+            *(f"{row['pose_age_ms'][share]:.0f}" for share in SHARES),
         )
-    table.caption = "tick: from waking until the command is out. late: waking behind its time" + (
-        "" if all(row["realtime"] for row in rows) else " (no real-time priority here)"
-    )
+    told = "tick: from waking until the command is out. late: waking behind its time. pose: its age"
+    realtime = all(row["realtime"] for row in rows)
+    table.caption = told if realtime else f"{told} (no real-time priority here)"
     console(WIDTH).print(table)

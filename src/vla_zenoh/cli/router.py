@@ -17,8 +17,8 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
-from vla_zenoh.nodes.clock import prefer_this_process
 from vla_zenoh.nodes.orphan import RUN_FOLDER_VARIABLE
+from vla_zenoh.nodes.priority import prefer_this_process, realtime_links
 from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
 from vla_zenoh.nodes.router import router_config, run_router, run_zenohd
 
@@ -43,10 +43,11 @@ def router(
         return
     die_with_parent()
     prefer_this_process()
-    if loaded.session.router == "zenohd":
-        given = os.environ.get(RUN_FOLDER_VARIABLE)
-        folder = Path(given) if given else Path(tempfile.mkdtemp(prefix="vla-zenoh-"))
-        run_zenohd(loaded, folder, host=host, also=others)
-    stop = stop_on_signals()
-    print(f"routing, {loaded.name}", flush=True)
-    run_router(loaded, stop, host=host, also=others)
+    with realtime_links():
+        if loaded.session.router == "zenohd":
+            given = os.environ.get(RUN_FOLDER_VARIABLE)
+            folder = Path(given) if given else Path(tempfile.mkdtemp(prefix="vla-zenoh-"))
+            run_zenohd(loaded, folder, host=host, also=others)
+        stop = stop_on_signals()
+        print(f"routing, {loaded.name}", flush=True)
+        run_router(loaded, stop, host=host, also=others)

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
-import ctypes.util
-import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import NamedTuple
 
 ADOPT_S = 0.005
 """A smaller difference to the system's wall clock is slewing, and is followed silently."""
 NOISE_S = 0.001
 """A still smaller one is mostly the time between reading two clocks: following it is jitter."""
-REALTIME_PRIORITY = 40
-NICENESS = -10
-SET_TIMER_SLACK, GET_TIMER_SLACK = 29, 30  # PR_SET_TIMERSLACK and PR_GET_TIMERSLACK of prctl(2)
 
 
 class Clock:
@@ -86,68 +78,3 @@ class FixedRate:
         periods = 1 + late_ns // self._period_ns
         self._next_ns += periods * self._period_ns
         return Tick(int(periods), self._next_ns - self._period_ns, late_ns / 1e9, computed_s)
-
-
-def prefer_this_process() -> bool:
-    """Ask that the threads started from now on go before those of other programs; False: refused.
-
-    The loop itself asks for more (`realtime_thread`), but it shares an interpreter with
-    the threads Zenoh calls back on: one of them that is put aside while it holds the interpreter
-    holds up the loop as well.
-    """
-    try:
-        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
-    except (OSError, AttributeError):
-        return False
-    return True
-
-
-@contextmanager
-def realtime_thread() -> Iterator[bool]:
-    """Ask for SCHED_FIFO for the calling thread while it is in here; False where not allowed.
-
-    What it starts meanwhile, threads and programs alike, does not inherit that: a tool that starts
-    up with the priority of a control loop would hold every loop of the computer up.
-    """
-    slack_ns = _timer_slack(1)
-    policy, priority = _scheduling()
-    try:
-        os.sched_setscheduler(
-            0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(REALTIME_PRIORITY)
-        )
-        granted = True
-    except (OSError, AttributeError):
-        granted = False
-    try:
-        yield granted
-    finally:
-        if granted:
-            _schedule(policy, priority)
-        _timer_slack(slack_ns)
-
-
-def _schedule(policy: int, priority: int) -> None:
-    """As it was before; whoever is not privileged cannot take back what is not inherited."""
-    try:
-        os.sched_setscheduler(0, policy, os.sched_param(priority))
-    except PermissionError:
-        os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
-
-
-def _scheduling() -> tuple[int, int]:
-    """Policy and priority of the calling thread; zeros where a system has no such thing."""
-    try:
-        return os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
-    except (OSError, AttributeError):
-        return 0, 0
-
-
-def _timer_slack(slack_ns: int) -> int:
-    """Set by how much the calling thread may be woken late; returns what was set before."""
-    library = ctypes.util.find_library("c")
-    if library is None:
-        return 0
-    control = ctypes.CDLL(library, use_errno=True).prctl
-    before_ns = int(control(GET_TIMER_SLACK, 0, 0, 0, 0))
-    control(SET_TIMER_SLACK, max(slack_ns, 0), 0, 0, 0)
-    return before_ns

@@ -16,10 +16,11 @@ from vla_zenoh.control.arm import make_shadow
 from vla_zenoh.control.commander import Commander, Outputs, Setting
 from vla_zenoh.control.states import State
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.clock import FixedRate, Tick, realtime_thread
+from vla_zenoh.nodes.clock import FixedRate, Tick
 from vla_zenoh.nodes.command_inputs import CommandInputs
 from vla_zenoh.nodes.command_status import CommandStatus
 from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.priority import realtime_thread
 from vla_zenoh.profile import Profile
 
 TASK_PERIOD_S = 0.2
@@ -120,7 +121,7 @@ class CommandNode:
         self._publish(out, now_ns)
         if any(event.kind == "transition" for event in out.events):
             self._keep_latch()
-        self._status.ticked(tick.stall_s, time.perf_counter() - began)
+        self._status.ticked(now_ns, tick.stall_s, time.perf_counter() - began)
         self._status.report(out, self._inputs.chunks_dropped)
 
     def _keep_latch(self) -> None:

@@ -30,12 +30,16 @@ class CommandStatus:
         ticks = round(SPREAD_S * node.profile.timing.command_hz)
         self._latency = {stage: Percentiles() for stage in STAGES}
         self._cost_us, self._late_us = Percentiles(ticks), Percentiles(ticks)
+        self._pose_age_ms = Percentiles(ticks)
         self._rate = RateMeter()
         self._was_at_rest = True
         self.realtime = False
 
-    def ticked(self, late_s: float, cost_s: float) -> None:
-        """A turn was made: so late it was woken, so long it took."""
+    def ticked(self, now_ns: int, late_s: float, cost_s: float) -> None:
+        """A turn was made for this time: so late it was woken, so long it took."""
+        pose = self._mind.pose
+        if pose is not None:
+            self._pose_age_ms.add((now_ns - pose.header.stamp_wall_ns) / 1e6)
         self._late_us.add(late_s * 1e6)
         self._rate.tick()
         self._cost_us.add(cost_s * 1e6)
@@ -91,6 +95,7 @@ class CommandStatus:
                 "tracking_mrad": round(mind.tracking_rad * 1e3, 3),
                 "tick_us": self._cost_us.spread(),
                 "late_us": self._late_us.spread(),
+                "pose_age_ms": self._pose_age_ms.spread(),
                 "realtime": self.realtime,
                 "dry_run": mind.dry_run,
                 **self._goal(),

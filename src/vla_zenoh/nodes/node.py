@@ -102,6 +102,7 @@ class Node:
         self.traffic = Traffic(session)
         self._last_event: dict[tuple[str, str, str], float] = {}
         self._held_events: Counter[tuple[str, str, str]] = Counter()
+        self._answers: dict[tuple[str, str, str], Event] = {}
         self._last_status = 0.0
         self._last_state = ""
         self._refuse_a_second_one()
@@ -145,11 +146,16 @@ class Node:
         return self._pictures
 
     def tell(self, event: Event) -> None:
-        """Write an event; a flood of the same is thinned out and counted."""
+        """Write an event; a flood of the same is thinned out and counted.
+
+        The refusal of a setting is thinned out too, but the last one is told in the end.
+        """
         # A person is told every reason of a refused setting, not only the first.
         about = event.why if event.what.endswith("_refused") else ""
         if event.kind == "transition" or self._due(event.kind, event.what, about):
             self._write(event, about)
+        elif about:  # who asks again at once waits for an answer, too
+            self._answers[event.kind, event.what, about] = event
 
     def refuse(self, reason: str, why: str, about: str = "") -> None:
         """Count a refusal by reason, and say why.
@@ -168,6 +174,7 @@ class Node:
         if len(self._last_event) > 512:
             self._last_event.clear()
             self._held_events.clear()
+            self._answers.clear()
         if time.monotonic() - self._last_event.get((kind, what, about), -1e9) >= EVENT_PERIOD_S:
             return True
         self._held_events[kind, what, about] += 1
@@ -176,8 +183,16 @@ class Node:
     def _write(self, event: Event, about: str = "") -> None:
         kind = (event.kind, event.what, about)
         self._last_event[kind] = time.monotonic()
+        self._answers.pop(kind, None)
         held = self._held_events.pop(kind, 0)
         self._events.put(replace(event, count=event.count + held) if held else event)
+
+    def _answer_late(self) -> None:
+        """What was asked again too soon to be answered then."""
+        for kind, event in list(self._answers.items()):
+            if time.monotonic() - self._last_event.get(kind, -1e9) >= EVENT_PERIOD_S:
+                self._held_events[kind] -= 1  # itself
+                self._write(event, kind[2])
 
     def report(
         self,
@@ -190,8 +205,7 @@ class Node:
         now: bool = False,
     ) -> None:
         """Write status when it is time, when `state` changed, or `now`."""
-        self.clocks.tick()
-        self._tell_of_oversize()
+        self._tick()
         clock = time.monotonic()
         if not now and state == self._last_state and clock - self._last_status < STATUS_PERIOD_S:
             return
@@ -210,6 +224,11 @@ class Node:
                 {**(detail or {}), "clocks": self._clocks_in_words(), "net": self._net()},
             )
         )
+
+    def _tick(self) -> None:
+        self.clocks.tick()
+        self._tell_of_oversize()
+        self._answer_late()
 
     def _net(self) -> dict[str, Any]:
         found = self.traffic.detail(self._streams)
@@ -233,8 +252,7 @@ class Node:
 
     def report_due(self, state: str) -> bool:
         """Whether `report` would write now: lets a fast loop skip collecting what to report."""
-        self.clocks.tick()
-        self._tell_of_oversize()
+        self._tick()
         due = time.monotonic() - self._last_status >= STATUS_PERIOD_S
         return due or state != self._last_state
 

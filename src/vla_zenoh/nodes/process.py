@@ -6,12 +6,13 @@ import os
 import signal
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 
 import zenoh
 
 from vla_zenoh.errors import SessionError
-from vla_zenoh.nodes.clock import prefer_this_process
 from vla_zenoh.nodes.orphan import PARENT_VARIABLE, die_with_parent
+from vla_zenoh.nodes.priority import prefer_this_process, realtime_links
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile
 
@@ -55,7 +56,8 @@ def run_node(
     if wait_s is None:
         wait_s = ROUTER_PATIENCE_S if PARENT_VARIABLE in os.environ else 0.0
     try:
-        session = open_session(profile.session, identity=identity, wait_s=wait_s, stop=stop)
+        with realtime_links() if preferred else nullcontext():
+            session = open_session(profile.session, identity=identity, wait_s=wait_s, stop=stop)
     except SessionError:
         if stop.is_set():
             return

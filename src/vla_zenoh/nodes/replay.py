@@ -19,8 +19,8 @@ import zenoh
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import CodecError, NodeError, RecordingError
 from vla_zenoh.keys import Keys
-from vla_zenoh.nodes.clock import realtime_thread
 from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.priority import realtime_thread
 from vla_zenoh.profile import Profile
 from vla_zenoh.recording.reader import Entry, RunFile
 from vla_zenoh.recording.restamp import Restamper

@@ -30,9 +30,9 @@ from vla_zenoh.control.so3 import Pose
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.bounded import bytes_of
-from vla_zenoh.nodes.clock import realtime_thread
 from vla_zenoh.nodes.meter import RateMeter
 from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.priority import realtime_thread
 from vla_zenoh.nodes.slots import Inbox
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.robot_model import RobotModel

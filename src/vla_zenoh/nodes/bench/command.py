@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from vla_zenoh.errors import NodeError
@@ -18,6 +21,7 @@ from vla_zenoh.profile import Profile, override
 PROMPT = "HARD: go up within 0.2"
 RATE_HZ = 10.0
 STATUS_S = 1.0
+COMPUTES = "while True: sum(range(100_000))"
 
 
 def measure_command(
@@ -26,6 +30,7 @@ def measure_command(
     seconds: float,
     stop: threading.Event,
     log: Callable[[str, str], None],
+    busy: int = 0,
 ) -> dict[str, Any]:
     """Cost and lateness of ticks while the arm goes up and down, at one rate.
 
@@ -35,6 +40,7 @@ def measure_command(
         seconds: how long to measure.
         stop: set by Ctrl-C.
         log: (node, line) for what nodes write.
+        busy: programs that do nothing but compute meanwhile.
 
     Raises:
         NodeError: the chain does not come up, or the arm is not obeyed to the end.
@@ -59,10 +65,11 @@ def measure_command(
             raise Interrupted
         pid = host.supervisor.pids()["command"]
         missed, spent_s, began_s = _missed(host), cpu_s(pid), time.monotonic()
-        if stop.wait(max(seconds, SPREAD_S)):
-            raise Interrupted
+        with others_compute(busy):
+            if stop.wait(max(seconds, SPREAD_S)):
+                raise Interrupted
+            status = client.status("command")
         spent_s, took_s = cpu_s(pid) - spent_s, time.monotonic() - began_s
-        status = client.status("command")
         if status is None or status.state != "active":
             found = f"{status.state} ({status.detail.get('why')})" if status else "silent"
             raise NodeError(f"the command node at {command_hz:g} Hz is {found}")
@@ -71,11 +78,25 @@ def measure_command(
             "held_hz": round(status.rates_hz.get("loop", 0.0), 1),
             "tick_us": status.detail["tick_us"],
             "late_us": status.detail["late_us"],
+            "pose_age_ms": status.detail["pose_age_ms"],
+            "busy": busy,
             "missed_ticks": _missed(host) - missed,
             "core_share": round(spent_s / took_s, 3),
             "realtime": status.detail["realtime"],
             "seconds": round(took_s, 1),
         }
+
+
+@contextmanager
+def others_compute(count: int) -> Iterator[None]:
+    """So many programs that do nothing but compute, at this one's own niceness."""
+    programs = [subprocess.Popen([sys.executable, "-c", COMPUTES]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
 
 
 def _missed(host: Host) -> int:

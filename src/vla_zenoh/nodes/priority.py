@@ -1,0 +1,87 @@
+"""Who goes first on a busy computer: the loops that keep an arm in motion, then their links."""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+LOOP_PRIORITY, LINK_PRIORITY = 40, 30
+"""Of SCHED_FIFO: a loop is never put aside for what arrives."""
+NICENESS = -10
+SET_TIMER_SLACK, GET_TIMER_SLACK = 29, 30  # PR_SET_TIMERSLACK and PR_GET_TIMERSLACK of prctl(2)
+
+
+def prefer_this_process() -> bool:
+    """Ask that the threads started from now on go before those of other programs; False: refused.
+
+    For those that get nothing better, and where there is nothing better to be had.
+    """
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+    except (OSError, AttributeError):
+        return False
+    return True
+
+
+@contextmanager
+def realtime_links() -> Iterator[bool]:
+    """What is started in here gets SCHED_FIFO: the threads of a Zenoh session opened here.
+
+    A state or a command that waits in one of them is as late as if the loop had waited, and one
+    that is put aside while it holds the interpreter holds the loop up as well. False where not
+    allowed.
+    """
+    with _scheduled(LINK_PRIORITY, inherited=True) as granted:
+        yield granted
+
+
+@contextmanager
+def realtime_thread() -> Iterator[bool]:
+    """Ask for SCHED_FIFO for the calling thread while it is in here; False where not allowed.
+
+    What it starts meanwhile, threads and programs alike, does not inherit that: a tool that starts
+    up with the priority of a control loop would hold every loop of the computer up.
+    """
+    slack_ns = _timer_slack(1)
+    try:
+        with _scheduled(LOOP_PRIORITY, inherited=False) as granted:
+            yield granted
+    finally:
+        _timer_slack(slack_ns)
+
+
+@contextmanager
+def _scheduled(priority: int, *, inherited: bool) -> Iterator[bool]:
+    try:
+        before = os.sched_getscheduler(0), os.sched_getparam(0)
+        flag = 0 if inherited else os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, os.SCHED_FIFO | flag, os.sched_param(priority))
+    except (OSError, AttributeError):  # not allowed, or not Linux
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        _give_back(*before)
+
+
+def _give_back(policy: int, parameter: os.sched_param) -> None:
+    """As it was before; whoever is not privileged cannot take back what is not inherited."""
+    try:
+        os.sched_setscheduler(0, policy, parameter)
+    except PermissionError:
+        os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameter)
+
+
+def _timer_slack(slack_ns: int) -> int:
+    """Set by how much the calling thread may be woken late; returns what was set before."""
+    library = ctypes.util.find_library("c")
+    if library is None:
+        return 0
+    control = ctypes.CDLL(library, use_errno=True).prctl
+    before_ns = int(control(GET_TIMER_SLACK, 0, 0, 0, 0))
+    control(SET_TIMER_SLACK, max(slack_ns, 0), 0, 0, 0)
+    return before_ns
