@@ -128,7 +128,8 @@ def test_a_killed_node_brakes_the_arm_and_needs_a_new_activation(
     if death.own_brake:
         assert chain.events("following->braking")
     else:
-        (event,) = chain.events("active->inactive")
+        # A computer that is busy may take longer to bury it than the watchdog waits.
+        (event,) = chain.events("active->inactive") or chain.events("holding->inactive")
         assert event.why == death.why
     assert_waits_and_works_again(chain)
 
