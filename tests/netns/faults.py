@@ -23,8 +23,8 @@ def _nothing(_: Stage) -> None:
     """It ends by itself."""
 
 
-def _shape(shape: Shape, stage: Stage) -> None:
-    stage.site.hosts.shape("gpu", shape)
+def _shape(shape: Shape, stage: Stage, host: str = "gpu") -> None:
+    stage.site.hosts.shape(host, shape)
 
 
 _good = partial(_shape, GOOD)
@@ -34,8 +34,8 @@ def _bad_link(name: str, about: str, shape: Shape, *, goes_on: bool = True) -> F
     return Fault(name, about, partial(_shape, shape), _good, goes_on=goes_on)
 
 
-def _kill_router(stage: Stage) -> float:
-    return stage.site.hosts["robot"].kill("router")
+def _kill_router(stage: Stage, host: str = "robot") -> float:
+    return stage.site.hosts[host].kill("router")
 
 
 def _crash_hub(stage: Stage) -> float:
@@ -139,6 +139,100 @@ def catalogue() -> Iterator[Fault]:
         _plug_eyes,
         layout="eyes",
         seconds=5.0,
+    )
+
+    yield from _other_links()
+    yield from _sites()
+
+
+def _other_links() -> Iterator[Fault]:
+    """Of the robot's and the camera's computer, where the router is on neither."""
+    for host, whose, shapes in (
+        (
+            "eyes",
+            "the camera's link",
+            {
+                "loss-5": ("loses 5% of all frames", Shape(loss=0.05)),
+                "delay-100": (
+                    "takes 100 ms more each way, +-20 ms",
+                    Shape(delay_s=0.1, jitter_s=0.02),
+                ),
+                "slow": ("carries 1 Mbit/s", Shape(rate_bit_s=1e6)),
+            },
+        ),
+        (
+            "robot",
+            "the robot's link",
+            {
+                "loss-1": ("loses 1% of all frames", Shape(loss=0.01)),
+                "loss-1-ever": ("loses 1% of all frames, always", Shape(loss=0.01)),
+                "delay-20-ever": (
+                    "takes 20 ms more each way, +-5 ms, always",
+                    Shape(delay_s=0.02, jitter_s=0.005),
+                ),
+                "loss-5": ("loses 5% of all frames", Shape(loss=0.05)),
+                "delay-20": (
+                    "takes 20 ms more each way, +-5 ms",
+                    Shape(delay_s=0.02, jitter_s=0.005),
+                ),
+                "delay-100": (
+                    "takes 100 ms more each way, +-20 ms",
+                    Shape(delay_s=0.1, jitter_s=0.02),
+                ),
+                "slow": ("carries 1 Mbit/s", Shape(rate_bit_s=1e6)),
+            },
+        ),
+    ):
+        good = partial(_shape, GOOD, host=host)
+        for name, (does, shape) in shapes.items():
+            yield Fault(
+                f"{host}-{name}",
+                f"{whose} {does}",
+                partial(_shape, shape, host=host),
+                good,
+                layout="apart",
+                ever=name.endswith("-ever"),
+            )
+        for seconds in (0.5, 5.0):
+            yield Fault(
+                f"{host}-cut-{seconds:g}",
+                f"{whose} is dead for {seconds:g} s",
+                partial(_shape, CUT, host=host),
+                good,
+                layout="apart",
+                seconds=seconds,
+                alone=host == "robot",
+            )
+
+
+def _sites() -> Iterator[Fault]:
+    """Two sites with a router each, and a second one at the robot's."""
+    yield Fault(
+        "site-spare",
+        "two sites: the second router beside the robot is killed, started again",
+        partial(_kill_router, host="spare"),
+        _nothing,
+        layout="sites",
+        goes_on=True,
+    )
+    yield Fault(
+        "site-model",
+        "two sites: the router of the model's site is killed, started again",
+        partial(_kill_router, host="gpu"),
+        _nothing,
+        layout="sites",
+        seconds=1.0,
+        from_fault=True,
+    )
+    yield Fault(
+        "site-robot",
+        "two sites: the router of the robot's site is killed, started again; another stands by",
+        _kill_router,
+        _nothing,
+        layout="sites",
+        seconds=1.0,
+        from_fault=True,
+        alone=True,
     )
 
 

@@ -45,7 +45,27 @@ LAYOUTS = {
         ("robot", "eyes", "gpu"),
         ("robot",),
     ),
-    # The same with wall clocks of their own.
+    # Robot and cameras each on the network, the router on neither.
+    "apart": Layout(
+        _profile(
+            "panda_sim_lab",
+            "hosts:\n"
+            "  hub: {nodes: [router]}\n"
+            "  robot: {nodes: [sim, command]}\n"
+            "  eyes: {nodes: [camera]}\n"
+            "  gpu: {nodes: [worker]}\n",
+        ),
+        ("hub", "robot", "eyes", "gpu"),
+        ("hub",),
+        ("robot", "eyes"),
+    ),
+    # The robot with a router and one in reserve, the model at another site with its own.
+    "sites": Layout(
+        _profile("panda_sim_two_sites"),
+        ("robot", "spare", "gpu"),
+        ("robot", "spare", "gpu"),
+    ),
+    # The first one with wall clocks of their own.
     "clocks": Layout(
         _profile("panda_sim_lab"), ("robot", "gpu"), ("robot",), clocks=("robot", "gpu")
     ),

@@ -14,6 +14,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from chain import READY_PATIENCE_S
 
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, SessionError
+from vla_zenoh.nodes.bounded import header_of
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import load_profile
@@ -30,7 +32,9 @@ from vla_zenoh.types import PoseState
 MOVING_M_S, STILL_M_S = 0.05, 0.005
 POLL_S = 0.005
 TRY_S, SETTLE_S = 0.1, 0.6
-FRESH_S = 0.2
+FRESH_S, LATE_S = 0.2, 0.4
+CATCH_UP_S = 2.0
+"""A link that is slow for good never does."""
 LOW_M, HIGH_M = 0.25, 0.62
 AND_BACK = " within 0.25"
 """Without an end, and without reaching one of the arm's."""
@@ -45,12 +49,15 @@ class Probe:
         self._client = client
         self._payload = b""
         self._heard_s = -1e9
+        self._stamp_ns = 0
         self._why = ""
         handler = zenoh.handlers.Callback(self._hear, indirect=False)
         self._subscriber = client.session.declare_subscriber(client.keys.state_pose, handler)
 
     def _hear(self, sample: zenoh.Sample) -> None:
-        self._payload, self._heard_s = sample.payload.to_bytes(), time.monotonic()
+        with suppress(CodecError):
+            self._stamp_ns = header_of(sample).stamp_wall_ns
+            self._payload, self._heard_s = sample.payload.to_bytes(), time.monotonic()
 
     # -- orders -------------------------------------------------------------------------------
     def ready(self, rate_hz: float, patience_s: float = READY_PATIENCE_S) -> dict[str, Any]:
@@ -156,9 +163,16 @@ class Probe:
         return task.prompt if task is not None else ""
 
     def newest(self) -> PoseState:
-        """The newest state, waited for while the robot is silent."""
-        give_up = time.monotonic() + READY_PATIENCE_S
-        while time.monotonic() - self._heard_s > FRESH_S and time.monotonic() < give_up:
+        """The newest state, waited for while the robot is silent.
+
+        What a link held up arrives in a heap, and tells of a motion that may be over long since.
+        """
+        began_s = time.monotonic()
+        while time.monotonic() - began_s < READY_PATIENCE_S:
+            heard = time.monotonic() - self._heard_s < FRESH_S
+            late = time.time_ns() - self._stamp_ns > LATE_S * 1e9
+            if heard and (not late or time.monotonic() - began_s > CATCH_UP_S):
+                break
             time.sleep(POLL_S)
         try:
             return records.decode(PoseState, self._payload)

@@ -21,6 +21,7 @@ class Fault:
         clear: ends it.
         layout: of `LAYOUTS`.
         needs: why it cannot be done here; empty: it can.
+        ever: it is so before the motion begins, and does not come as a surprise.
         seconds: how long it lasts; None: until the motion has come to its end.
         goes_on: the arm is to reach its goal all the same.
         from_fault: recovery counts from the fault itself, which ends without us.
@@ -33,6 +34,7 @@ class Fault:
     clear: Callable[[Stage], None]
     layout: str = "lab"
     needs: str = ""
+    ever: bool = False
     seconds: float | None = None
     goes_on: bool = False
     from_fault: bool = False
