@@ -29,9 +29,10 @@ $(READY): pyproject.toml constraints.txt scripts/bootstrap.py
 demo: $(READY) ## Simulator, model and command node at work, no GPU needed
 	$(BIN)/vla-zenoh demo $(ARGS)
 
-# What depends on time runs alone, the rest on every core; 5 is pytest's word for "none of these".
+# What depends on time runs alone, the rest on every core, in order of the folders: the long files of tests/sim are not
+# the last ones. 5 is pytest's word for "none of these".
 test: $(READY) ## Run the tests
-	$(BIN)/python -m pytest -n auto --dist loadfile -m "$(SUITE) and not realtime" $(ARGS) || [ $$? = 5 ]
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "$(SUITE) and not realtime" $(ARGS) || [ $$? = 5 ]
 	$(BIN)/python -m pytest $(AGAIN) -m "$(SUITE) and realtime" $(ARGS) || [ $$? = 5 ]
 
 slow: $(READY) ## Run the tests that take long, too, and search for new examples
