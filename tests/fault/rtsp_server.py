@@ -14,11 +14,13 @@ from types import TracebackType
 PACKET_SIZE = 188  # of an MPEG transport stream
 PACKETS_AT_ONCE = 7
 MPEG_TS = 33  # RTP's payload type
-RTP_CLOCK_HZ = 90_000
+CLOCK_HZ = 90_000
+VIDEO = b"\x00\x00\x01\xe0"
+"""Begins a picture of the first video."""
 
 
 class RtspServer:
-    """Serves an MPEG transport stream over and over.
+    """Serves an MPEG transport stream over and over, each picture when it is due.
 
     Args:
         video: the ``.ts`` file.
@@ -30,7 +32,7 @@ class RtspServer:
     def __init__(
         self, video: Path, duration_s: float, port: int = 0, credentials: str = ""
     ) -> None:
-        self._data, self._duration_s = video.read_bytes(), duration_s
+        self._pictures, self._duration_s = pictures(video.read_bytes()), duration_s
         self._credentials = base64.b64encode(credentials.encode()).decode()
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port = self._listener.getsockname()[1]
@@ -109,19 +111,48 @@ class RtspServer:
 
     def _play(self, client: socket.socket) -> None:
         step = PACKET_SIZE * PACKETS_AT_ONCE
-        packets = [self._data[i : i + step] for i in range(0, len(self._data), step)]
-        pause_s = self._duration_s / len(packets)
-        number, began = 0, time.monotonic()
+        number, began, at_s = 0, time.monotonic(), 0.0
         while not self._stop.is_set():
-            if self.silent.is_set():
-                time.sleep(0.02)
-                began += 0.02
-                continue
-            stamp = int(number * pause_s * RTP_CLOCK_HZ) & 0xFFFFFFFF
-            packet = (
-                struct.pack(">BBHII", 0x80, MPEG_TS, number & 0xFFFF, stamp, 1)
-                + packets[number % len(packets)]
-            )
-            client.sendall(struct.pack(">BBH", ord("$"), 0, len(packet)) + packet)
-            number += 1
-            time.sleep(max(0.0, began + number * pause_s - time.monotonic()))
+            for due_s, data in self._pictures:
+                while self.silent.is_set() and not self._stop.is_set():
+                    time.sleep(0.02)
+                    began += 0.02
+                time.sleep(max(0.0, began + at_s + due_s - time.monotonic()))
+                stamp = int((at_s + due_s) * CLOCK_HZ) & 0xFFFFFFFF
+                for begin in range(0, len(data), step):
+                    packet = data[begin : begin + step]
+                    packet = (
+                        struct.pack(">BBHII", 0x80, MPEG_TS, number & 0xFFFF, stamp, 1) + packet
+                    )
+                    client.sendall(struct.pack(">BBH", ord("$"), 0, len(packet)) + packet)
+                    number += 1
+                if self._stop.is_set():
+                    return
+            at_s += self._duration_s
+
+
+def pictures(stream: bytes) -> list[tuple[float, bytes]]:
+    """(seconds after the first one, bytes) of every picture of an MPEG transport stream."""
+    begins = [
+        (begin, decoding_time_s(stream[begin : begin + PACKET_SIZE]))
+        for begin in range(0, len(stream), PACKET_SIZE)
+    ]
+    starts = [(begin, due_s) for begin, due_s in begins if due_s is not None]
+    ends = [begin for begin, _ in starts[1:]] + [len(stream)]
+    first_s = starts[0][1]
+    cut = [
+        (due_s - first_s, stream[begin:end])
+        for (begin, due_s), end in zip(starts, ends, strict=True)
+    ]
+    return [(0.0, stream[: starts[0][0]] + cut[0][1]), *cut[1:]]
+
+
+def decoding_time_s(packet: bytes) -> float | None:
+    """When a picture that begins in `packet` is to be decoded (ISO/IEC 13818-1, 2.4.3)."""
+    begins, adapted = packet[1] & 0x40, packet[3] & 0x20
+    pes = packet[4 + (1 + packet[4] if adapted else 0) :]
+    if not begins or pes[:4] != VIDEO:
+        return None
+    stamp = pes[14:19] if pes[7] & 0x40 else pes[9:14]  # of its own, else when it is shown
+    high, middle, low = stamp[0] >> 1 & 0b111, stamp[1] << 7 | stamp[2] >> 1, stamp[3:5]
+    return (high << 30 | middle << 15 | low[0] << 7 | low[1] >> 1) / CLOCK_HZ

@@ -20,6 +20,8 @@ from vla_zenoh.profile.schema import CameraProfile
 
 RATE_HZ, LENGTH_S = 25, 2.0
 COLOUR_TOLERANCE = 12  # of 255, MPEG-2
+LEFT_OUT = 0.25
+"""Of the pictures: what a busy computer may miss."""
 STOP_S = 0.5
 ORANGE_RGB = (200, 120, 20)
 
@@ -47,8 +49,7 @@ def test_a_stream_is_shown_as_it_comes_and_survives_a_stall_and_a_restart(video:
             frames, _ = rig.listen(rig.profile.keys.camera_raw("net"))
             until("two seconds of it", lambda: len(frames) > 2 * RATE_HZ)
             stamps = np.array([frame.header.stamp_wall_ns for frame in frames])
-            # Bytes come evenly, so small pictures come in bursts, of which some are left out.
-            assert 0.8 / RATE_HZ < np.mean(np.diff(stamps)) / 1e9 < 2.0 / RATE_HZ
+            assert np.mean(np.diff(stamps)) / 1e9 == pytest.approx(1 / RATE_HZ, rel=LEFT_OUT)
             difference = frames[-1].rgb[60, 40].astype(int) - ORANGE_RGB
             assert abs(difference).max() <= COLOUR_TOLERANCE
             assert rig.camera("net")["backend"] == "FFMPEG"
