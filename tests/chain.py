@@ -57,7 +57,7 @@ session:
 timing: {{command_timeout_s: {patience_s[command]}, state_timeout_s: {patience_s[state]}}}
 {more}"""
 # A computer that is busy with other things stands still for a tenth of a second now and then, which
-# is where the shipped profiles rightly brake. tests/fault/test_motion_robot.py holds them to it, in
+# is where the shipped profiles rightly brake. tests/sim/test_motion_robot.py holds them to it, in
 # the arm's own time.
 CHAIN_PATIENCE_S = {"command": 0.25, "state": 0.35}
 
@@ -266,6 +266,8 @@ class Chain:
     def activate_when_ready(self, timeout_s: float = READY_PATIENCE_S) -> None:
         """Activate as soon as preflight finds nothing more; until then it names what is missing."""
         give_up = time.monotonic() + timeout_s
+        # What is put before the command node listens is lost.
+        self.until("the task is said", lambda: self.client.task is not None, timeout_s)
         while True:
             try:
                 self.client.activate()
@@ -277,14 +279,19 @@ class Chain:
 
     def settle(self) -> None:
         """Whatever was before: inactive, standing, prompt ``hold``, worker ``scripted``."""
+        client = self.client
         if self.state() in ("stopped", "fault"):
-            self.client.put(self.client.keys.reset, "")
-        if not self.client.deactivate(END_PATIENCE_S):
-            raise AssertionError(f"the arm does not come to rest\n{self.story()}")
-        self.until("not stopped", lambda: self.state() == "inactive")
-        self.client.set_worker("scripted")
-        self.client.set_prompt("hold")
-        self.client.set_rate(self.profile.task.rate_hz)
+            client.put(client.keys.reset, "")
+        client.put(client.keys.active, "false")
+        client.put(client.keys.worker, "scripted")
+        client.put(client.keys.prompt, "hold")
+        # Settings are obeyed in the order they were put: this answer is one to all of them.
+        client.set_rate(self.profile.task.rate_hz, END_PATIENCE_S)
+        self.until(
+            "the arm comes to rest",
+            lambda: self.state() == "inactive" and self.detail("at_rest"),
+            END_PATIENCE_S,
+        )
 
     def move(self) -> None:
         """Activate with an endless motion, away from the nearer end, and wait until it is fast."""
