@@ -192,6 +192,7 @@ def _other_links() -> Iterator[Fault]:
                 good,
                 layout="apart",
                 ever=name.endswith("-ever"),
+                alone=host == "robot",
             )
         for seconds in (0.5, 5.0):
             yield Fault(
