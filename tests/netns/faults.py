@@ -209,6 +209,14 @@ def _other_links() -> Iterator[Fault]:
 def _sites() -> Iterator[Fault]:
     """Two sites with a router each, and a second one at the robot's."""
     yield Fault(
+        "site-cut-5",
+        "two sites: the link between them is dead for 5 s",
+        partial(_shape, CUT),
+        _good,
+        layout="sites",
+        seconds=5.0,
+    )
+    yield Fault(
         "site-spare",
         "two sites: the second router beside the robot is killed, started again",
         partial(_kill_router, host="spare"),

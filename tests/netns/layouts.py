@@ -64,6 +64,7 @@ LAYOUTS = {
         _profile("panda_sim_two_sites"),
         ("robot", "spare", "gpu"),
         ("robot", "spare", "gpu"),
+        ("gpu",),
     ),
     # The first one with wall clocks of their own.
     "clocks": Layout(

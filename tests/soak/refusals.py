@@ -12,26 +12,66 @@ from vla_zenoh.types import NodeStatus
 PREFIX = "refused."
 STALL_S = 0.04
 """A computer that did not run a waiting thread for so long may have made anything late."""
-LATE = frozenset(
-    {
-        *("stale", "expired", "future", "replayed", "foreign", "clock_step", "activate_refused"),
-        *("pose_braking", "pose_jump", "pose_replayed", "pose_foreign"),
-    }
+Reasons = Mapping[str, frozenset[str]]
+"""Kind of node that refuses -> its reasons."""
+BEGUN_ANEW = frozenset({"foreign"})
+"""A process speaks in the place of one that was heard a moment ago."""
+BACKLOG = frozenset({"replayed"})
+ASKED_EARLY: Reasons = {"command": frozenset({"activate_refused"})}
+"""The arm is asked for again while preflight still finds something missing: that is we."""
+OVERDUE: Reasons = {
+    "command": frozenset({"stale", "expired", "future", "clock_step"}),
+    "sim": frozenset({"pose_braking", "pose_jump", "clock_step"}),
+    "camera": frozenset({"clock_step"}),
+    "worker": frozenset({"clock_step"}),
+}
+"""Who did not run for a while: chunks are old, and the robot brakes as its stream fell silent."""
+FROM_ROBOT: Reasons = {
+    "command": BEGUN_ANEW | BACKLOG,
+    "worker": BEGUN_ANEW | BACKLOG,
+    "camera": BEGUN_ANEW | BACKLOG,
+}
+FROM_COMMAND: Reasons = {
+    "sim": frozenset({"pose_braking", "pose_jump", "pose_foreign"}) | BEGUN_ANEW,
+    "worker": BEGUN_ANEW,
+}
+FROM_WORKER: Reasons = {"command": frozenset({"stale", "expired"}) | BEGUN_ANEW}
+FROM_CAMERA: Reasons = {"command": frozenset({"stale"}), "worker": BEGUN_ANEW}
+WHO_LIVES: Reasons = {"command": frozenset({"foreign_spec", "foreign_status"})}
+"""Who was away, or hears of one who was, is told what they say before it knows that they live."""
+NEVER = frozenset(
+    {"simulation_fault", "inference_failed", "contract", "reset_failed", "seen", "oversize"}
 )
-"""What being late, or having been away, can lead to."""
-AWAY = frozenset({"foreign_spec", "foreign_status"})
-"""Who was away hears of others before it knows again that they live."""
-ANYTHING = frozenset({"*"})
-EXPLAINS: dict[str, frozenset[str]] = {
-    # what is done -> the refusals that follow from it
-    "prompt": frozenset(),
-    "worker": frozenset(),
-    "rate": frozenset(),
-    "toggle": frozenset({"activate_refused"}),
-    "stop": frozenset({"activate_refused"}),
-    "kill": LATE | AWAY | {"spec_mismatch"},
-    "freeze": LATE | AWAY,
-    "junk": ANYTHING,
+"""Nothing that is done here may lead to these."""
+
+
+def joined(*tables: Reasons) -> Reasons:
+    """All of them in one."""
+    kinds = {kind for table in tables for kind in table}
+    return {
+        kind: frozenset().union(*(table.get(kind, frozenset()) for table in tables))
+        for kind in kinds
+    }
+
+
+FROM: Mapping[str, Reasons] = {
+    "sim": FROM_ROBOT,
+    "command": FROM_COMMAND,
+    "worker": FROM_WORKER,
+    "camera": FROM_CAMERA,
+    "router": joined(OVERDUE, FROM_ROBOT, FROM_COMMAND, FROM_WORKER, FROM_CAMERA),
+}
+"""Kind of node that was away for a while -> who refuses what for it."""
+EXPLAINS: Mapping[str, Reasons] = {
+    # what is done, whoever it is done to -> the refusals that follow from it
+    "prompt": {},
+    "worker": {},
+    "rate": {},
+    "toggle": ASKED_EARLY,
+    "stop": ASKED_EARLY,
+    "kill": joined(ASKED_EARLY, WHO_LIVES),
+    "freeze": joined(ASKED_EARLY, WHO_LIVES),
+    "junk": ASKED_EARLY,
 }
 
 
@@ -60,12 +100,36 @@ class Refusals:
         return out
 
 
-def unexplained(found: Mapping[str, int], action: str, stall_s: float) -> dict[str, int]:
-    """Those of `found` that neither `action` nor a stall of the computer explains."""
-    allowed = EXPLAINS[action] | (LATE if stall_s > STALL_S else frozenset())
-    if "*" in allowed:
-        return {}
-    return {name: count for name, count in found.items() if name.rpartition(".")[2] not in allowed}
+def kind_of(node: str) -> str:
+    """``worker`` of ``worker-scripted``; other nodes are one of their kind."""
+    return node.partition("-")[0]
+
+
+def unexplained(
+    found: Mapping[str, int], action: str, stall_s: float, whom: str = ""
+) -> dict[str, int]:
+    """Those of `found` that neither `action` nor a stall of the computer explains.
+
+    Args:
+        found: ``node.reason`` -> how often.
+        action: what was done.
+        stall_s: the longest that the computer did not run a waiting thread.
+        whom: node it was done to; empty: to none.
+    """
+    tables = [EXPLAINS[action], FROM.get(kind_of(whom), {})]
+    if action == "freeze":  # it finds on its desk what has piled up
+        own = kind_of(whom)
+        tables.append({own: OVERDUE.get(own, frozenset()) | BACKLOG})
+    if stall_s > STALL_S:
+        tables += [OVERDUE, ASKED_EARLY]
+    allowed = joined(*tables)
+    out: dict[str, int] = {}
+    for name, count in found.items():
+        node, _, reason = name.rpartition(".")
+        by_junk = action == "junk" and reason not in NEVER
+        if not by_junk and reason not in allowed.get(kind_of(node), frozenset()):
+            out[name] = count
+    return out
 
 
 class Witness:

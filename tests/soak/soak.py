@@ -100,6 +100,7 @@ class Soak:
         self.chain, self.found, self._say = chain, Found(seed), say
         self._random = random.Random(seed)
         random.seed(seed)  # the junk's
+        self._whom = ""
         self._do: dict[str, Callable[[], str | None]] = {
             "prompt": self._prompt,
             "worker": self._worker,
@@ -187,7 +188,7 @@ class Soak:
     # -- one thing after the other ------------------------------------------------------------
     def _one(self) -> None:
         action = self._random.choices(list(WEIGHTS), list(WEIGHTS.values()))[0]
-        began_s = time.monotonic()
+        began_s, self._whom = time.monotonic(), ""
         said = self._do[action]()
         if said is None:
             return
@@ -235,7 +236,7 @@ class Soak:
         found.worst_stall_s = max(found.worst_stall_s, stall_s)
         refused = self._refusals.since(self._statuses())
         found.refused.setdefault(action, Counter()).update(refused)
-        for name, count in unexplained(refused, action, stall_s).items():
+        for name, count in unexplained(refused, action, stall_s, self._whom).items():
             found.unexplained.append(f"{name} x{count} after: {said}")
         faults = self._violations()
         found.violations += [f"{fault} after: {said}" for fault in faults]
@@ -313,7 +314,7 @@ class Soak:
         if not old:
             return None
         name = self._random.choices(old, [KILLED[kinds[one]] for one in old])[0]
-        pid = pids[name]
+        pid, self._whom = pids[name], name
         os.kill(pid, signal.SIGKILL)
         self.found.killed[name] += 1
         self.chain.until(
@@ -326,7 +327,7 @@ class Soak:
 
     def _freeze(self) -> str:
         pids = self.chain.host.supervisor.pids()
-        name = self._random.choice(sorted(pids))
+        name = self._whom = self._random.choice(sorted(pids))
         seconds = self._random.uniform(*FREEZE_S)
         os.kill(pids[name], signal.SIGSTOP)
         try:

@@ -6,8 +6,9 @@ import os
 import sys
 import time
 
+import pytest
 from ledger import GROWTH_HANDLES, GROWTH_MIB, Growth, Held, Ledger, look
-from refusals import EXPLAINS, STALL_S, Refusals, Witness, unexplained
+from refusals import EXPLAINS, FROM, NEVER, STALL_S, Refusals, Witness, unexplained
 
 from vla_zenoh.types import NodeStatus
 
@@ -30,11 +31,39 @@ def test_refusals_are_counted_from_look_to_look_and_anew_after_a_restart() -> No
 
 def test_a_refusal_needs_a_cause() -> None:
     found = {"command.stale": 1, "worker-a.malformed": 2}
+    malformed = {"worker-a.malformed": 2}
     assert unexplained(found, "prompt", 0.0) == found
-    assert unexplained(found, "kill", 0.0) == {"worker-a.malformed": 2}
-    assert unexplained(found, "prompt", 2 * STALL_S) == {"worker-a.malformed": 2}
+    assert unexplained(found, "kill", 0.0, "worker-b") == malformed
+    assert unexplained(found, "prompt", 2 * STALL_S) == malformed
     assert unexplained(found, "junk", 0.0) == {}
-    assert all("malformed" not in reasons for name, reasons in EXPLAINS.items() if name != "junk")
+    assert unexplained({"sim.simulation_fault": 1}, "junk", 0.0) == {"sim.simulation_fault": 1}
+
+
+@pytest.mark.parametrize(
+    ("found", "action", "whom", "explained"),
+    [
+        ("sim.pose_braking", "kill", "command", True),
+        ("sim.pose_braking", "kill", "camera", False),
+        ("sim.pose_braking", "freeze", "sim", True),
+        ("sim.pose_braking", "kill", "sim", False),
+        ("command.stale", "freeze", "camera", True),
+        ("command.stale", "freeze", "sim", False),
+        ("command.foreign_status", "freeze", "command", True),
+        ("command.activate_refused", "stop", "", True),
+        ("command.activate_refused", "prompt", "", False),
+        ("camera.stale", "freeze", "router", False),
+    ],
+)
+def test_a_cause_explains_what_follows_from_it_alone(
+    found: str, action: str, whom: str, explained: bool
+) -> None:
+    assert (unexplained({found: 1}, action, 0.0, whom) == {}) == explained
+
+
+def test_all_causes_name_reasons_of_nodes_that_there_are() -> None:
+    for table in (*EXPLAINS.values(), *FROM.values()):
+        assert table.keys() <= {"sim", "command", "worker", "camera"}
+        assert not any(reasons & NEVER or "malformed" in reasons for reasons in table.values())
 
 
 def test_growth_beyond_its_bound_is_a_leak() -> None:
