@@ -97,7 +97,7 @@ def check_seams(loop: Lockstep) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("horizon", [1, 8, 50])
+@pytest.mark.parametrize("horizon", [1, pytest.param(8, marks=pytest.mark.slow), 50])
 @pytest.mark.parametrize("late", DELAYS)
 def test_every_mode_ends_where_the_steps_end(mode: str, horizon: int, late: str) -> None:
     rate_hz, count = 6.0, 10
@@ -109,7 +109,10 @@ def test_every_mode_ends_where_the_steps_end(mode: str, horizon: int, late: str)
     check_seams(loop)
 
 
-@pytest.mark.parametrize("horizon", [1, 8, 50])
+@pytest.mark.parametrize(
+    "horizon",
+    [pytest.param(1, marks=pytest.mark.slow), 8, pytest.param(50, marks=pytest.mark.slow)],
+)
 def test_fifty_steps_are_counted_as_fifty(horizon: int) -> None:
     loop = begin(changed(), 7.0, horizon=horizon, delays=DELAYS["late"])
     moved_m, _ = carry_out(loop, "go up", 50)
@@ -117,7 +120,7 @@ def test_fifty_steps_are_counted_as_fifty(horizon: int) -> None:
     np.testing.assert_allclose(moved_m, [0, 0, 0.5], atol=REACHED_M)
 
 
-@pytest.mark.parametrize("horizon", [1, 50])
+@pytest.mark.parametrize("horizon", [pytest.param(1, marks=pytest.mark.slow), 50])
 def test_a_joint_limit_stops_a_turn_without_drift_and_the_way_back_is_free(horizon: int) -> None:
     loop = begin(changed(), 10.0, horizon=horizon)
     moved_m, turned_rad = carry_out(loop, "yaw right", 60)

@@ -34,7 +34,7 @@ from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand
 EXACT_M = 1e-3
 BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.020
 SLIP_M = 1e-3
-TOGGLES_S = 20.0
+TOGGLES_S = 10.0
 MOVES_M_S, TOGGLED_WAY_M = 0.02, 0.3
 GRIPPER_S = 6.0
 STALL_S = 1.0
