@@ -22,20 +22,19 @@ from vla_zenoh.control.joint_impedance import (
     JointImpedanceOutput,
     JointReference,
 )
-from vla_zenoh.errors import NodeError, ResourceError
+from vla_zenoh.errors import NodeError
 from vla_zenoh.simulation.arm import SimulatedArm
-from vla_zenoh.simulation.gripper import GripperServo
+from vla_zenoh.simulation.hand import SimulatedHand
 from vla_zenoh.simulation.look import DISTRACTORS, draw_look
-from vla_zenoh.simulation.placement import draw_places, objects_of
+from vla_zenoh.simulation.objects import SimulatedObjects
 from vla_zenoh.simulation.pose_vector import read_pose_vector, write_pose_vector
 from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.scene import GRIPPER, PREFIX, STEP_S, build_model
+from vla_zenoh.simulation.scene import STEP_S, build_model
 from vla_zenoh.types import GripperState, JointState, PoseState, vector
 
 FloatArray = NDArray[np.float64]
 
 STEP_NS = round(STEP_S * 1e9)
-MAX_GRIPPER_FORCE_N = 70.0
 
 
 class World:
@@ -82,7 +81,8 @@ class World:
         self._data = mujoco.MjData(self.model)
         self._home_rad = vector("home_rad", home_rad, len(robot.arm_joints))
         self._arm = SimulatedArm(self.model, self._data, robot)
-        self._objects = objects_of(self.model)
+        self._hand = SimulatedHand(self.model, self._data, robot)
+        self._objects = SimulatedObjects(self.model, self._data)
         self._controller = ImpedanceController(
             gains,
             lower_rad=self._arm.lower_rad,
@@ -98,12 +98,6 @@ class World:
         )
         self._in_charge: ImpedanceController | JointImpedanceController | None = None
         self._held_rad: FloatArray | None = None
-        fingers = [self.model.joint(PREFIX + name) for name in robot.finger_joints]
-        self._finger_q = [int(joint.qposadr[0]) for joint in fingers]
-        self._finger_dofs = [int(joint.dofadr[0]) for joint in fingers]
-        self._finger_open_m = [float(joint.range[1]) for joint in fingers]
-        self._gripper_actuator = int(self.model.actuator(PREFIX + GRIPPER).id)
-        self._gripper = GripperServo(sum(self._finger_open_m), STEP_S, MAX_GRIPPER_FORCE_N)
         self.saturated = 0
         self.reset(seed)
 
@@ -120,16 +114,9 @@ class World:
         self.seed = seed
         mujoco.mj_resetData(model, data)
         self._arm.position_rad[:] = self._home_rad
-        data.qpos[self._finger_q] = self._finger_open_m
+        self._hand.open()
         if seed is not None:
-            places = draw_places(model, seed, distractors=DISTRACTORS in self._vary)
-            for name, place in places.items():
-                height = float(model.body_pos[self._objects[name], 2])
-                half = place.yaw_rad / 2.0
-                turn = (0.0, 0.0, math.sin(half), math.cos(half))
-                self._put(name, (place.x_m, place.y_m, height), turn)
-        self._gripper.reset(self._gripper.max_width_m)
-        self._bound_gripper_force()
+            self._objects.draw(seed, distractors=DISTRACTORS in self._vary)
         self._controller.reset(self._home_rad)
         self._forget_controllers()
         self._ticks = 0
@@ -174,8 +161,7 @@ class World:
         Raises:
             RecordError: speed or force are not above zero.
         """
-        self._gripper.command(width_m, speed_m_s, force_n)
-        self._bound_gripper_force()
+        self._hand.command(width_m, speed_m_s, force_n)
 
     # -- what a robot reports ------------------------------------------------------------------
 
@@ -233,24 +219,19 @@ class World:
 
     def gripper_state(self) -> GripperState:
         """Opening between the fingers, and whether they move or hold something."""
-        width, _ = self._opening()
-        return GripperState(width, moving=self._gripper.moving, holding=self._gripper.holding)
+        return self._hand.state()
 
     @property
     def grip_force_n(self) -> float:
         """What either finger presses with, inwards positive."""
-        return -float(self._data.actuator_force[self._gripper_actuator])
+        return self._hand.force_n
 
     # -- objects and pictures ------------------------------------------------------------------
 
     def objects(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Position (3,) and quaternion x, y, z, w (4,) of every object, copies."""
         self._refresh()
-        data = self._data
-        return {
-            name: (data.xpos[body].copy(), np.roll(data.xquat[body], -1))
-            for name, body in self._objects.items()
-        }
+        return self._objects.poses()
 
     def place(self, name: str, position_m: ArrayLike, quat_xyzw: ArrayLike = (0, 0, 0, 1)) -> None:
         """Put an object somewhere, at rest.
@@ -258,11 +239,7 @@ class World:
         Raises:
             ResourceError: the scene has no such object.
         """
-        if name not in self._objects:
-            raise ResourceError(
-                f"the scene has no object {name!r}; it has: {', '.join(self._objects) or 'none'}"
-            )
-        self._put(name, position_m, quat_xyzw)
+        self._objects.put(name, position_m, quat_xyzw)
         mujoco.mj_forward(self.model, self._data)
         self._fresh = True
 
@@ -276,8 +253,7 @@ class World:
         self._data.qvel[:] = 0.0
         self._controller.reset()
         self._forget_controllers()
-        self._gripper.reset(self._opening()[0])
-        self._bound_gripper_force()
+        self._hand.stand()
         mujoco.mj_forward(self.model, self._data)
         self._fresh = True
 
@@ -306,7 +282,7 @@ class World:
             raise NodeError(f"the impedance controller got a bad reference: {reference}")
         self.saturated += output.saturated
         data.ctrl[self._arm.actuators] = output.torque_nm
-        data.ctrl[self._gripper_actuator] = self._gripper.step(*self._opening())
+        self._hand.drive()
         mujoco.mj_step2(self.model, data)
         self._ticks += 1
         self._fresh = False
@@ -319,28 +295,6 @@ class World:
             mujoco.mj_kinematics(self.model, self._data)
             mujoco.mj_comPos(self.model, self._data)
             self._fresh = True
-
-    def _opening(self) -> tuple[float, float]:
-        left, right = self._finger_q
-        left_dof, right_dof = self._finger_dofs
-        q, v = self._data.qpos, self._data.qvel
-        return float(q[left] + q[right]), float(v[left_dof] + v[right_dof])
-
-    def _bound_gripper_force(self) -> None:
-        limit = self._gripper.force_n
-        self.model.actuator_forcerange[self._gripper_actuator] = (-limit, limit)
-
-    def _put(self, name: str, position_m: ArrayLike, quat_xyzw: ArrayLike) -> None:
-        model, data, body = self.model, self._data, self._objects[name]
-        quat_wxyz = np.roll(np.asarray(quat_xyzw, float), 1)
-        mocap = model.body_mocapid[body]
-        if mocap >= 0:
-            data.mocap_pos[mocap], data.mocap_quat[mocap] = position_m, quat_wxyz
-            return
-        joint = model.body_jntadr[body]
-        q, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
-        data.qpos[q : q + 3], data.qpos[q + 3 : q + 7] = position_m, quat_wxyz
-        data.qvel[dof : dof + 6] = 0.0
 
     def _raise_blown_up(self) -> None:
         raised = [
