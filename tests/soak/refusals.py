@@ -59,7 +59,7 @@ FROM: Mapping[str, Reasons] = {
     "command": FROM_COMMAND,
     "worker": FROM_WORKER,
     "camera": FROM_CAMERA,
-    "router": joined(OVERDUE, FROM_ROBOT, FROM_COMMAND, FROM_WORKER, FROM_CAMERA),
+    "router": joined(FROM_ROBOT, FROM_COMMAND, FROM_WORKER, FROM_CAMERA),
 }
 """Kind of node that was away for a while -> who refuses what for it."""
 EXPLAINS: Mapping[str, Reasons] = {

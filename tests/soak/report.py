@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from rich.console import Console
@@ -30,6 +30,11 @@ class Found:
     held: dict[str, Any] = field(default_factory=dict)
     latency: dict[str, Any] = field(default_factory=dict)
     failure: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """All of it, as JSON takes it."""
+        # Not dataclasses.asdict: of a counter it makes one that counts its pairs.
+        return {part.name: getattr(self, part.name) for part in fields(self)} | {"code": self.code}
 
     @property
     def code(self) -> int:

@@ -27,7 +27,6 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -375,7 +374,7 @@ def main() -> int:
             found = soak.run(asked.minutes)
             story = chain.story() if found.failure else ""
     if asked.json:
-        print(json.dumps({**asdict(found), "code": found.code}, indent=2))
+        print(json.dumps(found.to_dict(), indent=2))
     else:
         show(found)
     if story:

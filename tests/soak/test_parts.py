@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import time
+from collections import Counter
 
 import pytest
-from ledger import GROWTH_HANDLES, GROWTH_MIB, Growth, Held, Ledger, look
+from ledger import GROWTH_HANDLES, GROWTH_MIB, Growth, Held, Ledger, look, segments
 from refusals import EXPLAINS, FROM, NEVER, STALL_S, Refusals, Witness, unexplained
+from report import Found
 
 from vla_zenoh.types import NodeStatus
 
@@ -64,6 +67,15 @@ def test_all_causes_name_reasons_of_nodes_that_there_are() -> None:
     for table in (*EXPLAINS.values(), *FROM.values()):
         assert table.keys() <= {"sim", "command", "worker", "camera"}
         assert not any(reasons & NEVER or "malformed" in reasons for reasons in table.values())
+
+
+def test_what_was_found_is_told_as_json() -> None:
+    found = Found(1, killed=Counter(sim=2), refused={"kill": Counter({"command.stale": 3})})
+    found.held["start"] = {"segments": segments()}
+    told = json.loads(json.dumps(found.to_dict()))
+    assert told["killed"] == {"sim": 2}
+    assert told["refused"] == {"kill": {"command.stale": 3}}
+    assert told["code"] == 0
 
 
 def test_growth_beyond_its_bound_is_a_leak() -> None:
