@@ -20,7 +20,7 @@ BACKLOG = frozenset({"replayed"})
 ASKED_EARLY: Reasons = {"command": frozenset({"activate_refused"})}
 """The arm is asked for again while preflight still finds something missing: that is we."""
 OVERDUE: Reasons = {
-    "command": frozenset({"stale", "expired", "future", "clock_step"}),
+    "command": frozenset({"stale", "expired", "future", "clock_step", "worker_refused"}),
     "sim": frozenset({"pose_braking", "pose_jump", "clock_step"}),
     "camera": frozenset({"clock_step"}),
     "worker": frozenset({"clock_step"}),
@@ -39,9 +39,7 @@ FROM_WORKER: Reasons = {"command": frozenset({"stale", "expired"}) | BEGUN_ANEW}
 FROM_CAMERA: Reasons = {"command": frozenset({"stale"}), "worker": BEGUN_ANEW}
 WHO_LIVES: Reasons = {"command": frozenset({"foreign_spec", "foreign_status"})}
 """Who was away, or hears of one who was, is told what they say before it knows that they live."""
-NEVER = frozenset(
-    {"simulation_fault", "inference_failed", "contract", "reset_failed", "seen", "oversize"}
-)
+NEVER = frozenset({"simulation_fault", "inference_failed", "contract", "reset_failed", "seen"})
 """Nothing that is done here may lead to these."""
 
 

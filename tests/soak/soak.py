@@ -284,8 +284,16 @@ class Soak:
     def _worker(self) -> str:
         task = self.chain.client.task
         other = next(name for name in WORKERS if task is None or name != task.worker)
-        self.chain.client.set_worker(other, PATIENCE_S)
-        return f"worker {other}"
+        give_up_s = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                self.chain.client.set_worker(other, PATIENCE_S)
+            except SessionError:  # its pictures are late, say; whether that may be is judged later
+                if time.monotonic() > give_up_s:
+                    raise
+                time.sleep(POLL_S)
+            else:
+                return f"worker {other}"
 
     def _rate(self) -> str:
         rate_hz = round(self._random.uniform(2.0, 15.0), 1)
