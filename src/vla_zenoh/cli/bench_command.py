@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.box import SIMPLE
 from rich.progress import track
 from rich.table import Table
 
+from vla_zenoh.cli.bench_rows import kept_rows
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
 from vla_zenoh.cli.output import console, errors
 
@@ -42,36 +42,15 @@ def command(
     """
     from vla_zenoh.cli.own_address import own_address
     from vla_zenoh.nodes.bench.command import measure_command
-    from vla_zenoh.nodes.demo import Interrupted
     from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
 
     rates_hz = number_list("--rates", rates, 50, 1000)
     stop = stop_on_signals()
     die_with_parent()
     loaded = own_address(effective_profile(profile))
-    rows: list[dict[str, Any]] = []
-    lines: list[str] = []
-    try:
+    with kept_rows(json_file) as rows:
         for rate_hz in track(rates_hz, "command node", console=errors()):
-            rows.append(
-                measure_command(
-                    loaded,
-                    rate_hz,
-                    seconds,
-                    stop,
-                    lambda node, line: lines.append(f"{node:>16} | {line}"),
-                    busy,
-                )
-            )
-    except Interrupted:
-        raise typer.Exit(130) from None
-    except Exception:
-        errors().print("\n".join(lines[-20:]), style="dim", markup=False)
-        raise
-    finally:
-        if json_file is not None:
-            json_file.parent.mkdir(parents=True, exist_ok=True)
-            json_file.write_text(json.dumps(rows, indent=2) + "\n", "utf-8")
+            rows.append(measure_command(loaded, rate_hz, seconds, stop, rows.log, busy))
     table = Table(box=SIMPLE, pad_edge=False)
     for column in ("asked Hz", "held Hz", "missed", "core share"):
         table.add_column(column, justify="right", no_wrap=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,6 +9,7 @@ import typer
 from rich.box import SIMPLE
 from rich.table import Table
 
+from vla_zenoh.cli.bench_rows import kept_rows
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
 from vla_zenoh.cli.output import console, errors
 
@@ -47,27 +47,14 @@ def load(
     stop = stop_on_signals()
     die_with_parent()
     loaded = own_address(effective_profile(profile))
-    rows: list[dict[str, Any]] = []
-    lines: list[str] = []
-
-    def log(node: str, line: str) -> None:
-        lines.append(f"{node:>16} | {line}")
-
-    try:
+    with kept_rows(json_file) as rows:
         for counts, make in ((robot_counts, "robots"), (camera_counts, "cameras")):
             if not counts:
                 continue
-            with Load(loaded, stop, log) as running:
+            with Load(loaded, stop, rows.log) as running:
                 for row in getattr(running, make)(counts, seconds):
                     rows.append(row)
                     errors().print(f"{row[make]} {make} measured", style="dim")
-    except Exception:
-        errors().print("\n".join(lines[-20:]), style="dim", markup=False)
-        raise
-    finally:
-        if json_file is not None:
-            json_file.parent.mkdir(parents=True, exist_ok=True)
-            json_file.write_text(json.dumps(rows, indent=2) + "\n", "utf-8")
     out = console(WIDTH)
     for title, kind, columns in (
         ("Robots", "robots", ROBOT_COLUMNS),

@@ -14,15 +14,12 @@ import gc
 import sys
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import TypeVar
+from dataclasses import replace
 
 import numpy as np
 import zenoh
 
-from vla_zenoh.codec import message, records, settings
-from vla_zenoh.codec.records import SMALL_BYTES
+from vla_zenoh.codec import message, records
 from vla_zenoh.control.arm_guard import ArmGuard, Measured, make_arm_guard
 from vla_zenoh.control.impedance import ImpedanceGains
 from vla_zenoh.control.joint_impedance import JointGains, JointReference
@@ -33,28 +30,17 @@ from vla_zenoh.nodes.bounded import bytes_of
 from vla_zenoh.nodes.meter import RateMeter
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.priority import realtime_thread
-from vla_zenoh.nodes.slots import Inbox
+from vla_zenoh.nodes.sim_inputs import SimInputs
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.world import STEP_NS, World
-from vla_zenoh.types import (
-    Event,
-    GripperCommand,
-    Header,
-    JointCommand,
-    ObjectPoses,
-    PoseCommand,
-    SceneState,
-    Stamped,
-)
+from vla_zenoh.types import Event, ObjectPoses, SceneState
 
 CATCH_UP_NS = 50_000_000
 SCENE_HZ, OBJECTS_HZ, WATCH_HZ = 60.0, 10.0, 4.0
 MAX_LOCKSTEP_NS = 60_000_000_000
 MAX_STEP_BYTES = 1024
 SWITCH_INTERVAL_S = 1e-4
-
-Command = TypeVar("Command", PoseCommand, JointCommand)
 
 
 def build_world(profile: Profile) -> World:
@@ -100,13 +86,8 @@ class SimNode:
         node = self.node = Node("sim", profile, session)
         self.lockstep = lockstep
         keys = node.keys
-        self._poses = node.listen(keys.command_pose, Inbox(64, SMALL_BYTES))
-        self._joints = node.listen(keys.command_joint, Inbox(64, SMALL_BYTES))
-        self._writer = ""
+        self._inputs = SimInputs(node, self.world, self.guard, self._reset, lockstep=lockstep)
         self._braking = False
-        self._widths = node.listen(keys.command_gripper, Inbox(16, SMALL_BYTES))
-        self._last_width: Header | None = None
-        self._resets = node.listen(keys.sim_reset, Inbox(4, settings.MAX_SETTING_BYTES))
         self._joint = node.stream(keys.state_joint, Kind.STATE)
         self._pose = node.stream(keys.state_pose, Kind.STATE)
         self._gripper = node.stream(keys.state_gripper, Kind.STATE)
@@ -196,7 +177,7 @@ class SimNode:
 
     # -- one millisecond ----------------------------------------------------------------------
     def _tick(self, now_ns: int) -> None:
-        self._take_orders(now_ns)
+        self._inputs.take(now_ns)
         self._ticks += 1
         if not self._blown_up:
             self._reference = self.guard.tick(now_ns)
@@ -222,60 +203,6 @@ class SimNode:
             self._publish_objects(now_ns)
         if self._ticks % self._every["watch"] == 0:
             self._watch()
-
-    def _take_orders(self, now_ns: int) -> None:
-        for arrival in self._poses.take_all():
-            pose = self.node.read(PoseCommand, arrival)
-            if pose is not None:
-                self._offer(pose, self.guard.offer_pose, "pose", now_ns)
-        for arrival in self._joints.take_all():
-            joints = self.node.read(JointCommand, arrival)
-            if joints is not None:
-                self._offer(joints, self.guard.offer_joint, "joint", now_ns)
-        for arrival in self._widths.take_all():
-            width = self.node.read(GripperCommand, arrival)
-            if width is not None:
-                self._take_width(width)
-        for arrival in self._resets.take_all():
-            seed = self.node.read_text(_seed_or_default, arrival)
-            if seed is not None:
-                self._reset(seed.value)
-
-    def _offer(
-        self,
-        command: Stamped[Command],
-        take: Callable[[Stamped[Command], int], str | None],
-        mode: str,
-        now_ns: int,
-    ) -> None:
-        if self.lockstep:  # where nobody's clock but the world's counts
-            command = replace(command, received_ns=now_ns)
-        reason = take(command, now_ns)
-        if reason is None:
-            self._writer = command.header.source
-            return
-        self.node.refuse(
-            f"{mode}_{reason}", f"command/{mode} by {command.header.source[:60]!r}: {reason}"
-        )
-
-    def _take_width(self, width: Stamped[GripperCommand]) -> None:
-        header, last, order = width.header, self._last_width, width.record
-        if self.guard.following and header.source != self._writer:
-            self.node.refuse(
-                "foreign",
-                f"command/gripper by {header.source[:60]!r}, while {self._writer[:60]!r} moves the "
-                "arm",
-            )
-            return
-        if last is not None and header.source == last.source and header.seq <= last.seq:
-            self.node.refuse("replayed", f"command/gripper {header.seq} came again or late")
-            return
-        self._last_width = header
-        self.world.set_gripper(
-            min(order.width_m, self.node.profile.robot.gripper.max_width_m),
-            order.speed_m_s,
-            max(order.force_n, 0.1),
-        )
 
     def _tell_braking(self) -> None:
         self._braking = self.guard.braking
@@ -353,14 +280,3 @@ class SimNode:
             "lockstep": self.lockstep,
             "fault": self._blown_up,
         }
-
-
-@dataclass(frozen=True, slots=True)
-class _Seed:
-    """A seed, or None for the profile's own."""
-
-    value: int | None
-
-
-def _seed_or_default(payload: bytes) -> _Seed:
-    return _Seed(settings.decode_seed(payload))

@@ -134,14 +134,10 @@ def main(arguments: list[str]) -> None:
 
         endpoint, how = rest
         serve(endpoint, listen=how == "listen", stop=stop)
-    elif role == "robot":
-        from vla_zenoh.nodes.bench.robot import stand
+    elif role in ("robot", "follower"):
+        from vla_zenoh.nodes.bench.robot import play_robot
 
-        stand(rest[0], stop)
-    elif role == "follower":
-        from vla_zenoh.nodes.bench.follower import follow
-
-        follow(rest[0], stop)
+        play_robot(rest[0], stop, follows=role == "follower")
     else:
         raise NodeError(f"{role!r} is no part of a benchmark")
 

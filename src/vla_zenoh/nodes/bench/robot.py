@@ -1,4 +1,4 @@
-"""A robot that stands: what the command node needs of one, without a simulator's load."""
+"""A robot that is all traffic and no simulator: it stands, or is always where it was told to be."""
 
 from __future__ import annotations
 
@@ -6,23 +6,28 @@ import threading
 
 import numpy as np
 
+from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.control.arm import make_kinematics
 from vla_zenoh.control.so3 import quat_from_rotation
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.clock import FixedRate
+from vla_zenoh.nodes.meter import RateMeter
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.process import ROUTER_PATIENCE_S
 from vla_zenoh.nodes.session import open_session
+from vla_zenoh.nodes.slots import Latest
 from vla_zenoh.profile import load_profile
-from vla_zenoh.types import GripperState, JointState, PoseState
+from vla_zenoh.types import GripperState, JointState, PoseCommand, PoseState
 
 
-def stand(profile_file: str, stop: threading.Event) -> None:
-    """Publish the state of an arm that stands at home, at the profile's rate.
+def play_robot(profile_file: str, stop: threading.Event, *, follows: bool) -> None:
+    """Publish the state of an arm at the profile's rate.
 
     Args:
         profile_file: whose robot it plays.
         stop: ends it.
+        follows: the newest commanded pose is the measured one; otherwise the arm stands at home,
+            and hears nothing.
     """
     profile = load_profile(profile_file)
     robot = profile.robot
@@ -31,17 +36,26 @@ def stand(profile_file: str, stop: threading.Event) -> None:
     still = np.zeros(len(robot.arm_joints))
     joints = JointState(robot.arm_joints, np.array(robot.home_rad), still, still)
     pose = PoseState(home.position_m, quat_from_rotation(home.rotation), np.zeros(6))
-    gripper = GripperState(profile.robot.gripper.max_width_m, moving=False, holding=False)
+    gripper = GripperState(robot.gripper.max_width_m, moving=False, holding=False)
     with open_session(profile.session, wait_s=ROUTER_PATIENCE_S) as session:
-        node = Node(profile.robot.driver, profile, session)
+        node = Node(robot.driver, profile, session)
+        orders = Latest(SMALL_BYTES)
+        if follows:
+            node.listen(node.keys.command_pose, orders)
         poses = node.stream(node.keys.state_pose, Kind.STATE)
         arms = node.stream(node.keys.state_joint, Kind.STATE)
         grippers = node.stream(node.keys.state_gripper, Kind.STATE)
-        pace = FixedRate(profile.timing.state_hz)
+        pace, rate = FixedRate(profile.timing.state_hz), RateMeter()
         while not stop.is_set():
             pace.wait()
+            arrival = orders.take()
+            order = node.read(PoseCommand, arrival) if arrival is not None else None
+            if order is not None:
+                told = order.record
+                pose = PoseState(told.position_m, told.quat_xyzw, told.twist)
             header = poses.put(pose)
             arms.put(joints, stamp_wall_ns=header.stamp_wall_ns, seq=header.seq)
             grippers.put(gripper, stamp_wall_ns=header.stamp_wall_ns, seq=header.seq)
-            node.report("standing")
+            rate.tick()
+            node.report("following" if follows else "standing", rates_hz={"state": rate.rate_hz})
         node.close()

@@ -1,0 +1,49 @@
+"""Benchmarks that take long: what was measured is kept, however they end."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from vla_zenoh.cli.output import errors
+
+LAST_LINES = 20
+
+
+class Rows(list[dict[str, Any]]):
+    """One row of figures each, and what the nodes wrote meanwhile."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def log(self, node: str, line: str) -> None:
+        """Keep a line of a node."""
+        self.lines.append(f"{node:>16} | {line}")
+
+
+@contextmanager
+def kept_rows(json_file: Path | None) -> Iterator[Rows]:
+    """Rows that are written to `json_file` at the end; the last lines are shown where it fails.
+
+    Raises:
+        typer.Exit: somebody ended it.
+    """
+    from vla_zenoh.nodes.demo import Interrupted
+
+    rows = Rows()
+    try:
+        yield rows
+    except Interrupted:
+        raise typer.Exit(130) from None
+    except Exception:
+        errors().print("\n".join(rows.lines[-LAST_LINES:]), style="dim", markup=False)
+        raise
+    finally:
+        if json_file is not None:
+            json_file.parent.mkdir(parents=True, exist_ok=True)
+            json_file.write_text(json.dumps(rows, indent=2) + "\n", "utf-8")
