@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import threading
+import time
 
 import pytest
 
 from vla_zenoh.bench.motion import PROTOCOL, Conditions
+from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes.bench.motion_lockstep import lockstep_row, run_in_lockstep
 from vla_zenoh.profile import load_profile, override
 
 NAMES = {trial.name: trial for trial in PROTOCOL}
 SLOW_MODEL = {"delay_ms": 140.0, "jitter": 0.3}
+PATIENCE_S = 60.0
 
 
 @pytest.mark.parametrize(
@@ -52,3 +56,49 @@ def test_rows_come_in_the_order_they_were_asked_for() -> None:
         ("open gripper", 5.0),
         ("close gripper", 5.0),
     ]
+
+
+def begun() -> list[multiprocessing.process.BaseProcess]:
+    """The processes of the bench, as soon as there are some."""
+    give_up_s = time.monotonic() + PATIENCE_S
+    while not (found := multiprocessing.active_children()):
+        assert time.monotonic() < give_up_s
+        time.sleep(0.05)
+    return found
+
+
+def test_a_process_that_is_killed_ends_the_bench_with_a_word() -> None:
+    def kill() -> None:
+        for process in begun():
+            process.kill()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    rows = run_in_lockstep(
+        load_profile("panda_sim"),
+        [NAMES["go up"]],
+        [Conditions(1.0)],
+        threading.Event(),
+        lambda _: None,
+        processes=1,
+    )
+    with pytest.raises(NodeError, match="was killed"):
+        list(rows)
+    killer.join()
+
+
+def test_who_stops_it_does_not_wait_for_the_end_of_a_row() -> None:
+    stop, ended = threading.Event(), []
+
+    def stop_soon() -> None:
+        begun()
+        stop.set()
+
+    stopper = threading.Thread(target=stop_soon)
+    stopper.start()
+    rows = run_in_lockstep(
+        load_profile("panda_sim"), [NAMES["go up"]], [Conditions(1.0)], stop, ended.append
+    )
+    assert list(rows) == ended == []
+    assert multiprocessing.active_children() == []
+    stopper.join()

@@ -11,6 +11,8 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 import numpy as np
@@ -65,18 +67,32 @@ def run_in_lockstep(
         done: called with every row as it ends, in whatever order.
         processes: at once; None: one a core.
 
+    Raises:
+        NodeError: one of them was killed.
     """
     jobs = [(profile, trial, each) for each in conditions for trial in trials]
     context = multiprocessing.get_context("spawn")
-    # Leaving the block ends the processes, in the middle of a row if need be.
-    with context.Pool(processes or os.cpu_count() or 1, initializer=_begin) as pool:
-        results = [pool.apply_async(lockstep_row, job) for job in jobs]
-        left = list(results)
-        while left and not stop.wait(LOOK_S):
-            for result in [result for result in left if result.ready()]:
-                left.remove(result)
-                done(result.get())
-        yield from (result.get() for result in results if result not in left)
+    many = processes or os.cpu_count() or 1
+    with ProcessPoolExecutor(many, mp_context=context, initializer=_begin) as pool:
+        futures = [pool.submit(lockstep_row, *job) for job in jobs]
+        left = set(futures)
+        while left and not stop.is_set():
+            ended, left = wait(left, LOOK_S, FIRST_COMPLETED)
+            for future in ended:
+                done(_result(future))
+        if left:  # not to the end of their rows
+            for process in multiprocessing.active_children():
+                process.terminate()
+        yield from (_result(future) for future in futures if future not in left)
+
+
+def _result(future: Future[Row]) -> Row:
+    try:
+        return future.result()
+    except BrokenProcessPool as error:
+        raise NodeError(
+            "a process of the bench was killed; is there enough memory for one on every core?"
+        ) from error
 
 
 def _begin() -> None:

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from vla_zenoh.bench.task import ARM_LOST, NOT_OBEYED, SAY_IT_IS_OVER_S, Asked, Ended, Plan
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.control.arm import make_shadow
-from vla_zenoh.errors import SpecError
+from vla_zenoh.errors import NodeError, SpecError
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.lockstep import Delays, Lockstep
 from vla_zenoh.nodes.process import die_with_parent
@@ -61,6 +62,9 @@ def run_in_lockstep(
         stop: set by Ctrl-C; episodes not begun are left out.
         processes: at once.
         named: name or path of the profile, for a model that takes one.
+
+    Raises:
+        NodeError: a process was killed.
     """
     with ProcessPoolExecutor(
         processes,
@@ -74,7 +78,13 @@ def run_in_lockstep(
                 if stop.wait(POLL_S):
                     pool.shutdown(wait=True, cancel_futures=True)
                     return
-            yield future.result()
+            try:
+                ended = future.result()
+            except BrokenProcessPool as error:
+                raise NodeError(
+                    "a process of the bench was killed; is there enough memory for --processes?"
+                ) from error
+            yield ended
 
 
 @dataclass(slots=True)
