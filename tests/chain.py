@@ -285,13 +285,16 @@ class Chain:
         client.put(client.keys.active, "false")
         client.put(client.keys.worker, "scripted")
         client.put(client.keys.prompt, "hold")
-        # Settings are obeyed in the order they were put: this answer is one to all of them.
         client.set_rate(self.profile.task.rate_hz, END_PATIENCE_S)
-        self.until(
-            "the arm comes to rest",
-            lambda: self.state() == "inactive" and self.detail("at_rest"),
-            END_PATIENCE_S,
-        )
+
+        def settled() -> bool:
+            # A task may have been under way when all this was put.
+            task = client.task
+            said = (task.worker, task.prompt, task.active) if task is not None else ()
+            still = self.state() == "inactive" and self.detail("at_rest")
+            return said == ("scripted", "hold", False) and bool(still)
+
+        self.until("the arm comes to rest", settled, END_PATIENCE_S)
 
     def move(self) -> None:
         """Activate with an endless motion, away from the nearer end, and wait until it is fast."""
