@@ -64,6 +64,7 @@ def test_models_on_another_host_get_jpeg_and_move_the_arm(tmp_path: Path) -> Non
         )
         with up(path, "gpu") as gpu:
             until("the worker", lambda: "worker-scripted" in client.alive, READY_PATIENCE_S)
+            until("the task is said", lambda: client.task is not None, READY_PATIENCE_S)
 
             def activated() -> bool:
                 try:
