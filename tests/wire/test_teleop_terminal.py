@@ -15,8 +15,12 @@ from vla_zenoh.types import GripperState
 
 MOVED_M = 0.03
 OFF_AXIS_M = 0.005
-AFTER_M = 0.05
-"""On after the key was let go: what one chunk asks for at 6 cm/s, and the brake."""
+SPEED_M_S = 0.06
+FASTEST = 1.8
+"""Of the asked speed: the measured arm swings, and catches up with a reference that was late."""
+AFTER_M = 0.03
+"""On after the key was let go: 0.15 s until that is known, a chunk and its cover, the brake, and a
+tenth of a second for a busy computer."""
 
 
 def activate_by_key(chain: Chain, screen: Screen) -> None:
@@ -24,9 +28,14 @@ def activate_by_key(chain: Chain, screen: Screen) -> None:
     give_up_s = time.monotonic() + READY_PATIENCE_S
     while chain.state() != "active":
         assert time.monotonic() < give_up_s, chain.story()
-        if chain.client.task is None or not chain.client.task.active:
-            screen.type(b"\r")
-        time.sleep(1.0)
+        refused = chain.counter("refused.activate_refused")
+        screen.type(b"\r")
+        chain.until(
+            "an answer",
+            lambda before=refused: (
+                chain.state() == "active" or chain.counter("refused.activate_refused") > before
+            ),
+        )
 
 
 def test_a_held_key_moves_the_arm_and_a_released_one_stops_it(chain: Chain) -> None:
@@ -34,12 +43,16 @@ def test_a_held_key_moves_the_arm_and_a_released_one_stops_it(chain: Chain) -> N
         chain.client.set_worker("teleop")
         chain.activate_when_ready()
         start_m = chain.reference_m()
+        chain.recorder.forget()
         screen.hold(b"r", lambda: chain.reference_m()[2] > start_m[2] + MOVED_M)
         let_go_m = chain.reference_m()
         chain.wait_still()
         end_m = chain.reference_m()
         assert 0 <= end_m[2] - let_go_m[2] < AFTER_M
         assert np.abs(end_m - start_m)[:2].max() < OFF_AXIS_M
+        fastest_m_s = chain.recorder.track().speed_m_s.max()
+        print(f"{fastest_m_s:.3f} m/s, {(end_m - let_go_m)[2] * 1e3:.1f} mm on")
+        assert SPEED_M_S / FASTEST < fastest_m_s < SPEED_M_S * FASTEST
         assert chain.state() == "active", "who lets go keeps the arm"
         assert chain.refused().get("command.shape", 0) == 0
         # A terminal that tells releases: one press, then a release.
