@@ -77,6 +77,33 @@ def table(found: Found) -> Table:
     return out
 
 
+def line(found: Found) -> str:
+    """The result as a row of the table in docs/reliability.md."""
+    back_s = sorted(found.recovery_s.get("kill", []))
+    killed = str(sum(found.killed.values()))
+    if back_s:
+        killed += f", back after {back_s[len(back_s) // 2]:.1f} s, at most {back_s[-1]:.1f} s"
+    refused = {action: sum(counts.values()) for action, counts in found.refused.items()}
+    ends = [found.latency.get(when, {}).get("stages_ms", {}) for when in ("start", "end")]
+    latency = [
+        "{:.1f}, {:.1f}".format(*stages["end_to_end"]) if "end_to_end" in stages else "-"
+        for stages in ends
+    ]
+    cells = (
+        f"{found.seed}, {found.minutes:g}",
+        sum(found.actions.values()),
+        killed,
+        f"{sum(refused.values())} ({refused.get('junk', 0)})",
+        len(found.unexplained),
+        len(found.violations),
+        len(found.leaks),
+        f"{found.fastest_m_s:.3f} m/s, {found.hardest_m_s2:.2f} m/s²",
+        f"{'; '.join(latency)} ms",
+        found.code,
+    )
+    return f"| {' | '.join(map(str, cells))} |"
+
+
 def show(found: Found) -> None:
     """Print it for people."""
     screen = Console(highlight=False, width=130)

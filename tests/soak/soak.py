@@ -38,7 +38,7 @@ import zenoh  # noqa: E402
 from chain import Chain, running_chain  # noqa: E402
 from ledger import Ledger, segments  # noqa: E402
 from refusals import EXPLAINS, STALL_S, Refusals, Witness, unexplained  # noqa: E402
-from report import Found, show  # noqa: E402
+from report import Found, line, show  # noqa: E402
 from rich.console import Console  # noqa: E402
 from test_strangers import all_junk, all_keys, samples_of  # noqa: E402
 
@@ -385,6 +385,7 @@ def main() -> int:
         print(json.dumps(found.to_dict(), indent=2))
     else:
         show(found)
+    say(line(found))
     if story:
         screen.print(story, markup=False)
     return found.code

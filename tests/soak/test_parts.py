@@ -11,7 +11,7 @@ from collections import Counter
 import pytest
 from ledger import GROWTH_HANDLES, GROWTH_MIB, Growth, Held, Ledger, look, segments
 from refusals import EXPLAINS, FROM, NEVER, STALL_S, Refusals, Witness, unexplained
-from report import Found
+from report import Found, line
 
 from vla_zenoh.types import NodeStatus
 
@@ -76,6 +76,9 @@ def test_what_was_found_is_told_as_json() -> None:
     assert told["killed"] == {"sim": 2}
     assert told["refused"] == {"kill": {"command.stale": 3}}
     assert told["code"] == 0
+    assert (
+        line(found) == "| 1, 0 | 0 | 2 | 3 (0) | 0 | 0 | 0 | 0.000 m/s, 0.00 m/s² | -; - ms | 0 |"
+    )
 
 
 def test_growth_beyond_its_bound_is_a_leak() -> None:
