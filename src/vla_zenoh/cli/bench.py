@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from vla_zenoh.cli.bench_codec import codec
 from vla_zenoh.cli.bench_command import command
+from vla_zenoh.cli.bench_file import JsonFileOption, write_json
 from vla_zenoh.cli.bench_load import load
 from vla_zenoh.cli.bench_motion import motion
 from vla_zenoh.cli.bench_openvla import openvla
@@ -44,9 +43,7 @@ def chain(
         list[str] | None,
         typer.Option("--only", help="Measure this way alone; may be given more than once."),
     ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the result to this file.")
-    ] = None,
+    json_file: JsonFileOption = None,
 ) -> None:
     """Measure picture to chunk and to pose command, beside other ways of serving a model.
 
@@ -82,9 +79,7 @@ def chain(
 
         result = run(ways, rounds, requests, progress)
         bars.update(bar, description="measured", completed=turns)
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps(result.to_dict(), indent=2) + "\n", "utf-8")
+    write_json(json_file, result.to_dict())
     out = console()
     out.print(report.main_table(result))
     stages = report.stage_table(result)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-
+from vla_zenoh.cli.bench_file import JsonFileOption, write_json
 from vla_zenoh.cli.output import console
 
 BUDGET_S = 0.3
@@ -19,9 +16,7 @@ MIN_TURNS, MAX_TURNS = 5, 2000
 
 
 def codec(
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the result to this file.")
-    ] = None,
+    json_file: JsonFileOption = None,
 ) -> None:
     """Measure encoding and decoding, ours and ROS 2's, in microseconds.
 
@@ -41,9 +36,7 @@ def codec(
                 f"{library} decode": _median_us(decode),
             }
         rows.append({"name": case.name, "bytes": case.payload_bytes, "us": us})
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps(rows, indent=2) + "\n", "utf-8")
+    write_json(json_file, rows)
     table = Table(title="microseconds (or ms) to encode / decode, median")
     table.add_column("what")
     table.add_column("bytes", justify="right", no_wrap=True)

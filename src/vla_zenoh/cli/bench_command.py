@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -10,7 +9,7 @@ from rich.box import SIMPLE
 from rich.progress import track
 from rich.table import Table
 
-from vla_zenoh.cli.bench_rows import kept_rows
+from vla_zenoh.cli.bench_file import JsonFileOption, kept_rows
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
 from vla_zenoh.cli.output import console, errors
 
@@ -32,9 +31,7 @@ def command(
     profile: Annotated[
         str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
     ] = DEFAULT_PROFILE,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the result to this file.")
-    ] = None,
+    json_file: JsonFileOption = None,
 ) -> None:
     """Measure what a tick of the command node costs while the simulated arm moves.
 

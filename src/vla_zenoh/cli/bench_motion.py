@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from rich.progress import (
 )
 
 from vla_zenoh.bench.motion import PROTOCOL, STEPS, Conditions, Trial
+from vla_zenoh.cli.bench_file import JsonFileOption, write_json
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
 from vla_zenoh.cli.output import console, errors
 from vla_zenoh.profile import Profile
@@ -48,9 +48,7 @@ def motion(
     profile: Annotated[
         str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
     ] = DEFAULT_PROFILE,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the rows to this file.")
-    ] = None,
+    json_file: JsonFileOption = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for a plot of every row.")
     ] = None,
@@ -84,7 +82,7 @@ def motion(
             run = _lockstep if lockstep else _real_time
             run(loaded, _trials(prompts), conditions, stop, bars, rows, out)
     finally:
-        _write(json_file, rows)
+        write_json(json_file, rows)
     beside = thesis_table(rows, virtual=lockstep)
     screen = console(WIDTH)
     screen.print(motion_table(rows))
@@ -206,9 +204,3 @@ def _trials(prompts: str) -> list[Trial]:
     if unknown:
         raise typer.BadParameter(f"{unknown[0]!r} is not a motion; there are: {', '.join(names)}")
     return [trial for trial in PROTOCOL if trial.name in wanted]
-
-
-def _write(path: Path | None, rows: Rows) -> None:
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(rows, indent=2) + "\n", "utf-8")

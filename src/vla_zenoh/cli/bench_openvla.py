@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import json
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 
+from vla_zenoh.cli.bench_file import JsonFileOption, write_json
 from vla_zenoh.cli.options import model_options
 from vla_zenoh.cli.output import console
 from vla_zenoh.errors import WorkerError
@@ -31,9 +30,7 @@ def openvla(
         typer.Option("--full-size", help="Random weights of the published size, 15 GB in bfloat16"),
     ] = False,
     rounds: Annotated[int, typer.Option("--rounds", min=1, max=1000)] = 20,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the result to this file.")
-    ] = None,
+    json_file: JsonFileOption = None,
     python: Annotated[
         str | None, typer.Option("--python", help="Interpreter of a prepared environment.")
     ] = None,
@@ -49,8 +46,7 @@ def openvla(
     run_in_own_environment(model, python)
     import_model(model)
     report = _full_size(rounds, chosen) if full_size else _loaded(rounds, chosen)
-    if json_file is not None:
-        json_file.write_text(json.dumps(report, indent=1) + "\n")
+    write_json(json_file, report)
     out = console()
     out.print(_table(report))
     memory = ", ".join(f"{part} {mb:.0f} MB" for part, mb in report["memory_mb"].items())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import threading
 import time
@@ -16,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from vla_zenoh.bench.task import Plan, Score
+from vla_zenoh.cli.bench_file import JsonFileOption, write_json
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, model_options
 from vla_zenoh.cli.output import console, errors, printable
 from vla_zenoh.profile import Profile, override
@@ -81,9 +81,7 @@ def task(
     profile: Annotated[
         str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
     ] = DEFAULT_PROFILE,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the result to this file.")
-    ] = None,
+    json_file: JsonFileOption = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="Folder for result.json, nodes.log and failures.jpg."),
@@ -259,13 +257,9 @@ def _real_time(
 def _write(score: Score, json_file: Path | None, out: Path | None) -> None:
     from vla_zenoh.bench.task_sheet import failure_sheet
 
-    text = json.dumps(score.to_dict(), indent=2) + "\n"
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(text, "utf-8")
+    write_json(json_file, score.to_dict())
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "result.json").write_text(text, "utf-8")
+        write_json(out / "result.json", score.to_dict())
         sheet = failure_sheet(score.ended)
         if sheet is not None:
             (out / "failures.jpg").write_bytes(sheet)

@@ -1,4 +1,4 @@
-"""Benchmarks that take long: what was measured is kept, however they end."""
+"""The file a benchmark writes; of one that takes long it is kept, however that ends."""
 
 from __future__ import annotations
 
@@ -6,13 +6,23 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
 from vla_zenoh.cli.output import errors
 
+JsonFileOption = Annotated[
+    Path | None, typer.Option("--json", help="Write the result to this file.")
+]
 LAST_LINES = 20
+
+
+def write_json(json_file: Path | None, result: Any) -> None:
+    """Write `result` where a file was asked for; its folder is made."""
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps(result, indent=2) + "\n", "utf-8")
 
 
 class Rows(list[dict[str, Any]]):
@@ -44,6 +54,4 @@ def kept_rows(json_file: Path | None) -> Iterator[Rows]:
         errors().print("\n".join(rows.lines[-LAST_LINES:]), style="dim", markup=False)
         raise
     finally:
-        if json_file is not None:
-            json_file.parent.mkdir(parents=True, exist_ok=True)
-            json_file.write_text(json.dumps(rows, indent=2) + "\n", "utf-8")
+        write_json(json_file, rows)
