@@ -243,9 +243,10 @@ def test_a_slow_model_sees_the_newest_picture(tmp_path: Path) -> None:
         subscriber = chain.session.declare_subscriber(
             chain.profile.keys.delta("scripted"), zenoh.handlers.Callback(keep, indirect=False)
         )
-        until("chunks", lambda: len(chunks) >= 4, READY_PATIENCE_S)
+        until("chunks", lambda: len(chunks) >= 6, READY_PATIENCE_S)
         subscriber.undeclare()
         ages_s = [(c.observed_ns - c.observation_stamp_ns) / 1e9 for c in chunks[1:]]
         took_s = [(c.inference_end_ns - c.inference_start_ns) / 1e9 for c in chunks[1:]]
         assert min(took_s) > 0.35
-        assert max(ages_s) < FRESH_S + BUSY_S, ages_s
+        # Were pictures queued, each would be a third of a second older than the one before.
+        assert ages_s[-1] < 1.0, ages_s

@@ -8,7 +8,6 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any, TypeVar
 
 import zenoh
@@ -20,6 +19,7 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.nodes import offsets
 from vla_zenoh.nodes.bounded import bytes_of, header_of
 from vla_zenoh.nodes.clock import Clock
+from vla_zenoh.nodes.news import News
 from vla_zenoh.nodes.offsets import Clocks
 from vla_zenoh.nodes.session import QOS, open_session
 from vla_zenoh.nodes.slots import Arrival, Inbox, Latest, Mailbox, Slot
@@ -31,8 +31,6 @@ from vla_zenoh.types import Event, Header, NodeStatus, Stamped
 MSGPACK = zenoh.Encoding("application/msgpack")
 STATUS_PERIOD_S = 0.5
 PICTURES_PATIENCE_S = 10.0
-EVENT_PERIOD_S = 0.25
-"""The same kind of event is written at most this often; what came between is counted in `count`."""
 
 Record = TypeVar("Record")
 AnySlot = TypeVar("AnySlot", Latest, Inbox, Mailbox)
@@ -100,9 +98,6 @@ class Node:
         self._slots: list[Slot] = []
         self._pictures: zenoh.Session | None = None
         self.traffic = Traffic(session)
-        self._last_event: dict[tuple[str, str, str], float] = {}
-        self._held_events: Counter[tuple[str, str, str]] = Counter()
-        self._answers: dict[tuple[str, str, str], Event] = {}
         self._last_status = 0.0
         self._last_state = ""
         self._refuse_a_second_one()
@@ -113,7 +108,7 @@ class Node:
         self.answer(own_clock, lambda query: offsets.answer(self.clock, own_clock, query))
         self._token = session.liveliness().declare_token(self.keys.alive(name))
         self._status = self.stream(self.keys.status(name), Kind.NEWS)
-        self._events = self.stream(self.keys.event(name), Kind.NEWS)
+        self._news = News(self.stream(self.keys.event(name), Kind.NEWS).put)
 
     def _refuse_a_second_one(self) -> None:
         for reply in self.session.liveliness().get(self.keys.alive(self.name), timeout=1.0):
@@ -146,16 +141,8 @@ class Node:
         return self._pictures
 
     def tell(self, event: Event) -> None:
-        """Write an event; a flood of the same is thinned out and counted.
-
-        The refusal of a setting is thinned out too, but the last one is told in the end.
-        """
-        # A person is told every reason of a refused setting, not only the first.
-        about = event.why if event.what.endswith("_refused") else ""
-        if event.kind == "transition" or self._due(event.kind, event.what, about):
-            self._write(event, about)
-        elif about:  # who asks again at once waits for an answer, too
-            self._answers[event.kind, event.what, about] = event
+        """Write an event; a flood of the same is thinned out and counted, see `News`."""
+        self._news.tell(event)
 
     def refuse(self, reason: str, why: str, about: str = "") -> None:
         """Count a refusal by reason, and say why.
@@ -166,33 +153,7 @@ class Node:
             about: what is refused; a flood of refusals of one thing does not silence another's.
         """
         self.counters[f"refused.{reason}"] += 1
-        if self._due("refusal", reason, about):
-            self._write(Event("warning", "refusal", reason, why[:1000]), about)
-
-    def _due(self, kind: str, what: str, about: str = "") -> bool:
-        """Whether an event of this kind may be written now; if not, it is counted."""
-        if len(self._last_event) > 512:
-            self._last_event.clear()
-            self._held_events.clear()
-            self._answers.clear()
-        if time.monotonic() - self._last_event.get((kind, what, about), -1e9) >= EVENT_PERIOD_S:
-            return True
-        self._held_events[kind, what, about] += 1
-        return False
-
-    def _write(self, event: Event, about: str = "") -> None:
-        kind = (event.kind, event.what, about)
-        self._last_event[kind] = time.monotonic()
-        self._answers.pop(kind, None)
-        held = self._held_events.pop(kind, 0)
-        self._events.put(replace(event, count=event.count + held) if held else event)
-
-    def _answer_late(self) -> None:
-        """What was asked again too soon to be answered then."""
-        for kind, event in list(self._answers.items()):
-            if time.monotonic() - self._last_event.get(kind, -1e9) >= EVENT_PERIOD_S:
-                self._held_events[kind] -= 1  # itself
-                self._write(event, kind[2])
+        self._news.tell(Event("warning", "refusal", reason, why[:1000]), about)
 
     def report(
         self,
@@ -228,7 +189,7 @@ class Node:
     def _tick(self) -> None:
         self.clocks.tick()
         self._tell_of_oversize()
-        self._answer_late()
+        self._news.tick()
 
     def _net(self) -> dict[str, Any]:
         found = self.traffic.detail(self._streams)
