@@ -26,8 +26,9 @@ SAME_M = 1e-3
 """Two placements of an object by one seed, once it has come to rest."""
 APART_M = 0.01
 SLOW_READER_S = 0.25
-FRESH_S = 0.1
-"""What is read of a stream is newer than this, however slow its reader."""
+FRESH_S = 0.8
+"""What is read of a stream is newer than this, however slow its reader: half of what a queue would
+have made of it by then, many times what it takes."""
 STOP_S = 0.4
 """From a put on stop to a standing arm: 0.2 s of braking, and its lag."""
 BUSY_S = 0.2
@@ -221,13 +222,13 @@ def test_a_slow_reader_has_the_newest_and_holds_nobody_up(chain: Chain) -> None:
                 arrival = slot.take()
                 assert arrival is not None
                 ages_s.append((time.monotonic_ns() - arrival.mono_ns) / 1e9)
-        assert max(ages_s) < FRESH_S + BUSY_S, ages_s  # 1.6 s, were they queued
+        assert max(ages_s) < FRESH_S, ages_s
         put_ns = time.monotonic_ns()
         chain.session.put(keys.stop, b"")
         assert stop.wait(1.0)
         arrival = stop.take()
         assert arrival is not None
-        assert (arrival.mono_ns - put_ns) / 1e9 < FRESH_S + BUSY_S
+        assert (arrival.mono_ns - put_ns) / 1e9 < FRESH_S
         for subscriber in subscribers:
             subscriber.undeclare()
 
@@ -248,5 +249,4 @@ def test_a_slow_model_sees_the_newest_picture(tmp_path: Path) -> None:
         ages_s = [(c.observed_ns - c.observation_stamp_ns) / 1e9 for c in chunks[1:]]
         took_s = [(c.inference_end_ns - c.inference_start_ns) / 1e9 for c in chunks[1:]]
         assert min(took_s) > 0.35
-        # Were pictures queued, each would be a third of a second older than the one before.
-        assert ages_s[-1] < 1.0, ages_s
+        assert ages_s[-1] < FRESH_S, ages_s
