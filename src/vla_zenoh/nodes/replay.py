@@ -54,7 +54,7 @@ START_AFTER_NS = 500_000_000
 SLICE_S = 0.1
 SWITCH_INTERVAL_S = 5e-4
 MAX_ERRORS = 1_000_000
-ALIVE_S = 1.0
+ALIVE_S, ATTEMPTS = 1.0, 5
 # One way for all: Zenoh keeps the order within a priority, and nothing is dropped.
 QOS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.BLOCK,
@@ -103,7 +103,8 @@ class Replay:
         loop: begin anew at the end.
 
     Raises:
-        NodeError: a robot lives on these keys, and more than pictures is to be put.
+        NodeError: a robot lives on these keys, and more than pictures is to be put; or nobody says
+            whether one does.
     """
 
     def __init__(
@@ -284,9 +285,21 @@ class Replay:
 
 
 def alive_nodes(session: zenoh.Session, keys: Keys) -> set[str]:
-    """Names of the nodes of a robot that are alive now."""
-    replies = session.liveliness().get(keys.all_alive, timeout=ALIVE_S)
-    return {str(reply.ok.key_expr).rsplit("/", 1)[-1] for reply in replies if reply.ok is not None}
+    """Names of the nodes of a robot that are alive now.
+
+    Raises:
+        NodeError: the router does not answer in time: who is not named may live all the same.
+    """
+    for _ in range(ATTEMPTS):
+        began_s = time.monotonic()
+        replies = list(session.liveliness().get(keys.all_alive, timeout=ALIVE_S))
+        found = {str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None}
+        if time.monotonic() - began_s < ALIVE_S and len(found) == len(replies):
+            return found
+    raise NodeError(
+        f"the router does not say within {ALIVE_S:g} s which nodes of {keys.robot!r} are alive, "
+        "and a replay must not meet a robot that lives; try again when it is less busy"
+    )
 
 
 def chosen_groups(names: Collection[str]) -> frozenset[str]:
