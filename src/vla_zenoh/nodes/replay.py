@@ -294,7 +294,7 @@ def alive_nodes(session: zenoh.Session, keys: Keys) -> set[str]:
         began_s = time.monotonic()
         replies = list(session.liveliness().get(keys.all_alive, timeout=ALIVE_S))
         found = {str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None}
-        if time.monotonic() - began_s < ALIVE_S and len(found) == len(replies):
+        if time.monotonic() - began_s < ALIVE_S and all(r.ok is not None for r in replies):
             return found
     raise NodeError(
         f"the router does not say within {ALIVE_S:g} s which nodes of {keys.robot!r} are alive, "
