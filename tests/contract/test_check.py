@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,26 @@ def test_a_worker_too_slow_for_the_command_node_is_told_so_before_its_patience_e
     report = examined("slow", budget_s=3.0)
     assert names(report, "error") == {"slower_than_chunk", "too_slow"}
     assert names(report, "note") == {"cut_short"}
+
+
+class SlowToLoad(CheckBench):
+    """As if the first thing that is asked of a model, to load, had taken a minute."""
+
+    asked = 0
+
+    def call(self, what: Callable[[], Any]) -> tuple[Any, float]:
+        self.asked += 1
+        return super().call(what)
+
+    def spent_s(self) -> float:
+        return 60.0 if self.asked else 0.0
+
+
+def test_the_time_to_load_is_not_taken_from_that_to_examine() -> None:
+    policy = make_policy(find_model(str(BROKEN)), {"fault": ""})
+    report = Examination(policy, "broken", SlowToLoad(PATIENCE_S), runs=RUNS, budget_s=30.0).run()
+    assert "cut_short" not in names(report, "note")
+    assert report.depends_on["pictures"]
 
 
 def test_a_worker_that_hangs_is_given_up() -> None:

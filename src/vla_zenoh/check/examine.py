@@ -33,7 +33,7 @@ class Examination:
         rate_hz: chunks per second that will be asked of it; None: as the profile says.
         prompts: to try, the first one most; None: the model's `example_prompts`, or `PROMPTS`.
         runs: timed inferences.
-        budget_s: no new example after this time.
+        budget_s: no new example after this time; loading does not count.
     """
 
     def __init__(
@@ -56,6 +56,7 @@ class Examination:
         named = prompts or getattr(policy, "example_prompts", None)
         self._looks = looks(tuple(named) if named else PROMPTS)
         self._runs, self._budget_s = runs, budget_s
+        self._loaded_s = 0.0
         self._maker, self._continuation = Maker(policy.spec, profile), Continuation(policy)
         self._answers: list[tuple[Look, Steps]] = []
         self._took_ms: list[float] = []
@@ -112,6 +113,7 @@ class Examination:
             except Failed as failed:
                 report.findings.append(error("load_failed", str(failed)))
                 return False
+        self._loaded_s = self._bench.spent_s()
         if policy.spec.hash != declared:
             report.findings.append(
                 error(
@@ -255,7 +257,7 @@ class Examination:
         return steps
 
     def _in_budget(self) -> bool:
-        if self._bench.spent_s() < self._budget_s:
+        if self._bench.spent_s() - self._loaded_s < self._budget_s:
             return True
         if not any(finding.name == "cut_short" for finding in self.report.findings):
             self.report.findings.append(

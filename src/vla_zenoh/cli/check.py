@@ -46,7 +46,10 @@ def check(
     ] = None,
     runs: Annotated[int, typer.Option("--runs", help="Timed inferences.", min=1)] = DEFAULT_RUNS,
     budget_s: Annotated[
-        float, typer.Option("--budget", help="Seconds after which nothing new is tried.", min=1)
+        float,
+        typer.Option(
+            "--budget", help="Seconds from loading on after which nothing new is tried.", min=1
+        ),
     ] = 30.0,
     patience_s: Annotated[
         float, typer.Option("--patience", help="Seconds for one call of the model.", min=0.1)
