@@ -31,6 +31,8 @@ CONTACT_M = 0.027
 """From the middle of the shut fingers to that of a brick they push."""
 LOW_M = 0.035
 """Under this height the way of the hand is counted as a push, see `Hand.swept_m`."""
+FOLLOWS = 0.5
+"""Share of the way to its waypoint that the hand makes in a step, about as Ruckig smooths it."""
 UP_M = 0.05
 """Over this height a push that was broken off begins anew."""
 
@@ -215,17 +217,28 @@ def _push(hand: Hand, target: Point, u_x: float, u_y: float) -> Wish:
     )
 
 
-def move(hand: Hand, wished: Wish) -> Hand:
-    """The hand one step on, if it gets where it wants; the gripper not taken into account."""
-    x, y, z = wished.x_m - hand.x_m, wished.y_m - hand.y_m, wished.z_m - hand.z_m
+def advance(goal: Hand, hand: Hand, wished: Wish) -> Hand:
+    """The next waypoint, a step on from the last one towards what is wished of the hand."""
+    x, y, z = wished.x_m - goal.x_m, wished.y_m - goal.y_m, wished.z_m - goal.z_m
     share = min(1.0, wished.step_m / max(math.sqrt(x * x + y * y + z * z), 1e-9))
-    turn = clip(wished.turn_rad, -STEP_RAD, STEP_RAD)
+    turn = clip(hand.yaw_rad + wished.turn_rad - goal.yaw_rad, -STEP_RAD, STEP_RAD)
+    return replace(
+        goal,
+        x_m=goal.x_m + share * x,
+        y_m=goal.y_m + share * y,
+        z_m=goal.z_m + share * z,
+        yaw_rad=goal.yaw_rad + turn,
+    )
+
+
+def follow(hand: Hand, goal: Hand, share: float) -> Hand:
+    """The hand one step on, the gripper not taken into account: it lags behind the waypoints."""
     return replace(
         hand,
-        x_m=hand.x_m + share * x,
-        y_m=hand.y_m + share * y,
-        z_m=hand.z_m + share * z,
-        yaw_rad=hand.yaw_rad + turn,
+        x_m=hand.x_m + share * (goal.x_m - hand.x_m),
+        y_m=hand.y_m + share * (goal.y_m - hand.y_m),
+        z_m=hand.z_m + share * (goal.z_m - hand.z_m),
+        yaw_rad=hand.yaw_rad + share * (goal.yaw_rad - hand.yaw_rad),
     )
 
 
@@ -234,13 +247,19 @@ def foretell(
 ) -> list[tuple[float, float, float, float, float]]:
     """The next `HORIZON` waypoints: x, y, z, yaw relative to the hand now, and 1 for open.
 
+    What is wished is asked of where the hand will be, not of the waypoint it was sent to: it is a
+    smoothed arm, and what is decided of a corner it has not reached cuts that corner. A push is
+    short and straight, there the two are taken for one.
+
     What the hand holds goes with it. The fingers stay as they are in what is foretold: whether they
     have gripped is to be seen, so nothing is lifted on trust.
     """
-    begin, out = hand, []
+    begin, way, out = hand, hand, []
+    share = 1.0 if family == "push" else FOLLOWS
     for _ in range(HORIZON):
         wished = wish(family, hand, target, goal, direction)
-        after = move(hand, wished)
+        way = advance(way, hand, wished)
+        after = follow(hand, way, share)
         if is_held(hand, target) and not wished.opened:
             target = Point(
                 target.x_m + after.x_m - hand.x_m,
@@ -253,10 +272,10 @@ def foretell(
         hand = after.swept()
         out.append(
             (
-                hand.x_m - begin.x_m,
-                hand.y_m - begin.y_m,
-                hand.z_m - begin.z_m,
-                hand.yaw_rad - begin.yaw_rad,
+                way.x_m - begin.x_m,
+                way.y_m - begin.y_m,
+                way.z_m - begin.z_m,
+                way.yaw_rad - begin.yaw_rad,
                 float(wished.opened),
             )
         )
