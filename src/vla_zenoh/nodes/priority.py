@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import ctypes.util
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -78,8 +79,7 @@ def _give_back(policy: int, parameter: os.sched_param) -> None:
 
 def _timer_slack(slack_ns: int) -> int:
     """Set by how much the calling thread may be woken late; returns what was set before."""
-    library = ctypes.util.find_library("c")
-    if library is None:
+    if sys.platform != "linux" or (library := ctypes.util.find_library("c")) is None:
         return 0
     control = ctypes.CDLL(library, use_errno=True).prctl
     before_ns = int(control(GET_TIMER_SLACK, 0, 0, 0, 0))
