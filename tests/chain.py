@@ -403,6 +403,7 @@ def running_chain(
     rate_hz: float = 10.0,
     more: str = "",
     worker_options: Mapping[str, Sequence[str]] | None = None,
+    also: Sequence[Path] = (),
 ) -> Iterator[Chain]:
     """Every node of a small profile, up while the block lasts.
 
@@ -413,9 +414,11 @@ def running_chain(
         rate_hz: chunks per second at first.
         more: YAML at the end of the profile.
         worker_options: worker -> ``name=value`` options of its model.
+        also: profiles of other robots that the router serves.
     """
     path = profile_file or write_profile(folder, rate_hz=rate_hz, more=more)
     profile = load_profile(str(path))
+    others = [load_profile(str(other)) for other in also]
     lines: list[tuple[str, str]] = []
     told: list[tuple[str, str]] = []
 
@@ -433,7 +436,9 @@ def running_chain(
     def serve() -> None:
         # Children die with the thread that started them: it has to be the one that serves.
         try:
-            with Host(profile, host, log=log, tell=tell, worker_options=worker_options) as running:
+            with Host(
+                profile, host, log=log, tell=tell, worker_options=worker_options, also=others
+            ) as running:
                 hosts.append(running)
                 running.serve(stop)
         except BaseException as error:

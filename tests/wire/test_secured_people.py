@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
-from camera_rig import PATIENCE_S, await_match, until
+from camera_rig import await_match, until
 from chain import READY_PATIENCE_S, Chain, command_line, running_chain, write_profile
 from recording_rig import recording
 from teleop_rig import Screen, teleop
@@ -61,19 +59,6 @@ def secure(*words: str) -> None:
     assert done.exit_code == 0, done.output
 
 
-@contextmanager
-def router(profile: Path, also: Path) -> Iterator[None]:
-    """One for both robots."""
-    words = [sys.executable, "-m", "vla_zenoh", "router", "--profile", str(profile)]
-    process = subprocess.Popen([*words, "--also", str(also), "--host", HERE])
-    try:
-        open_session(load_profile(str(profile)).session, wait_s=READY_PATIENCE_S).close()
-        yield
-    finally:
-        process.terminate()
-        process.wait(PATIENCE_S)
-
-
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     folder = tmp_path_factory.mktemp("lab")
@@ -85,10 +70,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         text = f"extends: lab\nsession: {{security: {{host: {place}}}}}\n"
         (folder / f"{place}.yaml").write_text(text)
     (folder / "ghost.yaml").write_text(f"extends: {HERE}\nrobot: {{name: {GHOST}}}\n")
-    with (
-        router(folder / f"{HERE}.yaml", folder / "ghost.yaml"),
-        running_chain(folder, profile_file=folder / f"{HERE}.yaml", host=HERE) as chain,
-    ):
+    here, ghost = folder / f"{HERE}.yaml", folder / "ghost.yaml"
+    with running_chain(folder, profile_file=here, host=HERE, also=[ghost]) as chain:
         chain.activate_when_ready()
         yield Lab(chain, folder)
 
@@ -267,3 +250,11 @@ def test_a_player_reads_nothing_and_an_operator_plays_no_robot(lab: Lab) -> None
         until("what a player may say", lambda: len(heard.marked) > 1)
         assert curious.counts == {}
     assert heard.marked == ["prompt", "state/pose"]
+
+
+def test_a_router_at_work_is_not_told_of_more_robots(lab: Lab) -> None:
+    words = ("up", str(lab.profile(HERE)), "--host", HERE, "--also", str(lab.profile("ghost")))
+    done = command_line(*words, profile=lab.profile(HERE), timeout_s=READY_PATIENCE_S)
+    assert done.returncode == 1
+    assert "cannot be told of other robots" in done.stderr
+    assert "sim" in lab.chain.client.alive

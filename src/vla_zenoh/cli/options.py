@@ -39,6 +39,12 @@ ListenOption = Annotated[
 HostOption = Annotated[
     str | None, typer.Option("--host", help="Which host of the profile this computer is.")
 ]
+AlsoOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--also", help="Profile of another robot that the router serves; may be given repeatedly."
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for a script.")]
 
 

@@ -12,6 +12,7 @@ import typer
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
+    AlsoOption,
     HostOption,
     ListenOption,
     ProfileOption,
@@ -27,10 +28,7 @@ def router(
     profile: ProfileOption = DEFAULT_PROFILE,
     listen: ListenOption = None,
     host: HostOption = None,
-    also: Annotated[
-        list[str] | None,
-        typer.Option("--also", help="Profile of another robot to serve; may be repeated."),
-    ] = None,
+    also: AlsoOption = None,
     show_config: Annotated[
         bool, typer.Option("--config", help="Print Zenoh's configuration of it, and end.")
     ] = False,

@@ -12,6 +12,7 @@ from rich.markup import escape
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
+    AlsoOption,
     ConnectOption,
     HostOption,
     ListenOption,
@@ -32,6 +33,7 @@ def up(
     host: HostOption = None,
     connect: ConnectOption = None,
     listen: ListenOption = None,
+    also: AlsoOption = None,
 ) -> None:
     """Start and supervise all nodes that belong on this host. Ctrl-C brakes the arm first."""
     stop = stop_on_signals()
@@ -49,7 +51,8 @@ def up(
     def tell(node: str, sentence: str) -> None:
         log(node, sentence, "bold")
 
-    with Host(loaded, host, log=log, tell=tell) as running:
+    others = [effective_profile(name, host=host) for name in also or ()]
+    with Host(loaded, host, log=log, tell=tell, also=others) as running:
         where = ", ".join(running.profile.session.connect)
         tell("up", f"profile {loaded.name}, host {running.host}, router at {where}")
         for sentence in _soon(running.profile, running.host):

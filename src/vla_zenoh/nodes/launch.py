@@ -54,9 +54,28 @@ def node_commands(
     profile_file: Path,
     worker_options: Mapping[str, Sequence[str]] | None = None,
     worker_arguments: Sequence[str] = (),
+    also_files: Sequence[Path] = (),
 ) -> list[NodeCommand]:
-    """Command lines of all nodes of `host`, in the order to start them."""
+    """Command lines of all nodes of `host`, in the order to start them.
+
+    Args:
+        profile: the effective profile.
+        host: one of its hosts.
+        profile_file: where nodes find that profile.
+        worker_options: worker -> ``name=value`` options.
+        worker_arguments: more of the command line of every worker.
+        also_files: profiles of other robots that the router of this host serves.
+
+    Raises:
+        ProfileError: there are such robots, and no router on this host.
+    """
     part = profile.hosts[host]
+    if also_files and "router" not in part.nodes:
+        routers = [name for name, other in profile.hosts.items() if "router" in other.nodes]
+        raise ProfileError(
+            f"host {host!r} of profile {profile.name} runs no router, which --also is for; "
+            f"{' and '.join(routers) or 'no host'} does"
+        )
     common = ("--profile", str(profile_file))
     commands: list[NodeCommand] = []
     for kind in sorted(part.nodes, key=START_ORDER.index):
@@ -71,7 +90,8 @@ def node_commands(
             arguments = ["camera", *(part.cameras or ()), *common, "--name", name]
             commands.append(NodeCommand(name, kind, tuple(arguments)))
         elif kind == "router":
-            commands.append(NodeCommand(name, kind, (kind, *common, "--host", host)))
+            others = [word for file in also_files for word in ("--also", str(file))]
+            commands.append(NodeCommand(name, kind, (kind, *common, "--host", host, *others)))
         else:
             commands.append(NodeCommand(kind, kind, (kind, *common)))
     return commands
@@ -88,9 +108,11 @@ class Host:
         own_router: refuse to use a router that answers already.
         worker_options: worker -> ``name=value`` options.
         worker_arguments: more of the command line of every worker.
+        also: other robots' profiles that the router of this host serves.
 
     Raises:
-        NodeError: a router answers although `own_router`.
+        NodeError: a router answers although `own_router`, or does not know who is in `also`.
+        ProfileError: there is no such host, or it has no router for `also`.
     """
 
     def __init__(
@@ -103,6 +125,7 @@ class Host:
         own_router: bool = False,
         worker_options: Mapping[str, Sequence[str]] | None = None,
         worker_arguments: Sequence[str] = (),
+        also: Sequence[Profile] = (),
     ) -> None:
         self.host, part = choose_host(profile, host)
         changes: dict[str, Any] = {}
@@ -115,10 +138,17 @@ class Host:
         self.profile, self._part, self._tell = profile, part, tell
         self._folder = tempfile.TemporaryDirectory(prefix="vla-zenoh-")
         # Children read the very profile that is in force here, whatever its options were.
-        self.profile_file = Path(self._folder.name) / f"{profile.name}.yaml"
-        self.profile_file.write_text(to_yaml(profile), "utf-8")
+        self.profile_file = self._write(profile)
+        self._also = [self._write(other) for other in also]
         self.supervisor = Supervisor(
-            node_commands(profile, self.host, self.profile_file, worker_options, worker_arguments),
+            node_commands(
+                profile,
+                self.host,
+                self.profile_file,
+                worker_options,
+                worker_arguments,
+                self._also,
+            ),
             log=log,
             tell=tell,
             folder=Path(self._folder.name),
@@ -126,6 +156,12 @@ class Host:
         self._own_router = own_router
         self.session: zenoh.Session | None = None
         self.client: Client | None = None
+
+    def _write(self, profile: Profile) -> Path:
+        folder = Path(tempfile.mkdtemp(dir=self._folder.name))
+        path = folder / f"{profile.name}.yaml"
+        path.write_text(to_yaml(profile), "utf-8")
+        return path
 
     def __enter__(self) -> Host:
         try:
@@ -140,6 +176,11 @@ class Host:
         if answers and self._own_router:
             where = ", ".join(self.profile.session.connect)
             raise NodeError(f"a router answers already at {where}")
+        if answers and self._also:
+            raise NodeError(
+                "a router answers already, and cannot be told of other robots; end it, or start it "
+                "with --also itself"
+            )
         if "router" in self._part.nodes:
             if answers:
                 self._tell("router", "one answers already; using it")

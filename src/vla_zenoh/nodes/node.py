@@ -17,6 +17,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes import offsets
+from vla_zenoh.nodes.alive import alive_nodes
 from vla_zenoh.nodes.bounded import bytes_of, header_of
 from vla_zenoh.nodes.clock import Clock
 from vla_zenoh.nodes.news import News
@@ -83,7 +84,7 @@ class Node:
         session: an open session, closed by whoever opened it.
 
     Raises:
-        NodeError: a node of this name is alive already.
+        NodeError: a node of this name is alive already, or the router does not say.
     """
 
     def __init__(self, name: str, profile: Profile, session: zenoh.Session) -> None:
@@ -111,12 +112,11 @@ class Node:
         self._news = News(self.stream(self.keys.event(name), Kind.NEWS).put)
 
     def _refuse_a_second_one(self) -> None:
-        for reply in self.session.liveliness().get(self.keys.alive(self.name), timeout=1.0):
-            if reply.ok is not None:
-                raise NodeError(
-                    f"a node {self.name!r} of robot {self.profile.robot.name!r} is alive already; "
-                    "stop it first, or give this one another --name where the command has it"
-                )
+        if alive_nodes(self.session, self.keys, self.name):
+            raise NodeError(
+                f"a node {self.name!r} of robot {self.profile.robot.name!r} is alive already; "
+                "stop it first, or give this one another --name where the command has it"
+            )
 
     # -- writing ------------------------------------------------------------------------------
     def stream(self, key: str, kind: Kind) -> Stream:

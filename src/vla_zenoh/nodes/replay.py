@@ -18,7 +18,7 @@ import zenoh
 
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import CodecError, NodeError, RecordingError
-from vla_zenoh.keys import Keys
+from vla_zenoh.nodes.alive import alive_nodes
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.priority import realtime_thread
 from vla_zenoh.profile import Profile
@@ -54,7 +54,6 @@ START_AFTER_NS = 500_000_000
 SLICE_S = 0.1
 SWITCH_INTERVAL_S = 5e-4
 MAX_ERRORS = 1_000_000
-ALIVE_S, ATTEMPTS = 1.0, 5
 # One way for all: Zenoh keeps the order within a priority, and nothing is dropped.
 QOS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.BLOCK,
@@ -282,24 +281,6 @@ class Replay:
             self.node.counters["samples"] = self.replayed.samples.total()
             detail = {"file": str(self._file.path), "pass": self.replayed.passes + 1}
             self.node.report("replaying", detail=detail)
-
-
-def alive_nodes(session: zenoh.Session, keys: Keys) -> set[str]:
-    """Names of the nodes of a robot that are alive now.
-
-    Raises:
-        NodeError: the router does not answer in time: who is not named may live all the same.
-    """
-    for _ in range(ATTEMPTS):
-        began_s = time.monotonic()
-        replies = list(session.liveliness().get(keys.all_alive, timeout=ALIVE_S))
-        found = {str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None}
-        if time.monotonic() - began_s < ALIVE_S and all(r.ok is not None for r in replies):
-            return found
-    raise NodeError(
-        f"the router does not say within {ALIVE_S:g} s which nodes of {keys.robot!r} are alive, "
-        "and a replay must not meet a robot that lives; try again when it is less busy"
-    )
 
 
 def chosen_groups(names: Collection[str]) -> frozenset[str]:

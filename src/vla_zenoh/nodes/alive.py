@@ -1,0 +1,36 @@
+"""Who is alive, by an answer that came in time."""
+
+from __future__ import annotations
+
+import time
+
+import zenoh
+
+from vla_zenoh.errors import NodeError
+from vla_zenoh.keys import Keys
+
+PATIENCE_S, ATTEMPTS = 1.0, 5
+
+
+def alive_nodes(session: zenoh.Session, keys: Keys, name: str | None = None) -> set[str]:
+    """Names of the nodes of a robot that are alive now.
+
+    Args:
+        session: an open session.
+        keys: of the robot.
+        name: only this one; None: all.
+
+    Raises:
+        NodeError: the router does not answer in time: who is not named may live all the same.
+    """
+    asked = keys.all_alive if name is None else keys.alive(name)
+    for _ in range(ATTEMPTS):
+        began_s = time.monotonic()
+        replies = list(session.liveliness().get(asked, timeout=PATIENCE_S))
+        # A query that ran out of time ends like one that has been answered in full.
+        if time.monotonic() - began_s < PATIENCE_S and all(r.ok is not None for r in replies):
+            return {str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None}
+    raise NodeError(
+        f"the router does not say within {PATIENCE_S:g} s which nodes of {keys.robot!r} are alive; "
+        "look whether it is too busy, or its access control does not know us, and try again"
+    )

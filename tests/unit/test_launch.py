@@ -1,0 +1,37 @@
+"""Which nodes a host starts, and how."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.nodes.launch import node_commands
+from vla_zenoh.profile import Profile, load_profile
+
+FILE = Path("mine.yaml")
+OTHERS = (Path("left.yaml"), Path("right.yaml"))
+
+
+def words_of(profile: Profile, host: str, kind: str, *also: Path) -> tuple[str, ...]:
+    """The command line of the only node of a kind."""
+    found = node_commands(profile, host, FILE, also_files=also)
+    (words,) = [each.arguments for each in found if each.kind == kind]
+    return words
+
+
+def test_the_router_is_told_of_every_robot_it_serves() -> None:
+    words = words_of(load_profile("panda_sim_lab"), "robot", "router", *OTHERS)
+    assert words[-4:] == ("--also", "left.yaml", "--also", "right.yaml")
+
+
+def test_no_other_node_is_told_of_other_robots() -> None:
+    profile = load_profile("panda_sim_lab")
+    alone, among = (node_commands(profile, "robot", FILE, also_files=f) for f in ((), OTHERS))
+    assert [c for c in among if c.kind != "router"] == [c for c in alone if c.kind != "router"]
+
+
+def test_a_host_without_a_router_cannot_serve_other_robots_and_says_who_can() -> None:
+    with pytest.raises(ProfileError, match=r"'gpu'.*no router.*; robot does"):
+        node_commands(load_profile("panda_sim_lab"), "gpu", FILE, also_files=OTHERS)
