@@ -8,12 +8,26 @@ quickest counts, and half its round trip is the uncertainty: a bound, no guess.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+from vla_zenoh.types import ActionChunk, Header
 
 WINDOW = 8
 """Exchanges of which the quickest is taken, as in NTP's clock filter."""
 DRIFT = 50e-6
 """Two clocks of ordinary computers run apart by this much, s per s."""
+LAST_NS = 2**63 - 1
+"""The greatest stamp that a record takes."""
+_STAMPS_OF_A_CHUNK = (
+    "observation_stamp_ns",
+    "valid_until_ns",
+    "observed_ns",
+    "inference_start_ns",
+    "inference_end_ns",
+)
+
+Record = TypeVar("Record")
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,3 +135,25 @@ class OffsetFilter:
     def _differ(self, one: Exchange, other: Exchange) -> bool:
         apart_ns = abs(one.ahead_ns - other.ahead_ns)
         return apart_ns > self._uncertainty_ns(one, other.got) + other.round_trip_ns // 2 + 1
+
+
+def shifted(header: Header, record: Record, ahead_ns: int) -> tuple[Header, Record]:
+    """Header and record with their stamps on our clock.
+
+    A stamp at an end of what a record takes ("at once", "for ever") stays within it: whether that
+    is stale or never expires is for whoever reads it to say.
+
+    Args:
+        header: of the record.
+        record: any; a chunk has stamps of its own.
+        ahead_ns: how far the writer's clock is ahead of ours.
+    """
+
+    def here(stamp_ns: int) -> int:
+        return min(max(stamp_ns - ahead_ns, 0), LAST_NS)
+
+    header = replace(header, stamp_wall_ns=here(header.stamp_wall_ns))
+    if isinstance(record, ActionChunk):
+        stamps = {name: here(getattr(record, name)) for name in _STAMPS_OF_A_CHUNK}
+        record = replace(record, **stamps)
+    return header, record

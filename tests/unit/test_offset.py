@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.offset import Exchange, OffsetFilter
+from vla_zenoh.offset import LAST_NS, Exchange, OffsetFilter, shifted
+from vla_zenoh.types import ActionChunk, Header
 
 MS = 1_000_000
 WALL_MINUS_MONO_NS = 1_700_000_000 * 10**9
@@ -106,3 +108,36 @@ def test_an_old_measurement_is_worth_less() -> None:
     assert young is not None
     assert old is not None
     assert old.uncertainty_s > young.uncertainty_s + 0.004
+
+
+stamps = st.sampled_from([0, 1, LAST_NS - 1, LAST_NS]) | st.integers(0, LAST_NS)
+
+
+@given(st.integers(-90 * MS, 90 * MS), st.tuples(*[stamps] * 6))
+def test_any_stamp_that_a_record_takes_is_put_on_our_clock(
+    ahead_ns: int, given_ns: tuple[int, ...]
+) -> None:
+    at_ns, observed_ns, valid_ns, began_ns, ended_ns, of_ns = given_ns
+    chunk = ActionChunk(
+        worker="scripted",
+        spec_hash="x",
+        episode=1,
+        observation_stamp_ns=of_ns,
+        observation_seq=0,
+        valid_until_ns=valid_ns,
+        steps=np.zeros((1, 7), np.float32),
+        observed_ns=observed_ns,
+        inference_start_ns=began_ns,
+        inference_end_ns=ended_ns,
+    )
+    header, moved = shifted(Header(at_ns, 0, "worker-scripted#1"), chunk, ahead_ns)
+    found_ns = (
+        header.stamp_wall_ns,
+        moved.observed_ns,
+        moved.valid_until_ns,
+        moved.inference_start_ns,
+        moved.inference_end_ns,
+        moved.observation_stamp_ns,
+    )
+    for stamp_ns, moved_ns in zip(given_ns, found_ns, strict=True):
+        assert moved_ns == min(max(stamp_ns - ahead_ns, 0), LAST_NS)

@@ -295,6 +295,7 @@ class Node:
             if speaker is not None:  # before the payload: who shouts nonsense costs least
                 speaker.check(header, arrival.mono_ns)
             record = records.decode(kind, bytes_of(sample.payload))
+            here, record = self.clocks.here(header, record)
         except CodecError as error:
             key = self.keys.short(str(sample.key_expr))
             self.refuse(error.reason, f"{key}: {error}", key)
@@ -302,8 +303,7 @@ class Node:
         if speaker is not None:
             speaker.heard(header, arrival.mono_ns)
         self.traffic.heard(str(sample.key_expr), header, arrival.nth)
-        header, record = self.clocks.here(header, record)
-        return Stamped(header, record, self.wall_of(arrival))
+        return Stamped(here, record, self.wall_of(arrival))
 
     @staticmethod
     def header(arrival: Arrival) -> Header:

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import TypeVar
 
 import zenoh
 
@@ -19,8 +18,8 @@ from vla_zenoh.keys import Keys, Kind
 from vla_zenoh.nodes.bounded import bytes_of
 from vla_zenoh.nodes.clock import Clock
 from vla_zenoh.nodes.session import QOS
-from vla_zenoh.offset import Exchange, Offset, OffsetFilter
-from vla_zenoh.types import ActionChunk, Header
+from vla_zenoh.offset import Exchange, Offset, OffsetFilter, shifted
+from vla_zenoh.types import Header
 
 ASK_PERIOD_S = 1.0
 FIRST_ASKS, FIRST_PERIOD_S = 8, 0.1
@@ -30,14 +29,6 @@ FORGET_S = 30.0
 """Who has not answered for so long has no clock we know of."""
 MAX_PEERS = 64
 MAX_STAMPS_BYTES = 1024
-_STAMPS_OF_A_CHUNK = (
-    "observation_stamp_ns",
-    "valid_until_ns",
-    "observed_ns",
-    "inference_start_ns",
-    "inference_end_ns",
-)
-
 Record = TypeVar("Record")
 
 
@@ -141,13 +132,7 @@ class Clocks:
         ahead_ns = self._ahead_ns(node)
         if not ahead_ns:
             return header, record
-        header = replace(header, stamp_wall_ns=header.stamp_wall_ns - ahead_ns)
-        if isinstance(record, ActionChunk):
-            changes: Mapping[str, Any] = {
-                name: getattr(record, name) - ahead_ns for name in _STAMPS_OF_A_CHUNK
-            }
-            record = replace(record, **changes)
-        return header, record
+        return shifted(header, record, ahead_ns)
 
     def _ahead_ns(self, node: str) -> int:
         peer = self._peers.get(node)
