@@ -96,6 +96,39 @@ def test_wrong_ones_are_told_line_by_line_on_stderr(own_folder: Path) -> None:
     assert lines[1].startswith(f"{path}:2: limts: unknown key; did you mean 'limits'?")
 
 
+@pytest.mark.parametrize(
+    ("robot", "told"),
+    [
+        ("tcp_frame: panda_hand_tpc", "has no link 'panda_hand_tpc'; did you mean"),
+        ("finger_joints: [panda_finger]", "has no joint 'panda_finger'; did you mean"),
+        ("base_frame: panda_hand", "base_frame 'panda_hand' of panda.urdf moves"),
+    ],
+)
+def test_what_the_description_of_the_robot_does_not_have_is_a_fault(
+    own_folder: Path, robot: str, told: str
+) -> None:
+    (own_folder / "lab.yaml").write_text(f"extends: panda_sim\nrobot: {{{robot}}}\n")
+    result = RUNNER.invoke(profile_app, ["check", "lab"])
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert result.stderr.startswith(f"{own_folder / 'lab.yaml'}: robot: ")
+    assert told in result.stderr
+
+
+def test_a_description_that_is_none_is_a_fault_and_one_elsewhere_is_advice(
+    own_folder: Path,
+) -> None:
+    urdf = own_folder / "arm.urdf"
+    (own_folder / "lab.yaml").write_text(f"extends: panda_sim\nrobot: {{description: {urdf}}}\n")
+    result = RUNNER.invoke(profile_app, ["check", "lab"])
+    assert result.exit_code == 0
+    assert result.stderr.count("is not a file") == 1
+    urdf.write_text("no robot")
+    result = RUNNER.invoke(profile_app, ["check", "lab"])
+    assert result.exit_code == 1
+    assert "cannot be read" in result.stderr
+
+
 def test_what_is_questionable_is_advice_and_no_failure() -> None:
     result = RUNNER.invoke(profile_app, ["check", "panda_sim_two_hosts"])
     assert result.exit_code == 0

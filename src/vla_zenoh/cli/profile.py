@@ -10,8 +10,15 @@ from rich.syntax import Syntax
 from rich.table import Table
 
 from vla_zenoh.cli.output import console, errors, fail, print_json, printable
-from vla_zenoh.errors import ProfileError
-from vla_zenoh.profile import advice, load_profile, profile_file, profile_names, to_yaml
+from vla_zenoh.errors import MissingExtraError, ProfileError, RecordError, ResourceError
+from vla_zenoh.profile import (
+    Profile,
+    advice,
+    load_profile,
+    profile_file,
+    profile_names,
+    to_yaml,
+)
 
 profile_app = typer.Typer(
     help="Profiles: what there is, what one comes to, and whether it is right.",
@@ -68,22 +75,46 @@ def check(
 ) -> None:
     """Check profiles: every fault with file and line, then what is worth a second look.
 
-    Exits with 1 when one of them is wrong. Advice alone leaves the exit code at 0.
+    The robot's description has to have the joints and links that a profile names. Exits with 1
+    when one of them is wrong. Advice alone leaves the exit code at 0.
     """
     wrong = False
     for name in names:
         try:
             profile = load_profile(name)
+            hints = [*advice(profile), *_arm(profile, name)]
         except ProfileError as error:
             wrong = True
             for line in str(error).splitlines():
                 errors().print(f"[red]{escape(printable(line))}[/]", soft_wrap=True)
             continue
         console().print(f"[green]ok[/] {escape(printable(name))}", soft_wrap=True)
-        for line in advice(profile):
+        for line in dict.fromkeys(hints):
             errors().print(f"[yellow]advice[/] {escape(printable(line))}", soft_wrap=True)
     if wrong:
         raise typer.Exit(1)
+
+
+def _arm(profile: Profile, name: str) -> list[str]:
+    """Builds the arm as the command node does; gives advice where this computer cannot.
+
+    Raises:
+        ProfileError: its description does not have what the profile names, or cannot be read.
+    """
+    try:
+        from vla_zenoh.control.arm import make_shadow
+
+        make_shadow(profile)
+    except (ResourceError, MissingExtraError) as error:
+        return [f"robot.description: {error}"]
+    except ImportError as error:
+        return [f"robot: its joints and links were not looked at: {error}"]
+    except (ProfileError, RecordError) as error:
+        raise ProfileError(f"{profile_file(name)}: robot: {error}") from error
+    except ValueError as error:  # Pinocchio's, of a file that is no URDF
+        what = f"{profile.robot.description!r} cannot be read: {error}"
+        raise ProfileError(f"{profile_file(name)}: robot.description: {what}") from error
+    return []
 
 
 def _row(name: str) -> dict[str, Any]:
