@@ -235,6 +235,19 @@ def test_a_profile_that_cannot_be_secured_leaves_nothing_behind(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_profile_of_ones_own_is_copied_with_the_secured_one_that_extends_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "mine.yaml").write_text("extends: panda_sim\n")
+    done = runner.invoke(secure_app, ["init", "--profile", "mine.yaml"])
+    assert done.exit_code == 0, done.output
+    assert f"  scp mine_secure.yaml {tmp_path / 'mine.yaml'} here:\n" in done.output
+    folder = tmp_path / ".config/vla-zenoh/lab"
+    assert f"  scp -rp {folder}/here here:.config/vla-zenoh/lab/\n" in done.output
+
+
 def test_a_lab_is_secured_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "keys"
@@ -250,12 +263,22 @@ def test_a_lab_is_secured_by_one_command(tmp_path: Path, monkeypatch: pytest.Mon
         "worker-scripted.key",
         "worker-scripted.pem",
     ]
+    lines = done.output.splitlines()
+    at = lines.index(f"  ssh gpu mkdir -p {folder}")
+    assert lines[at + 1 : at + 3] == [
+        f"  scp -rp {folder}/gpu gpu:{folder}/",
+        f"  scp {secured} gpu:",
+    ]
+    assert f"There: vla-zenoh up ./{secured} --host NAME" in lines
     again = runner.invoke(secure_app, init)
     assert again.exit_code == 1
 
     add = ["add", "desk", "--role", "operator", "--profile", secured]
     done = runner.invoke(secure_app, add)
     assert done.exit_code == 0, done.output
+    assert f"  scp -rp {folder}/desk desk:{folder}/" in done.output.splitlines()
+    assert f"For people, there: vla-zenoh status --profile ./{secured}" in done.output
+    assert " up " not in done.output
     assert (folder / "desk" / "operator.pem").exists()
 
     done = runner.invoke(secure_app, ["show", "--profile", secured, "--json"])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Sequence
+import shlex
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,6 +12,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from vla_zenoh import resources
 from vla_zenoh.cli.options import DEFAULT_PROFILE, JsonOption, ProfileOption
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.errors import SecurityError, VlaZenohError
@@ -84,10 +86,8 @@ def init(
     for path in made:
         out.print(f"made {path}", highlight=False, soft_wrap=True)
     out.print(f"made {file}", highlight=False, soft_wrap=True)
-    out.print(f"\nOn every host use --profile {file}, and give each its own folder:")
-    for host in written.hosts:
-        source, target = store.folder / host, Path(DEFAULT_FOLDER) / host
-        out.print(f"  scp -rp {source} {host}:{target}", highlight=False, soft_wrap=True)
+    out.print("\nGive each host but this one its own folder, and all of them the profile:")
+    _print_copying(written.hosts, store, written, file, _own_base(profile))
     out.print(f"Keep {store.folder / 'ca.key'} here: who has it can make certificates.")
     _complain_about_places(written)
 
@@ -132,9 +132,13 @@ def add(
     if new:
         _write(profile_file(profile), new)
         load_profile(profile)
-        console().print(f"{host} is in {profile_file(profile)} now; start the router again")
+    out = console()
     for path in made:
-        console().print(f"made {path}", highlight=False, soft_wrap=True)
+        out.print(f"made {path}", highlight=False, soft_wrap=True)
+    _print_copying([host], store, loaded, profile_file(profile))
+    if new:
+        told = f"{host} is in {profile_file(profile)} now: copy it to the router's host as well"
+        out.print(f"{told}, and start the router again", highlight=False, soft_wrap=True)
 
 
 @secure_app.command("show")
@@ -166,6 +170,43 @@ def _places(given: Sequence[str]) -> dict[str, str]:
             raise typer.BadParameter(f"--at wants HOST=ADDRESS, not {text!r}")
         out[host] = address
     return out
+
+
+def _own_base(name: str) -> tuple[Path, ...]:
+    """The file of a profile that other computers do not have from the package."""
+    path = profile_file(name)
+    return () if path.parent == resources.shipped("profiles") else (path,)
+
+
+def _print_copying(
+    hosts: Collection[str], store: Store, profile: Profile, file: Path, more: Sequence[Path] = ()
+) -> None:
+    """How certificates and profile get to other computers, and what is said there.
+
+    Args:
+        hosts: those computers.
+        store: of the certificates.
+        profile: the secured one.
+        file: of that profile.
+        more: files that it extends.
+    """
+    assert profile.session.security is not None
+    # ssh and scp begin at home.
+    target = profile.session.security.folder.removeprefix("~/")
+    files = " ".join(shlex.quote(str(path)) for path in (file, *more))
+    lines: list[str] = []
+    for host in hosts:
+        source = shlex.quote(str(store.folder / host))
+        lines += [
+            f"  ssh {host} mkdir -p {shlex.quote(target)}",
+            f"  scp -rp {source} {host}:{shlex.quote(target)}/",
+            f"  scp {files} {host}:",
+        ]
+    if any(host in profile.hosts for host in hosts):
+        lines.append(f"There: vla-zenoh up ./{file.name} --host NAME")
+    lines.append(f"For people, there: vla-zenoh status --profile ./{file.name}")
+    for line in lines:
+        console().print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _now() -> dt.datetime:
