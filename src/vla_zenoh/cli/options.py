@@ -13,10 +13,11 @@ from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile, load_profile, override
 
 DEFAULT_PROFILE = "panda_sim"
+PROFILE_VARIABLE = "VLA_ZENOH_PROFILE"
 
 ProfileOption = Annotated[
     str,
-    typer.Option("--profile", "-p", envvar="VLA_ZENOH_PROFILE", help="Name or path of a profile."),
+    typer.Option("--profile", "-p", envvar=PROFILE_VARIABLE, help="Name or path of a profile."),
 ]
 ConnectOption = Annotated[
     list[str] | None,

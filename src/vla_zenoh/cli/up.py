@@ -12,6 +12,7 @@ from rich.markup import escape
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
+    PROFILE_VARIABLE,
     AlsoOption,
     ConnectOption,
     HostOption,
@@ -29,7 +30,9 @@ COLOURS = ("cyan", "magenta", "green", "yellow", "blue", "bright_cyan", "bright_
 
 
 def up(
-    profile: Annotated[str, typer.Argument(help="Name or path of a profile.")] = DEFAULT_PROFILE,
+    profile: Annotated[
+        str, typer.Argument(envvar=PROFILE_VARIABLE, help="Name or path of a profile.")
+    ] = DEFAULT_PROFILE,
     host: HostOption = None,
     connect: ConnectOption = None,
     listen: ListenOption = None,
