@@ -23,6 +23,7 @@ from vla_zenoh.lockstep import Lockstep
 from vla_zenoh.nodes.sim import build_world
 from vla_zenoh.policy import example_observation
 from vla_zenoh.profile import load_profile
+from vla_zenoh.profile.fit import workers_of
 
 TEXT = (Path(__file__).parents[2] / "docs" / "models.md").read_text("utf-8")
 LINES = 10
@@ -88,6 +89,18 @@ def test_every_preset_and_option_is_told() -> None:
             assert f"`{preset}`" in TEXT, preset
     for option in DEFAULTS:
         assert f"`{option}`" in TEXT, option
+
+
+def test_its_profiles_are_right_and_each_host_knows_what_it_runs(tmp_path: Path) -> None:
+    blocks = re.findall(r"```yaml\n(# (\w+\.yaml).*?)```", TEXT, re.DOTALL)
+    for block, name in blocks:
+        (tmp_path / name).write_text(block, "utf-8")
+    profiles = {name: load_profile(str(tmp_path / name)) for _, name in blocks}
+    left, right = profiles["left.yaml"], profiles["right.yaml"]
+    assert left.serves == right.serves
+    assert left.session.connect == left.session.listen
+    assert workers_of(right, right.hosts["gpu"]) == ("mine",)
+    assert workers_of(left, left.hosts["gpu"]) == ("mine", "scripted")
 
 
 class Up(socketserver.StreamRequestHandler):
