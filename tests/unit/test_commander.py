@@ -143,6 +143,28 @@ def test_of_a_chunk_that_lasts_too_long_only_the_beginning_is_followed() -> None
     assert rig.state == "holding"
 
 
+def test_a_single_step_that_takes_too_long_does_not_keep_the_watchdog_waiting() -> None:
+    rig = Rig(profile(timing={"max_open_loop_s": 0.5}), dt_s=60.0)
+    rig.activate()
+    assert rig.send([UP]).accepted is not None
+    rig.run(1.5)
+    assert rig.state == "holding"
+
+
+def test_an_arm_that_holds_for_long_needs_activation_again() -> None:
+    rig = Rig(profile(timing={"max_hold_s": 2.0}))
+    rig.activate()
+    rig.send([UP])
+    rig.run(2.0)
+    assert rig.state == "holding"
+    rig.run(1.0)
+    assert rig.state == "inactive"
+    assert "held for 2 s" in rig.commander.why
+    rig.send([UP])
+    assert rig.state == "inactive"
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, STEP_M], atol=AT_GOAL_M)
+
+
 def test_a_chunk_whose_observation_does_not_show_the_last_chunk_replaces_it() -> None:
     rig = Rig()
     rig.activate()

@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.nodes.launch import node_commands
+from vla_zenoh.nodes.launch import START_ORDER, node_commands
+from vla_zenoh.nodes.supervisor import STOP_ORDER
 from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.profile.schema import NODE_KINDS
 
 FILE = Path("mine.yaml")
 OTHERS = (Path("left.yaml"), Path("right.yaml"))
@@ -19,6 +21,11 @@ def words_of(profile: Profile, host: str, kind: str, *also: Path) -> tuple[str, 
     found = node_commands(profile, host, FILE, also_files=also)
     (words,) = [each.arguments for each in found if each.kind == kind]
     return words
+
+
+def test_every_kind_of_node_has_its_turn_to_start_and_to_end() -> None:
+    assert sorted(START_ORDER) == sorted(NODE_KINDS)
+    assert sorted(kind for kinds, _ in STOP_ORDER for kind in kinds) == sorted(NODE_KINDS)
 
 
 def test_the_router_is_told_of_every_robot_it_serves() -> None:

@@ -336,7 +336,7 @@ class Commander:
         # heap after a pause replace each other.
         plan.effective_ns = max(plan.effective_ns, self._resumed_ns)
         timeline.add(plan, now_ns)
-        self._watch.expect_next(max(plan.end_ns, now_ns), self.task.rate_hz)
+        self._watch.expect_next(max(plan.end_ns, now_ns), self.task.rate_hz, now_ns)
         self._out.accepted = plan.cause
         return None
 
@@ -362,6 +362,8 @@ class Commander:
         )
         if not lost and self.streaming and not self.dry_run:
             lost = self._watch.blocked()
+        if not lost and self._watch.forsaken(now_ns):
+            lost = f"held for {self.profile.timing.max_hold_s:g} s, no fresh chunk came"
         if lost:
             self._change(Trigger.LOSE, lost)
         elif self._watch.starved(now_ns):

@@ -19,9 +19,11 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.clock import FixedRate, Tick
 from vla_zenoh.nodes.command_inputs import CommandInputs
 from vla_zenoh.nodes.command_status import CommandStatus
+from vla_zenoh.nodes.latch import Latch
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.priority import realtime_thread
 from vla_zenoh.profile import Profile
+from vla_zenoh.types import Event
 
 TASK_PERIOD_S = 0.2
 BRAKE_BEFORE_EXIT_S = 1.0
@@ -49,9 +51,10 @@ class CommandNode:
     ) -> None:
         node = self.node = Node("command", profile, session)
         self.commander = Commander(profile, reach=make_shadow(profile), dry_run=dry_run)
-        self._latch = latch
-        if latch is not None and latch.exists():
-            self.commander.latch(f"stopped before this node was started: {latch.read_text()}")
+        self._latch = None if latch is None else Latch(latch)
+        before = None if self._latch is None else self._latch.read()
+        if before is not None:
+            self.commander.latch(f"stopped before this node was started: {before}")
         keys = node.keys
         self._inputs = CommandInputs(node)
         self._status = CommandStatus(node, self.commander)
@@ -86,6 +89,8 @@ class CommandNode:
         gc.freeze()
         with realtime_thread() as self._status.realtime:
             self._loop(stop)
+        if self._latch is not None:
+            self._latch.close()
         self.node.report("stopped", now=True)
         self.node.close()
 
@@ -121,16 +126,21 @@ class CommandNode:
         self._publish(out, now_ns)
         if any(event.kind == "transition" for event in out.events):
             self._keep_latch()
+        self._tell_of_the_latch()
         self._status.ticked(now_ns, tick.stall_s, time.perf_counter() - began)
         self._status.report(out, self._inputs.chunks_dropped)
 
     def _keep_latch(self) -> None:
         if self._latch is None:
             return
-        if self.commander.state in (State.STOPPED, State.FAULT):
-            self._latch.write_text(self.commander.why)
-        else:
-            self._latch.unlink(missing_ok=True)
+        latched = self.commander.state in (State.STOPPED, State.FAULT)
+        self._latch.keep(self.commander.why if latched else None)
+
+    def _tell_of_the_latch(self) -> None:
+        why = None if self._latch is None else self._latch.failure()
+        if why is not None:
+            self.node.counters["command.latch_failed"] += 1
+            self.node.tell(Event("error", "fault", "latch", why))
 
     @property
     def _hz(self) -> float:

@@ -21,7 +21,7 @@ STABLE_S = 60.0
 and find, on a busy machine, that it cannot."""
 GIVE_UP_AFTER = 6
 """Deaths in a row, each before `STABLE_S`."""
-STOP_ORDER = ((("worker", "camera", "command"), 0.8), (("sim",), 0.4), (("router",), 0.1))
+STOP_ORDER = ((("worker", "camera", "command"), 0.8), (("sim", "ros2"), 0.4), (("router",), 0.1))
 """What is ended one after the other, and how long before the deadline the next one has its turn."""
 POLL_S = 0.05
 
@@ -32,7 +32,7 @@ class NodeCommand:
 
     Args:
         name: as in logs and status.
-        kind: router, sim, camera, command or worker.
+        kind: router, sim, ros2, camera, command or worker.
         arguments: of the command line, after ``vla-zenoh``.
     """
 

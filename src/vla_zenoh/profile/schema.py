@@ -60,6 +60,7 @@ class Timing(Section):
         command_hz: of the pose stream.
         state_hz: of the robot's state (the simulator's; a real robot has its own).
         watchdog_s: no fresh chunk for this long after the last one ran out: brake and hold.
+        max_hold_s: an arm that held for so long needs activation again.
         state_timeout_s: robot state older than this: brake, and activation is needed again.
         command_timeout_s: pose stream silent for this long: the robot side brakes by itself.
         max_observation_age_s: a chunk made from an older observation is refused.
@@ -72,6 +73,7 @@ class Timing(Section):
     command_hz: float = Field(default=250.0, ge=50, le=1000)
     state_hz: float = Field(default=200.0, ge=20, le=1000)
     watchdog_s: float = Field(default=0.3, ge=0.02, le=5)
+    max_hold_s: float = Field(default=60.0, ge=1, le=3600)
     state_timeout_s: float = Field(default=0.15, ge=0.02, le=2)
     command_timeout_s: float = Field(default=0.1, ge=0.01, le=1)
     max_observation_age_s: float = Field(default=1.0, gt=0, le=10)
