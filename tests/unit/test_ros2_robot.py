@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import Any
 
@@ -13,7 +14,7 @@ from panda_arm import ARM_JOINTS, HOME_RAD, panda
 
 from vla_zenoh.control.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.errors import CodecError
-from vla_zenoh.interop.ros2.arm_state import ArmState, Newness
+from vla_zenoh.interop.ros2.arm_state import BEYOND, ArmState, Newness, pose_state
 from vla_zenoh.interop.ros2.frames import MAX_FRAMES, Frames
 from vla_zenoh.interop.ros2.goals import GoalKeeper, Step
 from vla_zenoh.interop.ros2.hold import MOVED_M, SETTLE_NS, Hold
@@ -80,11 +81,63 @@ def test_other_robots_joints_say_nothing(arm: ArmState) -> None:
         (joints(position=np.array([math.nan, *np.zeros(8)])), "invalid"),
         (joints(position=np.array([*np.zeros(8), math.inf])), "invalid"),
         (joints(velocity=np.array([math.inf, *np.zeros(8)])), "invalid"),
+        (joints(velocity=np.array([1e308, *np.zeros(8)])), "invalid"),
+        (joints(position=np.array([-1e306, *np.zeros(8)])), "invalid"),
+        (joints(position=np.array([*np.zeros(7), 1e308, 1e308])), "invalid"),
     ],
 )
 def test_what_is_not_whole_is_refused(arm: ArmState, message: Joints, why: str) -> None:
     assert reason(arm.take, message, 1) == why
     assert arm.joints is None
+
+
+def test_a_position_far_off_after_a_sane_one_is_refused_and_the_sane_one_stays(
+    arm: ArmState,
+) -> None:
+    sane = joints(names=ARM_JOINTS, velocity=None)
+    arm.take(sane, 10 * MS)
+    assert reason(arm.take, sane._replace(position=np.full(7, 1e306)), 10 * MS + 1000) == "invalid"
+    assert arm.joints is not None
+    assert arm.joints.position_rad.tolist() == HOME_RAD.tolist()
+    assert arm.take(sane, 10 * MS + 1000) is not None, "its stamp is not used up"
+
+
+@given(
+    st.lists(st.floats(), min_size=9, max_size=9),
+    st.none() | st.lists(st.floats(), min_size=9, max_size=9),
+    st.integers(1, 2**62),
+)
+def test_whatever_joints_are_told_a_pose_can_be_made_of_what_is_taken(
+    position: list[float], velocity: list[float] | None, later_ns: int
+) -> None:
+    arm = ArmState(PROFILE, panda())
+    arm.take(joints(), 1)
+    told = joints(
+        position=np.array(position), velocity=None if velocity is None else np.array(velocity)
+    )
+    with contextlib.suppress(CodecError):
+        arm.take(told, 1 + later_ns)
+    pose_state(*arm.tcp(), None, None)
+    arm.gripper(busy=False, wanted_m=None, held=False)
+
+
+def test_an_arm_at_the_ends_of_its_range_at_full_speed_is_taken(arm: ArmState) -> None:
+    kinematics = panda()
+    for number, at in enumerate((kinematics.lower_rad, kinematics.upper_rad), 1):
+        told = joints(
+            position=np.array([*at, 0.04, 0.04]),
+            velocity=np.array([*kinematics.velocity_rad_s, 0, 0]),
+        )
+        assert arm.take(told, number) is not None
+
+
+def test_two_messages_stamped_at_nearly_one_time_do_not_make_an_arm_infinitely_fast(
+    arm: ArmState,
+) -> None:
+    arm.take(joints(velocity=None), 10 * MS)
+    state = arm.take(joints(velocity=None, position=joints().position + 0.01), 10 * MS + 1)
+    assert state is not None
+    assert (np.abs(state.velocity_rad_s) <= BEYOND * panda().velocity_rad_s).all()
 
 
 def test_efforts_that_are_missing_count_as_zero(arm: ArmState) -> None:

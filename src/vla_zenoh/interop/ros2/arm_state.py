@@ -1,7 +1,7 @@
 """Of joint states on ROS topics: our joint, pose and gripper states.
 
-Positions have to be finite and new. What an arm does not tell (velocities, efforts) is made up for:
-velocities by differences, efforts by zero.
+Positions have to be finite, new, and such as a joint of this arm can have. What an arm does not
+tell (velocities, efforts) is made up for: velocities by differences, efforts by zero.
 """
 
 from __future__ import annotations
@@ -10,13 +10,18 @@ import numpy as np
 
 from vla_zenoh.control.kinematics import Kinematics
 from vla_zenoh.control.so3 import Pose, quat_from_rotation
-from vla_zenoh.errors import CodecError
+from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.interop.ros2.samples import Joints
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
 
 MOVING_M_S = 0.002
 """Fingers faster than this move."""
+BEYOND = 10.0
+"""A joint may be told to be, and to move, this many times as far as its description allows: zero
+points are set in many ways, garbage is further off."""
+WIDEST_M = 10.0
+"""Fingers told to be further open, or to move so far within a second, are garbage."""
 RESTARTED_NS = 1_000_000_000
 """A stamp this much older than the last one is a robot that was started anew, or a clock that was
 set; a smaller step back is a message that was overtaken."""
@@ -55,6 +60,11 @@ class ArmState:
         self._arm, self._fingers = robot.arm_joints, robot.finger_joints
         self._max_width_m = robot.gripper.max_width_m
         self._kinematics = kinematics
+        at = [kinematics.arm_joints.index(name) for name in robot.arm_joints]
+        lower_rad, upper_rad = kinematics.lower_rad[at], kinematics.upper_rad[at]
+        self._middle_rad = (lower_rad + upper_rad) / 2
+        self._furthest_rad = BEYOND * (upper_rad - lower_rad) / 2
+        self._fastest_rad_s = BEYOND * kinematics.velocity_rad_s[at]
         self._arm_newness, self._finger_newness = Newness(), Newness()
         self._joints: JointState | None = None
         self.stamp_ns = 0
@@ -73,7 +83,7 @@ class ArmState:
 
         Raises:
             CodecError: ``frozen``, ``out_of_order``, ``partial`` (some of the arm's joints), or
-                ``invalid`` (not finite).
+                ``invalid`` (not finite, or nothing that this arm can do).
         """
         places = {name: index for index, name in enumerate(joints.names)}
         self._take_fingers(joints, places, stamp_ns)
@@ -83,27 +93,42 @@ class ArmState:
         if len(found) < len(self._arm):
             missing = ", ".join(name for name in self._arm if name not in places)
             raise CodecError("partial", f"joint states of this arm without {missing}")
-        self._arm_newness.check(stamp_ns)
         at = [places[name] for name in self._arm]
         position = _finite("position", joints.position[at])
-        state = JointState(
-            self._arm,
-            position,
-            self._velocity(joints, at, position, stamp_ns),
-            self._effort(joints, at),
-        )
+        self._check(position - self._middle_rad, self._furthest_rad, position, "rad")
+        velocity = None
+        if joints.velocity is not None:
+            velocity = _finite("velocity", joints.velocity[at])
+            self._check(velocity, self._fastest_rad_s, velocity, "rad/s")
+        self._arm_newness.check(stamp_ns)
+        if velocity is None:
+            velocity = self._velocity(position, stamp_ns)
+        try:
+            state = JointState(self._arm, position, velocity, self._effort(joints, at))
+        except RecordError as error:
+            raise CodecError("invalid", str(error)) from error
         self._joints, self.stamp_ns = state, stamp_ns
         return state
 
-    def _velocity(
-        self, joints: Joints, at: list[int], position: FloatArray, stamp_ns: int
-    ) -> FloatArray:
-        if joints.velocity is not None:
-            return _finite("velocity", joints.velocity[at])
+    def _check(self, off: FloatArray, most: FloatArray, told: FloatArray, unit: str) -> None:
+        """That no joint is told to be `off` by more than `most`, both (n,)."""
+        wrong = np.flatnonzero(np.abs(off) > most)
+        if wrong.size:
+            joint = int(wrong[0])
+            raise CodecError(
+                "invalid",
+                f"{self._arm[joint]} at {told[joint]:.4g} {unit}: more than {BEYOND:g} times what "
+                "its description allows",
+            )
+
+    def _velocity(self, position: FloatArray, stamp_ns: int) -> FloatArray:
+        """By the difference to the message before; two that were stamped at nearly one time say
+        nothing of velocity, hence the bound."""
         elapsed_s = (stamp_ns - self.stamp_ns) / 1e9
         if self._joints is None or not 0 < elapsed_s < 1:
-            return np.zeros(len(at))
-        return (position - self._joints.position_rad) / elapsed_s
+            return np.zeros(len(position))
+        velocity = (position - self._joints.position_rad) / elapsed_s
+        return np.clip(velocity, -self._fastest_rad_s, self._fastest_rad_s)
 
     def _effort(self, joints: Joints, at: list[int]) -> FloatArray:
         """Nothing here is controlled by efforts, and ros2_control writes NaN where it has none."""
@@ -117,12 +142,16 @@ class ArmState:
         at = [places[name] for name in self._fingers if name in places]
         if not at:
             return
-        self._finger_newness.check(stamp_ns)
         share = len(self._fingers) / len(at)
-        width_m = float(_finite("position", joints.position[at]).sum()) * share
+        positions = _finite("position", joints.position[at])
+        if float(np.abs(positions).max()) > WIDEST_M:
+            raise CodecError("invalid", f"a finger more than {WIDEST_M:g} m open")
+        self._finger_newness.check(stamp_ns)
+        width_m = float(positions.sum()) * share
         elapsed_s = (stamp_ns - self.width_stamp_ns) / 1e9
-        if joints.velocity is not None and np.isfinite(joints.velocity[at]).all():
-            self._finger_speed_m_s = abs(float(joints.velocity[at].sum())) * share
+        velocity = None if joints.velocity is None else joints.velocity[at]
+        if velocity is not None and bool((np.abs(velocity) <= WIDEST_M).all()):
+            self._finger_speed_m_s = abs(float(velocity.sum())) * share
         elif self.width_m is not None and 0 < elapsed_s < 1:
             self._finger_speed_m_s = abs(width_m - self.width_m) / elapsed_s
         self.width_m, self.width_stamp_ns = width_m, stamp_ns
