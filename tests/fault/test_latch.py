@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 
@@ -47,3 +48,12 @@ def test_refusals_while_stopped_do_not_pile_up(chain: Chain) -> None:
     assert chain.state() == "stopped"
     chain.client.put(chain.client.keys.reset, "reset")
     chain.until("it is reset", lambda: chain.state() == "inactive")
+
+
+def test_the_folder_of_a_lab_is_locked_against_whoever_tidies_up(chain: Chain) -> None:
+    folder = os.open(chain.host.profile_file.parents[1], os.O_RDONLY)
+    try:
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    finally:
+        os.close(folder)

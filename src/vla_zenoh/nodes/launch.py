@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import tempfile
 import threading
 import time
@@ -137,6 +139,10 @@ class Host:
             profile = override(profile, {"session": changes})
         self.profile, self._part, self._tell = profile, part, tell
         self._folder = tempfile.TemporaryDirectory(prefix="vla-zenoh-")
+        # A lab is up for weeks, and systemd-tmpfiles takes away what is 10 days old, but for what
+        # is below a folder that somebody has locked (tmpfiles.d(5)).
+        self._lock: int | None = os.open(self._folder.name, os.O_RDONLY | os.O_DIRECTORY)
+        fcntl.flock(self._lock, fcntl.LOCK_EX)
         # Children read the very profile that is in force here, whatever its options were.
         self.profile_file = self._write(profile)
         self._also = [self._write(other) for other in also]
@@ -225,6 +231,9 @@ class Host:
             self.session = self.client = None
         self.supervisor.stop(deadline_s)
         self._folder.cleanup()
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def _brake(self, client: Client) -> None:
         try:
