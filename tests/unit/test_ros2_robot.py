@@ -15,7 +15,7 @@ from panda_arm import ARM_JOINTS, HOME_RAD, panda
 from vla_zenoh.control.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.ros2.arm_state import BEYOND, ArmState, Newness, pose_state
-from vla_zenoh.interop.ros2.frames import MAX_FRAMES, Frames
+from vla_zenoh.interop.ros2.frames import FURTHEST_M, MAX_CHAIN, MAX_FRAMES, Frames
 from vla_zenoh.interop.ros2.goals import GoalKeeper, Step
 from vla_zenoh.interop.ros2.hold import MOVED_M, SETTLE_NS, Hold
 from vla_zenoh.interop.ros2.robot_clock import RobotClock
@@ -239,6 +239,7 @@ def test_transforms_that_are_none_and_floods_of_frames_are_refused() -> None:
     for entry in (
         bad._replace(quat_xyzw=np.zeros(4)),
         bad._replace(position_m=np.array([math.nan, 0, 0])),
+        bad._replace(position_m=np.array([0, 1.5 * FURTHEST_M, 0])),
     ):
         with pytest.raises(CodecError) as caught:
             frames.take([entry], static=False)
@@ -246,6 +247,21 @@ def test_transforms_that_are_none_and_floods_of_frames_are_refused() -> None:
     with pytest.raises(CodecError) as caught:
         frames.take([transform("a", f"f{n}") for n in range(MAX_FRAMES + 1)], static=False)
     assert caught.value.reason == "flood"
+
+
+def test_the_longest_chain_of_the_furthest_frames_is_finite() -> None:
+    frames = Frames()
+    turned = (0.3, 0.2, 0.1)
+    frames.take(
+        [
+            transform(f"f{n}", f"f{n + 1}", shift=(0, 0, FURTHEST_M), turn=turned)
+            for n in range(MAX_CHAIN)
+        ],
+        static=False,
+    )
+    found = frames.find("f0", f"f{MAX_CHAIN}")
+    assert found is not None
+    pose_state(found[0], np.zeros(6), None, None)
 
 
 # -- the robot's clock ----------------------------------------------------------------------------

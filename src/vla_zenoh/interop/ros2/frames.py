@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from vla_zenoh.control.so3 import Pose, rotation_from_quat
+from vla_zenoh.control.so3 import Pose, norm3, rotation_from_quat
 from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.interop.ros2.samples import Transform
 from vla_zenoh.types import unit_quaternion, vector
 
 MAX_FRAMES = 1000
 MAX_CHAIN = 64
+FURTHEST_M = 1e9
+"""Frames of the whole Earth are nearer to each other; a chain of such stays finite."""
 
 
 class Frames:
@@ -24,7 +26,8 @@ class Frames:
         """Keep these transforms; an older one than what is known is passed over.
 
         Raises:
-            CodecError: ``invalid`` (not finite, no unit quaternion) or ``flood``.
+            CodecError: ``invalid`` (not finite, out of this world, no unit quaternion) or
+                ``flood``.
         """
         for entry in transforms:
             known = self._parents.get(entry.child)
@@ -39,6 +42,11 @@ class Frames:
                 )
             except RecordError as error:
                 raise CodecError("invalid", f"frame {entry.child[:60]!r}: {error}") from error
+            if norm3(pose.position_m) > FURTHEST_M:
+                raise CodecError(
+                    "invalid",
+                    f"frame {entry.child[:60]!r} is more than {FURTHEST_M:g} m from its parent",
+                )
             self._parents[entry.child] = (entry.parent, entry.stamp_ns, pose, static)
 
     def find(self, base: str, tip: str) -> tuple[Pose, int] | None:
