@@ -96,6 +96,8 @@ def test_its_profiles_are_right_and_each_host_knows_what_it_runs(tmp_path: Path)
     for block, name in blocks:
         (tmp_path / name).write_text(block, "utf-8")
     profiles = {name: load_profile(str(tmp_path / name)) for _, name in blocks}
+    openvla = profiles["openvla.yaml"]
+    assert openvla.options["openvla"]["unnorm_key"] == "bridge_orig"
     left, right = profiles["left.yaml"], profiles["right.yaml"]
     assert left.serves == right.serves
     assert left.session.connect == left.session.listen

@@ -102,6 +102,9 @@ def told(path: str) -> list[str]:
         ("serves: {scripted: [panda, b, b]}", "serves.scripted: b: given more than once"),
         ("serves: {scripted: [panda, b/c]}", "serves.scripted.1: name 'b/c' cannot be part of a"),
         ("serves: [panda]", "lab.yaml:2: serves: wants a map"),
+        ("options: {scriptd: {a: b}}", "lab.yaml:2: options: 'scriptd' is not among workers; did"),
+        ("options: {scripted: {a-b: c}}", "options.scripted.a-b: 'a-b' cannot be the name of an"),
+        ("options: {scripted: {dt_s: 0.1}}", "options.scripted.dt_s: wants text; put it in quotes"),
         ("about: 5", "lab.yaml:2: about: wants text; put it in quotes (given: 5)"),
         ('about: "\\ud800"', "lab.yaml:2: about: holds half a character (a surrogate)"),
         (
@@ -447,6 +450,16 @@ def test_null_takes_an_inherited_camera_away(write: Write) -> None:
         "cameras.side: wants a map of: fit_for_workers, height"
         in told(write("cameras: {side: null}"))[0]
     )
+
+
+def test_options_of_a_worker_are_merged_with_those_inherited_and_null_ends_them(
+    write: Write,
+) -> None:
+    write("options: {scripted: {a: b, c: d}}", "base.yaml")
+    more = write("options: {scripted: {c: 'no'}}", "more.yaml", begin="extends: base\n")
+    assert load_profile(more).options == {"scripted": {"a": "b", "c": "no"}}
+    none = write("options: {scripted: null}", begin="extends: base\n")
+    assert load_profile(none).options == {}
 
 
 def test_null_ends_that_a_worker_serves_several_robots(write: Write) -> None:

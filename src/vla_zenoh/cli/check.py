@@ -65,8 +65,9 @@ def check(
     Exits with 0 when nothing is wrong, 1 when something is.
     """
     found = find_model(model)
-    chosen = model_options(options or [])
     against = load_profile(profile) if profile is not None else None
+    usual = against.options.get(name or found.name, {}) if against is not None else {}
+    chosen = {**usual, **model_options(options or [])}
     run_in_own_environment(found, python)
     with contextlib.redirect_stdout(sys.stderr):  # a model's own words are not the result
         report = _examine(

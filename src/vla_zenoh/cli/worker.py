@@ -34,7 +34,10 @@ def worker(
     ] = None,
     options: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Option of the model as name=value; may be repeated."),
+        typer.Option(
+            "--set",
+            help="Option of the model as name=value, before those of the profile; may be repeated.",
+        ),
     ] = None,
     images: Annotated[
         Literal["auto", "raw", "jpeg"],
@@ -55,8 +58,9 @@ def worker(
     """Run a model: observations in, action chunks out on its delta key."""
     loaded = effective_profile(profile, connect, host=host)
     found = find_model(model)
-    chosen = model_options(options or [])
-    served = robot_names(robots) or loaded.serves.get(name or found.name, ())
+    called = name or found.name
+    chosen = {**loaded.options.get(called, {}), **model_options(options or [])}
+    served = robot_names(robots) or loaded.serves.get(called, ())
     # Comes back only where this environment has what the model's header asks for.
     run_in_own_environment(found, python)
     policy = make_policy(found, chosen, profile=profile)
@@ -67,14 +71,14 @@ def worker(
             loaded,
             session,
             policy,
-            name or found.name,
+            called,
             images=form,
             host=host,
             delay_s=delay_ms / 1e3,
             robots=served,
             another=lambda: make_policy(found, chosen, profile=profile),
         ).run(stop),
-        identity=worker_node(name or found.name),
+        identity=worker_node(called),
     )
     # A model's library may leave threads behind that would keep the process.
     os._exit(0)

@@ -19,7 +19,7 @@ from vla_zenoh.profile.yaml_text import Lines
 MAX_EXTENDS = 8
 SUFFIXES = (".yaml", ".yml")
 REPLACED_WHOLE = {("hosts",)}
-WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("serves",)}
+WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("serves",), ("options",)}
 
 
 def profile_names() -> list[str]:

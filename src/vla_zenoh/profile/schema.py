@@ -44,6 +44,12 @@ def _source(value: str) -> str:
     return value
 
 
+def _option(value: str) -> str:
+    if not value.isidentifier():
+        raise ValueError(f"{value[:80]!r} cannot be the name of an option")
+    return value
+
+
 def _root(value: str) -> str:
     try:
         for part in value.split("/"):
@@ -220,6 +226,7 @@ class Profile(Section):
         workers: models by their names.
         serves: worker -> the robots it serves, this one among them, all like this one; a worker
             that is not named here serves this one alone.
+        options: worker -> what ``--set`` would give it, name -> text.
     """
 
     name: Name
@@ -233,6 +240,9 @@ class Profile(Section):
     sim: SimProfile = SimProfile()
     workers: Names = ("scripted",)
     serves: dict[Name, Annotated[Names, Field(min_length=1)]] = Field(default_factory=dict)
+    options: dict[Name, dict[Annotated[str, AfterValidator(_option)], Text]] = Field(
+        default_factory=dict
+    )
     task: TaskProfile = TaskProfile()
     session: SessionProfile = SessionProfile()
     hosts: dict[Name, HostProfile] = Field(
