@@ -191,10 +191,7 @@ def test_a_killed_supervisor_that_nobody_has_buried_yet_counts_as_gone(tmp_path:
 
 @pytest.mark.slow
 def test_a_node_that_dies_at_every_start_is_given_up(tmp_path: Path) -> None:
-    path = write_profile(tmp_path, more="workers: [missing_model]\n")
-    text = path.read_text().replace("worker: scripted", "worker: missing_model")
-    path.write_text(text)
-    with up(str(path)) as running:
+    with up(str(write_profile(tmp_path, more="robot: {tcp_frame: nobody}\n"))) as running:
         began = time.monotonic()
         running.process.wait(GIVE_UP_S)
         running.thread.join(5.0)
@@ -202,8 +199,18 @@ def test_a_node_that_dies_at_every_start_is_given_up(tmp_path: Path) -> None:
         assert running.process.returncode == 1
         assert running.children() == {}
         assert f"died {GIVE_UP_AFTER} times in a row; giving up" in running.text
-        assert "error: worker-missing_model dies again and again" in running.text
-        assert "missing_model" in running.text
+        assert "dies again and again" in running.text
+        assert "has no link 'nobody'" in running.text
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_at_every_start_leaves_the_robot_to_the_others(tmp_path: Path) -> None:
+    path = write_profile(tmp_path, more="workers: [scripted, missing_model]\n")
+    with up(str(path)) as running, client_of(path) as (client, recorder):
+        said = f"died {GIVE_UP_AFTER} times in a row; it is left alone"
+        until("it is left alone", lambda: said in running.text, GIVE_UP_S)
+        assert len(running.children()) == len(NODES)
+        get_moving(client, recorder)
 
 
 def test_a_router_that_runs_already_is_used_and_left_running(tmp_path: Path) -> None:
@@ -259,6 +266,60 @@ def test_what_a_node_has_started_ends_with_it(tmp_path: Path) -> None:
     supervisor.stop(time.monotonic() + END_S)
 
     until("nothing is left of it", lambda: not group_runs(group), BUSY_S)
+
+
+def begin(*commands: NodeCommand) -> tuple[Supervisor, list[str]]:
+    told: list[str] = []
+    supervisor = Supervisor(
+        commands, log=lambda *_: None, tell=lambda name, said: told.append(f"{name} {said}")
+    )
+    supervisor.start()
+    return supervisor, told
+
+
+def broken(name: str, kind: str) -> NodeCommand:
+    return NodeCommand(name, kind, ("no-such-command",))
+
+
+def lose(supervisor: Supervisor, name: str) -> None:
+    """As if it had died so often already that the next time is the last."""
+    (child,) = (each for each in supervisor.children if each.command.name == name)
+    child.deaths_in_a_row = GIVE_UP_AFTER - 1
+
+
+def test_a_spared_node_that_dies_again_and_again_is_left_alone_while_others_run() -> None:
+    robot = NodeCommand("sim", "sim", ("echo", "--help"))
+    supervisor, told = begin(robot, broken("worker-a", "worker"), broken("worker-b", "worker"))
+    try:
+        lose(supervisor, "worker-a")
+        end = f"worker-a died {GIVE_UP_AFTER} times in a row; it is left alone"
+
+        def left() -> bool:
+            assert supervisor.watch(spare=("worker",))
+            return any(each.startswith(end) for each in told)
+
+        until("it is left alone", left, READY_PATIENCE_S)
+        assert supervisor.given_up is None
+        until("the other one is started again", lambda: left() and starts(told, "worker-b") > 1)
+        assert starts(told, "worker-a") == 1
+    finally:
+        supervisor.kill()
+
+
+def starts(told: list[str], name: str) -> int:
+    return sum(each.startswith(f"{name} started") for each in told)
+
+
+@pytest.mark.parametrize("kind", ["worker", "camera"])
+def test_when_nothing_else_is_left_or_can_be_spared_it_is_given_up(kind: str) -> None:
+    supervisor, told = begin(broken("last", kind))
+    try:
+        lose(supervisor, "last")
+        until("given up", lambda: not supervisor.watch(spare=("worker",)), READY_PATIENCE_S)
+        assert supervisor.given_up is supervisor.children[0]
+        assert told[-1] == f"last died {GIVE_UP_AFTER} times in a row; giving up"
+    finally:
+        supervisor.kill()
 
 
 def group_runs(group: int) -> bool:

@@ -24,7 +24,8 @@ from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
 from vla_zenoh.profile.fit import node_name, workers_of
 from vla_zenoh.security.identity import Role, person
 
-START_ORDER = ("router", "sim", "ros2", "command", "camera", "worker")
+START_ORDER = ("router", "sim", "ros2", "arm", "command", "camera", "worker")
+EXPENDABLE = ("worker",)
 ROUTER_PATIENCE_S = 10.0
 BRAKE_PATIENCE_S = 1.0
 STOP_BUDGET_S = 2.9
@@ -245,12 +246,15 @@ class Host:
     def serve(self, stop: threading.Event) -> None:
         """Watch over the nodes until `stop` is set: what dies or hangs is started again.
 
+        A worker that dies again and again is left alone: somebody's broken model must not end the
+        robot's nodes beside it.
+
         Raises:
-            NodeError: a node dies again and again.
+            NodeError: another node dies again and again, or nothing is left here but such workers.
         """
         while not stop.wait(0.1):
             self._end_what_hangs()
-            if not self.supervisor.watch():
+            if not self.supervisor.watch(spare=EXPENDABLE):
                 given_up = self.supervisor.given_up
                 name = given_up.command.name if given_up else "a node"
                 raise NodeError(f"{name} dies again and again; its last lines above say why")

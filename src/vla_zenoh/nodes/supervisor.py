@@ -21,7 +21,11 @@ STABLE_S = 60.0
 and find, on a busy machine, that it cannot."""
 GIVE_UP_AFTER = 6
 """Deaths in a row, each before `STABLE_S`."""
-STOP_ORDER = ((("worker", "camera", "command"), 0.8), (("sim", "ros2"), 0.4), (("router",), 0.1))
+STOP_ORDER = (
+    (("worker", "camera", "command"), 0.8),
+    (("sim", "ros2", "arm"), 0.4),
+    (("router",), 0.1),
+)
 """What is ended one after the other, and how long before the deadline the next one has its turn."""
 POLL_S = 0.05
 
@@ -32,7 +36,7 @@ class NodeCommand:
 
     Args:
         name: as in logs and status.
-        kind: router, sim, ros2, camera, command or worker.
+        kind: router, sim, ros2, arm, camera, command or worker.
         arguments: of the command line, after ``vla-zenoh``.
     """
 
@@ -49,6 +53,7 @@ class Child:
     process: subprocess.Popen[str] | None = None
     started_s: float = 0.0
     deaths_in_a_row: int = 0
+    left_alone: bool = False
     restarts: int = 0
     start_again_s: float = 0.0
     threads: list[threading.Thread] = field(default_factory=list)
@@ -83,8 +88,13 @@ class Supervisor:
             if child.process is None and (kinds is None or child.command.kind in kinds):
                 self._spawn(child)
 
-    def watch(self) -> bool:
-        """Restart what died. False: a node dies again and again, and it makes no sense to go on."""
+    def watch(self, spare: Sequence[str] = ()) -> bool:
+        """Restart what died. False: a node dies again and again, and it makes no sense to go on.
+
+        Args:
+            spare: kinds without which the others go on: one of them that dies again and again is
+                left alone, as long as there are others.
+        """
         now = time.monotonic()
         for child in self.children:
             if child.process is not None and child.process.poll() is not None:
@@ -92,10 +102,20 @@ class Supervisor:
             elif child.process is None and child.start_again_s and now >= child.start_again_s:
                 child.restarts += 1
                 self._spawn(child)
-            if child.deaths_in_a_row >= GIVE_UP_AFTER:
+            if child.deaths_in_a_row < GIVE_UP_AFTER or child.left_alone:
+                continue
+            said = f"died {GIVE_UP_AFTER} times in a row"
+            child.left_alone = child.command.kind in spare
+            if not child.left_alone or all(each.left_alone for each in self.children):
                 self.given_up = child
-                self._tell(child.command.name, f"died {GIVE_UP_AFTER} times in a row; giving up")
+                self._tell(child.command.name, f"{said}; giving up")
                 return False
+            child.start_again_s = 0.0
+            self._tell(
+                child.command.name,
+                f"{said}; it is left alone until all are started anew, the others go on. Its last "
+                "lines above say why",
+            )
         return True
 
     def stop(self, deadline_s: float) -> None:
@@ -182,7 +202,9 @@ class Supervisor:
             _kill_group(child.process)
         child.process, child.start_again_s = None, now + wait_s
         how = f"killed by {_signal_name(-code)}" if code < 0 else f"ended with code {code}"
-        self._tell(child.command.name, f"{how}; starting again in {wait_s:g} s")
+        if child.deaths_in_a_row < GIVE_UP_AFTER:
+            how += f"; starting again in {wait_s:g} s"
+        self._tell(child.command.name, how)
 
     def _signal(self, kinds: Sequence[str], number: signal.Signals) -> None:
         for process in self._running(kinds):
