@@ -42,3 +42,16 @@ def test_no_other_node_is_told_of_other_robots() -> None:
 def test_a_host_without_a_router_cannot_serve_other_robots_and_says_who_can() -> None:
     with pytest.raises(ProfileError, match=r"'gpu'.*no router.*; robot does"):
         node_commands(load_profile("panda_sim_lab"), "gpu", FILE, also_files=OTHERS)
+
+
+def test_a_dry_run_is_for_the_command_node_alone() -> None:
+    profile = load_profile("panda_sim")
+    wet, dry = (node_commands(profile, "here", FILE, dry_run=dry) for dry in (False, True))
+    for before, after in zip(wet, dry, strict=True):
+        more = ("--dry-run",) if after.kind == "command" else ()
+        assert after.arguments == (*before.arguments, *more)
+
+
+def test_a_dry_run_where_nothing_commands_is_refused() -> None:
+    with pytest.raises(ProfileError, match=r"'gpu'.*no command node"):
+        node_commands(load_profile("panda_sim_lab"), "gpu", FILE, dry_run=True)

@@ -37,6 +37,9 @@ def up(
     connect: ConnectOption = None,
     listen: ListenOption = None,
     also: AlsoOption = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Compute and check everything, command nothing.")
+    ] = False,
 ) -> None:
     """Start and supervise all nodes that belong on this host. Ctrl-C brakes the arm first."""
     stop = stop_on_signals()
@@ -55,9 +58,11 @@ def up(
         log(node, sentence, "bold")
 
     others = [effective_profile(name, host=host) for name in also or ()]
-    with Host(loaded, host, log=log, tell=tell, also=others) as running:
+    with Host(loaded, host, log=log, tell=tell, also=others, dry_run=dry_run) as running:
         where = ", ".join(running.profile.session.connect)
         tell("up", f"profile {loaded.name}, host {running.host}, router at {where}")
+        if dry_run:
+            tell("up", "dry run: the robot is commanded nothing")
         for sentence in _soon(running.profile, running.host):
             tell("up", sentence)
         tell("up", "look: vla-zenoh status; drive: vla-zenoh prompt/activate; end: Ctrl-C")

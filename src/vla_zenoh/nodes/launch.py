@@ -58,6 +58,8 @@ def node_commands(
     worker_options: Mapping[str, Sequence[str]] | None = None,
     worker_arguments: Sequence[str] = (),
     also_files: Sequence[Path] = (),
+    *,
+    dry_run: bool = False,
 ) -> list[NodeCommand]:
     """Command lines of all nodes of `host`, in the order to start them.
 
@@ -68,11 +70,16 @@ def node_commands(
         worker_options: worker -> ``name=value`` options.
         worker_arguments: more of the command line of every worker.
         also_files: profiles of other robots that the router of this host serves.
+        dry_run: the command node commands nothing.
 
     Raises:
-        ProfileError: there are such robots, and no router on this host.
+        ProfileError: there are such robots, and no router on this host; or nothing to be run dry.
     """
     part = profile.hosts[host]
+    if dry_run and "command" not in part.nodes:
+        raise ProfileError(
+            f"host {host!r} of profile {profile.name} runs no command node, which --dry-run is for"
+        )
     if also_files and "router" not in part.nodes:
         routers = [name for name, other in profile.hosts.items() if "router" in other.nodes]
         raise ProfileError(
@@ -95,6 +102,8 @@ def node_commands(
         elif kind == "router":
             others = [word for file in also_files for word in ("--also", str(file))]
             commands.append(NodeCommand(name, kind, (kind, *common, "--host", host, *others)))
+        elif kind == "command" and dry_run:
+            commands.append(NodeCommand(kind, kind, (kind, *common, "--dry-run")))
         else:
             commands.append(NodeCommand(kind, kind, (kind, *common)))
     return commands
@@ -112,10 +121,12 @@ class Host:
         worker_options: worker -> ``name=value`` options.
         worker_arguments: more of the command line of every worker.
         also: other robots' profiles that the router of this host serves.
+        dry_run: the command node computes and checks everything and commands nothing.
 
     Raises:
         NodeError: a router answers although `own_router`, or does not know who is in `also`.
-        ProfileError: there is no such host, or it has no router for `also`.
+        ProfileError: there is no such host, or it has no router for `also`, or no command node
+            for `dry_run`.
     """
 
     def __init__(
@@ -129,6 +140,7 @@ class Host:
         worker_options: Mapping[str, Sequence[str]] | None = None,
         worker_arguments: Sequence[str] = (),
         also: Sequence[Profile] = (),
+        dry_run: bool = False,
     ) -> None:
         self.host, part = choose_host(profile, host)
         changes: dict[str, Any] = {}
@@ -155,6 +167,7 @@ class Host:
                 worker_options,
                 worker_arguments,
                 self._also,
+                dry_run=dry_run,
             ),
             log=log,
             tell=tell,
