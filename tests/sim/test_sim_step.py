@@ -24,7 +24,7 @@ from vla_zenoh.types import Header, PoseCommand, PoseState
 
 MS_NS = 1_000_000
 STEP_NS = 10 * MS_NS
-SPEED_M_S = 0.05
+SPEED_M_S = 0.02
 STEPS = 30
 FOLLOW_M = 0.002
 STILL_TWIST = 0.005

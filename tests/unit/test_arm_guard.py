@@ -72,7 +72,7 @@ def test_it_holds_the_arm_by_what_the_profile_says_until_somebody_commands(
 
 def test_while_poses_are_followed_joints_are_refused_and_change_nothing() -> None:
     side = Side()
-    assert side.pose(0.001, 0.1) is None
+    assert side.pose(0.0004, 0.02) is None
     before = side.tick()
     assert side.joint() == "other_mode"
     assert side.guard.mode == "pose"
@@ -81,10 +81,22 @@ def test_while_poses_are_followed_joints_are_refused_and_change_nothing() -> Non
 
 def test_while_joints_are_followed_poses_are_refused() -> None:
     side = Side("joint")
-    assert side.joint(0.01, 0.1) is None
+    assert side.joint(0.001, 0.05) is None
     side.tick()
     assert side.pose() == "other_mode"
     assert isinstance(side.tick(), JointReference)
+
+
+def test_whose_stream_is_followed_is_known_until_it_ends() -> None:
+    side = Side()
+    assert side.guard.writer == ""
+    assert side.pose(source="command#1") is None
+    assert side.pose(source="stranger#1") == "foreign"
+    assert side.guard.writer == "command#1"
+    side.tick(SILENT_MS)
+    assert side.guard.writer == ""
+    assert side.joint(source="command#2") is None
+    assert side.guard.writer == "command#2"
 
 
 def test_when_a_stream_has_ended_at_rest_the_other_may_begin_and_back_again() -> None:
@@ -100,7 +112,7 @@ def test_when_a_stream_has_ended_at_rest_the_other_may_begin_and_back_again() ->
 
 def test_while_the_arm_brakes_the_other_stream_may_not_begin() -> None:
     side = Side()
-    side.pose(v_m_s=0.3)
+    assert side.pose(v_m_s=0.02) is None
     side.tick(SILENT_MS)
     assert side.guard.braking
     assert side.joint() == "other_mode"
@@ -135,12 +147,12 @@ def test_the_other_stream_begins_where_the_arm_is_and_not_where_it_was() -> None
     side = Side()
     moved = Pose(np.array([0.5, 0.1, 0.4]), np.eye(3))
     side.measured = side.measured._replace(pose=moved, position_rad=HOME_RAD + 0.4)
-    assert side.joint(0.01) is None
-    np.testing.assert_allclose(side.tick()[0], HOME_RAD + 0.41)
+    assert side.joint(0.001) is None
+    np.testing.assert_allclose(side.tick()[0], HOME_RAD + 0.401)
     side.tick(SILENT_MS)
     side.measured = side.measured._replace(position_rad=HOME_RAD)
-    assert side.pose(0.001) is None
-    np.testing.assert_allclose(side.tick()[0], [0.501, 0.1, 0.4])
+    assert side.pose(0.0004) is None
+    np.testing.assert_allclose(side.tick()[0], [0.5004, 0.1, 0.4])
 
 
 def test_what_was_heard_before_a_change_is_not_new_after_it() -> None:
@@ -153,6 +165,23 @@ def test_what_was_heard_before_a_change_is_not_new_after_it() -> None:
     side.tick(SILENT_MS)
     assert side.guard.offer_joint(old, side.now_ns) == "replayed"
     assert side.guard.mode == "pose"
+
+
+@pytest.mark.parametrize("mode", ["pose", "joint"])
+def test_an_arm_that_somebody_else_moved_stands_there_and_knows_who_spoke(mode: Mode) -> None:
+    side = Side(mode)
+    offer = side.guard.offer_pose if mode == "pose" else side.guard.offer_joint
+    at, still = side.measured.pose.position_m, np.zeros(6)
+    record: Any = (
+        PoseCommand(at, UNIT, still, still, at, UNIT, "active")
+        if mode == "pose"
+        else JointCommand(NAMES, HOME_RAD, np.zeros(7), np.zeros(7), "active")
+    )
+    old = side.stamped(record, "command#1")
+    assert offer(old, side.now_ns) is None
+    side.guard.anchor()
+    assert not side.guard.following
+    assert offer(old, side.now_ns) == "replayed"
 
 
 @pytest.mark.parametrize("mode", ["pose", "joint"])

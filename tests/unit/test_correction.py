@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,36 +19,28 @@ SPEED_M_S = 0.2
 TICK_NS = 1_000_000
 STEP_SLACK_M = 2e-4
 
-differences = st.lists(
-    st.tuples(st.integers(0, 300), st.floats(-0.02, 0.02), st.floats(-0.2, 0.2)), max_size=6
-)
 
-
-@given(differences)
-def test_value_and_rate_change_continuously_whatever_is_added_when(
-    added: list[tuple[int, float, float]],
+@given(st.integers(1, 300), st.floats(-0.02, 0.02), st.floats(-0.2, 0.2))
+def test_value_and_rate_change_continuously_from_what_it_began_with(
+    ticks: int, value: float, rate: float
 ) -> None:
     correction = Correction(1, DT_S)
-    for ticks, value, rate in added:
-        before = correction.now
-        correction.add(np.array([value]), np.array([rate]))
-        assert correction.now is not None
-        # What is followed changes by minus the difference, so that their sum does not change.
-        old = before.value[0] if before else 0.0
-        assert correction.now.value[0] - value == pytest.approx(old, abs=1e-12)
-        for _ in range(ticks):
-            now = correction.now
-            correction.tick()
-            if now is None or correction.now is None:
-                continue
-            moved = correction.now.value - now.value
-            mean = (correction.now.rate + now.rate) * (DT_S / 2)
-            np.testing.assert_allclose(moved, mean, atol=1e-6)
+    correction.begin(np.array([value]), np.array([rate]))
+    assert correction.now is not None
+    assert (correction.now.value[0], correction.now.rate[0]) == (value, rate)
+    for _ in range(ticks):
+        now = correction.now
+        correction.tick()
+        if now is None or correction.now is None:
+            continue
+        moved = correction.now.value - now.value
+        mean = (correction.now.rate + now.rate) * (DT_S / 2)
+        np.testing.assert_allclose(moved, mean, atol=1e-6)
 
 
 def test_twenty_millimetres_are_gone_soon_and_never_in_haste() -> None:
     correction = Correction(3, DT_S)
-    correction.add(np.array([0.02, 0.0, 0.0]), np.zeros(3))
+    correction.begin(np.array([0.02, 0.0, 0.0]), np.zeros(3))
     fastest = 0.0
     for _ in range(round(WHOLE_S / DT_S)):
         assert correction.now is not None
@@ -74,11 +65,12 @@ def test_a_stream_that_stood_still_for_a_moment_does_not_pull_the_reference_back
         now_ns += TICK_NS
         # The writer stalls for 60 ms and then goes on where it was, not where it should be.
         if tick % 4 == 0 and not 300 <= tick < 360:
-            way_m += SPEED_M_S * 0.004
+            speed_m_s = min(SPEED_M_S * sent / 25, SPEED_M_S)
+            way_m += speed_m_s * 0.004
             record = PoseCommand(
                 start.position_m + [way_m, 0.0, 0.0],
                 [0.0, 0.0, 0.0, 1.0],
-                [SPEED_M_S, 0, 0, 0, 0, 0],
+                [speed_m_s, 0, 0, 0, 0, 0],
                 np.zeros(6),
                 start.position_m,
                 [0.0, 0.0, 0.0, 1.0],
@@ -87,6 +79,6 @@ def test_a_stream_that_stood_still_for_a_moment_does_not_pull_the_reference_back
             sent += 1
             assert guard.offer(Stamped(Header(now_ns, sent, "c"), record, now_ns), now_ns) is None
         positions.append(guard.tick(now_ns).pose.position_m[0])
-    steps = np.diff(positions)[50:]
+    steps = np.diff(positions)[150:]
     assert float(np.abs(steps - SPEED_M_S * DT_S).max()) < STEP_SLACK_M
     assert abs(positions[-1] - (start.position_m[0] + way_m)) < 2 * SPEED_M_S * 0.004

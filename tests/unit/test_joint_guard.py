@@ -14,6 +14,7 @@ from vla_zenoh.control.joint_reference import (
     JointGuardLimits,
     JointMotionLimits,
     joint_guard_limits,
+    joint_motion_limits,
     stop_from,
 )
 from vla_zenoh.profile import load_profile
@@ -30,6 +31,8 @@ COMMAND_TICKS = 4
 START_NS = 1_700_000_000_000_000_000
 PATH_ATOL_RAD = 2e-5  # between two commands 4 ms apart the jerk is not known
 STEP_RTOL = 1e-6
+STEP_RAD = 1e-3
+STREAM_S, RAMP_S = 0.004, 0.2
 SWING_RAD = np.array([0.2, -0.1, 0.15, 0.1, -0.2, 0.3, -0.3])
 
 
@@ -59,6 +62,13 @@ def stamped(
 
 def make_guard() -> JointGuard:
     return JointGuard(NAMES, HOME_RAD, TICK_S, LIMITS)
+
+
+def begun() -> JointGuard:
+    """A guard that follows a stream at home."""
+    guard = make_guard()
+    assert guard.offer(stamped(still(HOME_RAD), 0, START_NS), START_NS) is None
+    return guard
 
 
 def streamed(guard: JointGuard, duration_s: float) -> Iterator[tuple[int, JointReference]]:
@@ -117,7 +127,9 @@ def test_joints_in_another_order_are_put_in_the_arms() -> None:
     guard = make_guard()
     turned = tuple(reversed(NAMES))
     wanted = JointReference(
-        HOME_RAD + np.linspace(-0.03, 0.03, 7), np.linspace(0.1, 0.7, 7), np.linspace(-1.0, 1.0, 7)
+        HOME_RAD + np.linspace(-0.001, 0.001, 7),
+        np.linspace(0.01, 0.07, 7),
+        np.linspace(-1.0, 1.0, 7),
     )
     backwards = JointReference(*(column[::-1] for column in wanted))
     assert guard.offer(stamped(backwards, 0, START_NS, names=turned), START_NS) is None
@@ -155,10 +167,71 @@ def test_fewer_or_more_joints_than_the_arm_has_are_refused(count: int) -> None:
 
 @pytest.mark.parametrize("joint", range(7))
 def test_a_jump_of_any_joint_is_refused_and_a_small_step_is_not(joint: int) -> None:
-    step = np.zeros(7)
-    step[joint] = LIMITS.jump_rad * 1.01
-    assert refusal(make_guard(), START_NS, still(HOME_RAD + step)) == "jump"
-    assert make_guard().offer(stamped(still(HOME_RAD + 0.98 * step), 0, START_NS), START_NS) is None
+    for limit_rad, followed in ((LIMITS.begin_rad, False), (LIMITS.jump_rad, True)):
+        step = np.eye(7)[joint] * limit_rad * 1.01
+        guard = begun() if followed else make_guard()
+        assert refusal(guard, START_NS, still(HOME_RAD + step)) == "jump"
+        assert guard.offer(stamped(still(HOME_RAD + 0.98 * step), 1, START_NS), START_NS) is None
+
+
+@pytest.mark.parametrize("joint", range(7))
+def test_a_stream_begins_at_rest(joint: int) -> None:
+    for share, reason in ((0.99, None), (1.01, "too_fast")):
+        velocity = np.eye(7)[joint] * -share * LIMITS.begin_rad_s
+        given = JointReference(HOME_RAD, velocity, np.zeros(7))
+        assert make_guard().offer(stamped(given, 0, START_NS), START_NS) == reason
+
+
+@pytest.mark.parametrize("speed_rad_s", [0.1, 0.2, 0.3, 0.4, 0.5])
+def test_a_stream_that_goes_on_after_the_robots_own_brake_makes_no_step(
+    speed_rad_s: float,
+) -> None:
+    """Lost for a moment, and its writer brakes as well as soon as it hears of it."""
+    guard, dt_s = JointGuard(NAMES, HOME_RAD, STREAM_S, LIMITS), STREAM_S
+    velocity = np.eye(7)[0] * speed_rad_s
+    slow = joint_motion_limits(PROFILE)
+    stop, last, heard_s = None, guard.motion, np.inf
+    for k in range(500):
+        time_s, now_ns = k * dt_s, START_NS + round(k * dt_s * 1e9)
+        if guard.braking and stop is None:
+            heard_s = min(heard_s, time_s + 0.015)
+        moved_s = max(time_s - RAMP_S / 2, 0.0)
+        sent = JointReference(HOME_RAD + velocity * moved_s, velocity, np.zeros(7))
+        if time_s < RAMP_S:
+            share = time_s / RAMP_S
+            way = velocity * (time_s * share / 2)
+            sent = JointReference(HOME_RAD + way, velocity * share, velocity / RAMP_S)
+        if stop is None and time_s >= heard_s:
+            stop, heard_s = stop_from(sent, slow), time_s
+        if stop is not None:
+            sent = JointReference(*map(np.array, stop.at_time(time_s - heard_s)))
+        if not 0.4 <= time_s < 0.53:
+            guard.offer(stamped(sent, k, now_ns), now_ns)
+        motion = guard.tick(now_ns)
+        step = motion.position_rad - last.position_rad - last.velocity_rad_s * dt_s
+        assert np.abs(step).max() < STEP_RAD
+        last = motion
+    assert guard.silences == 1
+
+
+@pytest.mark.parametrize("asleep_ms", [12, 60, 95])
+def test_a_side_that_was_woken_late_goes_on_from_what_it_sent_last(asleep_ms: int) -> None:
+    guard, now_ns = in_motion()
+    sent = guard.motion
+    now_ns += (1 + asleep_ms) * TICK_NS
+    guard.offer(stamped(swing((now_ns - START_NS) / 1e9), 10_000, now_ns), now_ns)
+    step = guard.tick(now_ns).position_rad - sent.position_rad
+    np.testing.assert_allclose(step, sent.velocity_rad_s * TICK_S, atol=STEP_RAD)
+
+
+def test_a_side_that_slept_too_long_stands_where_it_sent_the_arm_last() -> None:
+    guard, now_ns = in_motion()
+    sent = guard.motion
+    guard.stand()
+    motion = guard.tick(now_ns + 10**10)
+    np.testing.assert_array_equal(motion.position_rad, sent.position_rad)
+    assert not motion.velocity_rad_s.any()
+    assert refusal(guard, now_ns, swing(0.8)) == "too_fast"
 
 
 @pytest.mark.parametrize("joint", range(7))
@@ -169,8 +242,7 @@ def test_a_joint_that_would_be_faster_than_its_own_limit_is_refused(joint: int, 
     motion[order] = np.eye(7)[joint] * -1.01 * limit
     assert refusal(make_guard(), START_NS, JointReference(*motion)) == "too_fast"
     motion[order] = np.eye(7)[joint] * -0.99 * limit
-    guard = make_guard()
-    assert guard.offer(stamped(JointReference(*motion), 0, START_NS), START_NS) is None
+    assert begun().offer(stamped(JointReference(*motion), 1, START_NS), START_NS) is None
 
 
 def test_the_robot_allows_twice_what_the_profile_lets_the_stream_do() -> None:
@@ -182,9 +254,9 @@ def test_the_robot_allows_twice_what_the_profile_lets_the_stream_do() -> None:
 @pytest.mark.parametrize("end", [-1.0, 1.0])
 def test_a_joint_stays_within_its_range(end: float) -> None:
     outside = HOME_RAD.copy()
-    outside[3] += end * 1.01
+    outside[3] += end * 1.001
     near = HOME_RAD.copy()
-    near[3] += end * 0.99
+    near[3] += end * 0.999
     guard = make_guard()
     guard.restart(near)
     assert refusal(guard, START_NS, still(outside)) == "out_of_range"
@@ -331,6 +403,6 @@ def test_limits_may_be_given_for_any_arm() -> None:
         np.full(2, 1.0),
     )
     guard = JointGuard(("a", "b"), np.zeros(2), TICK_S, two)
-    command = JointCommand(("b", "a"), [0.01, 0.02], [0, 0], [0, 0], "active")
+    command = JointCommand(("b", "a"), [0.001, 0.002], [0, 0], [0, 0], "active")
     assert guard.offer(Stamped(Header(START_NS, 0, "x"), command, START_NS), START_NS) is None
-    np.testing.assert_array_equal(guard.tick(START_NS).position_rad, [0.02, 0.01])
+    np.testing.assert_array_equal(guard.tick(START_NS).position_rad, [0.002, 0.001])

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from vla_zenoh.control.reference import GuardLimits, ReferenceGuard, guard_limits
 from vla_zenoh.control.smoothing import MotionLimits, Smoother, motion_limits
@@ -19,26 +22,38 @@ BRAKE = MotionLimits((1.0, 4.0, 40.0), (3.0, 12.0, 120.0))
 LIMITS = GuardLimits(0.1, BRAKE)
 START = Pose(np.array([0.43, 0.0, 0.3]), exp3(np.array([3.0, 0.1, 0.0])))
 SOURCE = "command-1"
+RAMP_S = 0.1
 PATH_ATOL_M = 5e-5  # what clocks may drift apart while a command is held up
 FOLLOWED_M, FOLLOWED_RAD = 1e-4, 1e-3
+STEP_M, STEP_M_S = (
+    6e-4,
+    0.2,
+)  # beside its own motion; 0.2 m/s in a tick of 4 ms is for an ill stream
+SHORT_STEP_M, CAUGHT_UP_M = 1e-4, 1e-5
 RTOL = 1e-6
 
 
 class Line:
-    """Commands along x at a constant speed, stamped on the clock of their writer."""
+    """Commands along x, stamped on the clock of their writer: from rest to a constant speed."""
 
     def __init__(self, speed: float, ahead_ns: int = 0) -> None:
         self.speed, self.ahead_ns, self.seq = speed, ahead_ns, 0
 
     def x(self, t_ns: int) -> float:
-        return float(START.position_m[0]) + self.speed * t_ns / 1e9
+        t_s = t_ns / 1e9
+        ramp_s = min(t_s, RAMP_S)
+        way_m = self.speed * (ramp_s * ramp_s / (2 * RAMP_S) + t_s - ramp_s)
+        return float(START.position_m[0]) + way_m
+
+    def v(self, t_ns: int) -> float:
+        return self.speed * min(t_ns / 1e9 / RAMP_S, 1.0)
 
     def at(self, t_ns: int, arrives_ns: int | None = None, **how: Any) -> Stamped[PoseCommand]:
         self.seq += 1
         header = Header(10**15 + t_ns + self.ahead_ns, self.seq, SOURCE)
-        return command(
-            self.x(t_ns), self.speed, header, t_ns if arrives_ns is None else arrives_ns, **how
-        )
+        arrives_ns = t_ns if arrives_ns is None else arrives_ns
+        how = {"acceleration": self.speed / RAMP_S if t_ns < RAMP_S * 1e9 else 0.0, **how}
+        return command(self.x(t_ns), self.v(t_ns), header, arrives_ns, **how)
 
 
 def command(
@@ -166,6 +181,23 @@ def test_a_stream_begins_where_the_reference_is(x: float, reason: str | None) ->
     assert guard().offer(command(x, 0.0, Header(now(0), 1, SOURCE), 0), now(0)) == reason
 
 
+@pytest.mark.parametrize(
+    ("speed", "spin", "reason"),
+    [(0.029, 0.09, None), (0.031, 0.0, "too_fast"), (0.0, 0.11, "too_fast")],
+)
+def test_a_stream_begins_at_rest(speed: float, spin: float, reason: str | None) -> None:
+    given = command(0.43, speed, Header(now(0), 1, SOURCE), 0, spin=spin)
+    assert guard().offer(given, now(0)) == reason
+
+
+def test_one_command_of_a_stranger_at_the_right_place_moves_nothing() -> None:
+    side = guard()
+    side.offer(command(0.43, 1.0, Header(now(0), 7, "anybody#1"), 0), now(0))
+    for t in range(300):
+        motion = side.tick(now(t * MS))
+    np.testing.assert_array_equal(motion.pose.position_m, START.position_m)
+
+
 @pytest.mark.parametrize(("turn_rad", "followed"), [(0.009, False), (0.09, True)])
 def test_a_turn_that_jumps_is_refused(turn_rad: float, followed: bool) -> None:
     for by_rad, reason in ((turn_rad, None), (turn_rad * 1.2, "jump")):
@@ -251,6 +283,72 @@ def test_restart_follows_nobody_from_another_place() -> None:
     assert not side.following
     np.testing.assert_array_equal(motion.pose.position_m, there.position_m)
     np.testing.assert_array_equal(motion.twist, np.zeros(6))
+
+
+@pytest.mark.parametrize("tick_ms", [1, 4])
+@given(
+    speed=st.floats(0.05, 0.5),
+    gaps_ms=st.lists(st.integers(1, 60), min_size=1, max_size=4),
+    begins_m=st.floats(-0.0019, 0.0019),
+    heard=st.booleans(),
+)
+@settings(max_examples=8, deadline=None)
+def test_the_reference_never_steps_whoever_was_late(
+    tick_ms: int, speed: float, gaps_ms: list[int], begins_m: float, heard: bool
+) -> None:
+    side = ReferenceGuard(START, tick_ms * 1e-3, LIMITS)
+    line, t, last = Line(speed), 0, side.motion
+    for gap_ms in [0, *gaps_ms]:
+        # This side slept: what came meanwhile lies in a heap, or was lost as well.
+        for late in range(t // 4 * 4 + 4, t + gap_ms, 4) if heard else ():
+            side.offer(line.at(late * MS, arrives_ns=(t + gap_ms) * MS), now((t + gap_ms) * MS))
+        t += gap_ms // 4 * 4
+        for _ in range(0, 200, tick_ms):
+            if t % 4 == 0:
+                given = line.at(t * MS)
+                record = replace(
+                    given.record, position_m=given.record.position_m + [begins_m, 0, 0]
+                )
+                side.offer(replace(given, record=record), now(t * MS))
+            motion = side.tick(now(t * MS))
+            way_m = motion.pose.position_m[0] - last.pose.position_m[0]
+            assert abs(way_m - last.twist[0] * tick_ms * 1e-3) < STEP_M
+            assert abs(motion.twist[0] - last.twist[0]) < STEP_M_S
+            last = motion
+            t += tick_ms
+
+
+@pytest.mark.parametrize("asleep_ms", [12, 60, 95])
+def test_a_side_that_was_woken_late_goes_on_from_what_it_sent_last(asleep_ms: int) -> None:
+    side, line = ReferenceGuard(START, STREAM_S, LIMITS), Line(0.2)
+    for t in range(0, 400, 4):
+        side.offer(line.at(t * MS), now(t * MS))
+        sent = side.tick(now(t * MS))
+    t += 4 + asleep_ms
+    side.offer(line.at(t * MS), now(t * MS))
+    step_m = side.tick(now(t * MS)).pose.position_m[0] - sent.pose.position_m[0]
+    assert step_m == pytest.approx(0.2 * STREAM_S, abs=SHORT_STEP_M)
+    for _ in range(200):
+        t += 4
+        side.offer(line.at(t * MS), now(t * MS))
+        x = side.tick(now(t * MS)).pose.position_m[0]
+    assert x == pytest.approx(line.x(t * MS), abs=CAUGHT_UP_M)
+
+
+def test_a_side_that_slept_too_long_stands_where_it_sent_the_arm_last() -> None:
+    side, line = guard(), Line(0.5)
+    for t in range(200):
+        if t % 4 == 0:
+            side.offer(line.at(t * MS), now(t * MS))
+        sent = side.tick(now(t * MS))
+    side.stand()
+    for t in range(10_200, 10_500):
+        motion = side.tick(now(t * MS))
+    np.testing.assert_array_equal(motion.pose.position_m, sent.pose.position_m)
+    np.testing.assert_array_equal(motion.twist, np.zeros(6))
+    assert side.offer(line.at(196 * MS), now(t * MS)) is not None, "it is on its way already"
+    again = command(line.x(100 * MS), 0.0, Header(now(0), 1, SOURCE), t * MS)
+    assert side.offer(again, now(t * MS)) == "replayed", "what was heard stays heard"
 
 
 def test_the_robots_own_stop_may_be_twice_as_hard_as_the_stream() -> None:

@@ -57,6 +57,7 @@ class ArmGuard:
     ) -> None:
         self._poses, self._joints = poses, joints
         self._measure = measure
+        self._writer = ""
         self.mode: Mode = mode
 
     @property
@@ -67,6 +68,11 @@ class ArmGuard:
     def following(self) -> bool:
         """A command stream is being followed."""
         return self._in_charge.following
+
+    @property
+    def writer(self) -> str:
+        """Source of the stream that is being followed, empty where none is."""
+        return self._writer if self.following else ""
 
     @property
     def braking(self) -> bool:
@@ -104,7 +110,7 @@ class ArmGuard:
             self._poses.anchor(measured.pose)
         reason = self._poses.offer(command, now_ns)
         if reason is None:
-            self.mode = "pose"
+            self.mode, self._writer = "pose", command.header.source
         return reason
 
     def offer_joint(self, command: Stamped[JointCommand], now_ns: int) -> str | None:
@@ -122,13 +128,23 @@ class ArmGuard:
             self._joints.anchor(measured.position_rad)
         reason = self._joints.offer(command, now_ns)
         if reason is None:
-            self.mode = "joint"
+            self.mode, self._writer = "joint", command.header.source
         return reason
 
     def tick(self, now_ns: int) -> Reference | JointReference:
         """What the arm has to hold at `now_ns`."""
         self._in_charge.tick(now_ns)
         return self.reference
+
+    def anchor(self) -> None:
+        """Somebody else moved the arm; follow nobody and stand. Commands heard stay heard."""
+        measured = self._measure()
+        self._poses.anchor(measured.pose)
+        self._joints.anchor(measured.position_rad)
+
+    def stand(self) -> None:
+        """Follow nobody and stand where the reference is: the arm stopped there by itself."""
+        self._in_charge.stand()
 
     def restart(self) -> None:
         """The robot was put elsewhere; follow nobody and stand there."""

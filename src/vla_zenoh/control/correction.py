@@ -1,8 +1,9 @@
 """A correction that comes in smoothly: what a late command changes is not done in one step.
 
 Between two commands the robot's side foretells the motion. Where the next command says something
-else (it was held up, one was lost), the difference ``d`` stays in the reference at first, so that
-neither position nor velocity steps, and then dies away like a critically damped spring::
+else (it was held up, one was lost), or this side itself was late, the difference ``d`` stays in the
+reference at first, so that neither position nor velocity steps, and then dies away like a
+critically damped spring::
 
     d'' + 2 w d' + w^2 d = 0
     d(t) = (d0 + (d0' + w d0) t) exp(-w t)
@@ -46,10 +47,8 @@ class Correction:
         """Nothing is to be corrected."""
         self.now: Difference | None = None
 
-    def add(self, value: FloatArray, rate: FloatArray) -> None:
-        """The motion that is followed has changed by minus this."""
-        if self.now is not None:
-            value, rate = value + self.now.value, rate + self.now.rate
+    def begin(self, value: FloatArray, rate: FloatArray) -> None:
+        """This, (n,) each, is what the reference is away from the motion that is followed."""
         w = STIFFNESS_1_S
         self.now = Difference(value, rate, -2 * w * rate - w * w * value)
 

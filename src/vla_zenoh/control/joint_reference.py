@@ -27,8 +27,9 @@ from vla_zenoh.types import FloatArray, JointCommand, Stamped
 STILL_RAD_S = 1e-4
 """A stream that ends slower than this has ended on purpose."""
 
-SMOOTHED_RAD = 0.002
-"""A command this far from what was foretold is not on its path: it was late, or one was lost."""
+SMOOTHED_RAD, SMOOTHED_RAD_S = 0.002, 0.1
+"""A reference that would step by this much, beyond its own motion, goes over instead: see
+`vla_zenoh.control.reference`."""
 
 
 class JointMotionLimits(NamedTuple):
@@ -48,6 +49,8 @@ class JointGuardLimits(NamedTuple):
         lower_rad: (n,) least position of every joint.
         upper_rad: (n,) greatest.
         jump_rad: no joint may be commanded further than this from the reference in force.
+        begin_rad: nor this far by the first command of a stream, which begins where the arm stands.
+        begin_rad_s: and no joint may move faster than this in it: a stream of ours begins at rest.
     """
 
     timeout_s: float
@@ -55,6 +58,8 @@ class JointGuardLimits(NamedTuple):
     lower_rad: FloatArray
     upper_rad: FloatArray
     jump_rad: float = 0.05
+    begin_rad: float = 0.004
+    begin_rad_s: float = 0.1
 
 
 class JointGuard:
@@ -96,6 +101,10 @@ class JointGuard:
         self._brake = None
         self.motion = JointReference.at_rest(position_rad)
 
+    def stand(self) -> None:
+        """Follow nobody and stand where the reference is: the arm stopped there by itself."""
+        self.anchor(self.motion.position_rad)
+
     @property
     def following(self) -> bool:
         """A command stream is being followed."""
@@ -122,28 +131,21 @@ class JointGuard:
         if wanted is None:
             return "names"
         here, limits = self.motion.position_rad, self._limits
-        if (np.abs(wanted.position_rad - here) > limits.jump_rad).any():
+        jump_rad = limits.jump_rad if self.following else limits.begin_rad
+        if (np.abs(wanted.position_rad - here) > jump_rad).any():
             return "jump"
         if (np.abs(wanted.velocity_rad_s) > limits.brake.velocity_rad_s).any() or (
             np.abs(wanted.acceleration_rad_s2) > limits.brake.acceleration_rad_s2
         ).any():
+            return "too_fast"
+        if not self.following and (np.abs(wanted.velocity_rad_s) > limits.begin_rad_s).any():
             return "too_fast"
         # An arm that stands outside its range may come back, and goes no further out.
         if (wanted.position_rad < np.minimum(limits.lower_rad, here)).any() or (
             wanted.position_rad > np.maximum(limits.upper_rad, here)
         ).any():
             return "out_of_range"
-        followed = self._stream.live(now_ns)
-        ahead_s = self._stream.ahead_s(now_ns)
         self._stream.take(Stamped(command.header, wanted, command.received_ns))
-        if followed is None:
-            self._correction.clear()
-            return None
-        foretold = self._extrapolate(followed, ahead_s)
-        told = self._extrapolate(wanted, self._stream.ahead_s(now_ns))
-        apart = foretold.position_rad - told.position_rad
-        if float(np.abs(apart).max()) > SMOOTHED_RAD:
-            self._correction.add(apart, foretold.velocity_rad_s - told.velocity_rad_s)
         return None
 
     def _ordered(self, record: JointCommand) -> JointReference | None:
@@ -161,7 +163,7 @@ class JointGuard:
         command = self._stream.live(now_ns)
         if command is not None:
             self._correction.tick()
-            self.motion = self._corrected(self._extrapolate(command, self._stream.ahead_s(now_ns)))
+            self.motion = self._joined(self._extrapolate(command, self._stream.ahead_s(now_ns)))
             return self.motion
         if self._stream.newest is not None:
             self._end_of_stream()
@@ -173,6 +175,19 @@ class JointGuard:
         if self._brake_s >= self._brake.duration:
             self._brake = None
         return self.motion
+
+    def _joined(self, told: JointReference) -> JointReference:
+        """What is told, so that it goes on from the reference of the tick before without a step."""
+        motion, dt_s, last = self._corrected(told), self._dt_s, self.motion
+        velocity = last.velocity_rad_s + last.acceleration_rad_s2 * dt_s
+        position = last.position_rad + (last.velocity_rad_s + velocity) * (0.5 * dt_s)
+        if (
+            float(np.abs(motion.position_rad - position).max()) > SMOOTHED_RAD
+            or float(np.abs(motion.velocity_rad_s - velocity).max()) > SMOOTHED_RAD_S
+        ):
+            self._correction.begin(position - told.position_rad, velocity - told.velocity_rad_s)
+            return self._corrected(told)
+        return motion
 
     def _corrected(self, motion: JointReference) -> JointReference:
         rest = self._correction.now

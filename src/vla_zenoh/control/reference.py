@@ -32,7 +32,9 @@ STILL = 1e-4
 
 
 SMOOTHED_M, SMOOTHED_RAD = 0.0005, 0.002
-"""A command this far from what was foretold is not on its path: it was late, or one was lost."""
+SMOOTHED_M_S, SMOOTHED_RAD_S = 0.03, 0.1
+"""A reference that would step by this much, beyond its own motion, goes over instead: a command was
+late or lost, the stream began a little aside, or this side itself was woken late."""
 
 
 class GuardLimits(NamedTuple):
@@ -45,6 +47,8 @@ class GuardLimits(NamedTuple):
         begin_m: the first command of a stream may differ by this much. A stream begins where the
             reference is; one that goes on after the robot has braked by itself would jerk it.
         begin_rad: likewise.
+        begin_m_s: and it may move this fast: a stream of ours begins at rest.
+        begin_rad_s: likewise.
         brake: velocity, acceleration and jerk of its own stop.
     """
 
@@ -54,6 +58,8 @@ class GuardLimits(NamedTuple):
     jump_rad: float = 0.1
     begin_m: float = 0.002
     begin_rad: float = 0.01
+    begin_m_s: float = 0.03
+    begin_rad_s: float = 0.1
 
 
 class ReferenceGuard:
@@ -89,6 +95,10 @@ class ReferenceGuard:
         self._smoother.reset(pose)
         self.motion = self._smoother.motion
 
+    def stand(self) -> None:
+        """Follow nobody and stand where the reference is: the arm stopped there by itself."""
+        self.anchor(self.motion.pose)
+
     @property
     def following(self) -> bool:
         """A command stream is being followed."""
@@ -123,28 +133,20 @@ class ReferenceGuard:
                 return "too_fast"
             if float(np.linalg.norm(values[3:])) > 2 * self._brake_limits.rotation[order]:
                 return "too_fast"
-        followed = self._stream.live(now_ns)
-        foretold = None if followed is None else self._extrapolate(followed, now_ns)
+        if not self.following and (
+            norm3(record.twist[:3]) > limits.begin_m_s
+            or norm3(record.twist[3:]) > limits.begin_rad_s
+        ):
+            return "too_fast"
         self._stream.take(command)
-        if foretold is None:
-            self._correction.clear()
-        else:
-            self._correct(foretold, self._extrapolate(record, now_ns))
         return None
-
-    def _correct(self, foretold: Motion, told: Motion) -> None:
-        """Where a command says something else than its predecessors, go over to it smoothly."""
-        apart = foretold.pose.position_m - told.pose.position_m
-        turned = log3(foretold.pose.rotation @ told.pose.rotation.T)
-        if norm3(apart) > SMOOTHED_M or norm3(turned) > SMOOTHED_RAD:
-            self._correction.add(np.concatenate([apart, turned]), foretold.twist - told.twist)
 
     def tick(self, now_ns: int) -> Motion:
         """The reference to follow at `now_ns`."""
         command = self._stream.live(now_ns)
         if command is not None:
             self._correction.tick()
-            self.motion = self._corrected(self._extrapolate(command, now_ns))
+            self.motion = self._joined(self._extrapolate(command, now_ns))
             return self.motion
         if self._stream.newest is not None:
             self._end_of_stream()
@@ -154,6 +156,25 @@ class ReferenceGuard:
             return self.motion
         self.motion = Motion(self.motion.pose, np.zeros(6), np.zeros(6))
         return self.motion
+
+    def _joined(self, told: Motion) -> Motion:
+        """What is told, so that it goes on from the reference of the tick before without a step."""
+        motion, dt_s, last = self._corrected(told), self._dt_s, self.motion
+        twist = last.twist + last.acceleration * dt_s
+        way = (last.twist + twist) * (0.5 * dt_s)
+        position_m = last.pose.position_m + way[:3]
+        rotation = exp3(way[3:]) @ last.pose.rotation
+        if (
+            norm3(motion.pose.position_m - position_m) <= SMOOTHED_M
+            and angle_between(motion.pose.rotation, rotation) <= SMOOTHED_RAD
+            and norm3(motion.twist[:3] - twist[:3]) <= SMOOTHED_M_S
+            and norm3(motion.twist[3:] - twist[3:]) <= SMOOTHED_RAD_S
+        ):
+            return motion
+        apart_m = position_m - told.pose.position_m
+        turned = log3(rotation @ told.pose.rotation.T)
+        self._correction.begin(np.concatenate([apart_m, turned]), twist - told.twist)
+        return self._corrected(told)
 
     def _corrected(self, motion: Motion) -> Motion:
         rest = self._correction.now
