@@ -12,6 +12,7 @@ from vla_zenoh import resources
 from vla_zenoh.errors import ProfileError, ResourceError
 from vla_zenoh.profile import yaml_text
 from vla_zenoh.profile.explain import explain
+from vla_zenoh.profile.paths import anchor
 from vla_zenoh.profile.schema import Profile
 from vla_zenoh.profile.section import Place
 from vla_zenoh.profile.yaml_text import Lines
@@ -110,6 +111,7 @@ def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], Lines]:
         way = " -> ".join(str(p) for p in (*seen, path))
         raise ProfileError(f"{path}:1: profiles extend each other in a circle or too deep: {way}")
     data, lines = yaml_text.read(_bytes(path), str(path))
+    anchor(data, path.parent)
     if "extends" not in data:
         return data, lines
     where, parent = lines["extends",], data.pop("extends")

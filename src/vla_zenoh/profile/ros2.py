@@ -121,7 +121,8 @@ class Ros2Profile(Section):
         pose_command: where poses go.
         joint_command: where joint positions go.
         gripper: where gripper commands go.
-        messages: type -> file with its definition, for types that ROS and we do not have.
+        messages: type -> file with its definition, for types that ROS and we do not have; a path
+            beside the profile.
         services: what our own services and topics begin with; null: there are none.
     """
 

@@ -125,7 +125,8 @@ class CameraProfile(Section):
 
     Args:
         source: ``sim:<camera of the scene>``, ``v4l2:<device>`` (``v4l2:/dev/video0``),
-            ``rtsp://...``, ``file:<video or folder of pictures>``, or ``ros2:<topic>``.
+            ``rtsp://...``, ``file:<video or folder of pictures>`` (a path beside the profile), or
+            ``ros2:<topic>``.
         width: pixels published.
         height: likewise.
         rate_hz: pictures per second, at most.
