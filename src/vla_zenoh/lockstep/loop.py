@@ -16,6 +16,7 @@ from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.control.arm_guard import Measured, make_arm_guard
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
+from vla_zenoh.control.gripper_guard import GripperGuard
 from vla_zenoh.control.joint_impedance import JointReference
 from vla_zenoh.control.preflight import Surroundings
 from vla_zenoh.control.reach import Shadow
@@ -87,6 +88,7 @@ class Lockstep:
         self.trace = Trace()
         self.events: list[Event] = []
         self.refused: Counter[str] = Counter()
+        self._gripper_guard = GripperGuard(profile.robot.gripper)
         self.guard_refused: Counter[str] = Counter()
         policies = {profile.task.worker: policy, **(others or {})}
         self.workers = {
@@ -298,7 +300,11 @@ class Lockstep:
             self.guard_refused[refusal] += 1
 
     def _take_gripper_command(self, command: Stamped[GripperCommand]) -> None:
-        order = command.record
+        try:
+            order = self._gripper_guard.take(command, self.guard.writer)
+        except CodecError as error:
+            self.guard_refused[error.reason] += 1
+            return
         self.world.set_gripper(order.width_m, order.speed_m_s, order.force_n)
 
 

@@ -9,10 +9,12 @@ from typing import TypeVar
 from vla_zenoh.codec import settings
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.control.arm_guard import ArmGuard
+from vla_zenoh.control.gripper_guard import GripperGuard
+from vla_zenoh.errors import CodecError
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.slots import Inbox
 from vla_zenoh.simulation.world import World
-from vla_zenoh.types import GripperCommand, Header, JointCommand, PoseCommand, Stamped
+from vla_zenoh.types import GripperCommand, JointCommand, PoseCommand, Stamped
 
 LEAST_FORCE_N = 0.1
 """A gripper told to press with nothing would not move."""
@@ -47,8 +49,7 @@ class SimInputs:
         self._joints = node.listen(keys.command_joint, Inbox(64, SMALL_BYTES))
         self._widths = node.listen(keys.command_gripper, Inbox(16, SMALL_BYTES))
         self._resets = node.listen(keys.sim_reset, Inbox(4, settings.MAX_SETTING_BYTES))
-        self._writer = ""
-        self._last_width: Header | None = None
+        self._gripper_guard = GripperGuard(node.profile.robot.gripper)
 
     def take(self, now_ns: int) -> None:
         """Obey or refuse what came since the last call."""
@@ -79,31 +80,19 @@ class SimInputs:
         if self._lockstep:
             command = replace(command, received_ns=now_ns)
         reason = take(command, now_ns)
-        if reason is None:
-            self._writer = command.header.source
-            return
-        self._node.refuse(
-            f"{mode}_{reason}", f"command/{mode} by {command.header.source[:60]!r}: {reason}"
-        )
+        if reason is not None:
+            self._node.refuse(
+                f"{mode}_{reason}", f"command/{mode} by {command.header.source[:60]!r}: {reason}"
+            )
 
     def _take_width(self, width: Stamped[GripperCommand]) -> None:
-        header, last, order = width.header, self._last_width, width.record
-        if self._guard.following and header.source != self._writer:
-            self._node.refuse(
-                "foreign",
-                f"command/gripper by {header.source[:60]!r}, while {self._writer[:60]!r} moves the "
-                "arm",
-            )
+        try:
+            order = self._gripper_guard.take(width, self._guard.writer)
+        except CodecError as error:
+            self._node.refuse(error.reason, f"command/gripper {error}")
             return
-        if last is not None and header.source == last.source and header.seq <= last.seq:
-            self._node.refuse("replayed", f"command/gripper {header.seq} came again or late")
-            return
-        self._last_width = header
-        self._world.set_gripper(
-            min(order.width_m, self._node.profile.robot.gripper.max_width_m),
-            order.speed_m_s,
-            max(order.force_n, LEAST_FORCE_N),
-        )
+        self._node.counters["gripper_bounded"] = self._gripper_guard.bounded
+        self._world.set_gripper(order.width_m, order.speed_m_s, max(order.force_n, LEAST_FORCE_N))
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ class GripperProfile(Section):
     """The gripper. A command is sent when the width differs by more than the dead band."""
 
     max_width_m: float = Field(default=0.08, gt=0, le=1)
-    speed_m_s: float = Field(default=0.1, gt=0, le=1)
+    speed_m_s: float = Field(default=0.1, ge=1e-4, le=1)
     force_n: float = Field(default=25.0, ge=0, le=500)
     dead_band_m: float = Field(default=0.001, gt=0, le=0.05)
     command_timeout_s: float = Field(default=2.0, gt=0, le=30)

@@ -245,6 +245,11 @@ class Arm:
         return self._guard is not None and (self._guard.following or self._guard.braking)
 
     @property
+    def writer(self) -> str:
+        """Source of the command stream that is followed, empty where none is."""
+        return "" if self._guard is None else self._guard.writer
+
+    @property
     def state(self) -> str:
         """One word."""
         age_s = self.heard.age_s

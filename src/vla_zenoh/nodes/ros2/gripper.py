@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import secrets
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from vla_zenoh.codec.records import SMALL_BYTES
+from vla_zenoh.control.gripper_guard import GripperGuard
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.ros2 import gripper_actions, table
 from vla_zenoh.interop.ros2.goals import Goal, GoalKeeper, Step
@@ -19,9 +21,8 @@ from vla_zenoh.interop.ros2.samples import Stamp
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.ros2.link import Caller, Link
 from vla_zenoh.nodes.slots import Inbox
-from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Gripper
-from vla_zenoh.types import Event, GripperCommand
+from vla_zenoh.types import Event, GripperCommand, Stamped
 
 GIVE_UP_S = 5.0
 """A goal of which nothing is heard for so long is given up."""
@@ -43,13 +44,13 @@ class Gripper:
     ) -> None:
         self._node, self._messages, self._profile = node, messages, profile
         self._orders = node.listen(node.keys.command_gripper, Inbox(16, SMALL_BYTES))
-        self._speaker = Speaker(node.profile.timing.command_timeout_s)
+        self._guard = GripperGuard(node.profile.robot.gripper)
         self._keeper = GoalKeeper(GIVE_UP_S)
         self._news: deque[Callable[[], None]] = deque()
         self._goal_id = b""
         self._closing = False
         self._action = ""
-        self._now_ns = 0
+        self._mono_ns = 0
         self.wanted_m: float | None = None
         self.holding = False
         self._callers: dict[str, dict[str, Caller]] = {}
@@ -68,22 +69,36 @@ class Gripper:
         """A goal is in flight."""
         return self._keeper.goal is not None
 
-    def turn(self, now_ns: int) -> None:
-        """Take commands and answers, and do what is due."""
-        self._now_ns = now_ns
+    def turn(self, now_ns: int, writer: str) -> None:
+        """Take commands and answers, and do what is due.
+
+        Args:
+            now_ns: on the wall clock, for stamps.
+            writer: source whose commands the arm follows, empty while it follows nobody's.
+        """
+        self._mono_ns = time.monotonic_ns()
         while self._news:
             self._news.popleft()()
         for arrival in self._orders.take_all():
-            order = self._node.read(GripperCommand, arrival, self._speaker)
+            order = self._node.read(GripperCommand, arrival)
             if order is not None:
-                self._take(order.record, now_ns)
-        step = self._keeper.step(now_ns)
+                self._offer(order, now_ns, writer)
+        step = self._keeper.step(self._mono_ns)
         self._node.counters["ros2.gripper_timeouts"] = self._keeper.timeouts
         goal = self._keeper.goal
         if step is Step.SEND and goal is not None:
             self._send(goal)
         elif step is Step.CANCEL and goal is not None:
             self._cancel()
+
+    def _offer(self, order: Stamped[GripperCommand], now_ns: int, writer: str) -> None:
+        try:
+            command = self._guard.take(order, writer)
+        except CodecError as error:
+            self._node.refuse(error.reason, f"command/gripper {error}")
+            return
+        self._node.counters["gripper_bounded"] = self._guard.bounded
+        self._take(command, now_ns)
 
     def _take(self, command: GripperCommand, now_ns: int) -> None:
         if self._profile is None:
@@ -131,7 +146,7 @@ class Gripper:
             if self._keeper.ended(number):
                 self._complain("refused the goal" if response is not None else "does not answer")
             return
-        self._keeper.accepted(number, self._now_ns)
+        self._keeper.accepted(number, self._mono_ns)
         request = self._messages.new(
             request_of(get_result_of(self._action)),
             goal_id=gripper_actions.uuid(self._messages, self._goal_id),

@@ -161,10 +161,10 @@ class Ros2Node:
                     return
                 self._arm.deafen()
             now_ns = self.node.clock.wall_at(tick.nominal_ns)
-            if self._gripper is not None:
-                self._gripper.turn(now_ns)
             if self._arm is not None:
                 self._arm.turn(now_ns)
+            if self._gripper is not None:
+                self._gripper.turn(now_ns, "" if self._arm is None else self._arm.writer)
             while self._news:
                 self._news.popleft()()
             self._rate.tick()

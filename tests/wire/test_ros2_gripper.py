@@ -1,0 +1,113 @@
+"""The gripper of a ROS 2 robot: whose orders it obeys, and what its goals are timed by."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from camera_rig import until
+from ros2_peer import Ros2Peer
+from ros2_rig import write_profile
+
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.clock import Clock
+from vla_zenoh.nodes.node import Node, Stream
+from vla_zenoh.nodes.ros2.gripper import Gripper
+from vla_zenoh.nodes.ros2.link import Link
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.profile import load_profile
+from vla_zenoh.types import GripperCommand
+
+HOUR_NS = 3_600_000_000_000
+FORGOTTEN_S = 0.15
+"""Longer than timing.command_timeout_s."""
+MOVE = "/panda_gripper/move/_action"
+ORDER = GripperCommand(0.02, 0.05, 10.0)
+
+
+class Rig:
+    """A gripper that is turned by hand, and the robot's side of its action."""
+
+    def __init__(self, node: Node, gripper: Gripper, command: Stream, stranger: Stream) -> None:
+        self.node, self.gripper = node, gripper
+        self.command, self.stranger = command, stranger
+        self.goals: list[Any] = []
+        self.over = threading.Event()
+
+    def turn_until(self, what: str, name: str, count: int, writer: str = "command#1") -> None:
+        """Turn until counter `name` stands at `count`."""
+
+        def reached() -> bool:
+            self.gripper.turn(time.time_ns(), writer)
+            return self.node.counters[name] >= count
+
+        until(what, reached)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    profile = load_profile(str(write_profile(tmp_path)))
+    assert profile.ros2 is not None
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as ours,
+        open_session(profile.session) as theirs,
+    ):
+        node = Node("ros2", profile, ours)
+        messages = Messages(profile.ros2.distribution)
+        link = Link(ours, profile.ros2, messages, "vla_panda")
+        gripper = Gripper(node, link, messages, profile.ros2.gripper)
+        streams = [
+            Stream(theirs, profile.keys.command_gripper, Kind.ORDER, source, Clock())
+            for source in ("command#1", "stranger#1")
+        ]
+        peer = Ros2Peer(theirs, "ros2dds")
+        rig = Rig(node, gripper, *streams)
+
+        def accept(asked: Any) -> Any:
+            rig.goals.append(asked.goal)
+            return peer.message("franka_msgs/action/Move_SendGoal_Response", accepted=True)
+
+        def finish(_: Any) -> Any:
+            rig.over.wait()
+            return peer.message("franka_msgs/action/Move_GetResult_Response")
+
+        peer.serve(f"{MOVE}/send_goal", "franka_msgs/action/Move_SendGoal", accept)
+        peer.serve(f"{MOVE}/get_result", "franka_msgs/action/Move_GetResult", finish)
+        until("the gripper listens", lambda: all(stream.wanted for stream in streams))
+        yield rig
+        rig.over.set()
+        peer.close()
+        link.close()
+        node.close()
+
+
+def test_strangers_and_orders_that_come_again_move_nothing_and_none_goes_beyond_the_profile(
+    rig: Rig,
+) -> None:
+    most = rig.node.profile.robot.gripper
+    rig.command.put(GripperCommand(1.0, 10.0, 1000.0))
+    rig.turn_until("the first goal", "ros2.gripper_goals", 1)
+    until("the robot hears it", lambda: rig.goals)
+    assert (rig.goals[0].width, rig.goals[0].speed) == (most.max_width_m, most.speed_m_s)
+    assert rig.node.counters["gripper_bounded"] == 1
+    time.sleep(FORGOTTEN_S)
+    rig.command.put(ORDER, seq=0)
+    rig.turn_until("it came again", "refused.replayed", 1)
+    rig.stranger.put(ORDER)
+    rig.turn_until("it is a stranger's", "refused.foreign", 1)
+    assert rig.gripper.wanted_m == most.max_width_m
+
+
+def test_a_wall_clock_that_is_set_does_not_give_up_a_goal(rig: Rig) -> None:
+    rig.command.put(ORDER)
+    rig.turn_until("the goal", "ros2.gripper_goals", 1)
+    for now_ns in (time.time_ns() + HOUR_NS, time.time_ns() - HOUR_NS):
+        rig.gripper.turn(now_ns, "command#1")
+        assert rig.gripper.busy
+    assert rig.node.counters["ros2.gripper_timeouts"] == 0
