@@ -1,0 +1,49 @@
+"""docs/robots.md: the profile of its text is right, and its arm can do what the text says of it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from vla_zenoh.cli.profile import profile_app
+from vla_zenoh.control.arm import make_kinematics, make_shadow
+from vla_zenoh.profile import load_profile
+
+TEXT = (Path(__file__).parents[2] / "docs" / "robots.md").read_text("utf-8")
+HOME_M = (0.49, 0.11, 0.43)
+TEXT_M = 0.005
+"""The text rounds to centimetres."""
+DOWN = -0.999
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    found = re.search(r"```yaml\n# (\w+\.yaml)\n(.*?)```", TEXT, re.DOTALL)
+    assert found is not None
+    path = tmp_path / found[1]
+    path.write_text(found[2], "utf-8")
+    return path
+
+
+def test_its_robot_is_right_and_needs_no_second_look(file: Path) -> None:
+    result = CliRunner().invoke(profile_app, ["check", str(file)])
+    assert result.exit_code == 0
+    assert result.stderr == ""
+
+
+def test_at_home_its_arm_is_where_the_text_says_and_free_to_move(file: Path) -> None:
+    profile = load_profile(str(file))
+    kinematics = make_kinematics(profile)
+    assert kinematics.arm_joints == profile.robot.arm_joints
+    home = kinematics.forward(kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad))
+    assert home.position_m == pytest.approx(HOME_M, abs=TEXT_M)
+    assert home.rotation[2, 2] < DOWN
+    box, reach = profile.limits.workspace, profile.limits.reach
+    for at_m, (low_m, high_m) in zip(home.position_m, (box.x_m, box.y_m, box.z_m), strict=True):
+        assert low_m < at_m < high_m
+    margins = make_shadow(profile, kinematics).margins
+    assert margins.singular_value > reach.singularity_slow
+    assert margins.self_m > reach.collision_slow_m
