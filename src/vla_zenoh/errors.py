@@ -65,6 +65,11 @@ class ResourceError(VlaZenohError, FileNotFoundError):
         return str(self.args[0]) if self.args else ""
 
 
+def how_to_install(extra: str) -> str:
+    """What brings an extra of this package, installed from an index or in its checkout."""
+    return f"pip install 'vla-zenoh[{extra}]', in a checkout: pip install '.[{extra}]'"
+
+
 class MissingExtraError(VlaZenohError, ImportError):
     """An optional dependency is not installed.
 
@@ -76,7 +81,7 @@ class MissingExtraError(VlaZenohError, ImportError):
     def __init__(self, module: str, extra: str) -> None:
         super().__init__(
             f"the Python module {module!r} is not installed; "
-            f"install it with: pip install 'vla-zenoh[{extra}]'"
+            f"install it with: {how_to_install(extra)}"
         )
 
 

@@ -10,7 +10,7 @@ import zenoh
 
 from vla_zenoh import __version__
 from vla_zenoh.cli.lazy import Part, commands_of
-from vla_zenoh.errors import VlaZenohError
+from vla_zenoh.errors import VlaZenohError, how_to_install
 
 EXTRA_OF = {
     "pinocchio": "control",
@@ -104,7 +104,7 @@ def app_entry() -> None:
         if extra is None and ".so" not in str(error):
             raise
         _complain(
-            f"{error}; install it with: pip install 'vla-zenoh[{extra}]'"
+            f"{error}; install it with: {how_to_install(extra)}"
             if extra
             else f"{error}; `vla-zenoh doctor` names the system package"
         )
