@@ -1,4 +1,4 @@
-"""Turns a file into a model: finds it, reads its PEP 723 header, makes its class."""
+"""Turns a file into a model or an arm: finds it, reads its PEP 723 header, makes its class."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from typing import Any
 from vla_zenoh import resources
 from vla_zenoh.errors import ResourceError, WorkerError
 from vla_zenoh.policy import ModelSpec, Policy
+from vla_zenoh.robot import Robot
 
 # The pattern of PEP 723: the block ends at the last line that can end it.
 _HEADER = re.compile(r"(?m)^# /// script$\s(?P<body>(?:^#(?:| .*)$\s)+)^# ///$")
@@ -139,19 +140,12 @@ def make_policy(
         WorkerError: the file does not import, has no such class, or refuses the options.
     """
     module = import_model(model)
-    maker = getattr(module, "MODEL", None) or _only_model(module, model.path)
-    if not callable(maker):
-        raise WorkerError(f"{model.path}: MODEL must be a class, it is a {type(maker).__name__}")
+    maker = _maker(module, model.path, "MODEL", "infer")
     name = getattr(maker, "__name__", "MODEL")
     chosen = dict(options or {})
     if profile is not None and "profile" in _parameters(maker):
         chosen.setdefault("profile", profile)
-    try:
-        policy: Any = maker(**chosen)
-    except (Exception, SystemExit) as error:
-        raise WorkerError(
-            f"{model.path}: {name} cannot be made: {error} (options it takes: {_accepted(maker)})"
-        ) from error
+    policy = _made(maker, model.path, name, chosen)
     try:
         fits = isinstance(policy, Policy) and isinstance(policy.spec, ModelSpec)
     except Exception as error:  # a property that fails
@@ -166,6 +160,42 @@ def make_policy(
     return policy
 
 
+def make_robot(path: Path, options: Mapping[str, str] | None = None) -> Robot:
+    """Import the file and make its arm, without connecting to it.
+
+    The arm is the one class in the file that has ``move``; where there are several, the name
+    ``ROBOT`` says which. `options` are given to its constructor by name, as text.
+
+    Raises:
+        WorkerError: the file does not import, has no such class, or refuses the options.
+    """
+    if not path.is_file():
+        raise WorkerError(f"{path} is not a file; arm.file of the profile names it")
+    module = import_model(ModelFile(path.stem, path))
+    maker = _maker(module, path, "ROBOT", "move")
+    name = getattr(maker, "__name__", "ROBOT")
+    robot = _made(maker, path, name, dict(options or {}))
+    if not isinstance(robot, Robot):
+        raise WorkerError(f"{path}: {name} needs methods `read()` and `move(command)`")
+    return robot
+
+
+def _maker(module: ModuleType, path: Path, named: str, method: str) -> Callable[..., Any]:
+    maker = getattr(module, named, None) or _only_class(module, path, named, method)
+    if not callable(maker):
+        raise WorkerError(f"{path}: {named} must be a class, it is a {type(maker).__name__}")
+    return maker
+
+
+def _made(maker: Callable[..., Any], path: Path, name: str, options: Mapping[str, str]) -> Any:
+    try:
+        return maker(**options)
+    except (Exception, SystemExit) as error:
+        raise WorkerError(
+            f"{path}: {name} cannot be made: {error} (options it takes: {_accepted(maker)})"
+        ) from error
+
+
 def _accepted(maker: Callable[..., Any]) -> str:
     return ", ".join(_parameters(maker)) or "none"
 
@@ -177,18 +207,18 @@ def _parameters(maker: Callable[..., Any]) -> list[str]:
         return []
 
 
-def _only_model(module: Any, path: Path) -> type:
+def _only_class(module: ModuleType, path: Path, named: str, method: str) -> type:
     candidates = [
         value
         for value in vars(module).values()
         if inspect.isclass(value)
         and value.__module__ == module.__name__
-        and callable(getattr(value, "infer", None))
+        and callable(getattr(value, method, None))
     ]
     if len(candidates) != 1:
         found = ", ".join(c.__name__ for c in candidates) or "none"
         raise WorkerError(
-            f"{path}: wanted one class with a method infer, found: {found}; "
-            "name the right one with MODEL = ClassName"
+            f"{path}: wanted one class with a method {method}, found: {found}; "
+            f"name the right one with {named} = ClassName"
         )
     return candidates[0]

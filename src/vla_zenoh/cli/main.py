@@ -25,7 +25,7 @@ EXTRA_OF = {
     "rerun": "view",
 }
 """Modules of the extras, for whoever starts a node whose extra is not installed."""
-NODES = frozenset({"up", "router", "sim", "ros2", "camera", "worker", "command"})
+NODES = frozenset({"up", "router", "sim", "ros2", "arm", "camera", "worker", "command"})
 """Commands whose output is a log: that of Zenoh belongs to it."""
 RUN, DRIVE, LOOK = "Run", "Drive the robot", "Look"
 
@@ -35,6 +35,7 @@ PARTS = (
     Part(RUN, "router", "router:router"),
     Part(RUN, "sim", "sim:sim"),
     Part(RUN, "ros2", "ros2:ros2"),
+    Part(RUN, "arm", "arm:arm"),
     Part(RUN, "camera", "camera:camera"),
     Part(RUN, "worker", "worker:worker"),
     Part(RUN, "command", "command:command"),

@@ -43,7 +43,7 @@ def needs_of(profile: Profile, host: str | None = None) -> Needs:
     hosts = [profile.hosts[host]] if host is not None else list(profile.hosts.values())
     nodes = {node for part in hosts for node in part.nodes}
     roles: set[Role] = {"base"}
-    if "command" in nodes:
+    if nodes & {"command", "arm"}:
         roles.add("control")
     if "ros2" in nodes:
         roles |= {"control", "ros2"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 from vla_zenoh import resources
 from vla_zenoh.errors import MissingExtraError, ResourceError
@@ -56,8 +57,9 @@ def _placement(profile: Profile) -> Iterator[str]:
         yield "hosts: none runs the command node; nothing will move"
     if "sim" not in running and profile.robot.driver == "sim":
         yield "hosts: none runs the simulator, and robot.driver is sim"
-    if "ros2" not in running and profile.robot.driver == "ros2":
-        yield "hosts: none runs the node ros2, and robot.driver is ros2"
+    for driver in ("ros2", "arm"):
+        if driver not in running and profile.robot.driver == driver:
+            yield f"hosts: none runs the node {driver}, and robot.driver is {driver}"
     for what, known, used in (
         (
             "cameras",
@@ -81,6 +83,8 @@ def _found_here(profile: Profile) -> Iterator[str]:
         resources.robot_urdf(profile.robot.description)
     except (ResourceError, MissingExtraError) as error:
         yield f"robot.description: {error}"
+    if profile.arm is not None and not Path(profile.arm.file).expanduser().is_file():
+        yield f"arm.file: on this computer there is no {profile.arm.file}"
     running = {kind for host in profile.hosts.values() for kind in host.nodes}
     wanted = [("workers", "models", worker) for worker in profile.workers]
     if "sim" in running:

@@ -20,6 +20,7 @@ ONLY_ONE = {
     "command": "the robot obeys one command node",
     "sim": "there is one simulated robot",
     "ros2": "the robot has one driver",
+    "arm": "the robot has one driver",
 }
 
 
@@ -59,6 +60,8 @@ def node_name(profile: Profile, host: str, kind: str) -> str:
 def _robot(profile: Profile) -> Iterator[Fault]:
     if profile.robot.driver == "ros2" and profile.ros2 is None:
         yield ("ros2",), "is missing: robot.driver is ros2"
+    if profile.robot.driver == "arm" and profile.arm is None:
+        yield ("arm",), "is missing: robot.driver is arm. Name the Python file, as arm: {file: ...}"
     joints = len(profile.robot.arm_joints)
     for name, values in profile.limits.joint:
         if len(values) not in (1, joints):
@@ -140,8 +143,9 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
         place = ("hosts", name)
         yield from _unknown((*place, "cameras"), host.cameras or (), "cameras", profile.cameras)
         yield from _unknown((*place, "workers"), host.workers or (), "workers", profile.workers)
-        if "sim" in host.nodes and profile.robot.driver != "sim":
-            yield (*place, "nodes"), f"has sim, and robot.driver is {profile.robot.driver}"
+        for kind in ("sim", "arm"):
+            if kind in host.nodes and profile.robot.driver != kind:
+                yield (*place, "nodes"), f"has {kind}, and robot.driver is {profile.robot.driver}"
         if "ros2" in host.nodes and profile.ros2 is None:
             yield (*place, "nodes"), "has ros2, which needs a section ros2"
         if host.pictures is not None and not workers_of(profile, host):

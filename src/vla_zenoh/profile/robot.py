@@ -25,7 +25,7 @@ class RobotProfile(Section):
 
     Args:
         name: part of every key.
-        driver: who moves it.
+        driver: who moves it: the simulator, a ROS 2 robot's controllers, or a Python file.
         command: what it is commanded by: ``pose`` of the TCP, for a Cartesian impedance
             controller, or ``joint`` positions, for an arm without one.
         description: path of the URDF, or ``example-robot-data:`` and a path in that package.
@@ -38,7 +38,7 @@ class RobotProfile(Section):
     """
 
     name: Name
-    driver: Literal["sim", "ros2"] = "sim"
+    driver: Literal["sim", "ros2", "arm"] = "sim"
     command: Literal["pose", "joint"] = "pose"
     description: Word
     base_frame: Word

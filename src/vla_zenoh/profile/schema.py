@@ -13,6 +13,7 @@ from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import fit
+from vla_zenoh.profile.arm import ArmProfile, Options
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import RobotProfile
 from vla_zenoh.profile.ros2 import Ros2Profile
@@ -27,8 +28,16 @@ from vla_zenoh.profile.section import (
 )
 from vla_zenoh.profile.session import Endpoints, SessionProfile
 
-NodeKind = Literal["router", "sim", "ros2", "camera", "command", "worker"]
-NODE_KINDS: tuple[NodeKind, ...] = ("router", "sim", "ros2", "camera", "command", "worker")
+NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker"]
+NODE_KINDS: tuple[NodeKind, ...] = (
+    "router",
+    "sim",
+    "ros2",
+    "arm",
+    "camera",
+    "command",
+    "worker",
+)
 SIMULATED: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")
 CAMERA_SOURCES = ("sim:CAMERA", "v4l2:DEVICE", "rtsp://...", "file:PATH", "ros2:TOPIC")
 MIN_PERIODS = 3
@@ -41,12 +50,6 @@ def _source(value: str) -> str:
         raise ValueError(f"{value!r} is not a camera: write one of {', '.join(CAMERA_SOURCES)}")
     if kind in ("rtsp", "rtsps") and not rest.removeprefix("//"):
         raise ValueError(f"{value!r} lacks the host: write rtsp://HOST/PATH")
-    return value
-
-
-def _option(value: str) -> str:
-    if not value.isidentifier():
-        raise ValueError(f"{value[:80]!r} cannot be the name of an option")
     return value
 
 
@@ -228,6 +231,8 @@ class Profile(Section):
         serves: worker -> the robots it serves, this one among them, all like this one; a worker
             that is not named here serves this one alone.
         options: worker -> what ``--set`` would give it, name -> text.
+        ros2: needed by a robot or camera of ROS 2.
+        arm: needed by a robot that a Python file moves.
     """
 
     name: Name
@@ -241,15 +246,14 @@ class Profile(Section):
     sim: SimProfile = SimProfile()
     workers: Names = ("scripted",)
     serves: dict[Name, Annotated[Names, Field(min_length=1)]] = Field(default_factory=dict)
-    options: dict[Name, dict[Annotated[str, AfterValidator(_option)], Text]] = Field(
-        default_factory=dict
-    )
+    options: dict[Name, Options] = Field(default_factory=dict)
     task: TaskProfile = TaskProfile()
     session: SessionProfile = SessionProfile()
     hosts: dict[Name, HostProfile] = Field(
         default_factory=lambda: {"here": HostProfile(nodes=SIMULATED)}
     )
     ros2: Ros2Profile | None = None
+    arm: ArmProfile | None = None
 
     @property
     def keys(self) -> Keys:

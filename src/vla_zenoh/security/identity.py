@@ -31,6 +31,7 @@ ROLE_OF_KIND = {
     "router": Role.ROUTER,
     "sim": Role.ROBOT,
     "ros2": Role.ROBOT,
+    "arm": Role.ROBOT,
     "camera": Role.CAMERA,
     "worker": Role.WORKER,
     "command": Role.COMMAND,

@@ -1,0 +1,177 @@
+"""An arm of one's own in the whole chain: real nodes, and MuJoCo behind a Python file.
+
+What happens to the arm is written into a file that the arm looks at; how it moved is what it
+measured, on `state/pose`.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import own_arm
+import pytest
+from chain import Chain, running_chain, write_profile
+
+from vla_zenoh.motions import STEP_WIDTH_M
+
+STEPS, STEP_M = 10, 0.01
+EXACT_M, WIDTH_M = 0.001, 0.002
+STANDS_S = 1.0
+"""The watchdogs of a test's profile (0.35 s) and a brake."""
+ARM_TOLERANCE = 2.7
+"""As in tests/fault/test_dead_nodes.py: the arm brakes by itself when nobody commands."""
+AGAIN_S = 20.0
+
+pytestmark = pytest.mark.timeout(120)
+
+
+@dataclass
+class Lab:
+    """The chain, and what ails the arm."""
+
+    chain: Chain
+    file: Path
+
+    def trouble(self, what: str) -> None:
+        self.file.write_text(what)
+
+    def stands_by_itself(self, since_ns: int) -> None:
+        """The arm comes to rest, and not by a jolt."""
+        chain = self.chain
+        chain.until("the arm stands", lambda: not chain.moves() and chain.state() != "active")
+        track = chain.recorder.track()
+        assert track.time_to_stand_s(since_ns) < STANDS_S
+        limit = chain.profile.limits.translation.acceleration_m_s2
+        assert track.hardest_change() < limit * ARM_TOLERANCE
+
+
+@pytest.fixture(scope="module", params=["joint", "pose"])
+def lab(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    folder = tmp_path_factory.mktemp("lab")
+    twin = write_profile(folder, name="twin")
+    trouble = folder / "trouble"
+    trouble.write_text("")
+    options = f"{{profile: {twin}, trouble: {trouble}}}"
+    lab = folder / "lab.yaml"
+    lab.write_text(
+        f"extends: {twin}\n"
+        f"robot: {{driver: arm, command: {request.param}}}\n"
+        f"arm: {{file: {own_arm.__file__}, options: {options}}}\n"
+        "cameras: {front: null}\n"
+        "hosts: {here: {nodes: [router, arm, command, worker]}}\n"
+    )
+    with running_chain(folder, profile_file=lab, worker_options={"scripted": ["camera="]}) as chain:
+        chain.recorder.only = {"state": "arm#", "command": "command#"}
+        yield Lab(chain, trouble)
+
+
+@pytest.fixture(autouse=True)
+def _well(lab: Lab) -> None:
+    lab.trouble("")
+    lab.chain.until("the arm is there", lambda: lab.chain.state("arm") == "running", AGAIN_S)
+    lab.chain.settle()
+    lab.chain.recorder.forget()
+
+
+def newest_ns(lab: Lab) -> int:
+    return int(lab.chain.recorder.track().stamp_ns[-1])
+
+
+def test_steps_that_are_asked_for_are_made_to_the_millimetre(lab: Lab) -> None:
+    chain = lab.chain
+    chain.activate_when_ready()
+    start_m = chain.height_m()
+    chain.go("up", STEPS)
+    assert abs(chain.height_m() - start_m - STEPS * STEP_M) < EXACT_M
+    chain.go("down", STEPS)
+    assert abs(chain.height_m() - start_m) < EXACT_M
+    track = chain.recorder.track()
+    assert np.abs(track.position_m[:, :2] - track.position_m[0, :2]).max() < EXACT_M
+    assert chain.counter("arm.commands_given", "arm") > 0
+
+
+def test_the_gripper_goes_where_it_is_asked_to(lab: Lab) -> None:
+    chain = lab.chain
+    chain.activate_when_ready()
+    before_m = width_m(lab)
+    for prompt, way_m in (("close", -STEP_WIDTH_M), ("open", 0.0)):
+        chain.client.set_prompt(f"HARD: {prompt} gripper x1")
+        wanted_m = before_m + way_m
+        chain.until(
+            f"{wanted_m:.3f} m", lambda wanted_m=wanted_m: abs(width_m(lab) - wanted_m) < WIDTH_M
+        )
+
+
+def width_m(lab: Lab) -> float:
+    """As the arm measured it."""
+    return float(lab.chain.detail("width_m", "arm"))
+
+
+def test_a_fault_of_the_robot_stops_it_until_it_is_gone_and_reset(lab: Lab) -> None:
+    chain = lab.chain
+    chain.move()
+    since_ns = newest_ns(lab)
+    lab.trouble("fault")
+    chain.until("fault", lambda: chain.state() == "fault")
+    lab.stands_by_itself(since_ns)
+    assert any("user stop" in event.why for event in chain.events("robot_fault"))
+    lab.trouble("")
+    chain.until("the robot is well", lambda: chain.state("arm") == "running")
+    assert chain.state() == "fault"
+    chain.client.put(chain.client.keys.reset, "")
+    chain.activate_when_ready()
+
+
+@pytest.mark.parametrize("what", ["frozen", "nan"])
+def test_without_a_state_that_can_be_believed_the_arm_brakes(lab: Lab, what: str) -> None:
+    chain = lab.chain
+    chain.move()
+    lab.trouble(what)
+    chain.until("it is told", lambda: chain.state("arm") == "silent")
+    chain.until("inactive", lambda: chain.state() == "inactive")
+    lab.trouble("")
+    chain.until("running", lambda: chain.state("arm") == "running")
+    assert not chain.moves()
+    assert (chain.refused().get("arm.invalid", 0) > 0) == (what == "nan")
+
+
+def test_an_arm_that_raises_is_braked_and_started_again(lab: Lab) -> None:
+    chain = lab.chain
+    chain.move()
+    pid = chain.pid("arm")
+    lab.trouble("raise")
+    chain.until("its node ends", lambda: chain.host.supervisor.pids().get("arm") != pid)
+    lab.trouble("")
+    chain.until("it is back", lambda: chain.state("arm") == "running", AGAIN_S)
+    assert chain.state() != "active"
+    assert not chain.moves()
+    assert any("the cable is out" in line for node, line in chain.lines if node == "arm")
+    chain.activate_when_ready()
+
+
+def test_an_arm_that_waits_in_move_is_told_so_and_stands(lab: Lab) -> None:
+    chain = lab.chain
+    chain.move()
+    lab.trouble("slow")
+    chain.until("stalled", lambda: chain.counter("arm.stalls", "arm") > 0)
+    lab.trouble("")
+    chain.until("the arm stands", lambda: not chain.moves() and chain.state() != "active")
+    assert any("my_arm" in e.why or "own_arm.py" in e.why for e in chain.events("running->stalled"))
+
+
+def test_a_command_node_that_is_killed_leaves_an_arm_that_brakes(lab: Lab) -> None:
+    chain = lab.chain
+    chain.move()
+    since_ns = newest_ns(lab)
+    os.kill(chain.pid("command"), signal.SIGKILL)
+    chain.until("it stands", lambda: not chain.moves())
+    track = chain.recorder.track()
+    assert track.time_to_stand_s(since_ns) < STANDS_S
+    limit = chain.profile.limits.translation.acceleration_m_s2
+    assert track.hardest_change() < limit * ARM_TOLERANCE
+    chain.until("the command node is back", lambda: chain.state() == "inactive", AGAIN_S)
