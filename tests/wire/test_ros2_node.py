@@ -28,7 +28,8 @@ from vla_zenoh.types import (
 
 POSITION_TOLERANCE_M = 1e-6
 PERIOD_S = 0.004
-SPEED_M_S = 0.05
+BRAKED_M = 1e-5
+SPEED_M_S = 0.02
 BACK_M = 0.0002
 """What a test's thread that is held up between two clocks makes of a steady stream."""
 SILENCE_S = 0.3
@@ -252,6 +253,25 @@ def test_a_stream_that_begins_elsewhere_is_refused(rig: Ros2Rig) -> None:
 
     rig.wait("it is refused", shout)
     assert len(rig.robot.goals) == sent
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_whatever_breaks_in_the_loop_the_arm_is_braked_before_it_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ros2_rig(tmp_path) as rig:
+        goals, commander = rig.robot.goals, Commander(rig)
+        rig.wait("goals arrive", lambda: len(goals) > 50)
+
+        def unforeseen() -> None:
+            raise RuntimeError("unforeseen")
+
+        monkeypatch.setattr(rig.node._rate, "tick", unforeseen)
+        rig.wait("it is told", lambda: rig.happened("broken"))
+        commander.end()
+        steps_m = np.diff([goal.pose.position.z for goal in goals])
+        assert steps_m[-20:].max() < BRAKED_M < steps_m[-100:].max()
+        assert rig.statuses[-1].state in ("braking", "running", "stopped")
 
 
 # -- gripper --------------------------------------------------------------------------------------

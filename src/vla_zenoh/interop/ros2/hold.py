@@ -14,7 +14,8 @@ class Hold:
     """Remembers whether the last command sent still counts.
 
     A controller goes on holding what it was sent last, some way from where the arm is measured; the
-    next stream has to begin there. When somebody else moves the arm that is no longer so.
+    next stream has to begin there. When somebody else moves the arm that is no longer so. Times are
+    of the monotonic clock.
     """
 
     def __init__(self) -> None:

@@ -19,10 +19,10 @@ from vla_zenoh.control.arm_guard import ArmGuard, Measured, make_arm_guard
 from vla_zenoh.control.impedance import Reference
 from vla_zenoh.control.joint_impedance import JointReference
 from vla_zenoh.control.so3 import Pose, quat_from_rotation
-from vla_zenoh.errors import ProfileError
+from vla_zenoh.errors import ProfileError, RecordError
 from vla_zenoh.interop.ros2 import table
 from vla_zenoh.interop.ros2.arm_state import pose_state
-from vla_zenoh.interop.ros2.hold import Hold
+from vla_zenoh.interop.ros2.hold import SETTLE_NS, Hold
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.qos import COMMAND
 from vla_zenoh.interop.ros2.samples import Stamp
@@ -31,7 +31,7 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.ros2.hearing import INBOX, Hearing
 from vla_zenoh.nodes.ros2.link import Link
-from vla_zenoh.nodes.slots import Inbox
+from vla_zenoh.nodes.slots import Arrival, Inbox
 from vla_zenoh.profile.ros2 import Ros2Output, Ros2Profile
 from vla_zenoh.types import Event, JointCommand, PoseCommand
 
@@ -40,6 +40,9 @@ FINGER_PATIENCE_NS = 1_000_000_000
 LEAD_PERIODS = 2
 """A trajectory's point lies this many command periods ahead."""
 STREAMING = "streaming"
+STALLED_NS = 500_000_000
+"""After a stall nobody is obeyed for so long, and the robot is not ready: what was sent meanwhile
+is still arriving, and who sent it has to hear of it and brake."""
 
 
 class Arm:
@@ -73,8 +76,9 @@ class Arm:
         self._hold = Hold()
         self._deaf = False
         self._was = ""
-        self._tcp: Pose | None = None
+        self._measured: Measured | None = None
         self._published_ns = 0
+        self._stalled_ns, self._stall_s = 0, 0.0
         self._clock_told = False
         self._fingers_lost = False
         keys = node.keys
@@ -118,35 +122,76 @@ class Arm:
         return pose.writer(posture_rad)
 
     # -- one turn -----------------------------------------------------------------------------
-    def turn(self, now_ns: int) -> None:
-        """Take what arrived, publish the state, and send what the arm has to follow."""
-        if self.heard.take():
-            self._publish(now_ns)
-        self._take_orders(now_ns)
-        self._follow(now_ns)
+    def turn(self, now_ns: int, mono_ns: int, stall_s: float = 0.0) -> None:
+        """Take what arrived, publish the state, and send what the arm has to follow.
+
+        Args:
+            now_ns: wall clock, for stamps.
+            mono_ns: the same moment on the monotonic clock: wall clocks are set now and then.
+            stall_s: how late this turn is.
+        """
+        if stall_s > self._profile.timing.command_timeout_s:
+            self._stand_after_a_stall(mono_ns, stall_s)
+        elif mono_ns >= self._stalled_ns:
+            self._stalled_ns = 0
+        if self.heard.take() and self._due(mono_ns):
+            self._publish()
+        self._take_orders(mono_ns)
+        self._follow(now_ns, mono_ns)
         self._tell()
 
+    def wind_down(self, now_ns: int, mono_ns: int) -> None:
+        """Nothing but braking: see `turn`, and `deafen`."""
+        self._follow(now_ns, mono_ns)
+
+    def _stand_after_a_stall(self, mono_ns: int, stall_s: float) -> None:
+        """The robot stopped at what it was sent last: stand there, whatever moved before."""
+        if stall_s * 1e9 > SETTLE_NS:
+            self._hold.lose()  # somebody else may have moved the arm meanwhile
+        if self._guard is not None and self.sending:
+            self._guard.stand()
+            self._stalled_ns, self._stall_s = mono_ns + STALLED_NS, stall_s
+            self._node.counters["ros2.stalls"] += 1
+        for _ in self._orders.take_all():
+            self._refuse_order("stalled")
+
     # -- state out ----------------------------------------------------------------------------
-    def _publish(self, now_ns: int) -> None:
+    def _due(self, mono_ns: int) -> bool:
+        if mono_ns - self._published_ns < 0.9e9 / self._profile.timing.state_hz:
+            return False
+        self._published_ns = mono_ns
+        return True
+
+    def _publish(self) -> None:
         joints, stamp_ns = self._state.joints, self._state.stamp_ns
         assert joints is not None
-        if now_ns - self._published_ns < 0.9e9 / self._profile.timing.state_hz:
+        reference = self._guard.reference if self._guard is not None and self._hold.held else None
+        try:
+            tcp, twist = self.heard.tcp(stamp_ns)
+            if tcp is None:
+                return
+            wrench = self.heard.wrench(stamp_ns)
+            record = pose_state(tcp, twist, wrench, self._pose_of(reference))
+            if isinstance(reference, JointReference):
+                joints = replace(joints, reference_rad=reference.position_rad)
+        except RecordError as error:  # finite, and no arm's: what comes of it is not
+            topic = self._ros2.joint_states
+            self._node.refuse("invalid", f"{topic}: {error}", topic)
             return
-        self._published_ns = now_ns
-        tcp, twist = self.heard.tcp(stamp_ns)
-        if tcp is None:
-            return
-        self._tcp = tcp
+        self._measured = Measured(tcp, joints.position_rad, joints.velocity_rad_s)
         if self._guard is None:
             self._guard = self._make_guard()
-        reference = self._guard.reference if self._hold.held else None
         seq = self._joint_out.seq
-        if isinstance(reference, JointReference):
-            joints = replace(joints, reference_rad=reference.position_rad)
         self._joint_out.put(joints, stamp_wall_ns=stamp_ns, seq=seq)
-        record = pose_state(tcp, twist, self.heard.wrench(stamp_ns), _pose_of(reference))
         self._pose_out.put(record, stamp_wall_ns=stamp_ns, seq=seq)
         self._publish_gripper(stamp_ns, seq)
+
+    def _pose_of(self, reference: Reference | JointReference | None) -> Pose | None:
+        """Where the TCP is held."""
+        if isinstance(reference, JointReference):
+            kinematics, names = self._kinematics, self._profile.robot.arm_joints
+            return kinematics.forward(kinematics.ordered(names, reference.position_rad))
+        return None if reference is None else Pose(reference.position_m, reference.rotation)
 
     def _publish_gripper(self, stamp_ns: int, seq: int) -> None:
         busy, wanted_m, held = self._ask_gripper()
@@ -163,15 +208,16 @@ class Arm:
             return
         if self._guard is not None and self._guard.braking:
             record = replace(record, mode="braking")
+        elif self._stalled_ns:
+            record = replace(record, mode="stalled")
         elif not self._writer.heard:
             record = replace(record, mode=f"not listening at {self._topic[:100]}")
         self._gripper_out.put(record, stamp_wall_ns=stamp_ns, seq=seq)
 
     # -- commands -----------------------------------------------------------------------------
     def _measure(self) -> Measured:
-        joints = self._state.joints
-        assert joints is not None and self._tcp is not None
-        return Measured(self._tcp, joints.position_rad, joints.velocity_rad_s)
+        assert self._measured is not None
+        return self._measured
 
     def _make_guard(self) -> ArmGuard:
         kinematics, names = self._kinematics, self._profile.robot.arm_joints
@@ -181,36 +227,50 @@ class Arm:
             self._profile, self._measure, ends, 1.0 / self._profile.timing.command_hz
         )
 
-    def _take_orders(self, now_ns: int) -> None:
-        guard, mode = self._guard, self._profile.robot.command
+    def _take_orders(self, mono_ns: int) -> None:
+        guard = self._guard
         for arrival in self._orders.take_all():
             if guard is None or self._deaf:
                 continue
+            if self._stalled_ns:
+                self._refuse_order("stalled")
+                continue
             if not (guard.following or guard.braking or self._hold.held):
-                guard.restart()  # nobody holds the arm at what was sent last: it is where it is
-            if mode == "joint":
-                joints = self._node.read(JointCommand, arrival)
-                reason = None if joints is None else guard.offer_joint(joints, now_ns)
-            else:
-                order = self._node.read(PoseCommand, arrival)
-                reason = None if order is None else guard.offer_pose(order, now_ns)
+                guard.anchor()  # nobody holds the arm at what was sent last: it is where it is
+            reason = self._offer(guard, arrival, mono_ns)
             if reason is not None:
-                self._node.refuse(f"{mode}_{reason}", f"command/{mode}: {reason}")
+                self._refuse_order(reason)
 
-    def _follow(self, now_ns: int) -> None:
+    def _offer(self, guard: ArmGuard, arrival: Arrival, mono_ns: int) -> str | None:
+        # Silence is counted by a clock that nobody sets.
+        if self._profile.robot.command == "joint":
+            joints = self._node.read(JointCommand, arrival)
+            if joints is None:
+                return None
+            return guard.offer_joint(replace(joints, received_ns=arrival.mono_ns), mono_ns)
+        order = self._node.read(PoseCommand, arrival)
+        if order is None:
+            return None
+        return guard.offer_pose(replace(order, received_ns=arrival.mono_ns), mono_ns)
+
+    def _refuse_order(self, reason: str) -> None:
+        mode = self._profile.robot.command
+        self._node.refuse(f"{mode}_{reason}", f"command/{mode}: {reason}")
+
+    def _follow(self, now_ns: int, mono_ns: int) -> None:
         guard = self._guard
         if guard is None:
             return
         heard = self._writer.heard
         if not heard and self.sending:
-            guard.restart()  # who listens later must not be led on from where nobody went
+            guard.anchor()  # who listens later must not be led on from where nobody went
         was_braking = guard.braking
-        reference = guard.tick(now_ns)
+        reference = guard.tick(mono_ns)
         if guard.following or guard.braking or was_braking:
-            self._hold.sent(now_ns)
+            self._hold.sent(mono_ns)
             self._send(reference, now_ns)
-        elif self._tcp is not None:
-            self._hold.look(self._tcp, now_ns)
+        elif self._measured is not None:
+            self._hold.look(self._measured.pose, mono_ns)
         # What nobody heard nobody holds: a bridge that is gone drops what is sent.
         if self.state == "silent" or not heard:
             self._hold.lose()
@@ -257,13 +317,15 @@ class Arm:
             return "waiting"
         if age_s > self._profile.timing.state_timeout_s:
             return "silent"
-        return "braking" if self._guard is not None and self._guard.braking else "running"
+        if self._guard is not None and self._guard.braking:
+            return "braking"
+        return "stalled" if self._stalled_ns else "running"
 
     def _tell(self) -> None:
         state = self.state
         if state != self._was:
             if self._was:
-                bad = state in ("silent", "braking")
+                bad = state in ("silent", "braking", "stalled")
                 level = "warning" if bad else "info"
                 change = f"{self._was}->{state}"
                 self._node.tell(Event(level, "transition", change, self._why(state)))
@@ -282,6 +344,11 @@ class Arm:
             return f"nothing on {self._ros2.joint_states}; is the robot or the bridge gone?"
         if state == "braking":
             return "the command stream fell silent in motion"
+        if state == "stalled":
+            return (
+                f"this loop stood still for {self._stall_s:.3f} s while it moved the arm, "
+                "which stands where it was sent last"
+            )
         return ""
 
     def detail(self) -> dict[str, Any]:
@@ -297,9 +364,3 @@ class Arm:
             "robot_clock_behind_s": self._clock.offset_s,
             "width_m": self._state.width_m,
         }
-
-
-def _pose_of(reference: Reference | JointReference | None) -> Pose | None:
-    if isinstance(reference, Reference):
-        return Pose(reference.position_m, reference.rotation)
-    return None

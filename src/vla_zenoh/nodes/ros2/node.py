@@ -149,6 +149,24 @@ class Ros2Node:
                 self._own_session.close()
 
     def _loop(self, stop: threading.Event) -> None:
+        """Drive; whatever goes wrong in it, the arm is braked before this ends."""
+        try:
+            self._drive(stop)
+        except Exception as error:
+            if self._arm is not None:
+                self._wind_down(self._arm)
+            self.node.tell(Event("error", "fault", "broken", f"{error!r}: braked, and ends"))
+            raise
+
+    def _wind_down(self, arm: Arm) -> None:
+        arm.deafen()
+        loop = FixedRate(self.node.profile.timing.command_hz)
+        give_up = time.monotonic() + BRAKE_BEFORE_EXIT_S
+        while arm.sending and time.monotonic() < give_up:
+            tick = loop.wait()
+            arm.wind_down(self.node.clock.wall_at(tick.nominal_ns), tick.nominal_ns)
+
+    def _drive(self, stop: threading.Event) -> None:
         loop = FixedRate(self.node.profile.timing.command_hz)
         give_up = 0.0
         while True:
@@ -162,7 +180,7 @@ class Ros2Node:
                 self._arm.deafen()
             now_ns = self.node.clock.wall_at(tick.nominal_ns)
             if self._arm is not None:
-                self._arm.turn(now_ns)
+                self._arm.turn(now_ns, tick.nominal_ns, tick.stall_s)
             if self._gripper is not None:
                 self._gripper.turn(now_ns, "" if self._arm is None else self._arm.writer)
             while self._news:
