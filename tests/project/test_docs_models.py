@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import dataclasses
 import json
 import re
 import socketserver
@@ -21,11 +23,18 @@ from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, ORIGAMI
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.lockstep import Lockstep
 from vla_zenoh.nodes.sim import build_world
-from vla_zenoh.policy import example_observation
+from vla_zenoh.policy import (
+    ActionSpec,
+    CameraSpec,
+    Observation,
+    ObservationSpec,
+    example_observation,
+)
 from vla_zenoh.profile import load_profile
 from vla_zenoh.profile.fit import workers_of
 
-TEXT = (Path(__file__).parents[2] / "docs" / "models.md").read_text("utf-8")
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs" / "models.md").read_text("utf-8")
 LINES = 10
 STEP_M, SECONDS, RATE_HZ = 0.01, 1.0, 10.0
 WAY_M = STEP_M * RATE_HZ * SECONDS
@@ -103,6 +112,25 @@ def test_its_profiles_are_right_and_each_host_knows_what_it_runs(tmp_path: Path)
     assert left.session.connect == left.session.listen
     assert workers_of(right, right.hosts["gpu"]) == ("mine",)
     assert workers_of(left, left.hosts["gpu"]) == ("mine", "scripted")
+
+
+@pytest.mark.parametrize("model", ["openpi", "groot", "openvla_rest", "origami", "lerobot/model"])
+def test_every_argument_of_an_adapter_is_told(model: str) -> None:
+    tree = ast.parse((ROOT / "models" / f"{model}.py").read_text("utf-8"))
+    makers = [
+        part
+        for part in ast.walk(tree)
+        if isinstance(part, ast.FunctionDef) and part.name == "__init__"
+    ]
+    told = [argument.arg for maker in makers for argument in maker.args.args[1:]]
+    assert told
+    assert [name for name in told if f"`{name}`" not in TEXT and f" {name}=" not in TEXT] == []
+
+
+def test_all_that_a_model_is_given_and_may_ask_for_is_told() -> None:
+    given = [field.name for field in dataclasses.fields(Observation)]
+    asked = [*CameraSpec.model_fields, *ObservationSpec.model_fields, *ActionSpec.model_fields]
+    assert [name for name in (*given, *asked) if f"`{name}`" not in TEXT] == []
 
 
 class Up(socketserver.StreamRequestHandler):

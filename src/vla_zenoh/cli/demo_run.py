@@ -168,8 +168,8 @@ def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
     refused = ", ".join(f"{reason} {count}" for reason, count in summary["refusals"].items())
     screen.print(f"rates: {rates}; refusals: {refused or 'none'}")
     screen.print(
-        f"run folder: {folder} (run.mcap, summary.json, commands.csv, poses.csv, plot.png, "
-        "front.mp4)"
+        f"run folder: {folder} (run.mcap, summary.json, commands.csv, poses.csv, chunks.npz, "
+        "plot.png, front.mp4)"
     )
     if result.interrupted:
         screen.print("[yellow]interrupted; the arm was braked[/]")
