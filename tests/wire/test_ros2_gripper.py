@@ -24,7 +24,7 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperCommand
 
 HOUR_NS = 3_600_000_000_000
-FORGOTTEN_S = 0.15
+FORGOTTEN_S = 0.35
 """Longer than timing.command_timeout_s."""
 MOVE = "/panda_gripper/move/_action"
 ORDER = GripperCommand(0.02, 0.05, 10.0)

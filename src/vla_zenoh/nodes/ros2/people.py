@@ -1,4 +1,4 @@
-"""Services and topics for ROS people: what they ask becomes a setting of ours.
+"""Services for ROS people: what they ask becomes a setting of ours. Topics: see `Wishes`.
 
 A thread of its own, because a setting has to be agreed to by the command node before it is
 answered. A stop waits for nothing.
@@ -17,13 +17,11 @@ import zenoh
 
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError, SessionError
-from vla_zenoh.interop.ros2 import diagnostics, table
+from vla_zenoh.interop.ros2 import diagnostics
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.names import request_of, response_of
 from vla_zenoh.interop.ros2.samples import Stamp
 from vla_zenoh.interop.ros2.services import (
-    ACTIVE_TOPIC,
-    PROMPT_TOPIC,
     RESET,
     SERVICES,
     SET_ACTIVE,
@@ -33,18 +31,15 @@ from vla_zenoh.interop.ros2.services import (
     STOP,
     Service,
 )
-from vla_zenoh.interop.ros2.topics import plain
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.ros2.link import Link, Request
-from vla_zenoh.nodes.slots import Inbox
+from vla_zenoh.nodes.ros2.wishes import Refuse, Wishes, text_of
 from vla_zenoh.profile import Profile
 
 STATUS_PERIOD_S = 1.0
 TURN_S = 0.05
 MAX_WAITING = 32
 STOP_PATIENCE_S = 2.0
-
-Refuse = Callable[[str, str, str], None]
 
 
 class People:
@@ -80,9 +75,7 @@ class People:
         }
         for service in SERVICES:
             link.serve(f"{prefix}/{service.name}", service.type, self._taker(service))
-        self._prefix = prefix
-        self._prompts = link.read(f"{prefix}/{PROMPT_TOPIC}", plain.TEXT, Inbox(8))
-        self._switches = link.read(f"{prefix}/{ACTIVE_TOPIC}", plain.TRUTH, Inbox(8))
+        self._wishes = Wishes(self._client, link, Messages(messages.distribution), prefix, refuse)
         self._status = link.write(f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)
 
     def _taker(self, service: Service) -> Callable[[Request], None]:
@@ -98,14 +91,18 @@ class People:
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set."""
+        topics = threading.Thread(
+            target=self._wishes.run, args=(stop,), name="ros2 wishes", daemon=True
+        )
+        topics.start()
         next_status_s = time.monotonic()
         while not stop.is_set():
             with contextlib.suppress(queue.Empty):
                 self._answer(*self._calls.get(timeout=TURN_S))
-            self._take_topics()
             if time.monotonic() >= next_status_s:
                 next_status_s = time.monotonic() + STATUS_PERIOD_S
                 self._tell_status()
+        topics.join()
 
     # -- services -----------------------------------------------------------------------------
     def _answer(self, service: Service, request: Request) -> None:
@@ -157,7 +154,7 @@ class People:
             raise SessionError(f"the command node is {now}, not {wanted}")
 
     def _set_prompt(self, asked: Any) -> str:
-        return f"prompt {self._client.set_prompt(_text(asked.prompt)).prompt!r}"
+        return f"prompt {self._client.set_prompt(text_of(asked.prompt)).prompt!r}"
 
     def _set_request(self, asked: Any) -> str:
         """One after the other: inactive first where that is asked, active last.
@@ -179,34 +176,8 @@ class People:
             done.append(self._activate(True))
         return "; ".join(done)
 
-    # -- topics -------------------------------------------------------------------------------
-    def _take_topics(self) -> None:
-        task = self._client.task
-        keys = self._client.keys
-        for slot, kind, topic in (
-            (self._prompts, plain.TEXT, PROMPT_TOPIC),
-            (self._switches, plain.TRUTH, ACTIVE_TOPIC),
-        ):
-            for arrival in slot.take_all():
-                try:
-                    value = table.read(self._messages, kind, arrival.sample.payload.to_bytes())
-                    wanted = _text(value) if kind == plain.TEXT else bool(value)
-                except CodecError as error:
-                    self._refuse(error.reason, f"{self._prefix}/{topic}: {error}", topic)
-                    continue
-                # ROS people publish again and again what is so already.
-                if isinstance(wanted, str):
-                    if task is None or task.prompt != wanted:
-                        self._client.put(keys.prompt, wanted)
-                elif task is None or task.active != wanted:
-                    self._client.put(keys.active, settings.encode_bool(wanted).decode())
-
     def _tell_status(self) -> None:
         message = diagnostics.write(
             self._messages, self._robot, self._client.snapshot(), Stamp(time.time_ns(), "")
         )
         self._status.put(self._messages.encode(message))
-
-
-def _text(value: str) -> str:
-    return settings.decode_text(value.encode("utf-8", "surrogatepass"))
