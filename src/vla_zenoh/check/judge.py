@@ -94,7 +94,8 @@ def behaviour(
         depends_on: pictures, colour order, prompt: whether they matter; None: not known.
     """
     found = _polarity(action, answers)
-    moves = any(np.any(np.abs(steps[:, :3]) > ALIKE) for _, steps in answers)
+    # The first three numbers of every rotation, x, y, z of a quaternion too, are zero for none.
+    moves = any(np.any(np.abs(steps[:, :6]) > ALIKE) for _, steps in answers)
     if action.kind == "delta" and not moves:
         found.append(
             note("stands_still", "no example made it move; try --prompt with one it knows")
