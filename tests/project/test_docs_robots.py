@@ -5,12 +5,15 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from vla_zenoh.cli.profile import profile_app
 from vla_zenoh.control.arm import make_kinematics, make_shadow
+from vla_zenoh.loader import make_robot
 from vla_zenoh.profile import load_profile
+from vla_zenoh.types import JointCommand
 
 TEXT = (Path(__file__).parents[2] / "docs" / "robots.md").read_text("utf-8")
 HOME_M = (0.49, 0.11, 0.43)
@@ -20,12 +23,18 @@ DOWN = -0.999
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
-    found = re.search(r"```yaml\n# (\w+\.yaml)\n(.*?)```", TEXT, re.DOTALL)
-    assert found is not None
-    path = tmp_path / found[1]
-    path.write_text(found[2], "utf-8")
-    return path
+def folder(tmp_path: Path) -> Path:
+    """With all files of the text."""
+    found = re.findall(r"```\w+\n# (\w+\.\w+)\n(.*?)```", TEXT, re.DOTALL)
+    assert [name for name, _ in found] == ["ur5.yaml", "my_arm.py", "mine.yaml"]
+    for name, text in found:
+        (tmp_path / name).write_text(text, "utf-8")
+    return tmp_path
+
+
+@pytest.fixture
+def file(folder: Path) -> Path:
+    return folder / "ur5.yaml"
 
 
 def test_its_robot_is_right_and_needs_no_second_look(file: Path) -> None:
@@ -47,3 +56,18 @@ def test_at_home_its_arm_is_where_the_text_says_and_free_to_move(file: Path) -> 
     margins = make_shadow(profile, kinematics).margins
     assert margins.singular_value > reach.singularity_slow
     assert margins.self_m > reach.collision_slow_m
+
+
+def test_its_own_arm_is_right_and_goes_where_it_is_told_to(folder: Path) -> None:
+    result = CliRunner().invoke(profile_app, ["check", str(folder / "mine.yaml")])
+    assert result.exit_code == 0
+    assert result.stderr == ""
+    profile = load_profile(str(folder / "mine.yaml"))
+    assert profile.arm is not None
+    arm = make_robot(Path(profile.arm.file), profile.arm.options)
+    target_rad = np.full(6, 0.3)
+    still = np.zeros(6)
+    arm.move(JointCommand(profile.robot.arm_joints, target_rad, still, still, "streaming"))
+    reading = arm.read()
+    assert reading is not None
+    np.testing.assert_array_equal(reading.position_rad, target_rad)

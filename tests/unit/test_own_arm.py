@@ -71,7 +71,7 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 def test_a_profile_of_an_own_arm_is_whole(tmp_path: Path) -> None:
     arm = written(tmp_path, ARM)
-    loaded = profile(tmp_path, PROFILE.format(file=arm))
+    loaded = profile(tmp_path, PROFILE.format(file="my_arm.py"))  # beside the profile
     assert loaded.arm is not None
     assert (loaded.arm.file, loaded.arm.options) == (str(arm), {"address": "10.0.0.3"})
 

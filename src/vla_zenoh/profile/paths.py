@@ -15,8 +15,8 @@ def anchor(data: dict[str, Any], folder: Path) -> None:
     """Make the relative paths in `data` absolute, in place; what is no text is left to the schema.
 
     Args:
-        data: as a profile file has it: ``robot.description``, ``ros2.messages.*`` and
-            ``cameras.*.source`` of the form ``file:PATH`` are paths.
+        data: as a profile file has it: ``robot.description``, ``arm.file``, ``ros2.messages.*``
+            and ``cameras.*.source`` of the form ``file:PATH`` are paths.
         folder: where that file is.
     """
     robot = data.get("robot")
@@ -29,6 +29,9 @@ def anchor(data: dict[str, Any], folder: Path) -> None:
         if isinstance(source, str) and source.startswith(FILE_SOURCE):
             path = source.removeprefix(FILE_SOURCE)
             camera["source"] = FILE_SOURCE + _below(folder, path)
+    arm = data.get("arm")
+    if isinstance(arm, dict) and isinstance(arm.get("file"), str):
+        arm["file"] = _below(folder, arm["file"])
     ros2 = data.get("ros2")
     messages = ros2.get("messages") if isinstance(ros2, dict) else None
     if isinstance(messages, dict):
