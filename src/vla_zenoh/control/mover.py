@@ -108,7 +108,7 @@ class Mover:
         if self._reach is not None and joint is not None:
             self._reach.reset(self._reach.kinematics.joints_of(joint))
         actual, start = pose_of(measured), held_pose(measured)
-        standing = not self.streaming or self._smoother is None or self._smoother.at_rest
+        standing = not self.streaming or self.at_rest
         if self._smoother is None:
             self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits))
         elif standing:
@@ -159,11 +159,12 @@ class Mover:
             self._cause = self._follow(self._smoother, self.timeline, now_ns, out)
         else:
             self._brake(self._smoother, self.timeline, now_ns)
-        self.streaming = self._must_stream(state, now_ns)
+        went_on, self.streaming = self.streaming, self._must_stream(state, now_ns)
         if not self.streaming:
             return True
         failures = self._smoother.failures
-        for _ in range(ticks):
+        # A stream that begins has nothing to make up for: the robot takes one that begins at rest.
+        for _ in range(ticks if went_on else 1):
             motion = self._smoother.tick()
             if self._joints is not None:
                 self._joints.tick(motion, braking=state is not State.ACTIVE)
