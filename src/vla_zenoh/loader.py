@@ -121,8 +121,13 @@ def import_model(model: ModelFile) -> ModuleType:
         found.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         del sys.modules[name]
+        hint = (
+            "; name what brings it in the header of a model's file (PEP 723), or install it here"
+            if isinstance(error, ModuleNotFoundError)
+            else ""
+        )
         raise WorkerError(
-            f"{model.path} cannot be imported: {type(error).__name__}: {error}"
+            f"{model.path} cannot be imported: {type(error).__name__}: {error}{hint}"
         ) from error
     return module
 
@@ -202,7 +207,8 @@ def _accepted(maker: Callable[..., Any]) -> str:
 
 def _parameters(maker: Callable[..., Any]) -> list[str]:
     try:
-        return list(inspect.signature(maker).parameters)
+        found = inspect.signature(maker).parameters.values()
+        return [each.name for each in found if each.kind is not each.VAR_KEYWORD]
     except (TypeError, ValueError):  # written in C, without a signature
         return []
 

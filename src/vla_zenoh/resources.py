@@ -14,6 +14,7 @@ from pathlib import Path
 from vla_zenoh.errors import MissingExtraError, ResourceError
 
 KINDS = {"models": (".py", ""), "profiles": (".yaml", ".yml"), "sim": ("",)}
+ONE = {"models": "model", "profiles": "profile", "sim": "scene"}
 SEARCH_PATH_VARIABLE = "VLA_ZENOH_PATH"
 ROBOT_DATA_PREFIX = "example-robot-data:"
 
@@ -69,8 +70,12 @@ def find(kind: str, name: str) -> Path:
                 return path
     known = names(kind)
     near = difflib.get_close_matches(name, known, 1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise ResourceError(f"no {kind} called {name!r}{hint} Known: {', '.join(known) or 'none'}")
+    hint = f"; did you mean {near[0]!r}?" if near else "."
+    raise ResourceError(
+        f"no {ONE[kind]} called {name!r}{hint} Known: {', '.join(known) or 'none'}. One of your "
+        f"own is found by its path, or as {kind}/{name[:80]}{KINDS[kind][0]} below a folder that "
+        f"{SEARCH_PATH_VARIABLE} names"
+    )
 
 
 def robot_urdf(description: str) -> Path:

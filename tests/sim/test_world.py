@@ -209,7 +209,7 @@ def test_regions_too_small_for_their_objects_are_refused(tmp_path: Path) -> None
 
 
 def test_a_scene_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(ResourceError, match="no sim called 'tabel'; did you mean 'table'"):
+    with pytest.raises(ResourceError, match="no scene called 'tabel'; did you mean 'table'"):
         World("tabel", RobotModel(), home_rad=HOME_RAD, gains=ImpedanceGains())
 
 

@@ -36,7 +36,7 @@ def test_a_profile_that_is_wrong_is_listed_with_its_fault(own_folder: Path) -> N
     (own_folder / "lab.yaml").write_text("extends: nobody\n")
     result = RUNNER.invoke(profile_app, ["list"])
     assert result.exit_code == 0
-    assert "no profiles called 'nobody'" in result.stdout
+    assert "no profile called 'nobody'" in result.stdout
     rows = {
         row["name"]: row
         for row in json.loads(RUNNER.invoke(profile_app, ["list", "--json"]).stdout)
@@ -73,7 +73,7 @@ def test_nothing_of_that_name_is_one_line_on_stderr() -> None:
     assert result.exit_code == 1
     assert result.stdout == ""
     assert result.stderr.startswith(
-        "error: no profiles called 'panda_simm'; did you mean 'panda_sim'?"
+        "error: no profile called 'panda_simm'; did you mean 'panda_sim'?"
     )
 
 

@@ -132,6 +132,14 @@ def test_two_classes_need_a_name(write) -> None:
     assert make_policy(find_model(write(TWO + "MODEL = Other\n"))).spec.name == "other"
 
 
+def test_options_that_are_passed_on_have_no_name_to_tell(write) -> None:
+    text = MODEL.replace('size: str = "1"', 'size: str = "1", **layout: str').replace(
+        "self.size = float(size)", "raise ValueError(layout)"
+    )
+    with pytest.raises(WorkerError, match=r"\(options it takes: size\)"):
+        make_policy(find_model(write(text)), {"colour": "red"})
+
+
 def test_an_imported_class_is_not_taken_for_the_files_own(write) -> None:
     text = "from vla_zenoh.policy import Policy\n" + MODEL
     assert make_policy(find_model(write(text))).spec.name == "still"
@@ -142,7 +150,10 @@ def test_an_imported_class_is_not_taken_for_the_files_own(write) -> None:
     [
         ("x = 1\n", "wanted one class with a method infer, found: none"),
         ("def broken(:\n", "cannot be imported: SyntaxError"),
-        ("import no_such_module_at_all\n", "cannot be imported: ModuleNotFoundError"),
+        (
+            "import no_such_module_at_all\n",
+            "cannot be imported: ModuleNotFoundError.*; name what brings it in the header",
+        ),
         ("import sys\nsys.exit(3)\n", "cannot be imported: SystemExit: 3"),
         ("1 / 0\n", "cannot be imported: ZeroDivisionError"),
         ("class A:\n    def infer(self, o): ...\n", "needs a property `spec`"),

@@ -55,11 +55,11 @@ def test_two_hosts_with_real_addresses_need_no_advice() -> None:
         ),
         (
             {"sim": {"scene": "kitchen"}},
-            "sim.scene: on this computer there is no sim called 'kitchen'",
+            "sim.scene: on this computer there is no scene called 'kitchen'",
         ),
         (
             {"workers": ["scripted", "pi9"]},
-            "workers: on this computer there is no models called 'pi9'",
+            "workers: on this computer there is no model called 'pi9'",
         ),
         (
             {"robot": {"description": "absent.urdf"}},

@@ -335,10 +335,10 @@ def test_a_replaced_section_does_not_keep_the_lines_of_the_old_one(write: Write)
         ("# only a remark\n", "lab.yaml:1: robot: is missing"),
         ("- a\n", "lab.yaml:1: a profile is a map of sections, this is a list"),
         ("robot: {name: a}\n", "lab.yaml:1: robot.description: is missing"),
-        ("extends: nobody\n", "lab.yaml:1: extends: no profiles called 'nobody'"),
+        ("extends: nobody\n", "lab.yaml:1: extends: no profile called 'nobody'"),
         (
             "\nextends: panda_sin\n",
-            "lab.yaml:2: extends: no profiles called 'panda_sin'; did you mean",
+            "lab.yaml:2: extends: no profile called 'panda_sin'; did you mean",
         ),
         ("extends: [panda_sim]\n", "lab.yaml:1: extends: wants the name of one profile"),
         ("extends:\n", "lab.yaml:1: extends: wants the name of one profile"),

@@ -76,7 +76,7 @@ def test_hidden_files_and_other_suffixes_are_not_listed(own_folder: Path) -> Non
 
 def test_a_folder_is_not_a_profile(own_folder: Path) -> None:
     (own_folder / "profiles" / "lab").mkdir()
-    with pytest.raises(ResourceError, match="no profiles called 'lab'"):
+    with pytest.raises(ResourceError, match="no profile called 'lab'"):
         resources.find("profiles", "lab")
 
 
@@ -99,7 +99,8 @@ def test_an_unknown_name_gets_the_nearest_one_and_the_list() -> None:
 def test_the_error_is_one_of_ours_and_reads_as_text() -> None:
     with pytest.raises(VlaZenohError) as caught:
         resources.find("profiles", "zzz")
-    assert str(caught.value).startswith("no profiles called 'zzz'")
+    assert str(caught.value).startswith("no profile called 'zzz'. Known: ")
+    assert "as profiles/zzz.yaml below a folder that VLA_ZENOH_PATH names" in str(caught.value)
 
 
 def test_the_robot_description_of_the_panda_has_its_meshes() -> None:

@@ -72,7 +72,10 @@ class Ros2Node:
 
     def __init__(self, profile: Profile, session: zenoh.Session) -> None:
         if profile.ros2 is None:
-            raise ProfileError(f"profile {profile.name!r} has no section ros2")
+            raise ProfileError(
+                f"profile {profile.name!r} has no section ros2; give --profile panda_ros2, or your "
+                "own"
+            )
         ros2 = profile.ros2
         messages = read_messages(ros2)
         node = self.node = Node(NAME, profile, session)
