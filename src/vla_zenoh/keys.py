@@ -25,7 +25,7 @@ _CHUNK = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
 
 class Kind(Enum):
-    """How samples on a key are to be carried (see nodes/qos.py)."""
+    """How samples on a key are to be carried (see nodes/session.py)."""
 
     FRAME = "frame"  # large, newest only, may be dropped
     STATE = "state"  # small, fast, newest only, may be dropped
