@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 
+from vla_zenoh.control.hold import MOVED_M, SETTLE_NS, Hold
 from vla_zenoh.control.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.errors import CodecError
-from vla_zenoh.interop.ros2.arm_state import BEYOND, ArmState, Newness, pose_state
+from vla_zenoh.interop.arm_state import BEYOND, ArmState, Newness, pose_state
 from vla_zenoh.interop.ros2.frames import FURTHEST_M, MAX_CHAIN, MAX_FRAMES, Frames
 from vla_zenoh.interop.ros2.goals import GoalKeeper, Step
-from vla_zenoh.interop.ros2.hold import MOVED_M, SETTLE_NS, Hold
 from vla_zenoh.interop.ros2.robot_clock import RobotClock
 from vla_zenoh.interop.ros2.samples import Joints, Transform
 from vla_zenoh.profile import load_profile

@@ -20,9 +20,10 @@ from vla_zenoh.codec import records
 from vla_zenoh.control.so3 import quat_from_rotation
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.nodes import slots
+from vla_zenoh.nodes.lead import STALLED_NS
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.ros2 import hearing
-from vla_zenoh.nodes.ros2.arm import STALLED_NS, Arm
+from vla_zenoh.nodes.ros2.arm import Arm
 from vla_zenoh.nodes.ros2.link import Link
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import (
@@ -180,7 +181,7 @@ def test_after_a_stall_it_stands_where_it_sent_the_arm_last_and_says_that_it_is_
         turns.up()
     turns.turn(stall_s)
     assert turns.refused("pose_stalled") == 30
-    assert turns.node.counters["ros2.stalls"] == 1
+    assert turns.arm.lead.stalls == 1
     for _ in range(STALLED_NS // TICK_NS - 1):
         turns.up()
         turns.turn()
@@ -216,7 +217,7 @@ def test_a_late_turn_goes_on_from_what_was_sent_last(turns: Turns, stall_s: floa
         turns.up()
     turns.turn(stall_s)
     turns.rise(0.6)
-    assert turns.node.counters["ros2.stalls"] == 0
+    assert turns.arm.lead.stalls == 0
     assert steps_m(turns)[30:].min() > 0.5 * SPEED_M_S * TICK_S
     assert np.abs(np.diff(steps_m(turns))).max() < STEP_M
     home_m = panda().forward(HOME_RAD).position_m[2]

@@ -22,7 +22,7 @@ from vla_zenoh.control.arm import make_kinematics
 from vla_zenoh.control.arm_guard import Measured
 from vla_zenoh.control.gripper_guard import GripperGuard
 from vla_zenoh.errors import CodecError, NodeError, ProfileError
-from vla_zenoh.interop.ros2.arm_state import ArmState, pose_state
+from vla_zenoh.interop.arm_state import ArmState, pose_state
 from vla_zenoh.interop.ros2.samples import Joints
 from vla_zenoh.keys import Kind
 from vla_zenoh.loader import make_robot

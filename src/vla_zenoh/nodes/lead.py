@@ -11,11 +11,11 @@ from dataclasses import replace
 
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.control.arm_guard import ArmGuard, Measured, make_arm_guard
+from vla_zenoh.control.hold import SETTLE_NS, Hold
 from vla_zenoh.control.impedance import Reference
 from vla_zenoh.control.joint_impedance import JointReference
 from vla_zenoh.control.kinematics import Kinematics
 from vla_zenoh.control.so3 import Pose, quat_from_rotation
-from vla_zenoh.interop.ros2.hold import SETTLE_NS, Hold
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.slots import Arrival, Inbox
 from vla_zenoh.types import FloatArray, JointCommand, PoseCommand

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 
 from vla_zenoh.errors import CodecError
+from vla_zenoh.interop.arm_state import Newness
 from vla_zenoh.interop.ros2 import table
-from vla_zenoh.interop.ros2.arm_state import Newness
 from vla_zenoh.interop.ros2.messages import MAX_PICTURE_BYTES, Messages
 from vla_zenoh.interop.ros2.qos import SENSOR
 from vla_zenoh.interop.ros2.samples import Picture

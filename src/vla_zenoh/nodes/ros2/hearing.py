@@ -10,8 +10,8 @@ import numpy as np
 from vla_zenoh.control.kinematics import Kinematics
 from vla_zenoh.control.so3 import Pose
 from vla_zenoh.errors import CodecError
+from vla_zenoh.interop.arm_state import ArmState
 from vla_zenoh.interop.ros2 import table
-from vla_zenoh.interop.ros2.arm_state import ArmState
 from vla_zenoh.interop.ros2.frames import Frames
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.qos import SENSOR, STATIC_TRANSFORMS

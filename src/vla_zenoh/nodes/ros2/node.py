@@ -162,10 +162,10 @@ class Ros2Node:
             raise
 
     def _wind_down(self, arm: Arm) -> None:
-        arm.deafen()
+        arm.lead.deafen()
         loop = FixedRate(self.node.profile.timing.command_hz)
         give_up = time.monotonic() + BRAKE_BEFORE_EXIT_S
-        while arm.sending and time.monotonic() < give_up:
+        while arm.lead.sending and time.monotonic() < give_up:
             tick = loop.wait()
             arm.wind_down(self.node.clock.wall_at(tick.nominal_ns), tick.nominal_ns)
 
@@ -178,14 +178,14 @@ class Ros2Node:
                 self.node.counters["ros2.missed_ticks"] += tick.periods - 1
             if stop.is_set():
                 give_up = give_up or time.monotonic() + BRAKE_BEFORE_EXIT_S
-                if self._arm is None or not self._arm.sending or time.monotonic() > give_up:
+                if self._arm is None or not self._arm.lead.sending or time.monotonic() > give_up:
                     return
-                self._arm.deafen()
+                self._arm.lead.deafen()
             now_ns = self.node.clock.wall_at(tick.nominal_ns)
             if self._arm is not None:
                 self._arm.turn(now_ns, tick.nominal_ns, tick.stall_s)
             if self._gripper is not None:
-                self._gripper.turn(now_ns, "" if self._arm is None else self._arm.writer)
+                self._gripper.turn(now_ns, "" if self._arm is None else self._arm.lead.writer)
             while self._news:
                 self._news.popleft()()
             self._rate.tick()

@@ -1,4 +1,4 @@
-"""Of joint states on ROS topics: our joint, pose and gripper states.
+"""Of joint states as robots tell them: our joint, pose and gripper states.
 
 Positions have to be finite, new, and such as a joint of this arm can have. What an arm does not
 tell (velocities, efforts) is made up for: velocities by differences, efforts by zero.
