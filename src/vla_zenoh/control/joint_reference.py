@@ -163,7 +163,9 @@ class JointGuard:
         command = self._stream.live(now_ns)
         if command is not None:
             self._correction.tick()
-            self.motion = self._joined(self._extrapolate(command, self._stream.ahead_s(now_ns)))
+            told = self._extrapolate(command, self._stream.ahead_s(now_ns))
+            may_step = self._stream.may_step(now_ns, self._dt_s)
+            self.motion = self._joined(told) if may_step else self._corrected(told)
             return self.motion
         if self._stream.newest is not None:
             self._end_of_stream()

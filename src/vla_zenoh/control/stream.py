@@ -30,6 +30,8 @@ class CommandStream(Generic[Command]):
         self._last_seq = -1
         self._base_ns = 0
         self._delay_ns = 0
+        self._ticked_ns = 0
+        self._anew = False
 
     def objection(self, header: Header) -> str | None:
         """Why a command with this header is not taken: ``foreign``, ``replayed``, or nothing."""
@@ -55,11 +57,21 @@ class CommandStream(Generic[Command]):
                 delay_ns = min(delay_ns, shortest_ns)
         self._delay_ns = delay_ns
         self._base_ns = stamp_ns + delay_ns
+        self._anew = True
         self.newest, self._source, self._last_seq = (
             command,
             command.header.source,
             command.header.seq,
         )
+
+    def may_step(self, now_ns: int, dt_s: float) -> bool:
+        """Whether this tick may be told something else than the one before foretold.
+
+        That is after a new command, or where this tick is not `dt_s` later.
+        """
+        late_s = (now_ns - self._ticked_ns) / 1e9 - dt_s
+        anew, self._anew, self._ticked_ns = self._anew, False, now_ns
+        return anew or abs(late_s) > 0.5 * dt_s
 
     def live(self, now_ns: int) -> Command | None:
         """The newest command, None where there is none or the stream has fallen silent."""
