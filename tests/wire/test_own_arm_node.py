@@ -40,17 +40,22 @@ class Lab:
     def trouble(self, what: str) -> None:
         self.file.write_text(what)
 
-    def stands_by_itself(self, since_ns: int) -> None:
-        """The arm comes to rest, and not by a jolt."""
+    def stands(self, since_ns: int) -> None:
+        """The arm comes to rest in time."""
         chain = self.chain
-        chain.until("the arm stands", lambda: not chain.moves() and chain.state() != "active")
-        track = chain.recorder.track()
-        assert track.time_to_stand_s(since_ns) < STANDS_S
-        limit = chain.profile.limits.translation.acceleration_m_s2
-        assert track.hardest_change() < limit * ARM_TOLERANCE
+        chain.until(
+            "the arm stands", lambda: np.isfinite(chain.recorder.track().time_to_stand_s(since_ns))
+        )
+        assert chain.recorder.track().time_to_stand_s(since_ns) < STANDS_S
+
+    def brakes(self, since_ns: int) -> None:
+        """It does, and not by a jolt."""
+        self.stands(since_ns)
+        limit = self.chain.profile.limits.translation.acceleration_m_s2
+        assert self.chain.recorder.track().hardest_change() < limit * ARM_TOLERANCE
 
 
-@pytest.fixture(scope="module", params=["joint", "pose"])
+@pytest.fixture(scope="module", params=["joint", pytest.param("pose", marks=pytest.mark.slow)])
 def lab(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     folder = tmp_path_factory.mktemp("lab")
     twin = write_profile(folder, name="twin")
@@ -118,7 +123,7 @@ def test_a_fault_of_the_robot_stops_it_until_it_is_gone_and_reset(lab: Lab) -> N
     since_ns = newest_ns(lab)
     lab.trouble("fault")
     chain.until("fault", lambda: chain.state() == "fault")
-    lab.stands_by_itself(since_ns)
+    lab.stands(since_ns)  # by what the robot itself does
     assert any("user stop" in event.why for event in chain.events("robot_fault"))
     lab.trouble("")
     chain.until("the robot is well", lambda: chain.state("arm") == "running")
@@ -169,9 +174,5 @@ def test_a_command_node_that_is_killed_leaves_an_arm_that_brakes(lab: Lab) -> No
     chain.move()
     since_ns = newest_ns(lab)
     os.kill(chain.pid("command"), signal.SIGKILL)
-    chain.until("it stands", lambda: not chain.moves())
-    track = chain.recorder.track()
-    assert track.time_to_stand_s(since_ns) < STANDS_S
-    limit = chain.profile.limits.translation.acceleration_m_s2
-    assert track.hardest_change() < limit * ARM_TOLERANCE
+    lab.brakes(since_ns)
     chain.until("the command node is back", lambda: chain.state() == "inactive", AGAIN_S)
