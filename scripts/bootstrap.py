@@ -202,7 +202,7 @@ def main() -> None:
         fail("a part of the system is missing. On Debian and Ubuntu: sudo apt install " + packages)
     uv = uv or install_uv()
     make_venv(uv)
-    say("installing the package and its libraries into .venv (once; 2 GB on disk)")
+    say("installing the package and its libraries into .venv (once; 2.7 GB on disk)")
     quiet = [] if sys.stderr.isatty() else ["--quiet"]
     target = ["--python", VENV / "bin" / "python", "--constraint", CONSTRAINTS]
     run(uv, *quiet, "pip", "install", *target, "--editable", ".[all,dev]")
