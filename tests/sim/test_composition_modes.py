@@ -20,6 +20,8 @@ SETTLE_S = 1.0
 STEP_M, STEP_RAD = 0.01, 0.05
 SEAM_TICKS = 2
 STOPPED_S = 0.1
+ELBOW_S = 0.6
+"""The pull to the posture dies away within its own jerk: all but a hundredth of it in 0.27 s."""
 MODES = ("replace", "blend", "ensemble")
 DELAYS = {"at once": Delays(), "late": Delays(inference_s=0.14, jitter=0.3, camera_s=0.03)}
 JOINT_7_MARGIN_RAD = 0.05
@@ -151,7 +153,7 @@ def test_joints_carry_out_fifty_steps_and_turns_exactly() -> None:
         np.testing.assert_allclose(turned_rad, expected, atol=TURNED_RAD)
         np.testing.assert_allclose(moved_m, np.zeros(3), atol=OFF_AXIS_M)
     loop.put("active", False)
-    assert loop.run_until(lambda: loop.commander.at_rest, STOPPED_S)
+    assert loop.run_until(lambda: loop.commander.at_rest, ELBOW_S)
     sent = [command for command in loop.trace.joints if command is not None]
     assert sent
     assert not any(loop.trace.commands)
