@@ -19,7 +19,6 @@ LIMIT_RTOL = 1e-6
 SETTLE_S = 1.0
 STEP_M, STEP_RAD = 0.01, 0.05
 SEAM_TICKS = 2
-STOPPED_S = 0.1
 ELBOW_S = 0.6
 """The pull to the posture dies away within its own jerk: all but a hundredth of it in 0.27 s."""
 MODES = ("replace", "blend", "ensemble")

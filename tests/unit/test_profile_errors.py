@@ -163,7 +163,10 @@ def told(path: str) -> list[str]:
             "robot: {gripper: {max_width_m: 0.01, dead_band_m: 0.02}}",
             "robot.gripper.dead_band_m: must be less than max_width_m (0.01): nothing would move",
         ),
-        ("robot: {driver: ros}", "wants 'sim', 'ros2' or 'arm'; did you mean 'ros2'? (given: 'ros')"),
+        (
+            "robot: {driver: ros}",
+            "wants 'sim', 'ros2' or 'arm'; did you mean 'ros2'? (given: 'ros')",
+        ),
         ("robot: {tcp_frame: ''}", "robot.tcp_frame: must not be empty"),
         (
             "task: {worker: scritped}",
@@ -186,8 +189,8 @@ def told(path: str) -> list[str]:
         ("hosts: {a: {}}", "lab.yaml:2: hosts.a.nodes: is missing"),
         (
             "hosts:\n  a:\n    nodes: [router, camer]",
-            "lab.yaml:4: hosts.a.nodes.1: wants 'router', 'sim', 'ros2', 'arm', 'camera', 'command' or "
-            "'worker'; did you mean 'camera'?",
+            "lab.yaml:4: hosts.a.nodes.1: wants 'router', 'sim', 'ros2', 'arm', 'camera', "
+            "'command' or 'worker'; did you mean 'camera'?",
         ),
         ("hosts: {a: {nodes: [sim, sim]}}", "hosts.a.nodes: sim: given more than once"),
         (
