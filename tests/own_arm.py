@@ -19,6 +19,9 @@ from vla_zenoh.robot import Command, Reading
 from vla_zenoh.simulation.world import STEP_NS
 from vla_zenoh.types import GripperState, JointCommand, JointState
 
+CONNECT_S = 12.0
+"""Longer than a node may say nothing."""
+
 
 class OwnArm:
     """See the module.
@@ -38,6 +41,8 @@ class OwnArm:
 
     # -- what vla-zenoh calls -----------------------------------------------------------------
     def connect(self) -> None:
+        if self._now() == "far away":
+            time.sleep(CONNECT_S)
         self._thread.start()
 
     def read(self) -> Reading | None:

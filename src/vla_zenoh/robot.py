@@ -75,7 +75,7 @@ class Robot(Protocol):
 
     ``connect()`` runs once before the first reading, and may take as long as it needs.
     ``grip(width_m, speed_m_s, force_n)`` asks for an absolute opening; it returns at once.
-    ``close()`` runs at the end, when the arm stands.
+    ``close()`` runs at the end, when the arm stands, also where ``connect()`` failed.
 
     What any of them raises ends the node, after what can be braked has been braked; under ``up`` it
     is started again, and begins with ``connect()``.

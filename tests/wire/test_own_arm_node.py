@@ -176,3 +176,15 @@ def test_a_command_node_that_is_killed_leaves_an_arm_that_brakes(lab: Lab) -> No
     os.kill(chain.pid("command"), signal.SIGKILL)
     lab.brakes(since_ns)
     chain.until("the command node is back", lambda: chain.state() == "inactive", AGAIN_S)
+
+
+@pytest.mark.slow
+def test_an_arm_that_takes_long_to_connect_is_not_taken_for_one_that_hangs(lab: Lab) -> None:
+    chain = lab.chain
+    lab.trouble("far away")
+    pid = chain.pid("arm")
+    os.kill(pid, signal.SIGKILL)
+    chain.until("it connects", lambda: chain.state("arm") == "connecting", AGAIN_S)
+    again = chain.pid("arm")
+    chain.until("it is there", lambda: chain.state("arm") == "running", own_arm.CONNECT_S + AGAIN_S)
+    assert chain.pid("arm") == again != pid

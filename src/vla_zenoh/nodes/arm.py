@@ -40,6 +40,7 @@ NAME = "arm"
 SWITCH_INTERVAL_S = 5e-4
 BRAKE_BEFORE_EXIT_S = 1.0
 CLOCK_PERIOD_S = 0.1
+REPORT_S = 0.2
 MAX_WORDS = 300
 FUTURE_NS = 100_000_000
 
@@ -97,22 +98,43 @@ class ArmNode:
         """
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         try:
-            self.node.report("connecting", now=True)
-            connect = self._method("connect")
-            if connect is not None:
-                self._called("connect", connect)
+            self._connect()
             gc.collect()
             gc.freeze()
             with realtime_thread() as self._realtime:
                 self._loop(stop)
         finally:
-            try:
-                close = self._method("close")
-                if close is not None:
-                    self._called("close", close)
-            finally:
-                self.node.report("stopped", now=True)
-                self.node.close()
+            self._close()
+
+    def _connect(self) -> None:
+        connect = self._method("connect")
+        if connect is None:
+            return
+        done = threading.Event()
+
+        def tell() -> None:  # a node that says nothing for long is taken for one that hangs
+            while not done.wait(REPORT_S):
+                self.node.report("connecting")
+
+        self.node.report("connecting", now=True)
+        teller = threading.Thread(target=tell, name="connecting", daemon=True)
+        teller.start()
+        try:
+            self._called("connect", connect)
+        finally:
+            done.set()
+            teller.join()
+
+    def _close(self) -> None:
+        close = self._method("close")
+        try:
+            if close is not None:
+                self._called("close", close)
+        except NodeError as error:  # what went wrong before it is what matters
+            self.node.refuse("robot_failed", str(error))
+        finally:
+            self.node.report("stopped", now=True)
+            self.node.close()
 
     def _called(self, name: str, method: Callable[..., Any], *given: Any) -> Any:
         try:
