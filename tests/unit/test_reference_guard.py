@@ -29,6 +29,7 @@ STEP_M, STEP_M_S = (
     6e-4,
     0.2,
 )  # beside its own motion; 0.2 m/s in a tick of 4 ms is for an ill stream
+EVEN_M_S2 = 13.0  # 60 ms of a drift of 1e-3 at 0.2 m/s, made up for in one tick; a stop is 200
 SHORT_STEP_M, CAUGHT_UP_M = 1e-4, 1e-5
 RTOL = 1e-6
 
@@ -241,6 +242,23 @@ def test_silence_in_motion_is_a_brake_within_the_limits() -> None:
     assert side.silences == 1
     assert not side.braking
     np.testing.assert_array_equal(before.twist, np.zeros(6))
+
+
+@pytest.mark.parametrize("held_up_ms", [1, 5, 29, 60])
+def test_silence_after_a_command_that_was_held_up_does_not_stop_it_within_a_tick(
+    held_up_ms: int,
+) -> None:
+    side, line = guard(), Line(0.2)
+    x_m = []
+    for t in range(1500):
+        if t % 4 == 0 and t < 396:
+            side.offer(line.at(t * MS), now(t * MS))
+        if t == 396 + held_up_ms:
+            assert side.offer(line.at(396 * MS, t * MS), now(t * MS)) is None
+        x_m.append(side.tick(now(t * MS)).pose.position_m[0])
+    hardest_m_s2 = np.abs(np.diff(x_m, 2)).max() / TICK_S**2
+    assert hardest_m_s2 < max(line.speed / RAMP_S, BRAKE.translation[1]) + EVEN_M_S2
+    assert side.silences == 1
 
 
 def test_while_it_brakes_by_itself_it_takes_no_commands_and_afterwards_it_does() -> None:

@@ -82,10 +82,12 @@ class CommandStream(Generic[Command]):
     def ahead_s(self, now_ns: int) -> float:
         """How far `now_ns` is past the time the newest command is meant for.
 
-        As far as silence is tolerated: the stream is a function of time, so a late command meets
-        the path its predecessors foretold.
+        The stream is a function of time, so a late command meets the path its predecessors
+        foretold. Nothing bounds it but the end of the stream, which comes a time-out after the
+        command did: a bound that is met before that, as by the last command where it was held up
+        on its way, would stop the reference in one tick.
         """
-        return min(max((now_ns - self._base_ns) / 1e9, 0.0), self._timeout_s)
+        return max((now_ns - self._base_ns) / 1e9, 0.0)
 
     def end(self) -> None:
         """Follow nobody; what was heard already is not new when it comes again."""
