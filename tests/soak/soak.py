@@ -235,13 +235,14 @@ class Soak:
         found.worst_stall_s = max(found.worst_stall_s, stall_s)
         refused = self._refusals.since(self._statuses())
         found.refused.setdefault(action, Counter()).update(refused)
-        for name, count in unexplained(refused, action, stall_s, self._whom).items():
-            found.unexplained.append(f"{name} x{count} after: {said}")
+        strange = unexplained(refused, action, stall_s, self._whom)
+        found.unexplained += [f"{name} x{count} after: {said}" for name, count in strange.items()]
         faults = self._violations()
         found.violations += [f"{fault} after: {said}" for fault in faults]
         self.chain.recorder.forget()
         words = [f"{said:<44} {time.monotonic() - began_s:5.1f} s  stall {stall_s * 1e3:4.0f} ms"]
         words += [f"refused {dict(refused)}"] if refused and action != "junk" else []
+        words += [f"?? without a cause: {name}" for name in strange]
         words += [f"!! {fault}" for fault in faults]
         self._say("  ".join(words))
 
