@@ -109,6 +109,7 @@ def test_steps_that_are_asked_for_are_made_to_the_millimetre(lab: Lab) -> None:
     assert chain.counter("arm.commands_given", "arm") > 0
 
 
+@pytest.mark.slow
 def test_the_gripper_goes_where_it_is_asked_to(lab: Lab) -> None:
     chain = lab.chain
     chain.activate_when_ready()
@@ -141,7 +142,7 @@ def test_a_fault_of_the_robot_stops_it_until_it_is_gone_and_reset(lab: Lab) -> N
     chain.activate_when_ready()
 
 
-@pytest.mark.parametrize("what", ["frozen", "nan"])
+@pytest.mark.parametrize("what", [pytest.param("frozen", marks=pytest.mark.slow), "nan"])
 def test_without_a_state_that_can_be_believed_the_arm_brakes(lab: Lab, what: str) -> None:
     chain = lab.chain
     chain.move()
