@@ -290,9 +290,7 @@ class ArmNode:
     def _watch(self) -> None:
         if time.monotonic() - self._clock_s >= CLOCK_PERIOD_S:
             self._clock_s = time.monotonic()
-            step_s = self.node.clock.follow()
-            if step_s:
-                self.node.refuse("clock_step", f"the wall clock was set by {step_s:+.3f} s")
+            self.node.follow_clock()
         state = self.state
         if state != self._was:
             level = "info" if state == "running" else "warning"

@@ -134,9 +134,7 @@ class CameraNode:
             changed = states != self._told
             if not changed and not self.node.report_due(state):
                 return
-            step_s = self.node.clock.follow()
-            if step_s:
-                self.node.refuse("clock_step", f"the wall clock was set by {step_s:+.3f} s")
+            self.node.follow_clock()
             self._told = states
             figures = {name: outlet.figures() for name, outlet in self._outlets.items()}
             for outlet in self._outlets.values():

@@ -273,6 +273,12 @@ class Node:
         handler = zenoh.handlers.Callback(handle, indirect=False)
         self._declared.append(self.session.declare_queryable(key, handler, complete=True))
 
+    def follow_clock(self) -> None:
+        """Take over the system's wall clock; that it was set is counted and told."""
+        step_s = self.clock.follow()
+        if step_s:
+            self.refuse("clock_step", f"the wall clock was set by {step_s:+.3f} s")
+
     def wall_of(self, arrival: Arrival) -> int:
         """Arrival time on this node's wall clock."""
         return self.clock.wall_ns() - (time.monotonic_ns() - arrival.mono_ns)

@@ -258,9 +258,7 @@ class SimNode:
 
     def _watch(self) -> None:
         self._scene_wanted, self._objects_wanted = self._scene.wanted, self._objects.wanted
-        step_s = self.node.clock.follow()
-        if step_s:
-            self.node.refuse("clock_step", f"the wall clock was set by {step_s:+.3f} s")
+        self.node.follow_clock()
         state = "fault" if self._blown_up else "braking" if self.guard.braking else "running"
         self.node.report(
             state,

@@ -195,9 +195,7 @@ class Ros2Node:
     def _watch(self) -> None:
         if time.monotonic() - self._clock_s >= CLOCK_PERIOD_S:
             self._clock_s = time.monotonic()
-            step_s = self.node.clock.follow()
-            if step_s:
-                self.node.refuse("clock_step", f"the wall clock was set by {step_s:+.3f} s")
+            self.node.follow_clock()
             self._watch_bridges()
         state = "running" if self._arm is None else self._arm.state
         if not self.node.report_due(state):
