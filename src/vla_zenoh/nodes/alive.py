@@ -11,7 +11,7 @@ from vla_zenoh.keys import Keys
 
 PATIENCE_S, ATTEMPTS = 1.0, 5
 ANSWERS = 2
-"""On a busy computer one was seen that came in time and lacked who was alive (Zenoh 1.10)."""
+"""One alone may come in time and lack who is alive: a robot that lived was once not found so."""
 
 
 def alive_nodes(session: zenoh.Session, keys: Keys, name: str | None = None) -> set[str]:
