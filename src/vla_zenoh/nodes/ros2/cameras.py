@@ -18,27 +18,15 @@ from vla_zenoh.nodes.camera_sources.source import STALL_S
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.ros2.link import Link
 from vla_zenoh.nodes.slots import Arrival, Latest
-from vla_zenoh.profile import Profile
 from vla_zenoh.profile.ros2 import Ros2Camera
 from vla_zenoh.types import Event
 
-SOURCE = "ros2:"
 WAIT_S = 0.1
 LOOK_S = 0.5
 """A picture is decoded this often even when nobody wants it: a broken camera is to be seen."""
 
 Tell = Callable[[Event], None]
 Refuse = Callable[[str, str, str], None]
-
-
-def camera_topics(profile: Profile) -> dict[str, Ros2Camera]:
-    """Camera -> its topic, of all that come from ROS 2."""
-    named = profile.ros2.cameras if profile.ros2 is not None else {}
-    return {
-        name: named.get(name) or Ros2Camera(topic=camera.source.removeprefix(SOURCE))
-        for name, camera in profile.cameras.items()
-        if camera.source.startswith(SOURCE)
-    }
 
 
 class Camera:

@@ -13,6 +13,7 @@ from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.arm_state import ArmState
 from vla_zenoh.interop.ros2 import table
 from vla_zenoh.interop.ros2.frames import Frames
+from vla_zenoh.interop.ros2.graph import TF, TF_STATIC
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.qos import SENSOR, STATIC_TRANSFORMS
 from vla_zenoh.interop.ros2.robot_clock import RobotClock
@@ -25,7 +26,6 @@ from vla_zenoh.nodes.slots import Arrival, Inbox
 from vla_zenoh.profile.ros2 import Ros2Profile
 from vla_zenoh.types import FloatArray
 
-TF, TF_STATIC = "/tf", "/tf_static"
 INBOX = 64
 WRENCH_PATIENCE_NS = 200_000_000
 

@@ -17,6 +17,7 @@ from pathlib import Path
 import zenoh
 
 from vla_zenoh.errors import ProfileError
+from vla_zenoh.interop.ros2.graph import camera_topics
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.nodes.clock import FixedRate
 from vla_zenoh.nodes.meter import RateMeter
@@ -24,7 +25,7 @@ from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.priority import realtime_thread
 from vla_zenoh.nodes.process import ROUTER_PATIENCE_S
 from vla_zenoh.nodes.ros2.arm import Arm
-from vla_zenoh.nodes.ros2.cameras import Camera, camera_topics
+from vla_zenoh.nodes.ros2.cameras import Camera
 from vla_zenoh.nodes.ros2.gripper import Gripper
 from vla_zenoh.nodes.ros2.link import Link
 from vla_zenoh.nodes.ros2.people import People
