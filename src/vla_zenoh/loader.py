@@ -75,6 +75,23 @@ def find_model(name: str) -> ModelFile:
     return ModelFile(stem, path, tuple(dependencies), requires)
 
 
+def find_worker(word: str, models: Mapping[str, str]) -> tuple[str, ModelFile]:
+    """What the worker that `word` means is called, and the model it runs.
+
+    Args:
+        word: a worker in `models`, else the name of a model or its path.
+        models: of the profile: worker -> path or name of its model.
+
+    Raises:
+        ResourceError: there is no such model.
+        WorkerError: its header cannot be read.
+    """
+    if word in models:
+        return word, find_model(models[word])
+    found = find_model(word)
+    return found.name, found
+
+
 def _read_header(path: Path) -> Mapping[str, Any]:
     try:
         blocks = [found["body"] for found in _HEADER.finditer(path.read_text("utf-8-sig"))]

@@ -52,13 +52,18 @@ def names(kind: str) -> list[str]:
     return sorted(found)
 
 
+def is_path(name: str) -> bool:
+    """Whether `find` takes `name` for a path and not for something's name."""
+    return os.sep in name or Path(name).suffix in (".py", ".yaml", ".yml")
+
+
 def find(kind: str, name: str) -> Path:
     """The file or folder called `name`, which may also be a path.
 
     Raises:
         ResourceError: nothing there; lists what exists and the nearest name.
     """
-    if os.sep in name or Path(name).suffix in (".py", ".yaml", ".yml"):
+    if is_path(name):
         path = Path(name).expanduser()
         if path.exists():
             return path.resolve()
@@ -71,10 +76,11 @@ def find(kind: str, name: str) -> Path:
     known = names(kind)
     near = difflib.get_close_matches(name, known, 1)
     hint = f"; did you mean {near[0]!r}?" if near else "."
+    own = f"by a profile's models: {{{name[:80]}: PATH}}, " if kind == "models" else ""
     raise ResourceError(
         f"no {ONE[kind]} called {name!r}{hint} Known: {', '.join(known) or 'none'}. One of your "
-        f"own is found by its path, or as {kind}/{name[:80]}{KINDS[kind][0]} below a folder that "
-        f"{SEARCH_PATH_VARIABLE} names"
+        f"own is found by its path, {own}or as {kind}/{name[:80]}{KINDS[kind][0]} below a folder "
+        f"that {SEARCH_PATH_VARIABLE} names"
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from vla_zenoh.errors import ResourceError, WorkerError
-from vla_zenoh.loader import find_model, import_model, make_policy
+from vla_zenoh.loader import find_model, find_worker, import_model, make_policy
 
 HEADER = """\
 # /// script
@@ -97,6 +97,23 @@ def test_a_folder_is_a_model_when_it_holds_a_model_file(write, tmp_path: Path) -
     (tmp_path / "empty").mkdir()
     with pytest.raises(ResourceError, match=r"a folder without a model\.py"):
         find_model(str(tmp_path / "empty"))
+
+
+def test_a_worker_of_the_profile_has_its_own_name_and_the_model_keeps_its_own(write) -> None:
+    path = write(MODEL, "big/model.py")
+    name, model = find_worker("lift", {"lift": path})
+    # Files beside a model.py are imported by the folder's name, whatever the worker is called.
+    assert (name, model.name, str(model.path)) == ("lift", "big", path)
+    name, model = find_worker("still", {"still": "scripted"})
+    assert (name, model.name) == ("still", "scripted")
+
+
+def test_what_is_no_worker_of_the_profile_is_the_name_or_path_of_a_model(write) -> None:
+    path = write(MODEL)
+    assert find_worker(path, {"lift": "scripted"})[0] == "mine"
+    assert find_worker("scripted", {})[0] == "scripted"
+    with pytest.raises(ResourceError, match=r"by a profile's models: \{lft: PATH\}"):
+        find_worker("lft", {"lift": path})
 
 
 def test_an_unknown_name_lists_what_there_is() -> None:

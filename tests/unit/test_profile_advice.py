@@ -59,7 +59,11 @@ def test_two_hosts_with_real_addresses_need_no_advice() -> None:
         ),
         (
             {"workers": ["scripted", "pi9"]},
-            "workers: on this computer there is no model called 'pi9'",
+            "workers: on this computer: no model called 'pi9'",
+        ),
+        (
+            {"models": {"scripted": "/absent/nod.py"}},
+            "models.scripted: on this computer: there is no file or folder '/absent/nod.py'",
         ),
         (
             {"robot": {"description": "absent.urdf"}},

@@ -89,6 +89,20 @@ def told(path: str) -> list[str]:
         ("workers: [scripted, a, a]", "lab.yaml:2: workers: a: given more than once"),
         ("workers: [scripted, 'a b']", "lab.yaml:2: workers.1: name 'a b' cannot be part of a key"),
         (
+            "workers: [scripted, ./nod.py]",
+            "lab.yaml:2: workers: './nod.py' is a path: give that model a name, as models: "
+            "{nod: ./nod.py}, and write nod here",
+        ),
+        (
+            "models: {scriptd: ./nod.py}",
+            "lab.yaml:2: models: 'scriptd' is not among workers; did you mean 'scripted'? Known: "
+            "scripted",
+        ),
+        ("models: {scripted: 5}", "lab.yaml:2: models.scripted: wants text; put it in quotes"),
+        ("models: {scripted: ''}", "lab.yaml:2: models.scripted: must not be empty"),
+        ("models: {'a b': x.py}", "lab.yaml:2: models.a b: name 'a b' cannot be part of a key"),
+        ("models: [scripted]", "lab.yaml:2: models: wants a map"),
+        (
             "serves: {scriptd: [panda]}",
             "lab.yaml:2: serves: 'scriptd' is not among workers; did you mean 'scripted'? Known: "
             "scripted",

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vla_zenoh import resources
-from vla_zenoh.errors import MissingExtraError, ResourceError
+from vla_zenoh.errors import MissingExtraError, ResourceError, WorkerError
+from vla_zenoh.loader import find_worker
 from vla_zenoh.profile.fit import cameras_of, workers_of
 from vla_zenoh.profile.schema import Profile
 from vla_zenoh.profile.session import ANYWHERE, address_of, is_loopback
@@ -86,14 +87,17 @@ def _found_here(profile: Profile) -> Iterator[str]:
     if profile.arm is not None and not Path(profile.arm.file).expanduser().is_file():
         yield f"arm.file: on this computer there is no {profile.arm.file}"
     running = {kind for host in profile.hosts.values() for kind in host.nodes}
-    wanted = [("workers", "models", worker) for worker in profile.workers]
     if "sim" in running:
-        wanted.insert(0, ("sim.scene", "sim", profile.sim.scene))
-    for where, kind, name in wanted:
         try:
-            resources.find(kind, name)
+            resources.find("sim", profile.sim.scene)
         except ResourceError as error:
-            yield f"{where}: on this computer there is {error}"
+            yield f"sim.scene: on this computer there is {error}"
+    for worker in profile.workers:
+        where = f"models.{worker}" if worker in profile.models else "workers"
+        try:
+            find_worker(worker, profile.models)
+        except (ResourceError, WorkerError) as error:
+            yield f"{where}: on this computer: {error}"
 
 
 def _timing(profile: Profile) -> Iterator[str]:

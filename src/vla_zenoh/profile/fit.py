@@ -32,6 +32,7 @@ def faults(profile: Profile) -> list[Fault]:
         *_ros2(profile),
         *_task(profile),
         *_serves(profile),
+        *_unknown(("models",), profile.models, "workers", profile.workers),
         *_unknown(("options",), profile.options, "workers", profile.workers),
         *_hosts(profile),
     ]

@@ -20,7 +20,7 @@ from vla_zenoh.profile.yaml_text import Lines
 MAX_EXTENDS = 8
 SUFFIXES = (".yaml", ".yml")
 REPLACED_WHOLE = {("hosts",)}
-WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("serves",), ("options",)}
+WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("models",), ("serves",), ("options",)}
 
 
 def profile_names() -> list[str]:

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from vla_zenoh.resources import ROBOT_DATA_PREFIX
+from vla_zenoh.resources import ROBOT_DATA_PREFIX, is_path
 
 FILE_SOURCE = "file:"
 
@@ -15,8 +15,9 @@ def anchor(data: dict[str, Any], folder: Path) -> None:
     """Make the relative paths in `data` absolute, in place; what is no text is left to the schema.
 
     Args:
-        data: as a profile file has it: ``robot.description``, ``arm.file``, ``ros2.messages.*``
-            and ``cameras.*.source`` of the form ``file:PATH`` are paths.
+        data: as a profile file has it: ``robot.description``, ``arm.file``, ``ros2.messages.*``,
+            those of ``models.*`` that are no names, and ``cameras.*.source`` of the form
+            ``file:PATH`` are paths.
         folder: where that file is.
     """
     robot = data.get("robot")
@@ -32,6 +33,11 @@ def anchor(data: dict[str, Any], folder: Path) -> None:
     arm = data.get("arm")
     if isinstance(arm, dict) and isinstance(arm.get("file"), str):
         arm["file"] = _below(folder, arm["file"])
+    models = data.get("models")
+    if isinstance(models, dict):
+        models.update(
+            {k: _below(folder, m) for k, m in models.items() if isinstance(m, str) and is_path(m)}
+        )
     ros2 = data.get("ros2")
     messages = ros2.get("messages") if isinstance(ros2, dict) else None
     if isinstance(messages, dict):

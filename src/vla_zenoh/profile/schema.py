@@ -5,9 +5,10 @@ Defaults are the safe choice, so a profile that says nothing about limits has li
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError
@@ -27,6 +28,7 @@ from vla_zenoh.profile.section import (
     refuse,
 )
 from vla_zenoh.profile.session import Endpoints, SessionProfile
+from vla_zenoh.resources import is_path
 
 NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker"]
 NODE_KINDS: tuple[NodeKind, ...] = (
@@ -60,6 +62,17 @@ def _root(value: str) -> str:
     except ProfileError as error:
         raise ValueError(str(error)) from error
     return value
+
+
+def _no_paths(names: Any) -> Any:
+    for name in names if isinstance(names, (list, tuple)) else ():
+        if isinstance(name, str) and is_path(name):
+            called = Path(name).stem
+            raise ValueError(
+                f"{name!r} is a path: give that model a name, as models: {{{called}: {name}}}, "
+                f"and write {called} here"
+            )
+    return names
 
 
 class Timing(Section):
@@ -227,7 +240,8 @@ class Profile(Section):
     """Everything about one robot and its lab.
 
     Args:
-        workers: models by their names.
+        workers: their names; each is that of a model, unless `models` says which one it runs.
+        models: worker -> its model: a path, or the name of another one.
         serves: worker -> the robots it serves, this one among them, all like this one; a worker
             that is not named here serves this one alone.
         options: worker -> what ``--set`` would give it, name -> text.
@@ -244,7 +258,8 @@ class Profile(Section):
     composition: Composition = Composition()
     cameras: dict[Name, CameraProfile] = Field(default_factory=dict)
     sim: SimProfile = SimProfile()
-    workers: Names = ("scripted",)
+    workers: Annotated[Names, BeforeValidator(_no_paths)] = ("scripted",)
+    models: dict[Name, Word] = Field(default_factory=dict)
     serves: dict[Name, Annotated[Names, Field(min_length=1)]] = Field(default_factory=dict)
     options: dict[Name, Options] = Field(default_factory=dict)
     task: TaskProfile = TaskProfile()
