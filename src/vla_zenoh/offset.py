@@ -71,6 +71,19 @@ class Offset:
     uncertainty_s: float
     round_trip_s: float
 
+    def beyond(self, bound_s: float) -> bool:
+        """Whether the clock is off by more than is reckoned with."""
+        return _beyond(self.offset_s, bound_s)
+
+
+def _beyond(offset_s: float, bound_s: float) -> bool:
+    """By the estimate alone: what is not corrected has to be refused, and the other way round.
+
+    However long a link is, the estimate is near zero where clocks agree and both ways take the
+    same time. It is off by half of what one way takes longer than the other.
+    """
+    return abs(offset_s) > bound_s
+
 
 class OffsetFilter:
     """Makes one offset of many exchanges, and a steady one to translate stamps by.
@@ -80,7 +93,7 @@ class OffsetFilter:
     """
 
     def __init__(self, bound_s: float) -> None:
-        self._bound_ns = int(bound_s * 1e9)
+        self._bound_s = bound_s
         self._window: deque[Exchange] = deque(maxlen=WINDOW)
         self._best: Exchange | None = None
         self._applied_ns = 0
@@ -121,7 +134,7 @@ class OffsetFilter:
         if best is None:
             return 0
         offset_ns = best.ahead_ns - wall_minus_mono_ns
-        if abs(offset_ns) > self._bound_ns:
+        if _beyond(offset_ns / 1e9, self._bound_s):
             self._applied_ns = 0
         elif abs(offset_ns - self._applied_ns) > self._uncertainty_ns(best, now_mono_ns):
             self._applied_ns = offset_ns

@@ -13,6 +13,7 @@ from vla_zenoh.types import ActionChunk, Header
 MS = 1_000_000
 WALL_MINUS_MONO_NS = 1_700_000_000 * 10**9
 BOUND_S = 0.1
+ROUNDING_S = 1e-8
 
 
 def exchange(at_ns: int, offset_ns: int, there_ns: int, back_ns: int, took_ns: int = 0) -> Exchange:
@@ -75,6 +76,41 @@ def test_a_clock_beyond_the_bound_is_not_translated() -> None:
     said = found.offset(WALL_MINUS_MONO_NS, 3 * MS)
     assert said is not None
     assert said.offset_s == pytest.approx(2.0, abs=0.002)
+
+
+@given(st.integers(-300 * MS, 300 * MS), st.lists(ways, min_size=1, max_size=12))
+def test_a_clock_is_refused_where_it_is_not_corrected_and_nowhere_else(
+    offset_ns: int, delays: list[tuple[int, int, int]]
+) -> None:
+    found, now_ns = OffsetFilter(BOUND_S), 0
+    for there_ns, back_ns, took_ns in delays:
+        found.add(exchange(now_ns, offset_ns, there_ns, back_ns, took_ns))
+        now_ns += 10**9
+    said = found.offset(WALL_MINUS_MONO_NS, now_ns)
+    assert said is not None
+    applied_ns = found.applied_ns(WALL_MINUS_MONO_NS, now_ns)
+    if said.beyond(BOUND_S):
+        assert applied_ns == 0
+    else:  # what is left as it is may be right as it is
+        assert abs(said.offset_s - applied_ns / 1e9) <= said.uncertainty_s + 1e-9
+
+
+@given(
+    st.sampled_from([(20, 5), (50, 10), (100, 20), (200, 40)]),
+    st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=12),
+)
+def test_clocks_that_agree_are_never_refused_for_a_long_link(
+    link_ms: tuple[int, int], jitters: list[tuple[float, float]]
+) -> None:
+    delay_ms, varying_ms = link_ms
+    found = OffsetFilter(BOUND_S)
+    for second, (there, back) in enumerate(jitters):
+        there_ms, back_ms = delay_ms + varying_ms * there, delay_ms + varying_ms * back
+        found.add(exchange(second * 10**9, 0, int(there_ms * MS), int(back_ms * MS)))
+        said = found.offset(WALL_MINUS_MONO_NS, second * 10**9 + 500 * MS)
+        assert said is not None
+        assert abs(said.offset_s) <= varying_ms / 1e3 + ROUNDING_S
+        assert not said.beyond(BOUND_S)
 
 
 def test_a_clock_that_is_set_is_noticed_at_the_next_exchange() -> None:

@@ -11,6 +11,7 @@ import pytest
 from command_rig import MS, START_NS, WORKER, Rig, model_spec
 
 from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
+from vla_zenoh.offset import Offset
 from vla_zenoh.policy import CameraSpec
 from vla_zenoh.types import GripperState, Header, PoseState, Stamped
 
@@ -103,6 +104,10 @@ def clocks_apart(ready: Ready) -> None:
     ready.pose = replace(ready.pose, header=header)
 
 
+def clock(node: str, offset: Offset) -> Callable[[Ready], None]:
+    return around(clocks={node: offset})
+
+
 def test_when_all_is_well_there_is_no_reason() -> None:
     assert Ready().reasons() == []
 
@@ -152,6 +157,12 @@ def test_when_all_is_well_there_is_no_reason() -> None:
         ("no living node serves camera 'front'", around(camera_nodes={})),
         ("camera 'front' has sent no picture for 1.5 s", around(camera_ages_s={"front": 1.5})),
         ("camera 'front' has sent no picture for inf s", around(camera_ages_s={})),
+        (r"the clock of node 'camera' is \+0\.150 s off", clock("camera", Offset(0.15, 0.1, 0.2))),
+        (r"the clock of node 'sim' is -0\.101 s off", clock("sim", Offset(-0.101, 0.3, 0.6))),
+        (
+            "the clock of node 'worker-scripted' on gpu is not known",
+            around(host="robot", hosts={"worker-scripted": "gpu"}),
+        ),
     ],
 )
 def test_each_thing_that_is_missing_is_a_reason(
@@ -160,6 +171,12 @@ def test_each_thing_that_is_missing_is_a_reason(
     ready = Ready()
     change(ready)
     assert any(re.search(match, reason) for reason in ready.reasons()), ready.reasons()
+
+
+def test_a_clock_that_is_reckoned_with_is_no_reason() -> None:
+    ready = Ready()
+    clock("camera", Offset(0.099, 0.3, 0.6))(ready)
+    assert ready.reasons() == []
 
 
 def test_a_camera_the_profile_does_not_have_is_a_reason() -> None:

@@ -278,7 +278,7 @@ def _clocks(profile: Profile, worker: str, around: Surroundings) -> list[str]:
     bound_s, reasons = profile.timing.max_clock_offset_s, []
     for node in dict.fromkeys(nodes):
         found = around.clocks.get(node)
-        if found is not None and abs(found.offset_s) - found.uncertainty_s > bound_s:
+        if found is not None and found.beyond(bound_s):
             reasons.append(
                 f"the clock of node {node!r} is {found.offset_s:+.3f} s off this one's "
                 f"(+-{found.uncertainty_s:.4f} s), at most {bound_s:g} s is allowed "

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import zenoh
@@ -12,6 +14,9 @@ from vla_zenoh.types import Header
 
 LINKS_PERIOD_S = 5.0
 MAX_SENDERS = 256
+"""So many are compared with themselves; where more come, who was silent longest is forgotten."""
+OTHERS = "others"
+"""Where losses are counted of more keys than `MAX_SENDERS`."""
 MAX_LINKS = 8
 
 
@@ -26,6 +31,15 @@ class Sender(Protocol):
     def sent_bytes(self) -> int: ...
 
 
+@dataclass(slots=True)
+class _Heard:
+    """A writer of a key: where its numbers and our arrivals began, and what is missing since."""
+
+    seq: int
+    arrivals: int
+    lost: int = 0
+
+
 class Traffic:
     """Rates of what is sent, from one report to the next, and records that never arrived.
 
@@ -37,8 +51,8 @@ class Traffic:
         self._sessions = [session]
         self._reported_s = time.monotonic()
         self._sent: dict[str, tuple[int, int]] = {}
-        self._first: dict[tuple[str, str], tuple[int, int]] = {}
-        self._lost: dict[tuple[str, str], int] = {}
+        self._heard: dict[tuple[str, str], _Heard] = {}  # in the order of when they spoke last
+        self._lost_before: Counter[str] = Counter()
         self._links: list[str] = []
         self._links_s = -1e9
 
@@ -57,20 +71,30 @@ class Traffic:
             header: its writer's word.
             arrivals: samples that had arrived in its slot by then; 0: nobody counts there.
         """
-        who = (key, header.source)
-        if arrivals == 0 or (who not in self._first and len(self._first) >= MAX_SENDERS):
+        if arrivals == 0:
             return
-        seq, count = self._first.setdefault(who, (header.seq, arrivals))
-        missing = (header.seq - seq) - (arrivals - count)
-        self._lost[who] = max(missing, self._lost.get(who, 0))
+        who = (key, header.source)
+        known = self._heard.pop(who, None) or _Heard(header.seq, arrivals)
+        missing = (header.seq - known.seq) - (arrivals - known.arrivals)
+        known.lost = max(missing, known.lost)
+        self._heard[who] = known
+        if len(self._heard) > MAX_SENDERS:
+            self._forget(next(iter(self._heard)))
+
+    def _forget(self, who: tuple[str, str]) -> None:
+        key, lost = who[0], self._heard.pop(who).lost
+        if lost:
+            full = key not in self._lost_before and len(self._lost_before) >= MAX_SENDERS
+            self._lost_before[OTHERS if full else key] += lost
 
     def sent(self, streams: Iterable[Sender]) -> dict[str, list[float]]:
         """Key -> records and bytes a second since the last call, of those that carried any."""
         now_s = time.monotonic()
         took_s = max(now_s - self._reported_s, 1e-3)
         out: dict[str, list[float]] = {}
+        before, self._sent = self._sent, {}
         for stream in streams:
-            count, size = self._sent.get(stream.key, (0, 0))
+            count, size = before.get(stream.key, (0, 0))
             self._sent[stream.key] = (stream.seq, stream.sent_bytes)
             if stream.seq > count:
                 rates = ((stream.seq - count) / took_s, (stream.sent_bytes - size) / took_s)
@@ -80,11 +104,10 @@ class Traffic:
 
     def lost(self) -> dict[str, int]:
         """Key -> records that were written and never arrived here."""
-        out: dict[str, int] = {}
-        for (key, _), count in self._lost.items():
-            if count:
-                out[key] = out.get(key, 0) + count
-        return out
+        out = Counter(self._lost_before)
+        for (key, _), heard in list(self._heard.items()):  # readers may have threads of their own
+            out[key] += heard.lost
+        return {key: count for key, count in out.items() if count}
 
     def links(self) -> list[str]:
         """Where this node is connected to, as Zenoh writes it."""
