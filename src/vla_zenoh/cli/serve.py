@@ -9,20 +9,18 @@ from typing import Annotated
 
 import typer
 
+from vla_zenoh.cli.chosen import chosen_worker
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ProfileOption,
     effective_profile,
-    model_options,
 )
 from vla_zenoh.cli.output import console
 from vla_zenoh.interop.offer import make_offer
 from vla_zenoh.interop.openpi import PORT
-from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.loader import make_policy
 from vla_zenoh.nodes.environment import run_in_own_environment
 from vla_zenoh.nodes.process import stop_on_signals
-
-WEBSOCKETS = "websockets>=15"
 
 serve_app = typer.Typer(help="Serve a model to other systems.", no_args_is_help=True)
 
@@ -34,7 +32,12 @@ def _group() -> None:
 
 @serve_app.command("openpi")
 def openpi(
-    worker: Annotated[str, typer.Option("--worker", "-w", help="Name of a model, or its file.")],
+    worker: Annotated[
+        str,
+        typer.Option(
+            "--worker", "-w", help="A worker of the profile, name of a model, or path to one."
+        ),
+    ],
     profile: ProfileOption = DEFAULT_PROFILE,
     options: Annotated[
         list[str] | None,
@@ -53,20 +56,19 @@ def openpi(
     ] = None,
 ) -> None:
     """Answer openpi's clients with a model of ours; whoever asks drives the robot."""
-    robot = effective_profile(profile).robot
-    found = find_model(worker)
-    chosen = model_options(options or [])
-    run_in_own_environment(found, python, (WEBSOCKETS,))
+    loaded = effective_profile(profile)
+    robot, chosen = loaded.robot, chosen_worker(loaded, worker, options or [])
+    run_in_own_environment(chosen.model, python, extra="serve")
     from vla_zenoh.nodes.openpi_server import OpenPiServer
 
-    policy = make_policy(found, chosen, profile=profile)
+    policy = make_policy(chosen.model, chosen.options, profile=profile)
     offer = make_offer(policy.spec, names, robot.arm_joints, robot.gripper.max_width_m)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     getattr(policy, "load", lambda: None)()
     stop = stop_on_signals()
     server = OpenPiServer(policy, offer, host, port, api_key=api_key)
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    console().print(f"{found.name} for openpi's clients at ws://{host}:{server.port}")
+    console().print(f"{chosen.name} for openpi's clients at ws://{host}:{server.port}")
     for name, what in offer.described().items():
         console().print(f"  {name}: {what}", highlight=False)
     stop.wait()

@@ -8,17 +8,17 @@ from typing import Annotated, Literal
 import typer
 
 from vla_zenoh import keys
+from vla_zenoh.cli.chosen import chosen_worker
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
     HostOption,
     ProfileOption,
     effective_profile,
-    model_options,
 )
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.loader import make_policy
 from vla_zenoh.nodes.environment import run_in_own_environment
 from vla_zenoh.nodes.process import run_node
 from vla_zenoh.nodes.worker import WorkerNode
@@ -26,7 +26,9 @@ from vla_zenoh.profile import Profile
 
 
 def worker(
-    model: Annotated[str, typer.Argument(help="Name of a model, or path to a file with one.")],
+    model: Annotated[
+        str, typer.Argument(help="A worker of the profile, name of a model, or path to one.")
+    ],
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
     name: Annotated[
@@ -57,13 +59,12 @@ def worker(
 ) -> None:
     """Run a model: observations in, action chunks out on its delta key."""
     loaded = effective_profile(profile, connect, host=host)
-    found = find_model(model)
-    called = name or found.name
-    chosen = {**loaded.options.get(called, {}), **model_options(options or [])}
+    chosen = chosen_worker(loaded, model, options or [], name)
+    called = chosen.name
     served = robot_names(robots) or loaded.serves.get(called, ())
     # Comes back only where this environment has what the model's header asks for.
-    run_in_own_environment(found, python)
-    policy = make_policy(found, chosen, profile=profile)
+    run_in_own_environment(chosen.model, python)
+    policy = make_policy(chosen.model, chosen.options, profile=profile)
     form = _image_form(loaded, host) if images == "auto" else images
     run_node(
         loaded,
@@ -76,7 +77,7 @@ def worker(
             host=host,
             delay_s=delay_ms / 1e3,
             robots=served,
-            another=lambda: make_policy(found, chosen, profile=profile),
+            another=lambda: make_policy(chosen.model, chosen.options, profile=profile),
         ).run(stop),
         identity=worker_node(called),
     )

@@ -22,13 +22,14 @@ from vla_zenoh.nodes.orphan import die_with_parent
 INSIDE_VARIABLE = "VLA_ZENOH_WORKER_ENVIRONMENT"
 
 
-def run_in_own_environment(model: ModelFile, python: str | None, more: Sequence[str] = ()) -> None:
+def run_in_own_environment(model: ModelFile, python: str | None, *, extra: str = "") -> None:
     """Replace this process by one in the right environment; returns where this one is right.
 
     Args:
         model: the file.
         python: interpreter of a prepared environment, which must have this package.
-        more: packages that the command needs beside the model's own.
+        extra: of this package, which the command needs beside the model's own packages; a prepared
+            environment has to have it.
 
     Raises:
         WorkerError: another environment is needed and cannot be made.
@@ -49,14 +50,16 @@ def run_in_own_environment(model: ModelFile, python: str | None, more: Sequence[
         if shutil.which(python) is None:
             raise WorkerError(f"--python {python!r} is not an interpreter")
         os.execvpe(python, [python, *arguments], environment)
-    command = environment_command(model, more)
+    command = environment_command(model, extra=extra)
     # Not on stdout, where `vla-zenoh check --json` writes its result.
     said = f"preparing an environment for {model.name}: {', '.join(model.dependencies)}"
     print(said, file=sys.stderr, flush=True)
     os.execve(command[0], [*command, "python", *arguments], environment)
 
 
-def environment_command(model: ModelFile, more: Sequence[str] = ()) -> list[str]:
+def environment_command(
+    model: ModelFile, more: Sequence[str] = (), *, extra: str = ""
+) -> list[str]:
     """What runs a command in the environment that the model's header asks for.
 
     uv makes it at the first time and keeps it.
@@ -64,6 +67,7 @@ def environment_command(model: ModelFile, more: Sequence[str] = ()) -> list[str]
     Args:
         model: the file.
         more: further packages.
+        extra: of this package.
 
     Raises:
         WorkerError: there is no uv.
@@ -80,7 +84,7 @@ def environment_command(model: ModelFile, more: Sequence[str] = ()) -> list[str]
         command += ["--python", model.requires_python]
     for requirement in (*model.dependencies, *more):
         command += ["--with", requirement]
-    return [*command, *_this_package()]
+    return [*command, *_this_package(extra)]
 
 
 def _uv() -> str | None:
@@ -88,9 +92,10 @@ def _uv() -> str | None:
     return str(beside) if beside.is_file() else shutil.which("uv")
 
 
-def _this_package() -> list[str]:
+def _this_package(extra: str) -> list[str]:
     """How uv gets the package that is running now: the checkout, else the same version."""
+    extras = f"[{extra}]" if extra else ""
     checkout = Path(__file__).resolve().parents[3]
     if (checkout / "pyproject.toml").is_file() and (checkout / "src" / "vla_zenoh").is_dir():
-        return ["--with-editable", str(checkout)]
-    return ["--with", f"vla-zenoh=={__version__}"]
+        return ["--with-editable", f"{checkout}{extras}"]
+    return ["--with", f"vla-zenoh{extras}=={__version__}"]
