@@ -42,6 +42,8 @@ PUSH_N = 150.0
 """At most, on what is in the way: stiffness times `tracking_m`, and what the brake adds."""
 PUSH_WAY_M = 0.005
 STANDS_M = 1e-3
+LOST_M = 0.006
+"""Further than a stream may begin aside of the reference, far less than `tracking_m`."""
 STATES = (PoseState, GripperState, JointState)
 
 
@@ -217,6 +219,34 @@ def test_without_commands_the_robot_brakes_by_itself_and_nothing_jumps_afterward
     assert way_m(loop, standing) < STANDS_M
     goes_on(loop)
     check_motion(loop, own_brake=True)
+
+
+def test_a_stream_whose_beginning_is_lost_moves_nothing_and_ends_the_activation() -> None:
+    loop = begin()
+    loop.put("active", False)
+    loop.run(1.0)
+    loop.put("prompt", UP)
+    loop.run(0.2)
+    since = mark(loop)
+    loop.tamper = dropped(PoseCommand)
+    activate(loop)
+    while ahead_m(loop, since) < LOST_M:
+        loop.run(0.02)
+    assert loop.commander.state.value == "active"
+    loop.tamper = None
+    loop.run(0.05)
+    assert loop.commander.state.value == "inactive"
+    assert "unheeded" in loop.commander.why
+    loop.run(1.0)
+    assert way_m(loop, since) < STANDS_M
+    goes_on(loop)
+    check_motion(loop)
+
+
+def ahead_m(loop: Lockstep, since: int) -> float:
+    """How far the commanded pose has gone since then."""
+    told = [command for command in loop.trace.commands[since:] if command is not None]
+    return float(norm3(told[-1].position_m - told[0].position_m)) if told else 0.0
 
 
 def test_a_goal_out_of_reach_is_approached_and_no_further() -> None:

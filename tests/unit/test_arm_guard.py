@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vla_zenoh.control.arm_guard import STANDING_RAD_S, ArmGuard, Measured, Mode
+from vla_zenoh.control.arm_guard import STANDING_RAD_S, UNHEEDED_NS, ArmGuard, Measured, Mode
 from vla_zenoh.control.impedance import Reference
 from vla_zenoh.control.joint_impedance import JointReference
 from vla_zenoh.control.joint_reference import JointGuard, joint_guard_limits
@@ -45,10 +45,12 @@ class Side:
         self.seq += 1
         return Stamped(Header(self.now_ns, self.seq, source), record, self.now_ns)
 
-    def pose(self, dx_m: float = 0.0, v_m_s: float = 0.0, source: str = "p") -> str | None:
+    def pose(
+        self, dx_m: float = 0.0, v_m_s: float = 0.0, source: str = "p", state: str = "active"
+    ) -> str | None:
         at = self.measured.pose.position_m + [dx_m, 0.0, 0.0]
         twist = np.array([v_m_s, 0, 0, 0, 0, 0])
-        record = PoseCommand(at, UNIT, twist, np.zeros(6), at, UNIT, "active")
+        record = PoseCommand(at, UNIT, twist, np.zeros(6), at, UNIT, state)
         return self.guard.offer_pose(self.stamped(record, source), self.now_ns)
 
     def joint(self, by_rad: float = 0.0, v_rad_s: float = 0.0, source: str = "j") -> str | None:
@@ -195,3 +197,51 @@ def test_a_restart_stands_where_the_robot_was_put(mode: Mode) -> None:
     assert side.guard.mode == mode
     where = elsewhere.position_m if mode == "pose" else HOME_RAD + 0.2
     np.testing.assert_array_equal(side.tick()[0], where)
+
+
+@pytest.mark.parametrize(
+    ("mode", "by", "speed", "reason"),
+    [
+        ("pose", 0.003, 0.0, "jump"),
+        ("pose", 0.0, 0.05, "too_fast"),
+        ("joint", 0.006, 0.0, "jump"),
+        ("joint", 0.0, 0.12, "too_fast"),
+    ],
+)
+def test_a_stream_whose_beginning_was_lost_is_said_to_be_unheeded_until_it_ends(
+    mode: Mode, by: float, speed: float, reason: str
+) -> None:
+    side = Side(mode)
+    for _ in range(20):
+        assert (side.pose if mode == "pose" else side.joint)(by, speed) == reason
+        side.tick(50)
+        assert side.guard.unheeded
+    side.tick(UNHEEDED_NS // MS)
+    assert not side.guard.unheeded
+    assert (side.pose() if mode == "pose" else side.joint()) is None
+
+
+def test_an_arm_that_follows_somebody_heeds_no_stranger_and_does_not_say_so() -> None:
+    side = Side()
+    assert side.pose(source="command#1") is None
+    side.tick()
+    assert side.pose(0.1, source="stranger#1") == "foreign"
+    assert side.joint(source="stranger#1") == "other_mode"
+    assert side.pose(0.1, source="command#1") == "jump"
+    side.tick()
+    assert not side.guard.unheeded
+
+
+def test_a_stream_of_one_that_brakes_already_need_not_be_told() -> None:
+    side = Side()
+    assert side.pose(0.1, state="inactive") == "jump"
+    side.tick()
+    assert not side.guard.unheeded
+
+
+def test_after_a_clock_was_set_back_it_is_not_unheeded_for_ever() -> None:
+    side = Side()
+    assert side.pose(0.1) == "jump"
+    side.now_ns -= 3_600_000 * MS
+    side.tick()
+    assert not side.guard.unheeded

@@ -17,6 +17,7 @@ from ros2_rig import write_profile
 
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
+from vla_zenoh.control.arm_guard import UNHEEDED_NS
 from vla_zenoh.control.so3 import quat_from_rotation
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.nodes import slots
@@ -42,6 +43,7 @@ SPEED_M_S = 0.2
 STEP_M = 2e-4
 SAG_RAD = 0.01
 SAME_M = 1e-6
+UNTURNED = np.array([0.0, 0.0, 0.0, 1.0])
 TOPIC = "/panda/panda_cartesian_impedance_controller/desired_pose"
 ALONE = """{
   mode: "peer", scouting: {multicast: {enabled: false}}, listen: {endpoints: []}
@@ -88,11 +90,11 @@ class Turns:
         for ns in ("mono_ns", "wall_ns"):
             setattr(self, ns, getattr(self, ns) + round(duration_s * 1e9))
 
-    def put(self, record: Any) -> None:
+    def put(self, record: Any, source: str = "command#1") -> None:
         self.seq += 1
         keys = self.node.keys
         key = keys.command_joint if isinstance(record, JointCommand) else keys.command_pose
-        header = header_codec.encode(Header(self.wall_ns, self.seq, "command#1"))
+        header = header_codec.encode(Header(self.wall_ns, self.seq, source))
         self.session.put(key, records.encode(record), attachment=header)
 
     def up(self, *, moves: bool = True) -> None:
@@ -190,6 +192,9 @@ def test_after_a_stall_it_stands_where_it_sent_the_arm_last_and_says_that_it_is_
         turns.up()
         turns.turn()
     assert len(turns.goals) == sent, "nobody is led on by an old motion"
+    assert turns.newest(GripperState).mode == "unheeded", "and who writes it hears of that"
+    for _ in range(UNHEEDED_NS // TICK_NS + 2):
+        turns.turn()
     assert turns.newest(GripperState).mode == "ready"
     held = turns.newest(PoseState).reference_position_m
     if stall_s > 0.5:
@@ -288,3 +293,42 @@ def test_where_joints_are_held_the_reference_of_the_tcp_is_theirs(turns: Turns) 
     np.testing.assert_allclose(pose.reference_position_m, held_m, atol=SAME_M)
     assert np.linalg.norm(pose.position_m - held_m) > 1e-3
     np.testing.assert_array_equal(turns.newest(JointState).reference_rad, HOME_RAD)
+
+
+# -- a beginning that is lost -----------------------------------------------------------------
+def test_a_stream_of_poses_whose_beginning_was_lost_is_told_to_who_writes_it(
+    turns: Turns,
+) -> None:
+    turns.moved_s = RAMP_S
+    for _ in range(10):
+        turns.up()
+        turns.turn()
+    assert turns.refused("pose_jump") == 10
+    assert turns.goals == []
+    assert turns.newest(GripperState).mode == turns.arm.state == "unheeded"
+
+
+@pytest.mark.parametrize("turns", [JOINT_GOALS], indirect=True)
+def test_a_stream_of_joints_whose_beginning_was_lost_is_told_to_who_writes_it(
+    turns: Turns,
+) -> None:
+    still, elbow_rad = np.zeros(len(ARM_JOINTS)), HOME_RAD.copy()
+    for _ in range(10):
+        elbow_rad[2] += 0.006  # the TCP stands nearly still
+        turns.put(JointCommand(ARM_JOINTS, elbow_rad, still, still, "active"))
+        turns.turn()
+    assert turns.refused("joint_jump") == 10
+    assert turns.newest(GripperState).mode == turns.arm.state == "unheeded"
+
+
+def test_no_stranger_makes_an_arm_that_is_followed_unready(turns: Turns) -> None:
+    turns.rise()
+    elsewhere = PoseCommand(
+        np.zeros(3), UNTURNED, np.zeros(6), np.zeros(6), np.zeros(3), UNTURNED, "active"
+    )
+    for _ in range(20):
+        turns.put(elsewhere, "stranger#1")
+        turns.up()
+        turns.turn()
+    assert turns.refused("pose_foreign") == 20
+    assert turns.newest(GripperState).mode == "ready"

@@ -12,11 +12,19 @@ from vla_zenoh.control.joint_impedance import JointReference
 from vla_zenoh.control.joint_reference import JointGuard, joint_guard_limits
 from vla_zenoh.control.reference import ReferenceGuard, guard_limits
 from vla_zenoh.control.so3 import Pose
+from vla_zenoh.control.states import OBEYING
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, JointCommand, PoseCommand, Stamped
 
 STANDING_RAD_S = 0.02
 """An arm of which no joint is faster stands: its law may be exchanged."""
+
+UNHEEDED = frozenset({"jump", "too_fast", "out_of_range", "names", "moving", "other_mode"})
+"""Why a stream is not followed although nobody else's is: who writes it has to hear of it."""
+UNHEEDED_NS = 200_000_000
+"""For so long it is said after the last such refusal."""
+LEADING = frozenset(state.value for state in OBEYING)
+"""Who commands in another state brakes or stands already, and waits for nothing."""
 
 Mode = Literal["pose", "joint"]
 
@@ -58,6 +66,8 @@ class ArmGuard:
         self._poses, self._joints = poses, joints
         self._measure = measure
         self._writer = ""
+        self._unheeded_until_ns = 0
+        self._now_ns = 0
         self.mode: Mode = mode
 
     @property
@@ -78,6 +88,16 @@ class ArmGuard:
     def braking(self) -> bool:
         """The stream fell silent in motion."""
         return self._in_charge.braking
+
+    @property
+    def unheeded(self) -> bool:
+        """Somebody leads an arm that follows nobody, and is not obeyed.
+
+        Who writes that stream cannot see it by the arm, which may stand when a motion begins.
+        """
+        if self.following or self.braking:
+            return False
+        return 0 < self._unheeded_until_ns - self._now_ns <= UNHEEDED_NS
 
     @property
     def silences(self) -> int:
@@ -101,6 +121,11 @@ class ArmGuard:
             None, ``other_mode`` (joints are followed), ``moving`` (the arm does, so that its law
             cannot be exchanged), or what `ReferenceGuard.offer` says.
         """
+        reason = self._offer_pose(command, now_ns)
+        self._note(reason, command.record.state, now_ns)
+        return reason
+
+    def _offer_pose(self, command: Stamped[PoseCommand], now_ns: int) -> str | None:
         if self.mode != "pose":
             if self.following or self.braking:
                 return "other_mode"
@@ -119,6 +144,11 @@ class ArmGuard:
         Returns:
             None, ``other_mode`` (poses are followed), ``moving``, or what `JointGuard.offer` says.
         """
+        reason = self._offer_joint(command, now_ns)
+        self._note(reason, command.record.state, now_ns)
+        return reason
+
+    def _offer_joint(self, command: Stamped[JointCommand], now_ns: int) -> str | None:
         if self.mode != "joint":
             if self.following or self.braking:
                 return "other_mode"
@@ -131,8 +161,14 @@ class ArmGuard:
             self.mode, self._writer = "joint", command.header.source
         return reason
 
+    def _note(self, reason: str | None, state: str, now_ns: int) -> None:
+        # While somebody is followed a stranger's word changes nothing.
+        if reason in UNHEEDED and state in LEADING and not (self.following or self.braking):
+            self._unheeded_until_ns = now_ns + UNHEEDED_NS
+
     def tick(self, now_ns: int) -> Reference | JointReference:
         """What the arm has to hold at `now_ns`."""
+        self._now_ns = now_ns
         self._in_charge.tick(now_ns)
         return self.reference
 

@@ -208,8 +208,8 @@ class Lockstep:
         held = self.world.pose_state(self.guard.reference)
         self._send(SIM, held, self._take_pose_state)
         gripper = self.world.gripper_state()
-        if self.guard.braking:
-            gripper = replace(gripper, mode="braking")
+        if self.guard.braking or self.guard.unheeded:
+            gripper = replace(gripper, mode="braking" if self.guard.braking else "unheeded")
         self._send(SIM, gripper, self._take_gripper_state)
         wanted = {part for w in self.workers.values() for part in w.spec.observation.state}
         if self.commander.reach is not None or "joint" in wanted:

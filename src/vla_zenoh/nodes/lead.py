@@ -26,6 +26,11 @@ STALLED_NS = 500_000_000
 """After a stall nobody is obeyed for so long, and the robot is not ready: what was sent meanwhile
 is still arriving, and who sent it has to hear of it and brake."""
 
+UNHEEDED_WHY = (
+    "the command stream is refused and nobody is followed: it does not begin where the arm stands, "
+    "or its beginning was lost"
+)
+
 
 class Lead:
     """See the module.
@@ -176,6 +181,11 @@ class Lead:
     def stalled(self) -> bool:
         """This side stood still a moment ago, while the arm was led."""
         return self._stalled_until_ns > 0
+
+    @property
+    def unheeded(self) -> bool:
+        """Somebody commands the arm and is not obeyed; see `ArmGuard.unheeded`."""
+        return self._guard is not None and self._guard.unheeded
 
     @property
     def sending(self) -> bool:

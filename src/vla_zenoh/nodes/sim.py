@@ -235,10 +235,11 @@ class SimNode:
     def _publish_state(self, now_ns: int) -> None:
         seq = self._joint.seq
         gripper = self.world.gripper_state()
-        if self._blown_up or self.guard.braking:
+        state = self._state
+        if state != "running":
             gripper = replace(
                 gripper,
-                mode="braking" if self.guard.braking else gripper.mode,
+                mode=state if state in ("braking", "unheeded") else gripper.mode,
                 faults=(self._blown_up,) if self._blown_up else (),
             )
         self._joint.put(self.world.joint_state(), stamp_wall_ns=now_ns, seq=seq)
@@ -259,12 +260,19 @@ class SimNode:
     def _watch(self) -> None:
         self._scene_wanted, self._objects_wanted = self._scene.wanted, self._objects.wanted
         self.node.follow_clock()
-        state = "fault" if self._blown_up else "braking" if self.guard.braking else "running"
         self.node.report(
-            state,
+            self._state,
             detail=self._detail(),
             rates_hz={"control": self._rate.rate_hz},
         )
+
+    @property
+    def _state(self) -> str:
+        if self._blown_up:
+            return "fault"
+        if self.guard.braking:
+            return "braking"
+        return "unheeded" if self.guard.unheeded else "running"
 
     def _detail(self) -> dict[str, object]:
         self.node.counters["sim.overruns"] = self._overruns

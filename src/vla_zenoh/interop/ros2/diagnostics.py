@@ -12,7 +12,9 @@ from vla_zenoh.types import NodeStatus
 
 TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 OK, WARN, ERROR, STALE = range(4)
-BAD = frozenset({"fault", "stopped", "degraded", "braking", "waiting"})
+BAD = frozenset(
+    {"fault", "stopped", "degraded", "braking", "waiting", "silent", "stalled", "unheeded"}
+)
 MAX_VALUE = 200
 
 

@@ -18,7 +18,7 @@ from vla_zenoh.interop.ros2.qos import COMMAND
 from vla_zenoh.interop.ros2.samples import Stamp
 from vla_zenoh.interop.ros2.topics import pose
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.lead import Lead
+from vla_zenoh.nodes.lead import UNHEEDED_WHY, Lead
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.ros2.hearing import Hearing
 from vla_zenoh.nodes.ros2.link import Link
@@ -166,7 +166,7 @@ class Arm:
         self._fingers_lost = lost
         if lost:
             return
-        if self.state in ("braking", "stalled"):
+        if self.state in ("braking", "stalled", "unheeded"):
             record = replace(record, mode=self.state)
         elif not self._writer.heard:
             record = replace(record, mode=f"not listening at {self._topic[:100]}")
@@ -188,13 +188,15 @@ class Arm:
             return "silent"
         if self.lead.braking:
             return "braking"
-        return "stalled" if self.lead.stalled else "running"
+        if self.lead.stalled:
+            return "stalled"
+        return "unheeded" if self.lead.unheeded else "running"
 
     def _tell(self) -> None:
         state = self.state
         if state != self._was:
             if self._was:
-                bad = state in ("silent", "braking", "stalled")
+                bad = state in ("silent", "braking", "stalled", "unheeded")
                 level = "warning" if bad else "info"
                 change = f"{self._was}->{state}"
                 self._node.tell(Event(level, "transition", change, self._why(state)))
@@ -218,7 +220,7 @@ class Arm:
                 f"this loop stood still for {self.lead.stall_s:.3f} s while it moved the arm, "
                 "which stands where it was sent last"
             )
-        return ""
+        return UNHEEDED_WHY if state == "unheeded" else ""
 
     def detail(self) -> dict[str, Any]:
         """For status."""
