@@ -34,7 +34,7 @@ PARTS = (
     Part(RUN, "up", "up:up"),
     Part(RUN, "router", "router:router"),
     Part(RUN, "sim", "sim:sim"),
-    Part(RUN, "ros2", "ros2:ros2"),
+    Part(RUN, "ros2", "ros2:ros2_app"),
     Part(RUN, "arm", "arm:arm"),
     Part(RUN, "camera", "camera:camera"),
     Part(RUN, "worker", "worker:worker"),

@@ -19,6 +19,7 @@ from vla_zenoh.errors import SecurityError, VlaZenohError
 from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.profile.session import DEFAULT_FOLDER
 from vla_zenoh.security.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
+from vla_zenoh.security.bridge import bridges
 from vla_zenoh.security.identity import PEOPLE, Role, identities, identities_of, people_at
 from vla_zenoh.security.store import Entry, Store
 from vla_zenoh.security.written import (
@@ -78,7 +79,8 @@ def init(
         written = load_profile(str(file))
         made = [store.make_authority(lab, now)]
         serving = serving_addresses(plain, (*addresses.values(), *(address or ())))
-        made += store.add(identities(plain), now, days=days, addresses=serving)
+        everybody = [*identities(plain), *bridges(plain)]
+        made += store.add(everybody, now, days=days, addresses=serving)
     except VlaZenohError:
         file.unlink()
         raise
@@ -122,9 +124,10 @@ def add(
         if host in loaded.hosts and renew:
             names = {one.node for one in chosen}
             nodes = [one for one in identities_of(loaded, host) if one.role not in PEOPLE]
+            nodes += bridges(loaded, host)
             chosen = [*(one for one in nodes if one.node not in names), *chosen]
     else:
-        chosen = identities_of(loaded, host)
+        chosen = [*identities_of(loaded, host), *bridges(loaded, host)]
     store = Store(security.folder)
     made = store.add(
         chosen, _now(), days=days, addresses=serving_addresses(loaded, address or ()), renew=renew

@@ -10,10 +10,13 @@ from vla_zenoh.doctor.finding import Finding
 from vla_zenoh.errors import MissingExtraError, SecurityError, VlaZenohError
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import is_loopback
+from vla_zenoh.security.bridge import NODE as BRIDGE
 from vla_zenoh.security.identity import Identity
 from vla_zenoh.security.store import Entry, Store
 
 SHOWN_FAULTS = 6
+SERVERS = ("router", BRIDGE)
+"""Whose certificates are not shown to the router."""
 
 
 class Tried(Protocol):
@@ -61,7 +64,7 @@ def access(
     except VlaZenohError as error:
         yield Finding("access", "fail", f"the rules could not be tried: {error}")
     for entry in entries:
-        if entry.node != "router" and not entry.faults:
+        if entry.node not in SERVERS and not entry.faults:
             yield _accepted(entry, try_identity)
 
 

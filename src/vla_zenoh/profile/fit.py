@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from vla_zenoh.faults import nearest
 from vla_zenoh.profile.ros2 import JOINT_COMMANDS
 from vla_zenoh.profile.section import Place
-from vla_zenoh.profile.session import endpoint_faults
+from vla_zenoh.profile.session import TRUSTED_PROTOCOLS, endpoint_faults, is_loopback
 
 if TYPE_CHECKING:
     from vla_zenoh.profile.schema import HostProfile, Profile
@@ -100,12 +100,7 @@ def _ros2(profile: Profile) -> Iterator[Fault]:
         source = profile.cameras[name].source if name in profile.cameras else ""
         if source.startswith("ros2:") and source.removeprefix("ros2:") != camera.topic:
             yield ("ros2", "cameras", name, "topic"), f"is not that of cameras.{name}: {source!r}"
-    if robot.driver == "ros2" and ros2.connect is None and profile.session.security is not None:
-        yield (
-            ("ros2", "connect"),
-            "is missing: the bridge has no certificate of this lab. Let it listen on the robot's "
-            "computer alone, at another port, and name that, as connect: [tcp/127.0.0.1:7448]",
-        )
+    yield from _way_to_ros2(profile)
     joints = ros2.joint_command
     if joints is not None and joints.type not in JOINT_COMMANDS:
         wanted = " or ".join(JOINT_COMMANDS)
@@ -113,6 +108,29 @@ def _ros2(profile: Profile) -> Iterator[Fault]:
     gripper = ros2.gripper
     if gripper is not None and gripper.grasp and gripper.type != "franka_msgs/action/Move":
         yield ("ros2", "gripper", "grasp"), "goes with type franka_msgs/action/Move only"
+
+
+def _way_to_ros2(profile: Profile) -> Iterator[Fault]:
+    """Whoever speaks to the bridge moves the robot past our command node."""
+    assert profile.ros2 is not None
+    places, secured = profile.ros2.connect, profile.session.security is not None
+    used = any("ros2" in host.nodes for host in profile.hosts.values())
+    if places is None and secured and used:
+        yield (
+            ("ros2", "connect"),
+            "is missing: in a secured lab the bridge has a router of its own. On the computer that "
+            "runs the node ros2: connect: [tcp/127.0.0.1:7450]; on another one, where it takes "
+            "this lab's certificates: connect: [tls/ADDRESS:7450]",
+        )
+    trusted = [endpoint.partition("/")[0] in TRUSTED_PROTOCOLS for endpoint in places or ()]
+    for index, endpoint in enumerate(places or ()):
+        why = ""
+        if trusted[index] and not secured:
+            why = "needs certificates: make them with `vla-zenoh secure init`"
+        elif secured and not trusted[index] and (any(trusted) or not is_loopback(endpoint)):
+            why = "lets everybody on the way command the robot: write tls/, or tcp/127.0.0.1:7450"
+        if why:
+            yield ("ros2", "connect", str(index)), why
 
 
 def _task(profile: Profile) -> Iterator[Fault]:

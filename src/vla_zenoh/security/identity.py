@@ -25,6 +25,7 @@ class Role(Enum):
     OPERATOR = "operator"  # a person who drives the robot
     VIEWER = "viewer"  # a person or screen that looks on, without pictures
     REPLAY = "replay"  # plays a recording: the part of everybody, where no robot lives
+    BRIDGE = "bridge"  # a ROS 2 robot's; serves the node ros2 alone, has no rights at our routers
 
 
 ROLE_OF_KIND = {
@@ -53,6 +54,7 @@ class Identity:
         worker: the worker it is, if it is one.
         cameras: the cameras it serves.
         speaks_for: whose part it plays as well: the node of a ROS 2 robot puts what ROS people ask.
+        addresses: of a bridge: where it serves.
     """
 
     role: Role
@@ -61,6 +63,7 @@ class Identity:
     worker: str = ""
     cameras: tuple[str, ...] = ()
     speaks_for: tuple[Role, ...] = ()
+    addresses: tuple[str, ...] = ()
 
     @property
     def roles(self) -> frozenset[Role]:

@@ -101,7 +101,7 @@ class Store:
             SecurityError: one is there already, the authority's key is not, or a file cannot be
                 written. Nothing is written then.
         """
-        identities = list(identities)
+        identities, serving = list(identities), tuple(addresses)
         if not renew:
             for identity in identities:
                 self._refuse_to_overwrite(self.files(identity.host, identity.node))
@@ -114,7 +114,9 @@ class Store:
                     identity.common_name,
                     now,
                     days=days,
-                    addresses=tuple(addresses) if identity.role is Role.ROUTER else None,
+                    addresses=serving
+                    if identity.role is Role.ROUTER
+                    else identity.addresses or None,
                 ),
             )
             for identity in identities

@@ -11,7 +11,7 @@ import yaml
 
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.profile import HostProfile, Profile
-from vla_zenoh.profile.session import ANYWHERE, address_of, host_of
+from vla_zenoh.profile.session import ANYWHERE, address_of, host_of, is_loopback
 from vla_zenoh.security.identity import Role
 
 HEAD = """\
@@ -95,6 +95,9 @@ def profile_text(
         "about": f"{profile.about}, with certificates" if profile.about else "with certificates",
         "session": session,
     }
+    bridge = profile.ros2.connect if profile.ros2 is not None else None
+    if not all(map(is_loopback, bridge or ())):
+        body["ros2"] = {"connect": [secured(endpoint) for endpoint in bridge or ()]}
     if any(host.connect or host.listen or host.link for host in profile.hosts.values()):
         # A profile's hosts are replaced whole, so all of them are written.
         body["hosts"] = {name: _host(host, secure) for name, host in profile.hosts.items()}

@@ -32,6 +32,7 @@ from vla_zenoh.nodes.ros2.people import People
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile, SessionProfile
 from vla_zenoh.profile.ros2 import Ros2Profile
+from vla_zenoh.profile.session import TRUSTED_PROTOCOLS
 from vla_zenoh.types import Event
 
 NAME = "ros2"
@@ -69,6 +70,7 @@ class Ros2Node:
         ProfileError: the section ros2 is missing or names what is not known.
         NodeError: a node of this name is alive already.
         SessionError: ros2.connect does not answer.
+        SecurityError: it is reached by TLS, and this node's certificate is not there.
     """
 
     def __init__(self, profile: Profile, session: zenoh.Session) -> None:
@@ -82,8 +84,8 @@ class Ros2Node:
         node = self.node = Node(NAME, profile, session)
         self._own_session = None
         if ros2.connect is not None:
-            way = SessionProfile(connect=ros2.connect, lease_ms=profile.session.lease_ms)
-            self._own_session = open_session(way, wait_s=ROUTER_PATIENCE_S)
+            way = _way(profile, ros2.connect)
+            self._own_session = open_session(way, identity=NAME, wait_s=ROUTER_PATIENCE_S)
         self.link = Link(
             self._own_session or session, ros2, messages, f"vla_{_ros_name(profile.robot.name)}"
         )
@@ -243,6 +245,15 @@ class Ros2Node:
             )
         )
         self.node.tell(event)
+
+
+def _way(profile: Profile, places: tuple[str, ...]) -> SessionProfile:
+    """The session to a bridge or router of the robot's own."""
+    lease_ms = profile.session.lease_ms
+    if all(endpoint.partition("/")[0] in TRUSTED_PROTOCOLS for endpoint in places):
+        security = profile.session.security
+        return SessionProfile(connect=places, listen=places, lease_ms=lease_ms, security=security)
+    return SessionProfile(connect=places, lease_ms=lease_ms)
 
 
 def _ros_name(name: str) -> str:

@@ -1,0 +1,151 @@
+"""The configuration of zenoh-bridge-ros2dds for a profile: what it uses is let through, by name."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.interop.ros2.graph import endpoints
+from vla_zenoh.interop.ros2.keys import Role
+from vla_zenoh.profile import Profile
+from vla_zenoh.profile.ros2 import Ros2Profile
+from vla_zenoh.profile.session import (
+    TRUSTED_PROTOCOLS,
+    endpoint_faults,
+    host_of,
+    is_loopback,
+)
+
+PROGRAM = "zenoh-bridge-ros2dds"
+ALLOWED_AS = {
+    Role.SUBSCRIBER: "publishers",
+    Role.PUBLISHER: "subscribers",
+    Role.CLIENT: "service_servers",
+    Role.SERVER: "service_clients",
+    Role.ACTION_CLIENT: "action_servers",
+}
+"""Our end -> what the robot's side of it is called in the bridge's list."""
+KINDS = (*ALLOWED_AS.values(), "action_clients")
+"""All kinds in that list. One that is empty lets nothing through."""
+
+HEAD = """\
+// {program} for the profile {name}. Written by `vla-zenoh ros2 bridge-config`.
+// What the profile uses of the robot's ROS graph is let through, by its whole name, and nothing
+// else. What a listener does not take in time is dropped: the next joint state is on its way, and
+// a slow listener must not hold up the others.
+"""
+
+
+def bridge_config(
+    profile: Profile, locks: Mapping[str, Any] | None = None, *, beside: bool = False
+) -> dict[str, Any]:
+    """Zenoh's configuration, with the plugin's section.
+
+    Args:
+        profile: the effective profile.
+        locks: sections for certificates and access, where the bridge is reached by TLS.
+        beside: the bridge is a client of our router; else it listens where the node ``ros2``
+            looks for it: ``ros2.connect``, or ``session.connect``.
+
+    Raises:
+        ProfileError: there is no such bridge, or it would listen to everybody.
+    """
+    ros2 = _section(profile)
+    if beside and ros2.connect is not None:
+        raise ProfileError(
+            f"profile {profile.name}: ros2.connect says that the bridge is at "
+            f"{', '.join(ros2.connect)}; leave that out where it is beside our router"
+        )
+    places = ros2.connect or profile.session.connect
+    config: dict[str, Any] = {
+        "mode": "client" if beside else "router",
+        "listen": {"endpoints": [] if beside else [_listening(profile, e) for e in places]},
+        "connect": {"endpoints": list(places) if beside else []},
+        "scouting": {"multicast": {"enabled": False}},
+        # The status of an action is kept for those who come late, which needs them.
+        "timestamping": {"enabled": True},
+    }
+    if beside:
+        config["connect"] |= {
+            "timeout_ms": -1,
+            "exit_on_failure": False,
+            "retry": {"period_init_ms": 100, "period_max_ms": 500},
+        }
+    return {
+        **config,
+        **(locks or {}),
+        "plugins": {
+            "ros2dds": {
+                "domain": ros2.domain,
+                "reliable_routes_blocking": False,
+                "allow": _allowed(profile),
+            }
+        },
+    }
+
+
+def bridge_text(profile: Profile, config: Mapping[str, Any]) -> str:
+    """That configuration as the text of a JSON5 file."""
+    head = HEAD.format(program=PROGRAM, name=profile.name)
+    return f"{head}{json.dumps(config, indent=2, ensure_ascii=False)}\n"
+
+
+def bridge_command(profile: Profile, file: str = "bridge.json5") -> str:
+    """The line that starts the bridge; it has to know which ROS it speaks to."""
+    return f"ROS_DISTRO={_section(profile).distribution} {PROGRAM} -c {file}"
+
+
+def is_locked(profile: Profile) -> bool:
+    """Whether the bridge is reached by TLS, and so has a certificate."""
+    ros2 = profile.ros2
+    return ros2 is not None and any(map(_is_trusted, ros2.connect or ()))
+
+
+def _section(profile: Profile) -> Ros2Profile:
+    ros2 = profile.ros2
+    if ros2 is None:
+        raise ProfileError(
+            f"profile {profile.name!r} has no section ros2; give --profile panda_ros2, or your own"
+        )
+    if ros2.bridge != "ros2dds":
+        raise ProfileError(
+            f"profile {profile.name}: ros2.bridge is {ros2.bridge}, and such a robot needs no "
+            f"bridge; {PROGRAM} is for ros2dds"
+        )
+    return ros2
+
+
+def _listening(profile: Profile, endpoint: str) -> str:
+    if not (_is_trusted(endpoint) or is_loopback(endpoint) or profile.session.insecure):
+        plain = profile.session.model_copy(update={"security": None})
+        (_, why), *_ = endpoint_faults([endpoint], plain, listen=True)
+        raise ProfileError(f"profile {profile.name}: a bridge that listens at {endpoint} {why}")
+    if is_loopback(endpoint) or _is_number(host_of(endpoint)):
+        return endpoint
+    # A computer often knows its own name as an address that nobody else reaches.
+    port = endpoint.rpartition(":")[2]
+    return f"{endpoint.partition('/')[0]}/[::]:{port}"
+
+
+def _is_trusted(endpoint: str) -> bool:
+    return endpoint.partition("/")[0] in TRUSTED_PROTOCOLS
+
+
+def _is_number(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _allowed(profile: Profile) -> dict[str, list[str]]:
+    """Kind of end on the robot's side -> expressions, each of one whole name."""
+    out: dict[str, list[str]] = {kind: [] for kind in KINDS}
+    for end in endpoints(profile):
+        out[ALLOWED_AS[end.role]].append(f"^{re.escape(end.name)}$")
+    return {kind: sorted(set(names)) for kind, names in out.items()}

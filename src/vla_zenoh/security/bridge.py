@@ -1,0 +1,86 @@
+"""The bridge of a ROS 2 robot that is reached over a network: its certificate, and who may use it.
+
+It is a router of its own, and whoever speaks to it moves the arm past our command node. So it takes
+certificates of this lab only, and of those the one of the node ``ros2`` alone.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from vla_zenoh.profile import Profile
+from vla_zenoh.profile.session import TRUSTED_PROTOCOLS, host_of, is_loopback
+from vla_zenoh.security.identity import Identity, Role
+from vla_zenoh.security.rules import EVERY_MESSAGE, IN, OUT
+from vla_zenoh.security.store import AUTHORITY
+
+NODE, USER = "bridge", "ros2"
+"""Its name in its certificate, and the one node that it serves."""
+KEYS = ("**", "**/@adv/**", "@/*/@ros2_lv/**")
+"""Topics and services, what late listeners ask for, and what bridges tell each other. A star stands
+for no name that begins with an @."""
+
+
+def bridges(profile: Profile, host: str | None = None) -> list[Identity]:
+    """The bridge, with the host that runs the node ``ros2``; none where only that host reaches it.
+
+    Args:
+        profile: the lab, secured or not yet.
+        host: leave out all others.
+    """
+    places = profile.ros2.connect if profile.ros2 is not None else None
+    if all(_is_open_here(endpoint) for endpoint in places or ()):
+        return []
+    addresses = tuple(dict.fromkeys(map(host_of, places or ())))
+    return [
+        Identity(Role.BRIDGE, NODE, name, addresses=addresses)
+        for name in _users(profile)
+        if host in (None, name)
+    ]
+
+
+def bridge_locks(profile: Profile, folder: Path) -> dict[str, Any]:
+    """Zenoh's sections ``transport`` and ``access_control`` for the bridge.
+
+    Args:
+        profile: the lab.
+        folder: where ``ca.pem``, ``bridge.pem`` and ``bridge.key`` are on the bridge's computer.
+    """
+    names = [f"{USER}@{host}" for host in _users(profile)]
+    return {
+        "transport": {
+            "link": {
+                "tls": {
+                    "root_ca_certificate": str(folder / f"{AUTHORITY}.pem"),
+                    "listen_certificate": str(folder / f"{NODE}.pem"),
+                    "listen_private_key": str(folder / f"{NODE}.key"),
+                    "enable_mtls": True,
+                    "close_link_on_expiration": True,
+                }
+            }
+        },
+        "access_control": {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": [
+                {
+                    "id": USER,
+                    "messages": list(EVERY_MESSAGE),
+                    "flows": [IN, OUT],
+                    "permission": "allow",
+                    "key_exprs": list(KEYS),
+                }
+            ],
+            "subjects": [{"id": USER, "cert_common_names": names}],
+            "policies": [{"rules": [USER], "subjects": [USER]}],
+        },
+    }
+
+
+def _users(profile: Profile) -> list[str]:
+    return [name for name, part in profile.hosts.items() if USER in part.nodes]
+
+
+def _is_open_here(endpoint: str) -> bool:
+    return is_loopback(endpoint) and endpoint.partition("/")[0] not in TRUSTED_PROTOCOLS
