@@ -1,4 +1,4 @@
-"""Whether an episode did what it was told, where the simulator's true poses tell."""
+"""Whether an episode did what it was told: a person said so, or the simulator's true poses tell."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from bisect import bisect_right
 
 from vla_zenoh.dataset.episodes import Episode
 from vla_zenoh.errors import RecordError
+from vla_zenoh.evaluation.trial.judged import verdict_in
 from vla_zenoh.recording.run import Heard
 from vla_zenoh.tasks.judge import SETTLED_S, Judge
 from vla_zenoh.tasks.understand import understand
@@ -15,7 +16,14 @@ AFTER_NS = int(1.2 * SETTLED_S * 1e9)
 
 
 def succeeded(episode: Episode) -> bool | None:
-    """The verdict; None: its prompt is no known task, or changed, or no true poses are recorded."""
+    """The verdict of a person, else that of the true poses; None: nobody knows.
+
+    That is: the person called the episode void; or nobody was asked, and its prompt is no known
+    task, or changed, or no true poses are recorded.
+    """
+    said = verdict_in(episode.run.file.ended, episode.worker)
+    if said is not None:
+        return None if said == "void" else said == "success"
     prompts = {frame.prompt for frame in episode.frames}
     order = understand(prompts.pop()) if len(prompts) == 1 else None
     run = episode.run
