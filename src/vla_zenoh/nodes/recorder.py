@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,6 +92,7 @@ class Recorder:
         self._queued_bytes, self._queue_limit = 0, queue_bytes
         self._change = threading.Condition()
         self._closing = False
+        self._ended: Mapping[str, Any] = {}
         self._subscribers: list[Any] = []
         self.recorded = Recorded(path)
         self._began_s = time.monotonic()
@@ -147,10 +148,20 @@ class Recorder:
             stop.wait(left_s)
         return self.close()
 
-    def close(self) -> Recorded:
-        """Stop listening, write what is queued, and finish the file."""
+    def stop_listening(self) -> None:
+        """Take no more samples; the file stays open until `close`."""
         for subscriber in self._subscribers:
             subscriber.undeclare()
+        self._subscribers.clear()
+
+    def close(self, ended: Mapping[str, Any] | None = None) -> Recorded:
+        """Stop listening, write what is queued, and finish the file.
+
+        Args:
+            ended: what else is to stand at its end.
+        """
+        self.stop_listening()
+        self._ended = ended or {}
         with self._change:
             self._closing = True
             self._change.notify()
@@ -187,7 +198,7 @@ class Recorder:
     def _write_all(self) -> None:
         try:
             self._write_until_closed()
-            self._writer.finish({"dropped": dict(self.recorded.dropped)})
+            self._writer.finish({"dropped": dict(self.recorded.dropped), **self._ended})
         except RecordingError as error:
             self._fail(str(error))
         self._measure()
