@@ -139,6 +139,40 @@ def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
         node.close()
 
 
+@pytest.mark.parametrize("make", [Latest, partial(Inbox, 4), partial(Mailbox, 4)])
+def test_what_deletes_is_not_taken_for_what_is_put(
+    make: Callable[[], Latest | Inbox | Mailbox],
+) -> None:
+    endpoint = free_endpoint()
+    profile = override(
+        load_profile("panda_sim"), {"session": {"listen": [endpoint], "connect": [endpoint]}}
+    )
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as reader,
+        open_session(profile.session) as writer,
+    ):
+        node = Node("reader", profile, reader)
+        key = node.keys.reset
+        slot = node.listen(key, make())  # pyright: ignore[reportArgumentType]
+        await_match(writer, key)
+        for _ in range(3):
+            writer.delete(key)
+        writer.put(key, b"")
+
+        def take() -> list[Arrival]:
+            if isinstance(slot, Latest):
+                arrival = slot.take()
+                return [] if arrival is None else [arrival]
+            return slot.take_all()
+
+        (taken,) = until("the one that was put", take)
+        assert taken.sample.kind == zenoh.SampleKind.PUT
+        node.report("running", now=True)
+        assert node.counters["refused.deleted"] == 3
+        node.close()
+
+
 def test_zenoh_itself_passes_over_what_nobody_could_read() -> None:
     endpoint = free_endpoint()
     profile = SessionProfile(listen=(endpoint,), connect=(endpoint,), shared_memory=False)

@@ -1,4 +1,4 @@
-"""Bytes out of Zenoh's hands: their number is looked at before they are copied."""
+"""Bytes out of Zenoh's hands: what they are is looked at before they are copied."""
 
 from __future__ import annotations
 
@@ -23,21 +23,28 @@ def bytes_of(payload: zenoh.ZBytes | None, limit: int = MAX_RECORD_BYTES) -> byt
     return payload.to_bytes()
 
 
-def size_of(sample: zenoh.Sample) -> int:
-    """Bytes of payload and attachment together."""
+def check(sample: zenoh.Sample, limit: int) -> None:
+    """Whether a sample may be taken. A deletion comes without bytes, and would pass for a setting.
+
+    Raises:
+        CodecError: ``deleted``, it was not put; ``oversize``, payload and attachment together are
+            more than `limit`.
+    """
+    if sample.kind != zenoh.SampleKind.PUT:
+        raise CodecError("deleted", "nothing is deleted here; what is put is taken")
     attachment = sample.attachment
-    return len(sample.payload) + (len(attachment) if attachment is not None else 0)
+    size = len(sample.payload) + (len(attachment) if attachment is not None else 0)
+    if size > limit:
+        raise CodecError("oversize", f"{size} bytes, at most {limit} are taken")
 
 
 def whole(sample: zenoh.Sample, limit: int) -> tuple[bytes, bytes | None]:
     """Payload and attachment.
 
     Raises:
-        CodecError: ``oversize``, both together are more than `limit`.
+        CodecError: as `check` says.
     """
-    size = size_of(sample)
-    if size > limit:
-        raise CodecError("oversize", f"{size} bytes, at most {limit} are taken")
+    check(sample, limit)
     attachment = sample.attachment
     return sample.payload.to_bytes(), attachment.to_bytes() if attachment is not None else None
 

@@ -188,7 +188,7 @@ class Node:
 
     def _tick(self) -> None:
         self.clocks.tick()
-        self._tell_of_oversize()
+        self._tell_of_refused()
         self._news.tick()
 
     def _net(self) -> dict[str, Any]:
@@ -221,7 +221,7 @@ class Node:
     def listen(self, key: str, slot: AnySlot, kind: Kind = Kind.STATE) -> AnySlot:
         """Let samples on `key` fall into `slot`; of `kind` it matters whether they are pictures.
 
-        Those that are larger than the slot takes are counted and told with the next report.
+        Those that it does not take are counted and told with the next report.
 
         Raises:
             SessionError: the router does not answer at the port of pictures.
@@ -238,19 +238,15 @@ class Node:
         return slot
 
     def watch(self, slot: Slot) -> None:
-        """Count and tell what `slot` drops for its size."""
+        """Count and tell what `slot` does not take."""
         self._slots.append(slot)
 
-    def _tell_of_oversize(self) -> None:
+    def _tell_of_refused(self) -> None:
         for slot in self._slots:
-            found = slot.take_oversize()
-            if found is None:
-                continue
-            key = self.keys.short(found.key)
-            self.counters["refused.oversize"] += found.times - 1
-            self.refuse(
-                "oversize", f"{key}: {found.size} bytes, at most {slot.limit} are taken", key
-            )
+            for found in slot.take_refused():
+                key = self.keys.short(found.key)
+                self.counters[f"refused.{found.reason}"] += found.times - 1
+                self.refuse(found.reason, f"{key}: {found.why}", key)
 
     def on_alive(self, callback: Callable[[str, bool], None]) -> None:
         """Call back with (node name, alive) now and at every change, on Zenoh's thread."""

@@ -174,9 +174,12 @@ class Recorder:
         key = str(sample.key_expr)
         try:
             payload, attachment = whole(sample, self._queue_limit)
-        except CodecError:  # copying it costs as much as keeping it
+        except CodecError as error:  # copying what is too large costs as much as keeping it
             with self._change:
-                self.recorded.dropped[key] += 1
+                if error.reason == "oversize":
+                    self.recorded.dropped[key] += 1
+                else:
+                    self.node.counters[f"refused.{error.reason}"] += 1
             return
         self._put(key, payload, str(sample.encoding), attachment)
 

@@ -15,7 +15,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES, encode_jpeg
 from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.keys import Keys, Kind
-from vla_zenoh.nodes.bounded import bytes_of, header_of
+from vla_zenoh.nodes.bounded import bytes_of, check, header_of
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
 from vla_zenoh.types import Header, Image, Seen
@@ -152,6 +152,7 @@ class SeenListener:
         return out
 
     def _read(self, sample: zenoh.Sample) -> Sight | None:
+        check(sample, MAX_JPEG_BYTES)
         header, payload = header_of(sample), bytes_of(sample.payload, MAX_JPEG_BYTES)
         _, worker, *camera = self._keys.short(str(sample.key_expr)).split("/")
         if camera:

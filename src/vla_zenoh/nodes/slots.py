@@ -2,7 +2,7 @@
 
 An unbounded queue or a slow callback on a stream makes everything behind it late, control keys
 included, so streams keep the newest sample only and orders a bounded number. A sample with more
-bytes than its slot takes is dropped before any of them is copied or kept, and told.
+bytes than its slot takes, or one that deletes, is dropped before anything is copied or kept, and told.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from typing import NamedTuple
 import zenoh
 
 from vla_zenoh.codec.records import MAX_RECORD_BYTES
-from vla_zenoh.nodes.bounded import size_of
+from vla_zenoh.errors import CodecError
+from vla_zenoh.nodes.bounded import check
 
 
 class Arrival(NamedTuple):
@@ -33,11 +34,19 @@ class Arrival(NamedTuple):
     nth: int = 0
 
 
-class Oversize(NamedTuple):
-    """Samples that were dropped for their size: key and bytes of the newest, and how many."""
+class Refused(NamedTuple):
+    """Samples that a slot did not take.
 
+    Args:
+        reason: short stable name.
+        key: of the newest.
+        why: a sentence on it.
+        times: how many.
+    """
+
+    reason: str
     key: str
-    size: int
+    why: str
     times: int
 
 
@@ -50,27 +59,25 @@ class Slot:
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
-        self._oversize: Oversize | None = None
+        self._refused: dict[str, Refused] = {}
 
     def _takes(self, sample: zenoh.Sample) -> bool:
-        size = size_of(sample)
-        if size <= self._limit:
-            return True
-        known = self._oversize
-        self._oversize = Oversize(str(sample.key_expr), size, known.times + 1 if known else 1)
-        return False
+        try:
+            check(sample, self._limit)
+        except CodecError as error:
+            refused = self._refused
+            known = refused.get(error.reason)
+            times = known.times + 1 if known else 1
+            refused[error.reason] = Refused(error.reason, str(sample.key_expr), str(error), times)
+            return False
+        return True
 
-    @property
-    def limit(self) -> int:
-        """Bytes of payload and attachment together that are taken at most."""
-        return self._limit
-
-    def take_oversize(self) -> Oversize | None:
-        """What was dropped for its size since the last call; None: nothing."""
-        found = self._oversize
-        if found is not None:
-            self._oversize = None
-        return found
+    def take_refused(self) -> list[Refused]:
+        """What was not taken since the last call, by reason."""
+        if not self._refused:
+            return []
+        found, self._refused = self._refused, {}
+        return list(found.values())
 
 
 class Latest(Slot):

@@ -36,7 +36,7 @@ class ViewListener:
     ) -> None:
         self.keys = profile.keys
         self.dropped: Counter[str] = Counter()
-        """Samples that did not fit, by key."""
+        """Samples that did not fit, or put nothing, by key."""
         self._clock = Clock()
         self._lock = threading.Lock()
         self._queue: deque[tuple[str, bytes, str, bytes | None, int]] = deque()
