@@ -1,8 +1,8 @@
 """Where Zenoh's callbacks leave samples. A callback does this and nothing else.
 
 An unbounded queue or a slow callback on a stream makes everything behind it late, control keys
-included, so streams keep the newest sample only and orders a bounded number. A sample with more
-bytes than its slot takes, or one that deletes, is dropped before anything is copied or kept, and told.
+included, so streams keep the newest sample only and orders a bounded number. A sample that was not
+put, or has more bytes than its slot takes, is dropped before any of them is copied, and told.
 """
 
 from __future__ import annotations
