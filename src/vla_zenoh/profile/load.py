@@ -54,6 +54,21 @@ def load_profile(name: str) -> Profile:
     return _checked(data, lines)
 
 
+def followed(name: str) -> list[tuple[Path, str]]:
+    """The files that the profile called `name` is made of, each with how the one before names it.
+
+    Args:
+        name: of a profile that can be loaded, or its path.
+    """
+    out = [(profile_file(name), name)]
+    while True:
+        path = out[-1][0]
+        parent = yaml_text.read(_bytes(path), str(path))[0].get("extends")
+        if not isinstance(parent, str):
+            return out
+        out.append((_parent(path, parent), parent))
+
+
 def read_profile(text: str, where: str) -> Profile:
     """The profile that `to_yaml` wrote.
 
