@@ -46,7 +46,7 @@ class Tick(NamedTuple):
     Args:
         periods: how many periods have passed since the last turn, at least 1.
         nominal_ns: the multiple this turn stands for, on the monotonic clock.
-        stall_s: how late this turn was woken in all.
+        stall_s: how late this turn was woken in all, and how long the computer was suspended.
         computed_s: processor time the turn before took of this thread. Where that is little and the
             stall is long, the computer was busy with something else.
     """
@@ -57,10 +57,24 @@ class Tick(NamedTuple):
     computed_s: float
 
 
+def suspended_ns() -> int:
+    """How long this computer was suspended since it was booted; 0 where the system does not say.
+
+    Never more than that, whatever is done to this thread between the two clocks.
+    """
+    clock = getattr(time, "CLOCK_BOOTTIME", None)
+    return 0 if clock is None else time.clock_gettime_ns(clock) - time.monotonic_ns()
+
+
 class FixedRate:
-    """Wakes at multiples of a period; a missed one is reported, not made up for."""
+    """Wakes at multiples of a period; a missed one is reported, not made up for.
+
+    Periods are those of the monotonic clock, which stands still while the computer is suspended:
+    nothing was missed then, but whoever goes on has to know of it.
+    """
 
     def __init__(self, rate_hz: float) -> None:
+        self._suspended_ns = max(suspended_ns() for _ in range(3))
         self._period_ns = round(1e9 / rate_hz)
         self._next_ns = time.monotonic_ns() + self._period_ns
         self._computed_ns = time.thread_time_ns()
@@ -75,6 +89,9 @@ class FixedRate:
             time.sleep((self._next_ns - now_ns) / 1e9)
             now_ns = time.monotonic_ns()
         late_ns = max(now_ns - self._next_ns, 0)
+        asleep_ns = max(suspended_ns() - self._suspended_ns, 0)
+        self._suspended_ns += asleep_ns
         periods = 1 + late_ns // self._period_ns
         self._next_ns += periods * self._period_ns
-        return Tick(int(periods), self._next_ns - self._period_ns, late_ns / 1e9, computed_s)
+        stall_s = (late_ns + asleep_ns) / 1e9
+        return Tick(int(periods), self._next_ns - self._period_ns, stall_s, computed_s)

@@ -99,10 +99,9 @@ class CommandNode:
         give_up = 0.0
         while True:
             tick = loop.wait()
-            extra: list[Setting] = []
             if tick.periods > 1:
                 self.node.counters["command.missed_ticks"] += tick.periods - 1
-                extra += self._after_a_stall(tick)
+            extra = self._after_a_stall(tick)
             if stop.is_set():
                 give_up = give_up or time.monotonic() + BRAKE_BEFORE_EXIT_S
                 extra.append(Setting("active", False))
