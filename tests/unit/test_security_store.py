@@ -231,7 +231,7 @@ def test_a_profile_that_cannot_be_secured_leaves_nothing_behind(
     folder = tmp_path / "keys"
     done = runner.invoke(secure_app, ["init", "-p", "panda_ros2", "--folder", str(folder)])
     assert done.exit_code == 1
-    assert "ros2.connect: is missing: the bridge has no certificate" in str(done.exception)
+    assert "ros2.connect: is missing: in a secured lab the bridge" in str(done.exception)
     assert list(tmp_path.iterdir()) == []
 
 
