@@ -24,9 +24,10 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperCommand
 
 HOUR_NS = 3_600_000_000_000
+WITH_GRASP = "  gripper: {grasp: /panda_gripper/grasp}\n"
 FORGOTTEN_S = 0.35
 """Longer than timing.command_timeout_s."""
-MOVE = "/panda_gripper/move/_action"
+MOVE, GRASP = "/panda_gripper/move/_action", "/panda_gripper/grasp/_action"
 ORDER = GripperCommand(0.02, 0.05, 10.0)
 
 
@@ -37,6 +38,8 @@ class Rig:
         self.node, self.gripper = node, gripper
         self.command, self.stranger = command, stranger
         self.goals: list[Any] = []
+        self.actions: list[str] = []
+        self.width_m: float | None = None
         self.over = threading.Event()
 
     def turn_until(self, what: str, name: str, count: int, writer: str = "command#1") -> None:
@@ -50,8 +53,9 @@ class Rig:
 
 
 @pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    profile = load_profile(str(write_profile(tmp_path)))
+def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
+    more = getattr(request, "param", "")
+    profile = load_profile(str(write_profile(tmp_path, more=more)))
     assert profile.ros2 is not None
     with (
         open_session(profile.session, mode="router"),
@@ -61,7 +65,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         node = Node("ros2", profile, ours)
         messages = Messages(profile.ros2.distribution)
         link = Link(ours, profile.ros2, messages, "vla_panda")
-        gripper = Gripper(node, link, messages, profile.ros2.gripper)
+        gripper = Gripper(node, link, messages, profile.ros2.gripper, lambda: rig.width_m)
         streams = [
             Stream(theirs, profile.keys.command_gripper, Kind.ORDER, source, Clock())
             for source in ("command#1", "stranger#1")
@@ -69,16 +73,23 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         peer = Ros2Peer(theirs, "ros2dds")
         rig = Rig(node, gripper, *streams)
 
-        def accept(asked: Any) -> Any:
-            rig.goals.append(asked.goal)
-            return peer.message("franka_msgs/action/Move_SendGoal_Response", accepted=True)
+        def serve(topic: str, action: str) -> None:
+            kind = f"franka_msgs/action/{action}"
 
-        def finish(_: Any) -> Any:
-            rig.over.wait()
-            return peer.message("franka_msgs/action/Move_GetResult_Response")
+            def accept(asked: Any) -> Any:
+                rig.goals.append(asked.goal)
+                rig.actions.append(action)
+                return peer.message(f"{kind}_SendGoal_Response", accepted=True)
 
-        peer.serve(f"{MOVE}/send_goal", "franka_msgs/action/Move_SendGoal", accept)
-        peer.serve(f"{MOVE}/get_result", "franka_msgs/action/Move_GetResult", finish)
+            def finish(_: Any) -> Any:
+                rig.over.wait()
+                return peer.message(f"{kind}_GetResult_Response")
+
+            peer.serve(f"{topic}/send_goal", f"{kind}_SendGoal", accept)
+            peer.serve(f"{topic}/get_result", f"{kind}_GetResult", finish)
+
+        serve(MOVE, "Move")
+        serve(GRASP, "Grasp")
         until("the gripper listens", lambda: all(stream.wanted for stream in streams))
         yield rig
         rig.over.set()
@@ -111,3 +122,40 @@ def test_a_wall_clock_that_is_set_does_not_give_up_a_goal(rig: Rig) -> None:
         rig.gripper.turn(now_ns, "command#1")
         assert rig.gripper.busy
     assert rig.node.counters["ros2.gripper_timeouts"] == 0
+
+
+@pytest.mark.parametrize(
+    ("rig", "at_m", "to_m", "action"),
+    [
+        (WITH_GRASP, 0.0, 0.08, "Move"),
+        (WITH_GRASP, 0.08, 0.08, "Move"),
+        (WITH_GRASP, 0.04, 0.0, "Grasp"),
+        (WITH_GRASP, None, 0.08, "Move"),
+        (WITH_GRASP, None, 0.02, "Grasp"),
+        ("", 0.04, 0.0, "Move"),
+    ],
+    indirect=["rig"],
+)
+def test_the_first_order_grasps_only_where_the_fingers_have_to_close(
+    rig: Rig, at_m: float | None, to_m: float, action: str
+) -> None:
+    rig.width_m = at_m
+    rig.command.put(GripperCommand(to_m, 0.05, 10.0))
+    rig.turn_until("the goal", "ros2.gripper_goals", 1)
+    until("the robot hears it", lambda: rig.actions)
+    assert rig.actions == [action]
+
+
+@pytest.mark.parametrize("rig", [WITH_GRASP], indirect=True)
+@pytest.mark.parametrize(("at_m", "action"), [(0.04, "Grasp"), (None, "Move"), (0.0, "Move")])
+def test_fingers_that_stand_apart_of_what_was_ordered_are_closed_from_where_they_are(
+    rig: Rig, at_m: float | None, action: str
+) -> None:
+    rig.over.set()
+    rig.command.put(GripperCommand(0.0, 0.05, 10.0))
+    rig.turn_until("the first goal", "ros2.gripper_goals", 1)
+    rig.width_m = at_m  # something is between them
+    rig.command.put(GripperCommand(0.02, 0.05, 10.0))
+    rig.turn_until("the second goal", "ros2.gripper_goals", 2)
+    until("the robot hears it", lambda: len(rig.actions) == 2)
+    assert rig.actions == ["Grasp", action]

@@ -34,6 +34,7 @@ def test_after_the_computer_was_suspended_the_activation_ends(
             return step(inputs, *rest)
 
         monkeypatch.setattr(node.commander, "step", heard)
+
         def sleep() -> bool:
             asleep_ns[0] += ASLEEP_NS  # and again, as nobody says when the loop has begun
             found = [re.search(r"stood still for ([\d.]+) s", why) for why in lost]

@@ -153,6 +153,11 @@ class Arm:
         self._pose_out.put(record, stamp_wall_ns=stamp_ns, seq=seq)
         self._publish_gripper(stamp_ns, seq)
 
+    @property
+    def width_m(self) -> float | None:
+        """How far the fingers are open, None where nobody has said so lately."""
+        return None if self._fingers_lost else self._state.width_m
+
     def _publish_gripper(self, stamp_ns: int, seq: int) -> None:
         busy, wanted_m, held = self._ask_gripper()
         record = self._state.gripper(busy=busy, wanted_m=wanted_m, held=held)

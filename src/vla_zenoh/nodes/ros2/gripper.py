@@ -37,18 +37,24 @@ class Gripper:
         link: to the ROS graph.
         messages: of the robot's distribution.
         profile: the gripper's section; None: this robot's gripper is not ours to command.
+        width: how far its fingers are open (m), None where nobody says.
     """
 
     def __init__(
-        self, node: Node, link: Link, messages: Messages, profile: Ros2Gripper | None
+        self,
+        node: Node,
+        link: Link,
+        messages: Messages,
+        profile: Ros2Gripper | None,
+        width: Callable[[], float | None],
     ) -> None:
         self._node, self._messages, self._profile = node, messages, profile
+        self._measured_m, self._sent_m = width, node.profile.robot.gripper.max_width_m
         self._orders = node.listen(node.keys.command_gripper, Inbox(16, SMALL_BYTES))
         self._guard = GripperGuard(node.profile.robot.gripper)
         self._keeper = GoalKeeper(GIVE_UP_S)
         self._news: deque[Callable[[], None]] = deque()
         self._goal_id = b""
-        self._closing = False
         self._action = ""
         self._mono_ns = 0
         self.wanted_m: float | None = None
@@ -104,7 +110,6 @@ class Gripper:
         if self._profile is None:
             self._node.refuse("no_gripper", "command/gripper: the profile has no ros2.gripper")
             return
-        self._closing = self.wanted_m is None or command.width_m < self.wanted_m
         self.wanted_m = command.width_m
         if self._topic is None:
             self._keeper.want(command)
@@ -119,7 +124,8 @@ class Gripper:
     # -- the action ---------------------------------------------------------------------------
     def _send(self, goal: Goal) -> None:
         assert self._profile is not None
-        use_grasp = self._closing and GRASP in self._callers
+        use_grasp = GRASP in self._callers and self._closes(goal.command.width_m)
+        self._sent_m = goal.command.width_m
         self._action = GRASP if use_grasp else self._profile.type
         self._goal_id = secrets.token_bytes(ID_BYTES)
         self.holding = False
@@ -133,6 +139,13 @@ class Gripper:
         )
         self._node.counters["ros2.gripper_goals"] += 1
         self._call("send_goal", request, lambda answer: self._accepted(goal.number, answer))
+
+    def _closes(self, width_m: float) -> bool:
+        """Whether the fingers have to close for it; they are where they were sent last, at first
+        wide open, where nobody says where they are."""
+        measured_m = self._measured_m()
+        at_m = self._sent_m if measured_m is None else measured_m
+        return width_m < at_m - self._node.profile.robot.gripper.dead_band_m
 
     def _call(self, part: str, request: Any, done: Callable[[bytes | None], None]) -> None:
         # Answers come on Zenoh's thread; they are looked at in the next turn.

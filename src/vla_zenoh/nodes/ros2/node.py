@@ -95,7 +95,9 @@ class Ros2Node:
         self._gripper: Gripper | None = None
         self._arm: Arm | None = None
         if profile.robot.driver == NAME:
-            gripper = self._gripper = Gripper(node, self.link, messages, ros2.gripper)
+            gripper = self._gripper = Gripper(
+                node, self.link, messages, ros2.gripper, self._width_m
+            )
             self._arm = Arm(
                 node,
                 self.link,
@@ -117,6 +119,9 @@ class Ros2Node:
         self._rate = RateMeter()
         self._realtime = False
         self._clock_s = 0.0
+
+    def _width_m(self) -> float | None:
+        return None if self._arm is None else self._arm.width_m
 
     # -- for the threads ----------------------------------------------------------------------
     def _tell(self, event: Event) -> None:
