@@ -221,6 +221,11 @@ class Keys:
         return (*self.without_pictures, self._at("camera", "*", "jpeg"), self._at("seen", "*", "*"))
 
     @property
+    def all_raw_pictures(self) -> str:
+        """The raw pictures of every camera."""
+        return self._at("camera", "*", "raw")
+
+    @property
     def all_deltas(self) -> str:
         return self._at("delta", "*")
 

@@ -28,10 +28,13 @@ def record(
         typer.Option(
             "--keys",
             "-k",
-            help="Key expression below <root>/<robot>/, or whole; may be given more than once. "
-            "Without it, everything but raw pictures.",
+            help="These alone: a key expression below <root>/<robot>/, or whole; may be given more "
+            "than once. Without it, everything but raw pictures.",
         ),
     ] = None,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="Raw pictures too; they are 1 MB each.")
+    ] = False,
     seconds: Annotated[
         float | None, typer.Option("--seconds", "-s", help="End after so long.", min=0.1)
     ] = None,
@@ -47,11 +50,11 @@ def record(
     Foxglove, Rerun and `ros2 bag` open it. It is whole at any time, also when the recorder is
     killed or the disk is full.
     """
-    from vla_zenoh.nodes.recorder import Recorded, Recorder
+    from vla_zenoh.nodes.recorder import Recorded, Recorder, to_record
 
     loaded = effective_profile(profile, connect)
     path = out or Path("runs") / time.strftime("record-%Y%m%d-%H%M%S.mcap")
-    expressions = [loaded.keys.whole(key) for key in keys or ()] or None
+    expressions = to_record(loaded.keys, keys or (), raw=raw)
     done: list[Recorded] = []
 
     def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
@@ -85,7 +88,8 @@ def record(
         )
     if recorded.dropped:
         worst = ", ".join(f"{key} {count}" for key, count in recorded.dropped.most_common(5))
-        errors().print(f"[yellow]dropped, because the disk did not keep up: {worst}[/]")
+        said = f"dropped, because the disk did not keep up: {worst}"
+        errors().print(said, style="yellow")
     if recorded.failure:
         fail(recorded.failure)
     if not recorded.samples:

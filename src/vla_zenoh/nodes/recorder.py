@@ -18,6 +18,7 @@ from typing import Any
 import zenoh
 
 from vla_zenoh.errors import CodecError, RecordingError
+from vla_zenoh.keys import Keys, covers
 from vla_zenoh.nodes.bounded import bytes_of, whole
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.profile import Profile, to_yaml
@@ -60,6 +61,24 @@ class Recorded:
     failure: str = ""
 
 
+def to_record(keys: Keys, given: Sequence[str] = (), *, raw: bool = False) -> tuple[str, ...]:
+    """Which key expressions are recorded.
+
+    Args:
+        keys: of the robot.
+        given: these alone, below ``<root>/<robot>/`` or whole; empty: everything the robot says
+            but raw pictures, which are 1 MB each.
+        raw: raw pictures too.
+    """
+    found = dict.fromkeys(map(keys.whole, given)) or dict.fromkeys(keys.without_raw_pictures)
+    if raw:
+        found[keys.all_raw_pictures] = None
+    # What two expressions mean would be heard, and recorded, twice.
+    return tuple(
+        each for each in found if not any(covers(other, each) for other in found if other != each)
+    )
+
+
 class Recorder:
     """Records from `start` to `close`.
 
@@ -67,7 +86,7 @@ class Recorder:
         profile: the effective profile; it goes into the file.
         session: an open session, closed by whoever opened it.
         path: of the file.
-        expressions: which keys; None: all of the robot but raw pictures, which are 1 MB each.
+        expressions: which keys, see `to_record`; None: what that gives by itself.
         name: the node's; a second recorder needs another one.
         queue_bytes: payloads in memory at most.
 
@@ -87,7 +106,7 @@ class Recorder:
         queue_bytes: int = QUEUE_BYTES,
     ) -> None:
         self.node = Node(name, profile, session)
-        self._expressions = expressions or self.node.keys.without_raw_pictures
+        self._expressions = expressions or to_record(self.node.keys)
         self._queue: deque[tuple[str, bytes, str, bytes | None, int]] = deque()
         self._queued_bytes, self._queue_limit = 0, queue_bytes
         self._change = threading.Condition()
