@@ -257,6 +257,11 @@ class Keys:
     def all_alive(self) -> str:
         return self._at("alive", "*")
 
+    @property
+    def all_robots(self) -> str:
+        """The liveliness token of every robot's command node below this root."""
+        return f"{self.root}/*/alive/command"
+
     def short(self, key: str) -> str:
         """`key` without the root and robot, as people say it; other keys as they are."""
         return key.removeprefix(f"{self.root}/{self.robot}/")

@@ -253,6 +253,34 @@ def test_a_router_of_two_robots_lets_each_lab_at_its_own_robot_only(lab: Profile
     assert not allows(config, "operator@desk", Passage("ingress", "put", Keys("ur").prompt))
 
 
+def test_people_may_ask_which_robots_there_are_and_are_told_of_theirs(lab: Profile) -> None:
+    others = {
+        **LAB,
+        "robot": {"name": "ur"},
+        "session": {**LAB["session"], "security": {"people": {"desk": "operator"}}},
+        "hosts": {"robot2": {"nodes": ["sim", "command", "camera", "worker"]}},
+    }
+    config = access_control([lab, override(load_profile("panda_sim"), others)])
+
+    def passes(common_name: str, flow: str, message: str, key: str) -> bool:
+        return allows(config, common_name, Passage(flow, message, key))
+
+    for message in ("liveliness_query", "declare_liveliness_subscriber"):
+        for person in ("operator@desk", "viewer@wall"):
+            assert passes(person, "ingress", message, KEYS.all_robots)
+            assert not passes(person, "ingress", message, "vla/*/alive/*")
+        assert not passes("worker-scripted@gpu", "ingress", message, KEYS.all_robots)
+    robots = {
+        person: [
+            name
+            for name in ("panda", "ur")
+            if passes(person, "egress", "liveliness_token", Keys(name).alive("command"))
+        ]
+        for person in ("operator@desk", "viewer@wall")
+    }
+    assert robots == {"operator@desk": ["panda", "ur"], "viewer@wall": ["panda"]}
+
+
 @pytest.mark.parametrize("act", Act)
 def test_every_act_needs_the_router_on_the_way_in_and_on_the_way_out(act: Act) -> None:
     assert {passage.flow for passage in passages(act, "k")} == {"ingress", "egress"}

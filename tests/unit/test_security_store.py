@@ -162,6 +162,21 @@ def test_a_computer_knows_which_host_it_is_when_it_has_one_folder(store: Store) 
     with pytest.raises(SecurityError, match=r"of gpu, robot: say which of them .*--host"):
         store.this_host(None)
     assert store.this_host("robot") == "robot"
+    with pytest.raises(SecurityError, match=r"Here are those of: gpu, robot\."):
+        store.identity_files("robto", "router")
+
+
+def test_a_computer_with_certificates_of_several_hosts_notes_which_it_is(store: Store) -> None:
+    store.add([WORKER, ROUTER], NOW)
+    note = store.note_this_host("robot")
+    assert store.this_host(None) == "robot"
+    assert store.this_host("gpu") == "gpu"
+    assert store.identity_files(None, "router").certificate.parent.name == "robot"
+    # Folders of hosts are copied, and none of them holds it.
+    assert note.parent == store.folder
+    assert store.hosts() == ["gpu", "robot"]
+    store.note_this_host("attic")
+    assert store.known_host() is None
 
 
 def test_people_are_the_operator_where_there_is_one_else_the_viewer(store: Store) -> None:
@@ -169,7 +184,7 @@ def test_people_are_the_operator_where_there_is_one_else_the_viewer(store: Store
     assert store.identity_files("desk", None).certificate.name == "viewer.pem"
     store.add([Identity(Role.OPERATOR, "operator", "desk")], NOW)
     assert store.identity_files("desk", None).certificate.name == "operator.pem"
-    with pytest.raises(SecurityError, match=r"camera\.pem is not there: make it with `vla-zenoh"):
+    with pytest.raises(SecurityError, match=r"camera\.pem is not there\. Make it with `vla-zenoh"):
         store.identity_files("desk", "camera")
 
 

@@ -40,3 +40,21 @@ def alive_nodes(session: zenoh.Session, keys: Keys, name: str | None = None) -> 
         f"the router does not say within {PATIENCE_S:g} s which nodes of {keys.robot!r} are alive; "
         "look whether it is too busy, or its access control does not know us, and try again"
     )
+
+
+def robots_alive(session: zenoh.Session, keys: Keys) -> list[str]:
+    """Robots below this root whose command node is alive, of those that one may know of.
+
+    Args:
+        session: an open session.
+        keys: of any robot there.
+
+    Returns:
+        Their names in order; fewer than there are where the router does not answer in time.
+    """
+    found: set[str] = set()
+    for _ in range(ANSWERS):
+        replies = session.liveliness().get(keys.all_robots, timeout=PATIENCE_S)
+        named = [Keys.of(str(r.ok.key_expr), keys.root) for r in replies if r.ok is not None]
+        found |= {one.robot for one in named if one is not None}
+    return sorted(found)

@@ -15,7 +15,7 @@ from typing import Any
 from vla_zenoh.keys import Keys, covers
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.identity import Identity, Role, identities
-from vla_zenoh.security.roles import TABLE, Act, expressions, rights
+from vla_zenoh.security.roles import LOOKERS, TABLE, Act, expressions, rights
 
 IN, OUT = "ingress", "egress"
 EVERY_MESSAGE = (
@@ -110,6 +110,9 @@ def _rules(identity: Identity, keys: Keys) -> list[dict[str, Any]]:
             granted.setdefault((flow, message), {})[key] = None
             if right.act is Act.SUBSCRIBE:
                 granted[flow, message].update(dict.fromkeys(wide(keys, identity)))
+            if right.act is Act.WATCH and flow == IN and identity.roles & LOOKERS:
+                # They may ask which robots there are; the answer holds those they may know of.
+                granted[flow, message][keys.all_robots] = None
     who = f"{keys.root}/{keys.robot}:{identity.common_name}"
     return [
         _rule(f"{who}:{flow}:{message}", (flow,), (message,), list(found))

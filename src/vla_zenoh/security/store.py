@@ -5,6 +5,7 @@
     FOLDER/ca.pem, ca.key         the authority; the key stays on the computer it was made on
     FOLDER/HOST/ca.pem            copy FOLDER/HOST to that host, into its own FOLDER
     FOLDER/HOST/NODE.pem, .key    one pair for each node there, and for its people
+    FOLDER/.this_host             which HOST this computer is; stays here, and no host is called so
 
 Private keys are readable by their owner alone. Nothing is ever overwritten unless asked for.
 """
@@ -24,6 +25,7 @@ from vla_zenoh.security.authority import Certificate, Pair
 from vla_zenoh.security.identity import PEOPLE, Identity, Role
 
 AUTHORITY = "ca"
+THIS_HOST = ".this_host"
 KEY_MODE = 0o600
 FOLDER_MODE = 0o700
 
@@ -168,16 +170,15 @@ class Store:
         return Files(folder / f"{AUTHORITY}.pem", folder / f"{node}.pem", folder / f"{node}.key")
 
     def this_host(self, host: str | None) -> str:
-        """Which host this computer is: `host`, or the only one there are certificates for.
+        """Which host this computer is: `host`, or what is known of it, see `known_host`.
 
         Raises:
-            SecurityError: there are none, or those of several hosts.
+            SecurityError: there are no certificates, or those of several hosts.
         """
-        if host is not None:
-            return host
+        found = host or self.known_host()
+        if found is not None:
+            return found
         hosts = self.hosts()
-        if len(hosts) == 1:
-            return hosts[0]
         if not hosts:
             raise SecurityError(
                 f"{self.folder} has no certificates: make them with `vla-zenoh secure init`, or "
@@ -185,12 +186,38 @@ class Store:
             )
         raise SecurityError(
             f"{self.folder} has certificates of {', '.join(hosts)}: say which of them this "
-            "computer is, with --host or session.security.host"
+            "computer is, with --host or VLA_ZENOH_HOST"
         )
+
+    def known_host(self) -> str | None:
+        """The host that was noted, or the only one there are certificates for; None: unknown."""
+        hosts = self.hosts()
+        try:
+            noted = (self.folder / THIS_HOST).read_text("utf-8").strip()
+        except (OSError, UnicodeDecodeError):
+            noted = ""
+        if noted in hosts:
+            return noted
+        return hosts[0] if len(hosts) == 1 else None
+
+    def note_this_host(self, host: str) -> Path:
+        """Write down that this computer is `host`.
+
+        Raises:
+            SecurityError: the folder cannot be written.
+        """
+        path = self.folder / THIS_HOST
+        _put(path, f"{host}\n".encode(), 0o644)
+        return path
 
     def hosts(self) -> list[str]:
         """Hosts there are certificates for."""
         return sorted(path.parent.name for path in self.folder.glob(f"*/{AUTHORITY}.pem"))
+
+    def has(self, host: str, node: str) -> bool:
+        """Whether certificate and key of a node are here."""
+        files = self.files(host, node)
+        return files.certificate.exists() and files.key.exists()
 
     def identity_files(self, host: str | None, node: str | None) -> Files:
         """The files of a node of this computer, or, without a node, of its people.
@@ -201,14 +228,16 @@ class Store:
         host = self.this_host(host)
         names = [node] if node is not None else [role.value for role in PEOPLE]
         for name in names:
-            files = self.files(host, name)
-            if files.certificate.exists() and files.key.exists():
+            if self.has(host, name):
+                files = self.files(host, name)
                 if fault := open_to_others(files.key):
                     raise SecurityError(fault)
                 return files
+        there = "" if host in self.hosts() else f" Here are those of: {', '.join(self.hosts())}."
         raise SecurityError(
-            f"{self.files(host, names[0]).certificate} is not there: make it with `vla-zenoh "
-            f"secure add {host}` on the computer of `secure init`, then copy the folder {host}"
+            f"{self.files(host, names[0]).certificate} is not there.{there} Make it with "
+            f"`vla-zenoh secure add {host}` on the computer of `secure init`, then copy the folder "
+            f"{host}"
         )
 
     # -- looking ------------------------------------------------------------------------------

@@ -1,0 +1,59 @@
+"""Whose certificate a person at this computer shows, where there are those of several hosts.
+
+Who can read a private key has its rights already: to choose among those that lie here gives nobody
+more than `--host` would. So the choice is made for convenience alone, and never stands in the way.
+"""
+
+from __future__ import annotations
+
+from vla_zenoh.errors import SecurityError
+from vla_zenoh.profile import Profile
+from vla_zenoh.security.identity import PEOPLE, Role, person
+from vla_zenoh.security.store import Store
+
+RANK = {Role.OPERATOR: 0, Role.VIEWER: 1}
+"""Who plays recordings is chosen by name alone: that role may say everything."""
+
+
+def people_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
+    """Hosts whose people's certificates lie here, the one to show first.
+
+    Args:
+        profile: secured. Hosts that it does not know are left out: the router would drop what they
+            say without a word.
+        stop: for a stop one who may comes first, also before this computer's own people.
+
+    Returns:
+        This computer's own host first where it is known, then operators before viewers, in the
+        order of the profile. Only that which ``session.security.host`` names, if it names one.
+        Empty where nobody's certificate for people lies here.
+    """
+    security = profile.session.security
+    if security is None:
+        return []
+    if security.host is not None:
+        return [security.host]
+    store = Store(security.folder)
+    own = store.known_host()
+    ranks: dict[str, int] = {}
+    for host in dict.fromkeys([*security.people, *profile.hosts]):
+        role = person(profile, host)
+        if role in RANK and store.has(host, role.value):
+            ranks[host] = RANK[role]
+    if stop:
+        found = sorted(ranks, key=lambda host: (ranks[host], host != own))
+    else:
+        found = sorted(ranks, key=lambda host: (host != own, ranks[host]))
+    return found or ([own] if own is not None else [])
+
+
+def role_here(profile: Profile) -> Role | None:
+    """What the people of this computer may do; None: everything, or nobody knows."""
+    security = profile.session.security
+    if security is None:
+        return None
+    try:
+        files = Store(security.folder).identity_files(security.host, None)
+    except SecurityError:
+        return None
+    return next((role for role in PEOPLE if role.value == files.certificate.stem), None)
