@@ -65,9 +65,13 @@ class ResourceError(VlaZenohError, FileNotFoundError):
         return str(self.args[0]) if self.args else ""
 
 
-def how_to_install(extra: str) -> str:
-    """What brings an extra of this package, installed from an index or in its checkout."""
-    return f"pip install 'vla-zenoh[{extra}]', in a checkout: pip install '.[{extra}]'"
+def how_to_install(extra: str = "") -> str:
+    """What brings an extra of this package, or the package itself.
+
+    Never its name alone: it is on no index, and whoever took that name there would be run here.
+    """
+    what = f"'.[{extra}]'" if extra else "."
+    return f"pip install -c constraints.txt {what} in a checkout of vla-zenoh"
 
 
 class MissingExtraError(VlaZenohError, ImportError):

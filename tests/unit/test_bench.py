@@ -21,7 +21,7 @@ from vla_zenoh.bench.picture import NOISE_SIGMA, noisy_picture
 from vla_zenoh.bench.report import CHUNK, LINES, POSE, ROUND_TRIP, STAGES, TICK_WAIT, Result
 from vla_zenoh.bench.statistics import Slot, summarise
 from vla_zenoh.bench.ways import REFERENCE, WAYS, Way
-from vla_zenoh.errors import NodeError
+from vla_zenoh.errors import NodeError, how_to_install
 from vla_zenoh.nodes.bench.chain import bench_profile
 from vla_zenoh.nodes.bench.process import Server, cpu_s, free_port
 
@@ -90,7 +90,7 @@ def test_a_way_that_was_not_measured_has_no_summary_and_no_reference_gives_no_ra
 # -- report ---------------------------------------------------------------------------------------
 def test_the_table_names_a_missing_library_and_how_to_install_it() -> None:
     result = Result([ABSENT], [{}], {}, 10)
-    assert "not installed: pip install 'vla-zenoh[bench]'" in shown(result)
+    assert f"not installed: {how_to_install('bench')}" in shown(result)
     assert result.to_dict()["ways"]["absent"]["missing"] == ["a_module_that_nobody_has"]
 
 

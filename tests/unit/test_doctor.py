@@ -34,7 +34,7 @@ from vla_zenoh.doctor.storage import SHARED_MEMORY, disk, left_segments, shared_
 from vla_zenoh.doctor.terminal import terminal
 from vla_zenoh.doctor.video import video_devices
 from vla_zenoh.doctor.wallclock import TIME_ERROR, judge, kernel_state
-from vla_zenoh.errors import ProfileError
+from vla_zenoh.errors import ProfileError, how_to_install
 from vla_zenoh.profile import SessionProfile, load_profile
 from vla_zenoh.simulation.backend import Backend
 
@@ -67,7 +67,7 @@ def test_a_missing_library_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> N
     finding = libraries("control", required=True)
     assert finding.level == "fail"
     assert "no_such_module" in finding.found
-    assert finding.advice == "pip install 'vla-zenoh[control]'"
+    assert finding.advice == how_to_install("control")
     assert libraries("control", required=False).level == "warn"
 
 

@@ -129,7 +129,7 @@ def test_robots_are_found_in_whichever_layer_of_an_environment_their_package_is(
 
 def test_without_the_collection_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", [])
-    with pytest.raises(MissingExtraError, match=r"pip install 'vla-zenoh\[control\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install .* '\.\[control\]'"):
         resources.robot_urdf(PANDA)
 
 

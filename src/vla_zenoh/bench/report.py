@@ -11,6 +11,7 @@ from rich.table import Table
 
 from vla_zenoh.bench.statistics import Slot, Summary, summarise
 from vla_zenoh.bench.ways import REFERENCE, Way
+from vla_zenoh.errors import how_to_install
 
 CHUNK, POSE, TICK_WAIT, ROUND_TRIP = "chunk", "pose", "tick_wait", "round_trip"
 POSE_WITHOUT_WAIT = "pose_without_tick_wait"
@@ -31,7 +32,6 @@ LINES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "echo": ((ROUND_TRIP, "picture -> 7 floats back"),),
     "peer": ((ROUND_TRIP, "picture -> 7 floats back"),),
 }
-INSTALL = "pip install 'vla-zenoh[bench]'"
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ def main_table(result: Result) -> Table:
         table.add_section()
         if way.missing():
             table.add_row(way.title, *[""] * 6)
-            table.add_row(escape(f"  not installed: {INSTALL}"), *[""] * 6, style="yellow")
+            table.add_row(escape(f"  not installed: {how_to_install('bench')}"), *[""] * 6, style="yellow")
             continue
         if way.kind == "chain":
             table.add_row(way.title, *[""] * 6, style="bold")

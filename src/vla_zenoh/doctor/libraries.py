@@ -11,6 +11,7 @@ from importlib import metadata
 
 from vla_zenoh.doctor.finding import Finding
 from vla_zenoh.doctor.needs import Role
+from vla_zenoh.errors import how_to_install
 
 OLDEST_PYTHON = (3, 11)
 LIMIT_S = 60
@@ -34,12 +35,6 @@ PURPOSE: Mapping[Role, str] = {
     "control": "command node",
     "sim": "simulator",
     "ros2": "node ros2",
-}
-EXTRA: Mapping[Role, str] = {
-    "base": "vla-zenoh",
-    "control": "vla-zenoh[control]",
-    "sim": "vla-zenoh[sim]",
-    "ros2": "vla-zenoh[ros2]",
 }
 VERSIONS: Mapping[str, tuple[tuple[int, ...], tuple[int, ...] | None]] = {
     # distribution: oldest that works, first that is not known to work
@@ -114,7 +109,7 @@ def libraries(role: Role, *, required: bool) -> Finding:
     """Everything a role of a host needs is installed, loads, and has a version that works."""
     name = f"libraries: {PURPOSE[role]}"
     level = "fail" if required else "warn"
-    install = f"pip install '{EXTRA[role]}'"
+    install = how_to_install("" if role == "base" else role)
     missing, wrong, versions = [], [], []
     for module, distribution in MODULES[role].items():
         try:
