@@ -47,6 +47,7 @@ PARTS = (
     Part(DRIVE, "rate", "switches:rate"),
     Part(DRIVE, "stop", "switches:stop"),
     Part(DRIVE, "reset", "switches:reset"),
+    Part(DRIVE, "trial", "trial:trial"),
     Part(LOOK, "view", "view:view"),
     Part(LOOK, "record", "record:record"),
     Part(LOOK, "replay", "replay:replay"),
