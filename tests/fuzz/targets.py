@@ -6,11 +6,13 @@ line here.
 
 from __future__ import annotations
 
+import io
 import json
 import runpy
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,8 +21,12 @@ import numpy as np
 import typer
 
 from vla_zenoh.cli import decode as cli_decode
+from vla_zenoh.cli import keys as cli_keys
+from vla_zenoh.cli import net as cli_net
+from vla_zenoh.cli import seen as cli_seen
+from vla_zenoh.cli import status as cli_status
 from vla_zenoh.cli.options import model_options, number_list
-from vla_zenoh.cli.output import plain_types, printable
+from vla_zenoh.cli.output import Screen, plain_types
 from vla_zenoh.codec import header, image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
 from vla_zenoh.evaluation.csv_file import evaluate_csv
@@ -29,17 +35,24 @@ from vla_zenoh.interop import groot, npy, openpi, openvla_rest, origami
 from vla_zenoh.interop.ros2 import attachment, table
 from vla_zenoh.interop.ros2.definitions import parse
 from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.keys import Keys
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.motions import parse_hard
 from vla_zenoh.nodes.offsets import decode_stamps
+from vla_zenoh.nodes.seen import Sight
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import load_profile
 from vla_zenoh.recording import cdr
 from vla_zenoh.recording.kinds import RECORDS
 from vla_zenoh.tasks.understand import understand
+from vla_zenoh.types import Event, Header, NodeStatus, Seen
 
 CORPUS = Path(__file__).parent / "corpus"
 """Inputs that once broke a reader, or nearly: a folder for each target."""
+
+
+MAX_SHOWN = 50_000
+"""Characters that a few nodes may fill a screen with."""
 
 
 class Target(NamedTuple):
@@ -102,8 +115,41 @@ def _cli(data: bytes) -> None:
     found = cli_decode.read(payload, _text(words))
     json.dumps(found)
     json.dumps(plain_types(found))
-    shown = printable(str(found))
+    _display(str(found))
+
+
+def _display(*renderables: Any) -> int:
+    """Print as commands do; without colours nothing but lines may come of it. How much it is."""
+    out = io.StringIO()
+    screen = Screen(file=out, width=120)
+    for each in renderables:
+        screen.print(each)
+    shown = out.getvalue()
     assert not any(ord(c) < 32 and c not in "\n\t" for c in shown), "it steers the terminal"
+    return len(shown)
+
+
+def _told(data: bytes) -> None:
+    """What ``status``, ``net`` and ``keys`` show of nodes that say anything."""
+    found = records.decode(NodeStatus, data)
+    other = replace(found, host="elsewhere")
+    nodes = {"command": found, "a\x1b[2J[/b]": other}
+    heard = {name: (status, 0.1, True) for name, status in nodes.items()}
+    assert _display(cli_status.picture("panda", heard, [])) < MAX_SHOWN
+    pairs, lines = cli_net.pairs_of(nodes, []), cli_net.lines_of(nodes)
+    _display(*cli_net.tables("panda", pairs, lines, 100.0))
+    _display(cli_keys.table(cli_keys.pictures_of(Keys("panda"), heard)))
+
+
+def _event_told(data: bytes) -> None:
+    event = records.decode(Event, data)
+    happened = [("a\x1b[2J", Header(1, 2, "sim#1"), event)] * 9
+    assert _display(cli_status.picture("panda", {}, happened)) < MAX_SHOWN
+
+
+def _sight(data: bytes) -> None:
+    sight = Sight(records.decode(Seen, data), {"front": data})
+    assert _display(cli_seen.table({"w": sight})) < MAX_SHOWN
 
 
 def _options(data: bytes) -> None:
@@ -383,6 +429,32 @@ def _targets() -> Iterator[Target]:
             b"text/plain\nwords",
         ],
     )
+    status = NodeStatus(
+        "command",
+        "active",
+        "h",
+        1,
+        2,
+        rates_hz={"front": 30.0},
+        latency_ms={"inference": (1.0, 2.0)},
+        counters={"refused.late": 1},
+        detail={
+            "rate_hz": 5.0,
+            "why": "",
+            "cameras": {"front": {}},
+            "security": "insecure",
+            "listen": ["tcp/0.0.0.0:7447"],
+            "clocks": {"command": {"round_trip_ms": 1.0, "offset_ms": 1.0, "uncertainty_ms": 1.0}},
+            "net": {
+                "links": ["tls/[fe80::1]:7447"],
+                "sent": {"a": [1.0, 2.0]},
+                "lost": {"a": 1},
+            },
+        },
+    )
+    yield Target("cli-told", _told, codec, lambda: [records.encode(status)])
+    yield Target("cli-event", _event_told, codec, lambda: [records.encode(examples()[Event])])
+    yield Target("cli-seen", _sight, codec, lambda: [records.encode(examples()[Seen])])
     yield Target("cli-options", _options, own, lambda: [b"horizon=4", b"1,2.5,3"])
 
 

@@ -12,7 +12,8 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.cli.output import console, errors, fail, print_json, printable
+from vla_zenoh.cli.output import console, errors, fail, print_json
+from vla_zenoh.printable import printable
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState, SceneState
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.box import SIMPLE
 from rich.table import Table
+from rich.text import Text
 
 from vla_zenoh.bench.thesis import THESIS
 
@@ -45,7 +46,7 @@ def motion_table(rows: Sequence[Row]) -> Table:
             *([f"{row['horizon']}"] if chunked else []),
             *([f"{row['delay_ms']:g}±{row['jitter']:.0%}"] if delayed else []),
         )
-        verdict = "[green]ok[/]" if row["ok"] else f"[red]{'; '.join(row['faults'])}[/]"
+        verdict = Text("ok", "green") if row["ok"] else Text("; ".join(row["faults"]), "red")
         if "asked_m" not in row:
             missing = len(table.columns) - len(conditions) - 1
             table.add_row(*conditions, *["-"] * missing, verdict)

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from vla_zenoh.bench.statistics import Slot, Summary, summarise
@@ -101,7 +100,7 @@ def main_table(result: Result) -> Table:
         table.add_section()
         if way.missing():
             table.add_row(way.title, *[""] * 6)
-            table.add_row(escape(f"  not installed: {how_to_install('bench')}"), *[""] * 6, style="yellow")
+            table.add_row(f"  not installed: {how_to_install('bench')}", *[""] * 6, style="yellow")
             continue
         if way.kind == "chain":
             table.add_row(way.title, *[""] * 6, style="bold")

@@ -62,7 +62,7 @@ def chain(
         raise typer.BadParameter(f"{unknown[0]!r} is not a way; there are: {', '.join(names)}")
     ways = [way for way in WAYS if not only or way.name in only]
     with Progress(
-        TextColumn("{task.description:<44}"),
+        TextColumn("{task.description:<44}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
@@ -86,4 +86,4 @@ def chain(
     if stages is not None:
         out.print(stages)
     for note in report.notes(result):
-        out.print(f"- {note}", markup=False)
+        out.print(f"- {note}")

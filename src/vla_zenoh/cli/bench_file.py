@@ -51,7 +51,7 @@ def kept_rows(json_file: Path | None) -> Iterator[Rows]:
     except Interrupted:
         raise typer.Exit(130) from None
     except Exception:
-        errors().print("\n".join(rows.lines[-LAST_LINES:]), style="dim", markup=False)
+        errors().print("\n".join(rows.lines[-LAST_LINES:]), style="dim")
         raise
     finally:
         write_json(json_file, rows)

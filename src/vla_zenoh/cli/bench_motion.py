@@ -73,7 +73,7 @@ def motion(
     rows: Rows = []
     try:
         with Progress(
-            TextColumn("{task.description:<44}"),
+            TextColumn("{task.description:<44}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
@@ -193,7 +193,7 @@ def _with_one_worker(
     except Interrupted:
         raise
     except Exception:
-        errors().print("\n".join(lines[-20:]), style="dim", markup=False)
+        errors().print("\n".join(lines[-20:]), style="dim")
         raise
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.table import Table
+from rich.text import Text
 
 from vla_zenoh.cli.bench_file import JsonFileOption, write_json
 from vla_zenoh.cli.options import model_options
@@ -51,9 +52,8 @@ def openvla(
     out.print(_table(report))
     memory = ", ".join(f"{part} {mb:.0f} MB" for part, mb in report["memory_mb"].items())
     out.print(f"memory: {memory}")
-    out.print(
-        f"both ways gave the same tokens: {'yes' if report['same_tokens'] else '[bold]no[/bold]'}"
-    )
+    same = ("yes", "") if report["same_tokens"] else ("no", "bold")
+    out.print(Text.assemble("both ways gave the same tokens: ", same))
 
 
 def _part(name: str) -> Any:

@@ -17,7 +17,7 @@ from rich.table import Table
 from vla_zenoh.bench.task import Plan, Score
 from vla_zenoh.cli.bench_file import JsonFileOption, write_json
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, model_options
-from vla_zenoh.cli.output import console, errors, printable
+from vla_zenoh.cli.output import console, errors
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.tasks import FAMILIES, LIMIT_S
 
@@ -158,7 +158,7 @@ def _with_bricks(profile: Profile, worker: str, vary: list[str]) -> Profile:
 @contextmanager
 def _bar(episodes: int) -> Iterator[Callable[[Score], None]]:
     with Progress(
-        TextColumn("{task.description:<44}"),
+        TextColumn("{task.description:<44}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
@@ -289,7 +289,7 @@ def _print(result: dict[str, Any]) -> None:
         out.print(f"{stage}: p50 {p50:.1f} ms, p95 {p95:.1f} ms", style="dim")
     whys = dict.fromkeys(each["why"] for each in result["all"] if each.get("why"))
     for why in list(whys)[:3]:
-        out.print(f"- {printable(why)}", markup=False)
+        out.print(f"- {why}")
 
 
 def _title(result: dict[str, Any]) -> str:

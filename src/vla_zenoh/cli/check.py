@@ -9,12 +9,13 @@ from typing import Annotated
 
 import typer
 from rich.table import Table
+from rich.text import Text
 
 from vla_zenoh.check.examine import DEFAULT_RUNS, Examination
 from vla_zenoh.check.finding import Finding, error
 from vla_zenoh.check.report import Report
 from vla_zenoh.cli.options import JsonOption, model_options
-from vla_zenoh.cli.output import console, print_json, printable
+from vla_zenoh.cli.output import console, print_json, styled
 from vla_zenoh.errors import WorkerError
 from vla_zenoh.loader import ModelFile, find_model, make_policy
 from vla_zenoh.nodes.check_bench import CheckBench
@@ -128,18 +129,19 @@ def _print(report: Report) -> None:
     out = console()
     table = Table(show_header=False, title=f"worker {report.worker}", title_justify="left")
     for what, said in _lines(report):
-        table.add_row(what, printable(said))
+        table.add_row(what, said)
     if table.row_count:
         out.print(table)
     for finding in report.findings:
-        style = STYLES[finding.level]
-        out.print(f"[{style}]{finding.level:<7}[/] [bold]{finding.name}[/]: ", end="")
-        out.print(printable(finding.why), markup=False, soft_wrap=True)
+        level = styled(f"{finding.level:<7}", STYLES[finding.level])
+        out.print(level, styled(finding.name, "bold"), end=": ")
+        out.print(finding.why, soft_wrap=True)
     errors, warnings = len(_of(report, "error")), len(_of(report, "warning"))
     if report.ok:
-        out.print(f"[green]keeps its contract[/], {warnings} warnings")
+        out.print(Text.assemble(("keeps its contract", "green"), f", {warnings} warnings"))
     else:
-        out.print(f"[bold red]breaks its contract[/]: {errors} errors, {warnings} warnings")
+        said = f": {errors} errors, {warnings} warnings"
+        out.print(Text.assemble(("breaks its contract", "bold red"), said))
 
 
 def _lines(report: Report) -> list[tuple[str, str]]:

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
-from rich.markup import escape
 
-from vla_zenoh.cli.output import console, errors, fail, print_json, printable
+from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.evaluation.files import MCAP
 
@@ -52,7 +51,7 @@ def export(
     for path in _files(runs):
         run = load_run(path)
         for problem in run.problems:
-            errors().print(f"[yellow]{escape(printable(f'{path.name}: {problem}'))}[/]")
+            errors().print(f"{path.name}: {problem}", style="yellow")
         found = episodes_of(run, worker)
         for episode in found:
             episode.success = succeeded(episode)

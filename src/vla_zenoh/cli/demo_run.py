@@ -10,7 +10,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from vla_zenoh.cli.demo_stage import Stage, prepare, refusals
-from vla_zenoh.cli.output import console
+from vla_zenoh.cli.output import console, styled
 from vla_zenoh.demo.analysis import Outcome, latencies
 from vla_zenoh.demo.plot import plot_run
 from vla_zenoh.demo.segments import Segment
@@ -128,7 +128,7 @@ def _write_tables(stage: Stage, run: Run) -> None:
     ]
     write_chunks(folder / "chunks.npz", spec, chunks)
     marks = [(at_ns, prompt) for at_ns, prompt in run.prompts() if prompt != HOLD]
-    columns = (TextColumn("{task.description:<24}"), BarColumn(), TimeElapsedColumn())
+    columns = (TextColumn("{task.description:<24}", markup=False), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=stage.screen) as bars:
         plotting = bars.add_task("drawing plot.png", total=1)
         plot_run(folder / "plot.png", profile, run.poses, run.commands, marks, first)
@@ -150,7 +150,7 @@ def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
             reached,
             f"{outcome.drift_mm:.2f} mm",
             f"{outcome.drift_rad * 1e3:.2f} mrad",
-            "[red]" + "; ".join(faults) + "[/]" if faults else "[green]ok[/]",
+            styled("; ".join(faults), "red") if faults else styled("ok", "green"),
         )
     screen = console()
     screen.print(table)
@@ -172,11 +172,11 @@ def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
         "plot.png, front.mp4)"
     )
     if result.interrupted:
-        screen.print("[yellow]interrupted; the arm was braked[/]")
+        screen.print("interrupted; the arm was braked", style="yellow")
     elif summary["ok"]:
-        screen.print("[bold green]the arm did what was asked[/]")
+        screen.print("the arm did what was asked", style="bold green")
     else:
-        screen.print("[bold red]the arm did not do what was asked[/]")
+        screen.print("the arm did not do what was asked", style="bold red")
 
 
 def _amounts(outcome: Outcome) -> tuple[str, str]:

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from vla_zenoh.cli.options import effective_profile
-from vla_zenoh.cli.output import errors
+from vla_zenoh.cli.output import Screen, errors
 from vla_zenoh.cli.own_address import own_address
 from vla_zenoh.demo.video import write_video
 from vla_zenoh.nodes.launch import Host
@@ -45,7 +44,7 @@ class Stage:
     profile: Profile
     folder: Path
     stop: threading.Event
-    screen: Console
+    screen: Screen
 
     @property
     def camera(self) -> str | None:
@@ -66,7 +65,12 @@ class Stage:
             described: format of the bars' first column.
         """
         profile, lines = self.profile, []
-        columns = (TextColumn(described), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        columns = (
+            TextColumn(described, markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+        )
         with (
             (self.folder / "nodes.log").open("w", encoding="utf-8") as log_file,
             Progress(*columns, console=self.screen) as bars,
@@ -95,7 +99,7 @@ class Stage:
                         recorder.close()
             except Exception:
                 last = "\n".join(lines[-MAX_LOG_LINES:])
-                self.screen.print(last, style="dim", markup=False)
+                self.screen.print(last, style="dim")
                 raise
 
     def recorded(self) -> Run:
@@ -114,7 +118,11 @@ class Stage:
     def film(self, run: Run, marks: list[tuple[int, str]]) -> None:
         """front.mp4, with `marks` (ns, text) in it."""
         frames = self._frames(run)
-        columns = (TextColumn("{task.description:<24}"), BarColumn(), TimeElapsedColumn())
+        columns = (
+            TextColumn("{task.description:<24}", markup=False),
+            BarColumn(),
+            TimeElapsedColumn(),
+        )
         with Progress(*columns, console=self.screen) as bars:
             filming = bars.add_task("writing front.mp4", total=max(1, len(frames)))
             written = write_video(

@@ -8,15 +8,17 @@ from typing import Any
 
 import typer
 from rich.table import Table
+from rich.text import Text
 
 from vla_zenoh.bench.task import Ended
 from vla_zenoh.bench.task_sheet import sheet
 from vla_zenoh.cli.demo_stage import Stage, prepare, refusals
-from vla_zenoh.cli.output import console, printable
+from vla_zenoh.cli.output import console, styled
 from vla_zenoh.demo.analysis import latencies
 from vla_zenoh.demo.tasks import Tour, judged
 from vla_zenoh.nodes.bench.task import TaskRun
 from vla_zenoh.nodes.demo import Interrupted
+from vla_zenoh.printable import one_line, printable
 from vla_zenoh.tasks import FAILURES, LIMIT_S
 
 ROUNDS = 3
@@ -78,7 +80,7 @@ def _run(stage: Stage, plan: Tour) -> tuple[list[Ended], dict[str, int]]:
         try:
             for each in TaskRun(running, plan, stage.stop, stage.camera).run():
                 ended.append(each)
-                said = f"{printable(each.prompt)[:40]}: {_word(each)}"
+                said = f"{one_line(each.prompt, 40)}: {_word(each)}"
                 bars.update(bar, completed=len(ended), description=said)
         except Interrupted:
             pass
@@ -110,8 +112,8 @@ def _show(ended: list[Ended], summary: dict[str, Any], folder: Path) -> None:
         colour = {True: "green", False: "red", None: "yellow"}[_well(each)]
         known = judged(each.prompt) and each.failure in FAILURES
         why = FAILURES[each.failure] if known else each.why
-        said = f"[{colour}]{_word(each)}[/]{f': {why}' if why else ''}"
-        table.add_row(printable(each.prompt), said)
+        said = Text.assemble(styled(_word(each), colour), printable(f": {why}") if why else "")
+        table.add_row(each.prompt, said)
     screen = console()
     screen.print(table)
     latency = summary["latency_ms"]

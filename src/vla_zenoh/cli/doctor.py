@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime as dt
 import functools
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 import zenoh
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from vla_zenoh.cli.options import effective_profile
+from vla_zenoh.cli.output import console, errors, print_json, styled
 from vla_zenoh.doctor import Finding, Needs, examine, needs_of
 from vla_zenoh.doctor.access import access
 from vla_zenoh.errors import SecurityError, SessionError
@@ -65,7 +62,7 @@ def doctor(
     if profile is not None:
         loaded = effective_profile(profile, host=host)
         needs, session = needs_of(loaded, host), loaded.session
-    with Console(stderr=True).status("Looking at this computer"):
+    with errors().status("Looking at this computer"):
         findings = list(examine(needs, functools.partial(try_zenoh, session)))
         if loaded is not None:
             findings += access(
@@ -75,9 +72,9 @@ def doctor(
                 functools.partial(try_identity, loaded),
             )
     if as_json:
-        print(json.dumps([dataclasses.asdict(finding) for finding in findings], indent=2))
+        print_json(findings)
     else:
-        show(findings, Console())
+        show(findings)
     if any(finding.level == "fail" for finding in findings):
         raise typer.Exit(1)
 
@@ -86,7 +83,7 @@ def _rehearse(profile: Profile, rules: Path | None) -> list[Verdict]:
     return rehearse(profile, None if rules is None else read_access(rules))
 
 
-def show(findings: list[Finding], console: Console) -> None:
+def show(findings: list[Finding]) -> None:
     """Prints a table and how many findings want something done."""
     table = Table(show_lines=False, header_style="bold")
     table.add_column("what", no_wrap=True)
@@ -94,9 +91,9 @@ def show(findings: list[Finding], console: Console) -> None:
     table.add_column("found and what to do", overflow="fold")
     for finding in findings:
         text = finding.found if not finding.advice else f"{finding.found}\n-> {finding.advice}"
-        colour = COLOURS[finding.level]
-        table.add_row(finding.name, f"[{colour}]{finding.level}[/]", escape(text))
-    console.print(table)
+        table.add_row(finding.name, styled(finding.level, COLOURS[finding.level]), text)
+    out = console()
+    out.print(table)
     fails = sum(finding.level == "fail" for finding in findings)
     warns = sum(finding.level == "warn" for finding in findings)
-    console.print(f"{fails} will not work, {warns} could work better")
+    out.print(f"{fails} will not work, {warns} could work better")

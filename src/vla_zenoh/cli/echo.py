@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 import zenoh
-from rich.markup import escape
 from rich.pretty import pretty_repr
 
 from vla_zenoh.cli import decode
@@ -19,7 +18,7 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
-from vla_zenoh.cli.output import console, fail, printable
+from vla_zenoh.cli.output import console, fail, styled
 from vla_zenoh.codec.image import MAX_PICTURE_BYTES
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.slots import Inbox
@@ -71,7 +70,7 @@ def _show(sample: zenoh.Sample, as_json: bool) -> None:
         print(json.dumps(line), flush=True)
         return
     stamp = f" seq {header['seq']} by {header['source']}" if header else ""
-    key, stamp = (escape(printable(part)) for part in (str(sample.key_expr), stamp))
-    console().print(f"[bold cyan]{key}[/][dim]{stamp}[/]", highlight=False)
-    text = content if isinstance(content, str) else pretty_repr(content, max_width=console().width)
-    console().print(escape(printable(text)))
+    out = console()
+    out.print(styled(sample.key_expr, "bold cyan"), styled(stamp, "dim"), sep="")
+    text = content if isinstance(content, str) else pretty_repr(content, max_width=out.width)
+    out.print(text)

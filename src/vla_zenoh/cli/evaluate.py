@@ -12,10 +12,9 @@ from typing import Annotated
 
 import typer
 from rich import box
-from rich.markup import escape
 from rich.table import Table
 
-from vla_zenoh.cli.output import console, errors, fail, plain_types, printable
+from vla_zenoh.cli.output import console, errors, fail, plain_types
 from vla_zenoh.evaluation import tables
 from vla_zenoh.evaluation.files import evaluate
 from vla_zenoh.evaluation.overall import overall, to_mapping
@@ -57,9 +56,9 @@ def evaluation(
         _show(runs)
     for run in runs:
         for problem in run.problems:
-            errors().print(f"[yellow]{escape(printable(f'{run.name}: {problem}'))}[/]")
+            errors().print(f"{run.name}: {problem}", style="yellow")
     for why in faults.values():
-        errors().print(f"[red]not evaluated: {escape(printable(why))}[/]")
+        errors().print(f"not evaluated: {why}", style="red")
     if json_file is not None:
         _write(json_file, json.dumps(plain_types(to_mapping(runs, faults)), indent=2) + "\n")
     if csv_file is not None:
@@ -104,7 +103,7 @@ def _show(runs: Sequence[Evaluation]) -> None:
         table.add_column(column, justify="left" if left else "right", overflow="fold")
     for run in runs:
         row = tables.summary_row(run)[:shown_columns]
-        table.add_row(*(escape(printable(word)) for word in row))
+        table.add_row(*row)
     if len(runs) > 1:
         table.add_section()
         table.add_row(*tables.summary_row(overall(runs))[:shown_columns], style="bold")
@@ -114,7 +113,7 @@ def _show(runs: Sequence[Evaluation]) -> None:
     if len(runs) == 1:
         _show_segments(shown)
     for name, value in tables.figures(shown):
-        screen.print(f"{name}: {escape(printable(value))}")
+        screen.print(f"{name}: {value}")
 
 
 def _show_latency(runs: Sequence[Evaluation]) -> None:
@@ -130,7 +129,7 @@ def _show_latency(runs: Sequence[Evaluation]) -> None:
     if wide:
         table.add_column("")
     for run in runs:
-        name = escape(printable(run.name))
+        name = run.name
         for index, row in enumerate(tables.latency_rows(run)):
             first = [name if index == 0 else ""] if several else []
             table.add_row(*first, *row, *([STAGES[row[0]]] if wide else []))
@@ -145,5 +144,5 @@ def _show_segments(run: Evaluation) -> None:
     for column in tables.SEGMENT_COLUMNS:
         table.add_column(column, justify="left" if column == "prompt" else "right")
     for row in tables.segment_rows(run):
-        table.add_row(*(escape(printable(word)) for word in row))
+        table.add_row(*row)
     console().print(table)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Annotated
 
 import typer
 import zenoh
 from rich.table import Table
-from rich.text import Text
 
 from vla_zenoh.cli import decode
 from vla_zenoh.cli.options import (
@@ -21,15 +20,21 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     client,
 )
-from vla_zenoh.cli.output import console, fail, print_json, printable
+from vla_zenoh.cli.output import console, fail, print_json
 from vla_zenoh.errors import ProfileError
+from vla_zenoh.keys import Keys
 from vla_zenoh.nodes.client import Client
+from vla_zenoh.printable import one_line
+from vla_zenoh.types import NodeStatus
 
+MAX_NUMBER = 40
 SETTINGS = ("prompt", "active", "worker", "rate")
 
 
 @dataclass(slots=True)
-class _Seen:
+class Seen:
+    """A key and what is written on it."""
+
     key: str
     type: str
     writer: str
@@ -56,29 +61,34 @@ def keys(
         found = _listen(robot, seconds, pictures)
         found += _settings(robot)
         if not pictures:
-            found += _pictures(robot)
+            found += pictures_of(robot.keys, robot.snapshot())
     found.sort(key=lambda seen: seen.key)
     if as_json:
         print_json([asdict(seen) for seen in found])
     else:
-        table = Table(header_style="bold")
-        for column in ("key", "type", "writer", "rate", "bytes/s"):
-            table.add_column(column, overflow="fold")
-        for seen in found:
-            table.add_row(
-                Text(printable(seen.key)),
-                Text(printable(seen.type)),
-                Text(printable(seen.writer)),
-                f"{seen.rate_hz:.1f} Hz" if seen.rate_hz else "",
-                f"{seen.bytes_s:,.0f}" if seen.bytes_s else "",
-            )
-        console().print(table)
+        console().print(table(found))
     if not found:
         fail("nothing is written; is a robot up? (`vla-zenoh up`)")
 
 
-def _listen(robot: Client, seconds: float, pictures: bool) -> list[_Seen]:
-    seen: dict[str, _Seen] = {}
+def table(found: Iterable[Seen]) -> Table:
+    """What a person sees."""
+    out = Table(header_style="bold")
+    for column in ("key", "type", "writer", "rate", "bytes/s"):
+        out.add_column(column, overflow="fold")
+    for seen in found:
+        out.add_row(
+            one_line(seen.key),
+            one_line(seen.type),
+            one_line(seen.writer),
+            one_line(f"{seen.rate_hz:.1f} Hz" if seen.rate_hz else "", MAX_NUMBER),
+            f"{seen.bytes_s:,.0f}" if seen.bytes_s else "",
+        )
+    return out
+
+
+def _listen(robot: Client, seconds: float, pictures: bool) -> list[Seen]:
+    seen: dict[str, Seen] = {}
     lock = threading.Lock()
 
     def take(sample: zenoh.Sample) -> None:
@@ -87,7 +97,7 @@ def _listen(robot: Client, seconds: float, pictures: bool) -> list[_Seen]:
             entry = seen.get(key)
             if entry is None:
                 header = decode.head(sample)
-                entry = seen[key] = _Seen(
+                entry = seen[key] = Seen(
                     key, decode.encoding_of(sample), header["source"] if header else "?"
                 )
             entry.count += 1
@@ -116,27 +126,28 @@ def _expressions(robot: Client, pictures: bool) -> Iterable[str]:
     return [below + group for group in groups]
 
 
-def _settings(robot: Client) -> list[_Seen]:
-    out: list[_Seen] = []
+def _settings(robot: Client) -> list[Seen]:
+    out: list[Seen] = []
     for name in SETTINGS:
         key = getattr(robot.keys, name)
         for reply in robot.session.get(key, timeout=1.0):
             if reply.ok is not None:
                 value = decode.text(reply.ok.payload)
-                out.append(_Seen(key, f"text, now {value!r}", "anyone; kept by command"))
+                out.append(Seen(key, f"text, now {value!r}", "anyone; kept by command"))
     return out
 
 
-def _pictures(robot: Client) -> list[_Seen]:
-    out: list[_Seen] = []
-    for name, (found, _, _) in robot.snapshot().items():
+def pictures_of(of: Keys, nodes: Mapping[str, tuple[NodeStatus, float, bool]]) -> list[Seen]:
+    """Keys of pictures, by the word of the nodes that make them."""
+    out: list[Seen] = []
+    for name, (found, _, _) in nodes.items():
         cameras = found.detail.get("cameras")
         for camera in cameras if isinstance(cameras, dict) else ():
             rate_hz = round(float(found.rates_hz.get(camera, 0.0)), 2)
             try:
-                raw, jpeg = robot.keys.camera_raw(camera), robot.keys.camera_jpeg(camera)
+                raw, jpeg = of.camera_raw(camera), of.camera_jpeg(camera)
             except ProfileError:  # no camera of ours: anybody can write a status
                 continue
-            out.append(_Seen(raw, "pixels, on demand", name, rate_hz=rate_hz))
-            out.append(_Seen(jpeg, "image/jpeg, on demand", name))
+            out.append(Seen(raw, "pixels, on demand", name, rate_hz=rate_hz))
+            out.append(Seen(jpeg, "image/jpeg, on demand", name))
     return out

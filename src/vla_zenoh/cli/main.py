@@ -115,10 +115,7 @@ def app_entry() -> None:
 
 
 def _complain(message: str) -> NoReturn:
-    from rich.text import Text
+    from vla_zenoh.cli.output import complain
 
-    from vla_zenoh.cli.output import errors, printable
-
-    text = Text("error: ", style="bold red").append(printable(message), style="not bold default")
-    errors().print(text, soft_wrap=True)
+    complain(message)
     sys.exit(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -10,14 +11,16 @@ import typer
 from rich.table import Table
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, ConnectOption, JsonOption, ProfileOption, client
-from vla_zenoh.cli.output import console, fail, print_json, printable
-from vla_zenoh.nodes.client import Client
+from vla_zenoh.cli.output import console, fail, print_json, styled
 from vla_zenoh.nodes.clock import Clock
 from vla_zenoh.nodes.offsets import Clocks
+from vla_zenoh.printable import one_line
 from vla_zenoh.types import NodeStatus
 
 HERE = "this computer"
 POLL_S = 0.05
+MAX_NUMBER = 40
+"""Characters: anybody may say 1e308."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,18 +94,19 @@ def net(
             time.sleep(POLL_S)
         statuses = {name: found for name, (found, _, alive) in robot.snapshot().items() if alive}
         own_links = tuple(sorted(str(link.dst) for link in robot.session.info.links()))
-        pairs = _pairs(statuses, _own(clocks, statuses, own_links))
-        lines = _lines(statuses)
+        pairs = pairs_of(statuses, _own(clocks, statuses, own_links))
+        lines = lines_of(statuses)
     bound_ms = robot.profile.timing.max_clock_offset_s * 1e3
     if as_json:
         print_json({"hosts": pairs, "keys": lines, "max_clock_offset_ms": bound_ms})
     else:
-        _print(robot, pairs, lines, bound_ms)
+        for table in tables(robot.keys.robot, pairs, lines, bound_ms):
+            console().print(table)
     if not statuses:
         fail(f"no node of robot {robot.keys.robot!r} says anything")
 
 
-def _own(clocks: Clocks, statuses: dict[str, NodeStatus], links: tuple[str, ...]) -> list[Pair]:
+def _own(clocks: Clocks, statuses: Mapping[str, NodeStatus], links: tuple[str, ...]) -> list[Pair]:
     """Each host as seen from here."""
     return [
         Pair(
@@ -120,8 +124,8 @@ def _own(clocks: Clocks, statuses: dict[str, NodeStatus], links: tuple[str, ...]
     ]
 
 
-def _pairs(statuses: dict[str, NodeStatus], own: list[Pair]) -> list[Pair]:
-    """The best measurement of each pair of hosts."""
+def pairs_of(statuses: Mapping[str, NodeStatus], own: list[Pair]) -> list[Pair]:
+    """The best measurement of each pair of hosts: `own`, and what nodes tell."""
     best: dict[tuple[str, str], Pair] = {}
     for pair in [*own, *_told(statuses)]:
         hosts = (pair.seen_from, pair.host)
@@ -130,7 +134,7 @@ def _pairs(statuses: dict[str, NodeStatus], own: list[Pair]) -> list[Pair]:
     return [best[hosts] for hosts in sorted(best)]
 
 
-def _told(statuses: dict[str, NodeStatus]) -> list[Pair]:
+def _told(statuses: Mapping[str, NodeStatus]) -> list[Pair]:
     """What nodes say of nodes on other hosts."""
     out: list[Pair] = []
     for name, status in statuses.items():
@@ -142,7 +146,7 @@ def _told(statuses: dict[str, NodeStatus]) -> list[Pair]:
             ]
             if there is not None and there.host != status.host and None not in numbers:
                 round_trip_ms, offset_ms, uncertainty_ms = (n or 0.0 for n in numbers)
-                links = _map(status.detail.get("net")).get("links") or ()
+                links = _texts(_map(status.detail.get("net")).get("links"))
                 out.append(
                     Pair(
                         status.host,
@@ -152,13 +156,14 @@ def _told(statuses: dict[str, NodeStatus]) -> list[Pair]:
                         round_trip_ms,
                         offset_ms,
                         uncertainty_ms,
-                        tuple(map(str, links)),
+                        links,
                     )
                 )
     return out
 
 
-def _lines(statuses: dict[str, NodeStatus]) -> list[Line]:
+def lines_of(statuses: Mapping[str, NodeStatus]) -> list[Line]:
+    """What nodes say that they write, the most bytes first."""
     lost: dict[str, dict[str, int]] = {}
     for name, status in statuses.items():
         for key, count in _map(_map(status.detail.get("net")).get("lost")).items():
@@ -182,20 +187,32 @@ def _number(value: Any) -> float | None:
     return float(value) if fine else None
 
 
-def _print(robot: Client, pairs: list[Pair], lines: list[Line], bound_ms: float) -> None:
-    hosts = Table(header_style="bold", title=f"robot {robot.keys.robot}", title_justify="left")
+def _texts(value: Any) -> tuple[str, ...]:
+    return tuple(map(str, value)) if isinstance(value, (list, tuple)) else ()
+
+
+def tables(robot: str, pairs: list[Pair], lines: list[Line], bound_ms: float) -> tuple[Table, ...]:
+    """What a person sees: the pairs of hosts, and the keys.
+
+    Args:
+        robot: its name.
+        pairs: of hosts.
+        lines: of nodes and keys.
+        bound_ms: clocks that differ by more are marked.
+    """
+    hosts = Table(header_style="bold", title=f"robot {robot}", title_justify="left")
     for column in ("from", "to", "round trip", "clock is ahead by", "link", "measured by"):
         hosts.add_column(column, overflow="fold")
     for pair in pairs:
         wrong = abs(pair.offset_ms) - pair.uncertainty_ms > bound_ms
+        clock = f"{pair.offset_ms:+.2f} +- {pair.uncertainty_ms:.2f} ms"
         hosts.add_row(
-            printable(pair.seen_from),
-            printable(pair.host),
-            f"{pair.round_trip_ms:.2f} ms",
-            f"[{'bold red' if wrong else 'white'}]"
-            f"{pair.offset_ms:+.2f} +- {pair.uncertainty_ms:.2f} ms[/]",
-            printable(", ".join(pair.links)),
-            f"{pair.by} of {pair.of}",
+            one_line(pair.seen_from),
+            one_line(pair.host),
+            one_line(f"{pair.round_trip_ms:.2f} ms", MAX_NUMBER),
+            styled(one_line(clock, MAX_NUMBER), "bold red" if wrong else "white"),
+            one_line(", ".join(pair.links)),
+            one_line(f"{pair.by} of {pair.of}"),
         )
     keys = Table(header_style="bold")
     for column in ("key", "node", "host", "rate", "kbit/s", "lost on the way to"):
@@ -203,12 +220,11 @@ def _print(robot: Client, pairs: list[Pair], lines: list[Line], bound_ms: float)
     for line in lines:
         lost = ", ".join(f"{node} {count}" for node, count in sorted(line.lost.items()))
         keys.add_row(
-            printable(line.key),
-            printable(line.node),
-            printable(line.host),
-            f"{line.rate_hz:.1f} Hz",
-            f"{line.bytes_s * 8e-3:,.1f}",
-            f"[yellow]{printable(lost)}[/]" if lost else "",
+            one_line(line.key),
+            one_line(line.node),
+            one_line(line.host),
+            one_line(f"{line.rate_hz:.1f} Hz", MAX_NUMBER),
+            one_line(f"{line.bytes_s * 8e-3:,.1f}", MAX_NUMBER),
+            styled(one_line(lost), "yellow"),
         )
-    console().print(hosts)
-    console().print(keys)
+    return hosts, keys

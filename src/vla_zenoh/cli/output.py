@@ -1,6 +1,9 @@
 """How every command prints: tables and text for people, JSON for programs, errors on stderr.
 
-Consoles are made at each call, so that they see the terminal, colours and streams of that moment.
+What is printed is mostly somebody else's: names, states and sentences of nodes, lines of a model, a
+prompt. It is printed as it stands, never read as Rich's markup, and what would steer the terminal
+is written as an escape. Colour is given by `styled`. Everything a person sees goes through a
+`Screen`. They are made at each call, so that they see the terminal, colours and streams of then.
 """
 
 from __future__ import annotations
@@ -8,34 +11,60 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 import typer
 from pydantic import BaseModel
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 from rich.text import Text
 
-_NOT_PRINTED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+from vla_zenoh.printable import printable
 
 
-def console(least_width: int = 0) -> Console:
+class Screen(Console):
+    """A console for words of anybody, see the module. Takes what Rich's own takes."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(markup=False, emoji=False, highlight=False, **settings)
+
+    def render_str(self, text: str, **how: Any) -> Text:
+        """`text` as it stands, whatever is asked for: also cells, titles and columns of tables."""
+        return super().render_str(printable(text), **{**how, "markup": False, "emoji": False})
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
+        """What Rich makes of it, where only Rich itself steers the terminal."""
+        for segment in super().render(renderable, options):
+            if segment.control or segment.text.isprintable():
+                yield segment
+            else:
+                yield Segment(printable(segment.text), segment.style)
+
+
+def console(least_width: int = 0) -> Screen:
     """A console on stdout.
 
     Args:
         least_width: for a wide table, which shall rather wrap on a narrow screen than lose figures.
     """
-    screen = Console(highlight=False)
+    screen = Screen()
     screen.width = max(screen.width, least_width)
     return screen
 
 
-def errors() -> Console:
+def errors() -> Screen:
     """A console on stderr: errors, progress, and whatever is not the result."""
-    return Console(stderr=True, highlight=False)
+    return Screen(stderr=True)
+
+
+def styled(text: object, style: str) -> Text:
+    """`text` of anybody in a colour."""
+    return Text(printable(str(text)), style=style)
 
 
 def print_json(value: Any) -> None:
@@ -47,22 +76,15 @@ def print_json(value: Any) -> None:
     print(json.dumps(plain_types(value), indent=2))
 
 
+def complain(message: str) -> None:
+    """Prints ``error: message`` on stderr."""
+    errors().print(Text.assemble(("error: ", "bold red"), printable(message)), soft_wrap=True)
+
+
 def fail(message: str, code: int = 1) -> NoReturn:
     """Prints ``error: message`` on stderr and ends the command with `code`."""
-    text = Text("error: ", style="bold red")
-    text.append(printable(message), style="not bold default")
-    errors().print(text, soft_wrap=True)
+    complain(message)
     raise typer.Exit(code)
-
-
-def printable(text: str) -> str:
-    """`text` from anybody, safe for a terminal: what would steer it is written as an escape."""
-    return "".join(
-        c
-        if c in "\n\t" or unicodedata.category(c) not in _NOT_PRINTED
-        else c.encode("unicode_escape", "backslashreplace").decode("ascii")
-        for c in text
-    )
 
 
 def plain_types(value: Any) -> Any:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.syntax import Syntax
 from rich.table import Table
 
-from vla_zenoh.cli.output import console, errors, fail, print_json, printable
+from vla_zenoh.cli.output import console, errors, fail, print_json, styled
 from vla_zenoh.errors import MissingExtraError, ProfileError, RecordError, ResourceError
 from vla_zenoh.profile import (
     Profile,
@@ -40,12 +39,12 @@ def list_profiles(as_json: JsonOption = False) -> None:
         table.add_column(column, no_wrap=column == "name", overflow="fold")
     for row in rows:
         if "fault" in row:
-            wrong = f"[red]{escape(printable(row['fault']))}[/]"
-            table.add_row(escape(row["name"]), wrong, "", "", "", escape(row["file"]))
+            wrong = styled(row["fault"], "red")
+            table.add_row(row["name"], wrong, "", "", "", row["file"])
         else:
             told = ("name", "about", "robot", "driver")
             cells = [*(row[key] for key in told), ", ".join(row["hosts"]), row["file"]]
-            table.add_row(*(escape(printable(cell)) for cell in cells))
+            table.add_row(*cells)
     console().print(table)
 
 
@@ -86,11 +85,11 @@ def check(
         except ProfileError as error:
             wrong = True
             for line in str(error).splitlines():
-                errors().print(f"[red]{escape(printable(line))}[/]", soft_wrap=True)
+                errors().print(line, style="red", soft_wrap=True)
             continue
-        console().print(f"[green]ok[/] {escape(printable(name))}", soft_wrap=True)
+        console().print(styled("ok", "green"), name, soft_wrap=True)
         for line in dict.fromkeys(hints):
-            errors().print(f"[yellow]advice[/] {escape(printable(line))}", soft_wrap=True)
+            errors().print(styled("advice", "yellow"), line, soft_wrap=True)
     if wrong:
         raise typer.Exit(1)
 

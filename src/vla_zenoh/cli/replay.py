@@ -76,7 +76,7 @@ def replay(
     for node, count in replayed.left_out.items():
         errors().print(f"left out: {count} samples of node {node}, which is alive itself")
     if replayed.damage:
-        errors().print(f"[yellow]{file} is {replayed.damage}[/]")
+        errors().print(f"{file} is {replayed.damage}", style="yellow")
     if replayed.failure:
         fail(replayed.failure)
 

@@ -13,6 +13,7 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
+from vla_zenoh.cli.output import errors
 from vla_zenoh.profile import Profile
 
 ros2_app = typer.Typer(invoke_without_command=True)
@@ -80,7 +81,7 @@ def bridge_config(
     text = bridge.bridge_text(loaded, bridge.bridge_config(loaded, locks, beside=beside))
     print(text, end="")
     for note in notes:
-        typer.echo(note, err=True)
+        errors().print(note, soft_wrap=True)
 
 
 def _locks(profile: Profile, given: Path | None) -> tuple[dict[str, object], str]:

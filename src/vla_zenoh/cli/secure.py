@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from vla_zenoh import resources
 from vla_zenoh.cli.options import DEFAULT_PROFILE, JsonOption, ProfileOption
-from vla_zenoh.cli.output import console, errors, fail, print_json
+from vla_zenoh.cli.output import console, errors, fail, print_json, styled
 from vla_zenoh.errors import SecurityError, VlaZenohError
 from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.profile.session import DEFAULT_FOLDER
@@ -237,8 +236,9 @@ def _complain_about_places(profile: Profile) -> None:
         "127.0.0.1" in endpoint for endpoint in profile.session.listen
     ):
         errors().print(
-            "[yellow]the router listens on its own computer only; for a network say where it is: "
-            "--at HOST=ADDRESS[/]"
+            "the router listens on its own computer only; for a network say where it is: "
+            "--at HOST=ADDRESS",
+            style="yellow",
         )
 
 
@@ -255,10 +255,10 @@ def _print(entries: list[Entry], now: dt.datetime) -> None:
         table.add_row(
             entry.host or "(the lab)",
             entry.node,
-            f"[{colour}]{found.not_after:%Y-%m-%d}[/]" if found else "",
-            f"[{colour}]{found.days_left(now)}[/]" if found else "",
+            styled(f"{found.not_after:%Y-%m-%d}", colour) if found else "",
+            styled(found.days_left(now), colour) if found else "",
             ", ".join(found.addresses) if found else "",
-            f"[{colour}]{escape('; '.join(entry.faults) or entry.warning)}[/]",
+            styled("; ".join(entry.faults) or entry.warning, colour),
         )
     console().print(table)
 

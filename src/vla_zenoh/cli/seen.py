@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,14 +19,17 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     client,
 )
-from vla_zenoh.cli.output import console, errors, fail, printable
+from vla_zenoh.cli.output import console, errors, fail
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
 from vla_zenoh.nodes.seen import SeenListener, Sight
+from vla_zenoh.printable import one_line
 
 POLL_S = 0.05
 PATIENCE_S = 5.0
-MAX_RAW = 160
+MAX_RAW, MAX_PROMPT = 160, 1000
+"""Characters."""
+MAX_NUMBERS, MAX_CAMERAS = 32, 16
 
 
 def seen(
@@ -75,15 +79,15 @@ def seen(
                     if as_json:
                         print(json.dumps(_plain(sight)), flush=True)
                 if screen is not None:
-                    screen.update(_table(newest), refresh=True)
+                    screen.update(table(newest), refresh=True)
                 time.sleep(POLL_S)
         listener.close()
     if not told:
         fail(f"{worker or 'no worker'} shows nothing; does it infer? (`vla-zenoh status`)")
     if not live and not as_json:
-        console().print(_table(newest))
+        console().print(table(newest))
     if out is not None:
-        errors().print(f"{told} inferences in {out}", markup=False)
+        errors().print(f"{told} inferences in {out}")
 
 
 def _plain(sight: Sight) -> dict[str, Any]:
@@ -114,23 +118,25 @@ def _save(folder: Path, sight: Sight) -> None:
     (into / f"{stem}.json").write_text(json.dumps(_plain(sight), indent=2) + "\n", "utf-8")
 
 
-def _table(newest: dict[str, Sight]) -> Table:
-    table = Table(header_style="bold")
+def table(newest: Mapping[str, Sight]) -> Table:
+    """What a person sees: worker -> its newest inference."""
+    out = Table(header_style="bold")
     for column in ("worker", "sees", "prompt", "raw", "first step", "inference"):
-        table.add_column(column, overflow="fold")
+        out.add_column(column, overflow="fold")
     for name, sight in sorted(newest.items()):
         record = sight.record
-        raw = json.dumps(record.raw) if record.raw else ""
-        table.add_row(
-            name,
-            "\n".join(f"{camera} {_size(jpeg)}" for camera, jpeg in sorted(sight.jpegs.items())),
-            printable(record.prompt),
-            printable(raw if len(raw) <= MAX_RAW else f"{raw[:MAX_RAW]}..."),
-            " ".join(f"{value:.4g}" for value in record.steps[0])
-            + (f"\n+ {len(record.steps) - 1} more" if len(record.steps) > 1 else ""),
-            f"{record.inference_ms:.1f} ms\nchunk {record.chunk_seq}",
+        sees = [one_line(f"{camera} {_size(jpeg)}") for camera, jpeg in sorted(sight.jpegs.items())]
+        first = record.steps[0][:MAX_NUMBERS] if len(record.steps) else ()
+        more = f"\n+ {len(record.steps) - 1} more" if len(record.steps) > 1 else ""
+        out.add_row(
+            one_line(name),
+            "\n".join(sees[:MAX_CAMERAS]),
+            one_line(record.prompt, MAX_PROMPT),
+            one_line(json.dumps(record.raw) if record.raw else "", MAX_RAW),
+            " ".join(f"{value:.4g}" for value in first) + more,
+            f"{record.inference_ms:.4g} ms\nchunk {record.chunk_seq}",
         )
-    return table
+    return out
 
 
 def _size(jpeg: bytes) -> str:

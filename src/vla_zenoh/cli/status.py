@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import typer
 from rich.console import Group
 from rich.live import Live
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -20,13 +20,22 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     client,
 )
-from vla_zenoh.cli.output import console, fail, print_json, printable
+from vla_zenoh.cli.output import console, fail, print_json, styled
 from vla_zenoh.nodes.client import Client
+from vla_zenoh.printable import one_line
 from vla_zenoh.types import Event, Header, NodeStatus
 
+Heard = Mapping[str, tuple[NodeStatus, float, bool]]
+"""Node -> (status, seconds since it came, alive)."""
 LISTEN_S = 1.2
 REFRESH_HZ = 4.0
 MAX_EVENTS = 8
+MAX_LINES = 12
+"""Of one cell."""
+MAX_LINE = 60
+"""Characters of each."""
+MAX_WORDS = 400
+"""Characters of one sentence."""
 STALE_S = 1.5
 STYLES = {
     "active": "bold green",
@@ -38,6 +47,9 @@ STYLES = {
     "holding": "yellow",
     "waiting": "yellow",
     "braking": "yellow",
+    "silent": "yellow",
+    "stalled": "yellow",
+    "unheeded": "yellow",
     "stopped": "bold red",
     "fault": "bold red",
     "dead": "bold red",
@@ -57,7 +69,7 @@ def status(
             if as_json:
                 print_json(_plain(robot))
             else:
-                console().print(_picture(robot, robot.take_events()))
+                console().print(_now(robot, robot.take_events()))
             if not robot.statuses:
                 fail(f"no node of robot {robot.keys.robot!r} says anything")
             return
@@ -69,7 +81,7 @@ def _live(robot: Client) -> None:
     with Live(console=console(), auto_refresh=False, screen=False) as live:
         while True:
             events = [*events, *robot.take_events()][-MAX_EVENTS:]
-            live.update(_picture(robot, events), refresh=True)
+            live.update(_now(robot, events), refresh=True)
             time.sleep(1.0 / REFRESH_HZ)
 
 
@@ -80,33 +92,53 @@ def _plain(robot: Client) -> dict[str, object]:
     }
 
 
-def _picture(robot: Client, events: list[tuple[str, Header, Event]]) -> Group:
-    table = Table(header_style="bold", title=f"robot {robot.keys.robot}", title_justify="left")
+def _now(robot: Client, events: Sequence[tuple[str, Header, Event]]) -> Group:
+    insecure = robot.profile.session.insecure
+    return picture(robot.keys.robot, robot.snapshot(), events, insecure=insecure)
+
+
+def picture(
+    robot: str,
+    nodes: Heard,
+    events: Sequence[tuple[str, Header, Event]],
+    *,
+    insecure: bool = False,
+) -> Group:
+    """What a person sees. Warnings stand first: no table can push them from the screen.
+
+    Args:
+        robot: its name.
+        nodes: what each said of itself. A node is who its key says it is.
+        events: oldest first.
+        insecure: the profile says that strangers may command the robot.
+    """
+    table = Table(header_style="bold", title=f"robot {robot}", title_justify="left")
     for column in ("node", "state", "age", "rate", "refused", "what it says"):
         table.add_column(column, overflow="fold")
-    for name, (found, age_s, alive) in robot.snapshot().items():
+    for name, (found, age_s, alive) in nodes.items():
         state = found.state if alive else "dead"
         table.add_row(
-            name,
-            f"[{STYLES.get(state, 'white')}]{escape(state)}[/]",
-            f"[{'red' if age_s > STALE_S else 'white'}]{age_s:.1f} s[/]",
-            "\n".join(f"{key} {value:.0f} Hz" for key, value in found.rates_hz.items()),
-            _refused(found),
-            escape(_word(found)),
+            one_line(name),
+            styled(one_line(state, MAX_LINE), STYLES.get(state, "white")),
+            styled(f"{age_s:.1f} s", "red" if age_s > STALE_S else "white"),
+            _lines(_rates(found)),
+            _lines(_refused(found)),
+            _word(name, found),
         )
-    lines = [_latency(name, found) for name, (found, _, _) in robot.snapshot().items()]
+    lines = [_latency(name, found) for name, (found, _, _) in nodes.items()]
     news = [_event(*happened) for happened in events[-MAX_EVENTS:]]
-    return Group(table, *_open_to_all(robot), *(line for line in lines if line), *news)
+    warnings = _open_to_all(nodes, insecure=insecure)
+    return Group(*warnings, table, *(line for line in lines if line), *news)
 
 
-def _open_to_all(robot: Client) -> list[Text]:
+def _open_to_all(nodes: Heard, *, insecure: bool) -> list[Text]:
     """In red: that strangers may command the robot, by the profile's word or a router's."""
     said = {
         name: found.detail.get("listen")
-        for name, (found, _, _) in robot.snapshot().items()
+        for name, (found, _, _) in nodes.items()
         if found.detail.get("security") == "insecure"
     }
-    if not said and not robot.profile.session.insecure:
+    if not said and not insecure:
         return []
     where = "; ".join(
         f"{name} listens on {', '.join(map(str, listen))}"
@@ -114,7 +146,8 @@ def _open_to_all(robot: Client) -> list[Text]:
         if isinstance(listen, (list, tuple))
     )
     words = "insecure: everybody on the network can command this robot"
-    return [Text(printable(f"{words} ({where})" if where else words), style="bold red")]
+    more = f" ({one_line(where, MAX_WORDS)})" if where else ""
+    return [styled(f"{words}{more}", "bold red")]
 
 
 def _latency(name: str, found: NodeStatus) -> Text | None:
@@ -124,34 +157,46 @@ def _latency(name: str, found: NodeStatus) -> Text | None:
         f"{stage.replace('_', ' ')} {values[0]:.1f}/{values[1]:.1f}"
         for stage, values in found.latency_ms.items()
     )
-    return Text(f"{name}, ms p50/p95: {stages}", style="dim")
+    return styled(f"{one_line(name)}, ms p50/p95: {one_line(stages, MAX_WORDS)}", "dim")
 
 
-def _refused(found: NodeStatus) -> str:
+def _lines(lines: list[str]) -> str:
+    more = [f"and {len(lines) - MAX_LINES} more"] if len(lines) > MAX_LINES else []
+    return "\n".join([*lines[:MAX_LINES], *more])
+
+
+def _rates(found: NodeStatus) -> list[str]:
+    return [one_line(f"{key} {value:.0f} Hz", MAX_LINE) for key, value in found.rates_hz.items()]
+
+
+def _refused(found: NodeStatus) -> list[str]:
     refused = {
         name.removeprefix("refused."): count
         for name, count in found.counters.items()
         if name.startswith("refused.")
     }
-    return "\n".join(f"{escape(reason)} {count}" for reason, count in sorted(refused.items()))
+    return [one_line(f"{reason} {count}", MAX_LINE) for reason, count in sorted(refused.items())]
 
 
-def _word(found: NodeStatus) -> str:
+def _word(name: str, found: NodeStatus) -> str:
     detail = found.detail
-    if found.node == "command":
-        return (
-            f"{detail.get('why', '')}\nprompt {detail.get('prompt', '')!r}, worker "
-            f"{detail.get('worker', '')}, {detail.get('rate_hz', 0):g} Hz, "
+    if name == "command":
+        rate_hz = detail.get("rate_hz")
+        rate = f"{rate_hz:g}" if isinstance(rate_hz, (int, float)) else "?"
+        doing = (
+            f"prompt {detail.get('prompt', '')!r}, worker {detail.get('worker', '')}, {rate} Hz, "
             f"{detail.get('accepted_chunks', 0)} chunks carried out"
         )
+        return f"{one_line(detail.get('why', ''), MAX_WORDS)}\n{one_line(doing, MAX_WORDS)}"
     word = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
     if not word and "obeyed" in detail:
         return "obeyed" if detail["obeyed"] else "in the shadow"
-    return word
+    return one_line(word, MAX_WORDS)
 
 
 def _event(node: str, header: Header, event: Event) -> Text:
     when = time.strftime("%H:%M:%S", time.localtime(header.stamp_wall_ns / 1e9))
     style = {"info": "white", "warning": "yellow", "error": "red"}.get(event.level, "white")
     again = f" (x{event.count})" if event.count > 1 else ""
-    return Text(f"{when} {node:>16} {event.what}{again}: {event.why[:160]}", style=style)
+    said = f"{one_line(event.what)}{again}: {one_line(event.why, 160)}"
+    return styled(f"{when} {one_line(node):>16} {said}", style)

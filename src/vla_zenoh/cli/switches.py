@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, ConnectOption, ProfileOption, client
-from vla_zenoh.cli.output import console, fail
+from vla_zenoh.cli.output import console, fail, styled
 
 STOP_PATIENCE_S = 3.0
 
@@ -62,7 +62,7 @@ def stop(profile: ProfileOption = DEFAULT_PROFILE, connect: ConnectOption = None
 
         if not robot.wait_for(stopped, STOP_PATIENCE_S):
             fail("no command node says that it stopped; look at `vla-zenoh status`")
-        console().print("[bold red]stopped[/]; `vla-zenoh reset` clears it")
+        console().print(styled("stopped", "bold red"), "`vla-zenoh reset` clears it", sep="; ")
 
 
 def reset(profile: ProfileOption = DEFAULT_PROFILE, connect: ConnectOption = None) -> None:

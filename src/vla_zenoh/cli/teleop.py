@@ -59,5 +59,5 @@ def _people(profile: Profile, stack: ExitStack) -> zenoh.Session | None:
     try:
         return stack.enter_context(open_session(profile.session))
     except SecurityError as error:
-        errors().print(f"[yellow]enter, tab and x will do nothing: {error}[/]")
+        errors().print(f"enter, tab and x will do nothing: {error}", style="yellow")
         return None

@@ -8,7 +8,6 @@ import zlib
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
@@ -19,7 +18,7 @@ from vla_zenoh.cli.options import (
     ListenOption,
     effective_profile,
 )
-from vla_zenoh.cli.output import console
+from vla_zenoh.cli.output import console, styled
 from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.nodes.launch import Host
 from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
@@ -49,10 +48,9 @@ def up(
     lock = threading.Lock()
 
     def log(node: str, line: str, style: str = "") -> None:
-        colour = COLOURS[zlib.crc32(node.encode()) % len(COLOURS)]
-        text = f"[{style}]{escape(line)}[/]" if style else escape(line)
+        name = styled(f"{node:>16}", COLOURS[zlib.crc32(node.encode()) % len(COLOURS)])
         with lock:
-            out.print(f"[{colour}]{node:>16}[/] | {text}", highlight=False, soft_wrap=True)
+            out.print(name, styled(line, style), sep=" | ", soft_wrap=True)
 
     def tell(node: str, sentence: str) -> None:
         log(node, sentence, "bold")

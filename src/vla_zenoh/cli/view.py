@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
@@ -18,7 +17,7 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
-from vla_zenoh.cli.output import errors, fail, printable
+from vla_zenoh.cli.output import errors, fail
 from vla_zenoh.errors import MissingExtraError, ProfileError, RecordingError
 from vla_zenoh.nodes.process import run_node, stop_on_signals
 from vla_zenoh.nodes.viewer import Viewer, open_server, open_window
@@ -125,7 +124,7 @@ def _recorded(
             show.take(entry)
         _tell(show, save)
         if file.damage:
-            errors().print(f"[yellow]{escape(printable(f'{path} is {file.damage}'))}[/]")
+            errors().print(f"{path} is {file.damage}", style="yellow")
         while viewer is not None and not stop.is_set() and not viewer.closed:
             stop.wait(POLL_S)
     if not show.shown and not stop.is_set():
@@ -136,8 +135,8 @@ def _profile_of(file: RunFile, name: str) -> Profile:
     try:
         return read_profile(file.profile_yaml, f"profile in {file.path}")
     except ProfileError as error:
-        why = escape(printable(f"{error}; --profile {name} says what the robot looks like"))
-        errors().print(f"[yellow]{why}[/]")
+        why = f"{error}; --profile {name} says what the robot looks like"
+        errors().print(why, style="yellow")
         return effective_profile(name)
 
 
@@ -161,7 +160,7 @@ def _sink(
     viewer = None
     if serve:
         viewer = open_server(bind, port)
-        errors().print(f"open in a browser: {viewer.page_url}", soft_wrap=True, markup=False)
+        errors().print(f"open in a browser: {viewer.page_url}", soft_wrap=True)
     elif save is None:
         viewer = open_window()
     try:
@@ -184,12 +183,12 @@ def _tell(show: Show, save: Path | None) -> None:
     where = f" in {save}" if save is not None else ""
     screen.print(
         f"{show.shown.total():,} samples of {len(show.shown)} keys{where}",
-        markup=False,
         soft_wrap=True,
     )
     if show.refused:
         worst = show.refused.most_common(SHOWN_REASONS)
         reasons = ", ".join(f"{why} ({count})" for why, count in worst)
-        screen.print(f"[yellow]not shown: {escape(printable(reasons))}[/]")
+        screen.print(f"not shown: {reasons}", style="yellow")
     if show.dropped:
-        screen.print(f"[yellow]left out, because this was too slow: {show.dropped} samples[/]")
+        said = f"left out, because this was too slow: {show.dropped} samples"
+        screen.print(said, style="yellow")

@@ -13,6 +13,7 @@ from vla_zenoh.nodes.teleop.sticks import Stick
 from vla_zenoh.nodes.teleop.terminal import Terminal
 from vla_zenoh.nodes.worker import WorkerNode
 from vla_zenoh.policy import Frame
+from vla_zenoh.printable import one_line
 from vla_zenoh.profile import Profile
 from vla_zenoh.teleop.keyboard import GIVE, LEGEND, QUIT, STOP, SWITCH, Keyboard
 from vla_zenoh.teleop.policy import TeleopPolicy
@@ -119,7 +120,7 @@ class Teleop:
                 if event.level != "info" or event.kind == "transition":
                     self._news.append(f"{node}: {event.what} {event.why}".rstrip())
             while self._news:
-                terminal.say(_safe(self._news.popleft()))
+                terminal.say(one_line(self._news.popleft()))
             terminal.show(self._line())
 
     def _line(self) -> str:
@@ -135,11 +136,7 @@ class Teleop:
             )
             if value
         )
-        return _safe(
+        return one_line(
             f"{state}, obeys {whose} | {100 * speed.translation_m_s:g} cm/s, "
             f"{speed.rotation_rad_s:.2g} rad/s | {moving or 'still'}"
         )[:118]
-
-
-def _safe(text: str) -> str:
-    return "".join(character if character.isprintable() else " " for character in text)

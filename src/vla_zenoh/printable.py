@@ -1,0 +1,32 @@
+"""Text that anybody may have written, as a terminal can be given it."""
+
+from __future__ import annotations
+
+import unicodedata
+
+_NOT_PRINTED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+_TO_SPACES = {ord("\n"): " ", ord("\t"): " "}
+
+
+def printable(text: str) -> str:
+    """`text` from anybody, safe for a terminal: what would steer it is written as an escape."""
+    if text.isprintable():
+        return text
+    return "".join(
+        c
+        if c in "\n\t" or unicodedata.category(c) not in _NOT_PRINTED
+        else c.encode("unicode_escape", "backslashreplace").decode("ascii")
+        for c in text
+    )
+
+
+def one_line(value: object, most: int = 200) -> str:
+    """Likewise, in one line that does not push everything else from the screen.
+
+    Args:
+        value: text, or anything that has a text.
+        most: characters that are kept.
+    """
+    text = str(value)
+    cut = text if len(text) <= most else f"{text[:most]}..."
+    return printable(cut.translate(_TO_SPACES))
