@@ -14,6 +14,7 @@ from vla_zenoh.profile import Profile, load_profile, override
 
 DEFAULT_PROFILE = "panda_sim"
 PROFILE_VARIABLE = "VLA_ZENOH_PROFILE"
+HOST_VARIABLE = "VLA_ZENOH_HOST"
 
 ProfileOption = Annotated[
     str,
@@ -38,7 +39,14 @@ ListenOption = Annotated[
     ),
 ]
 HostOption = Annotated[
-    str | None, typer.Option("--host", help="Which host of the profile this computer is.")
+    str | None,
+    typer.Option(
+        "--host", envvar=HOST_VARIABLE, help="Which host of the profile this computer is."
+    ),
+]
+RobotOption = Annotated[
+    str | None,
+    typer.Option("--robot", help="Another robot at the same router than that of the profile."),
 ]
 AlsoOption = Annotated[
     list[str] | None,
