@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +68,7 @@ def write_run(
     prompts: Sequence[str] = PROMPTS,
     silent: Sequence[int] = (),
     with_spec: bool = True,
+    ended: Mapping[str, Any] | None = None,
 ) -> Path:
     """One activation of 2 s for each prompt, half a second of rest after each.
 
@@ -77,6 +78,7 @@ def write_run(
         prompts: of the activations.
         silent: chunks that were never published, in each activation.
         with_spec: the worker says what its steps mean.
+        ended: what stands at its end beside what was dropped.
     """
     said = of or spec()
     samples: list[Sample] = []
@@ -120,5 +122,5 @@ def write_run(
     out = RunWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
     for sample in sorted(samples, key=lambda each: each.heard_ns):
         out.write(sample)
-    out.finish({"dropped": {}})
+    out.finish({"dropped": {}, **(ended or {})})
     return path
