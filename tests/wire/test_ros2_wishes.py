@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.switch import QUIET_S
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.ros2.link import Link
+from vla_zenoh.nodes.ros2.stops import Stops
 from vla_zenoh.nodes.ros2.wishes import PATIENCE_NS, Wishes
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import load_profile
@@ -29,6 +30,7 @@ class Rig(NamedTuple):
     wishes: Wishes
     heard: list[tuple[str, str]]
     refused: list[str]
+    stop: Callable[[], None]
 
     def say(self, *words: bool | str) -> None:
         for word in words:
@@ -66,16 +68,22 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         messages = Messages(profile.ros2.distribution)
         link = Link(ours, profile.ros2, messages, "vla_panda")
         wishes = Wishes(
-            Client(profile, ours), link, messages, "/vla", lambda reason, *_: refused.append(reason)
+            Client(profile, ours),
+            link,
+            messages,
+            "/vla",
+            lambda reason, *_: refused.append(reason),
+            Stops(ours, profile.keys.stop),
         )
         peer = Ros2Peer(theirs)
         handler = zenoh.handlers.Callback(keep, indirect=False)
         for key in (profile.keys.active, profile.keys.prompt):
             theirs.declare_subscriber(key, handler)
             await_match(ours, key)
+        await_match(theirs, profile.keys.stop)
         for topic in ("/vla/active", "/vla/prompt"):
             await_match(theirs, topic[1:])
-        yield Rig(peer, wishes, heard, refused)
+        yield Rig(peer, wishes, heard, refused, lambda: theirs.put(profile.keys.stop, ""))
         peer.close()
         link.close()
 
@@ -103,3 +111,14 @@ def test_true_is_obeyed_once_and_what_is_repeated_is_told_once(rig: Rig) -> None
     rig.say(True, True, True, False)
     rig.expect(("active", "true"), ("active", "false"))
     assert rig.refused == ["repeated"]
+
+
+def test_true_that_was_said_before_a_stop_is_not_obeyed_after_it(rig: Rig) -> None:
+    time.sleep(QUIET_S)
+    rig.say(True)
+    until("it waits", lambda: rig.wishes._switches._arrivals)
+    rig.stop()
+    until("the stop is heard", lambda: rig.wishes._stops.overtook(0))
+    rig.say(False)
+    rig.expect(("active", "false"))
+    assert rig.refused == ["stopped"]

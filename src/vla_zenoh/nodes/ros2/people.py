@@ -1,7 +1,7 @@
 """Services for ROS people: what they ask becomes a setting of ours. Topics: see `Wishes`.
 
 A thread of its own, because a setting has to be agreed to by the command node before it is
-answered. A stop waits for nothing.
+answered. A stop waits for nothing, and what was asked before it is not done after it.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from vla_zenoh.interop.ros2.services import (
 )
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.ros2.link import Link, Request
+from vla_zenoh.nodes.ros2.stops import Stops
 from vla_zenoh.nodes.ros2.wishes import Refuse, Wishes, text_of
 from vla_zenoh.profile import Profile
 
@@ -65,7 +66,9 @@ class People:
     ) -> None:
         self._robot, self._messages, self._refuse = profile.robot.name, messages, refuse
         self._client = Client(profile, session).follow()
-        self._calls: queue.Queue[tuple[Service, Request]] = queue.Queue(MAX_WAITING)
+        self._stops = Stops(session, profile.keys.stop)
+        self._calls: queue.Queue[tuple[Service, Request, int]] = queue.Queue(MAX_WAITING)
+        self._asked_ns = 0
         self._do: dict[str, Callable[[Any], str]] = {
             SET_ACTIVE.name: self._set_active,
             STOP.name: self._stop,
@@ -75,15 +78,17 @@ class People:
         }
         for service in SERVICES:
             link.serve(f"{prefix}/{service.name}", service.type, self._taker(service))
-        self._wishes = Wishes(self._client, link, Messages(messages.distribution), prefix, refuse)
+        self._wishes = Wishes(
+            self._client, link, Messages(messages.distribution), prefix, refuse, self._stops
+        )
         self._status = link.write(f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)
 
     def _taker(self, service: Service) -> Callable[[Request], None]:
         def take(request: Request) -> None:
             if service is STOP:  # before all that wait
-                self._client.put(self._client.keys.stop, "")
+                self._stops.stop(lambda: self._client.put(self._client.keys.stop, ""))
             try:
-                self._calls.put_nowait((service, request))
+                self._calls.put_nowait((service, request, time.monotonic_ns()))
             except queue.Full:
                 request.drop("too many calls at once")
 
@@ -105,7 +110,7 @@ class People:
         topics.join()
 
     # -- services -----------------------------------------------------------------------------
-    def _answer(self, service: Service, request: Request) -> None:
+    def _answer(self, service: Service, request: Request, asked_ns: int) -> None:
         try:
             asked = self._messages.decode(request_of(service.type), request.payload)
         except CodecError as error:
@@ -113,7 +118,10 @@ class People:
             request.drop(str(error))
             return
         # An error in place of an answer never reaches a ROS client: it would wait for ever.
+        self._asked_ns = asked_ns
         try:
+            if service is not STOP:
+                self._stops.check(asked_ns)
             said, success = self._do[service.name](asked), True
         except CodecError as error:
             self._refuse(error.reason, f"{service.name}: {error}", service.name)
@@ -128,6 +136,7 @@ class People:
 
     def _activate(self, wanted: bool) -> str:
         if wanted:
+            self._stops.check(self._asked_ns)  # what comes before it in a request may take seconds
             task = self._client.activate()
             return f"active: worker {task.worker}, {task.prompt!r}"
         if not self._client.deactivate():
@@ -139,7 +148,9 @@ class People:
         return "stopped; call reset, then activate"
 
     def _reset(self, asked: Any) -> str:
-        self._client.put(self._client.keys.reset, "")
+        self._stops.unless_stopped(
+            self._asked_ns, lambda: self._client.put(self._client.keys.reset, "")
+        )
         self._await_state("inactive")
         return "inactive"
 

@@ -18,6 +18,7 @@ from vla_zenoh.interop.ros2.switch import QUIET_S, Switch
 from vla_zenoh.interop.ros2.topics import plain
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.ros2.link import Link
+from vla_zenoh.nodes.ros2.stops import Stops
 from vla_zenoh.nodes.slots import Arrival, Inbox
 
 TURN_S = 0.05
@@ -38,12 +39,20 @@ class Wishes:
         messages: of the robot's distribution, for this thread alone.
         prefix: what names of topics begin with.
         refuse: counts a refusal; may be called from any thread.
+        stops: known so far.
     """
 
     def __init__(
-        self, client: Client, link: Link, messages: Messages, prefix: str, refuse: Refuse
+        self,
+        client: Client,
+        link: Link,
+        messages: Messages,
+        prefix: str,
+        refuse: Refuse,
+        stops: Stops,
     ) -> None:
         self._client, self._messages, self._refuse = client, messages, refuse
+        self._stops = stops
         self._prefix = prefix
         self._prompts = link.read(f"{prefix}/{PROMPT_TOPIC}", plain.TEXT, Inbox(WAITING))
         self._switches = link.read(f"{prefix}/{ACTIVE_TOPIC}", plain.TRUTH, Inbox(WAITING))
@@ -90,6 +99,9 @@ class Wishes:
             return
         wanted = bool(value)
         if self._switch.take(wanted, arrival.mono_ns):
+            if wanted and self._stops.overtook(arrival.mono_ns):
+                self._refuse("stopped", f"{topic}: true, and then an emergency stop", ACTIVE_TOPIC)
+                return
             self._put_ns, self._told = arrival.mono_ns, False
             self._client.put(self._client.keys.active, settings.encode_bool(wanted).decode())
             return
