@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from vla_zenoh import resources
 from vla_zenoh.cli.profile import profile_app
 from vla_zenoh.profile import load_profile, profile_names
+from vla_zenoh.resources import robot_urdf
 
 RUNNER = CliRunner()
 
@@ -115,18 +116,45 @@ def test_what_the_description_of_the_robot_does_not_have_is_a_fault(
     assert told in result.stderr
 
 
-def test_a_description_that_is_none_is_a_fault_and_one_elsewhere_is_advice(
-    own_folder: Path,
-) -> None:
+def test_a_description_that_is_none_is_a_fault_wherever_it_is(own_folder: Path) -> None:
     urdf = own_folder / "arm.urdf"
-    (own_folder / "lab.yaml").write_text(f"extends: panda_sim\nrobot: {{description: {urdf}}}\n")
-    result = RUNNER.invoke(profile_app, ["check", "lab"])
-    assert result.exit_code == 0
-    assert result.stderr.count("is not a file") == 1
     urdf.write_text("no robot")
+    (own_folder / "lab.yaml").write_text(f"extends: panda_sim\nrobot: {{description: {urdf}}}\n")
     result = RUNNER.invoke(profile_app, ["check", "lab"])
     assert result.exit_code == 1
     assert "cannot be read" in result.stderr
+
+
+TWO_HOSTS = """\
+extends: panda_sim
+robot: {{description: {urdf}}}
+hosts: {{desk: {{nodes: [router, sim, command]}}, gpu: {{nodes: [worker, camera]}}}}
+"""
+
+
+@pytest.mark.parametrize("what", ["description", "meshes"])
+def test_a_robot_that_is_not_here_is_a_fault_where_the_command_node_runs_and_elsewhere_advice(
+    own_folder: Path, what: str
+) -> None:
+    urdf, told = own_folder / "arm.urdf", "is not a file"
+    if what == "meshes":
+        shipped = load_profile("panda_sim").robot.description
+        urdf.write_text(robot_urdf(shipped).read_text())  # its meshes are not below this folder
+        told = "package://NAME/... is looked for as NAME/... beside the URDF"
+    (own_folder / "lab.yaml").write_text(TWO_HOSTS.format(urdf=urdf))
+    for words, code in (([], 0), (["--host", "gpu"], 0), (["--host", "desk"], 1)):
+        result = RUNNER.invoke(profile_app, ["check", "lab", *words])
+        assert result.exit_code == code, result.stderr
+        assert result.stderr.count(told) == 1
+        assert result.stderr.count("advice robot.description") == 1 - code
+
+    (own_folder / "one.yaml").write_text(
+        "extends: lab\nhosts: {here: {nodes: [router, sim, command, camera, worker]}}\n"
+    )
+    assert RUNNER.invoke(profile_app, ["check", "one"]).exit_code == 1
+    result = RUNNER.invoke(profile_app, ["check", "lab", "--host", "robot"])
+    assert result.exit_code == 1
+    assert "hosts: has no 'robot', it has: desk, gpu" in result.stderr
 
 
 def test_what_is_questionable_is_advice_and_no_failure() -> None:

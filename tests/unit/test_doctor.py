@@ -29,6 +29,7 @@ from vla_zenoh.doctor.libraries import (
 from vla_zenoh.doctor.opengl import judge as judge_backend
 from vla_zenoh.doctor.opengl import opengl
 from vla_zenoh.doctor.realtime import governor, niceness, processors, real_time_priority
+from vla_zenoh.doctor.robot import robot
 from vla_zenoh.doctor.router import router
 from vla_zenoh.doctor.storage import SHARED_MEMORY, disk, left_segments, shared_memory
 from vla_zenoh.doctor.terminal import terminal
@@ -393,3 +394,18 @@ def test_a_missing_camera_makes_the_command_fail(tmp_path: Path) -> None:
 def test_a_host_without_a_profile_is_refused() -> None:
     result = CliRunner().invoke(app(), ["--host", "robot"])
     assert result.exit_code == 2
+
+
+def test_a_robot_that_is_not_here_fails_the_host_that_commands_it_alone(tmp_path: Path) -> None:
+    (tmp_path / "lab.yaml").write_text(
+        f"extends: panda_sim\nrobot: {{description: {tmp_path}/arm.urdf}}\n"
+        "hosts: {desk: {nodes: [router, sim, command]}, gpu: {nodes: [worker, camera]}}\n"
+    )
+    lab = load_profile(str(tmp_path / "lab.yaml"))
+    for host in ("desk", None):
+        (found,) = robot(lab, host)
+        assert (found.name, found.level) == ("robot", "fail")
+        assert "arm.urdf' is not a file" in found.found
+    assert list(robot(lab, "gpu")) == []
+    (found,) = robot(load_profile("panda_sim"))
+    assert found.level == "ok"

@@ -15,6 +15,7 @@ from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import console, errors, print_json, styled
 from vla_zenoh.doctor import Finding, Needs, examine, needs_of
 from vla_zenoh.doctor.access import access
+from vla_zenoh.doctor.robot import robot
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.nodes.rehearsal import Verdict, read_access, rehearse, try_identity
 from vla_zenoh.nodes.session import open_session
@@ -65,6 +66,7 @@ def doctor(
     with errors().status("Looking at this computer"):
         findings = list(examine(needs, functools.partial(try_zenoh, session)))
         if loaded is not None:
+            findings += robot(loaded, host)
             findings += access(
                 loaded,
                 dt.datetime.now(dt.UTC),

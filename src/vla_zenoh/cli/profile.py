@@ -8,6 +8,7 @@ import typer
 from rich.syntax import Syntax
 from rich.table import Table
 
+from vla_zenoh.cli.options import HostOption
 from vla_zenoh.cli.output import console, errors, fail, print_json, styled
 from vla_zenoh.errors import MissingExtraError, ProfileError, RecordError, ResourceError
 from vla_zenoh.profile import (
@@ -71,17 +72,19 @@ def show(
 @profile_app.command("check")
 def check(
     names: Annotated[list[str], typer.Argument(help="Names or paths of profiles.", metavar="NAME")],
+    host: HostOption = None,
 ) -> None:
     """Check profiles: every fault with file and line, then what is worth a second look.
 
-    The robot's description has to have the joints and links that a profile names. Exits with 1
-    when one of them is wrong. Advice alone leaves the exit code at 0.
+    The robot's description has to have the joints and links that a profile names. On the host that
+    runs the command node it has to be there with its meshes: say which host this is with --host,
+    where there are several. Exits with 1 when a profile is wrong; advice leaves the exit code at 0.
     """
     wrong = False
     for name in names:
         try:
             profile = load_profile(name)
-            hints = [*advice(profile), *_arm(profile, name)]
+            hints = [*advice(profile), *_arm(profile, name, host)]
         except ProfileError as error:
             wrong = True
             for line in str(error).splitlines():
@@ -94,17 +97,23 @@ def check(
         raise typer.Exit(1)
 
 
-def _arm(profile: Profile, name: str) -> list[str]:
-    """Builds the arm as the command node does; gives advice where this computer cannot.
+def _arm(profile: Profile, name: str, host: str | None) -> list[str]:
+    """Builds the arm as the command node does; gives advice where this computer need not.
 
     Raises:
-        ProfileError: its description does not have what the profile names, or cannot be read.
+        ProfileError: its description does not have what the profile names, or cannot be read; or
+            it is not here, nor are its meshes, and the command node is to run here.
     """
+    commands = _runs_command(profile, name, host)
     try:
         from vla_zenoh.control.arm import make_shadow
 
         make_shadow(profile)
-    except (ResourceError, MissingExtraError) as error:
+    except ResourceError as error:
+        if commands:
+            raise ProfileError(f"{profile_file(name)}: robot.description: {error}") from error
+        return [f"robot.description: {error}"]
+    except MissingExtraError as error:
         return [f"robot.description: {error}"]
     except ImportError as error:
         return [f"robot: its joints and links were not looked at: {error}"]
@@ -114,6 +123,22 @@ def _arm(profile: Profile, name: str) -> list[str]:
         what = f"{profile.robot.description!r} cannot be read: {error}"
         raise ProfileError(f"{profile_file(name)}: robot.description: {what}") from error
     return []
+
+
+def _runs_command(profile: Profile, name: str, host: str | None) -> bool:
+    """Whether this computer does, as far as is known which host it is.
+
+    Raises:
+        ProfileError: the profile has no such host.
+    """
+    if host is None:
+        host = next(iter(profile.hosts)) if len(profile.hosts) == 1 else None
+    if host is None:
+        return False
+    if host not in profile.hosts:
+        known = ", ".join(profile.hosts)
+        raise ProfileError(f"{profile_file(name)}: hosts: has no {host!r}, it has: {known}")
+    return "command" in profile.hosts[host].nodes
 
 
 def _row(name: str) -> dict[str, Any]:

@@ -130,11 +130,17 @@ def _load(kinematics: Kinematics) -> Any:
         )
     except (ValueError, RuntimeError) as error:
         raise ResourceError(
-            f"the collision shapes of {urdf.name} cannot be loaded: {error}"
+            f"the collision shapes of {urdf.name} cannot be loaded: {_one_line(error)}. "
+            "package://NAME/... is looked for as NAME/... beside the URDF and in every folder "
+            "above it"
         ) from error
     if geometry.ngeoms == 0:
         raise ResourceError(f"{urdf.name} has no collision shapes; give it some, or do without")
     return geometry
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 def _one_hull_a_link(kinematics: Kinematics) -> Any:
