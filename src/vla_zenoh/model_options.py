@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
 from vla_zenoh.errors import SpecError, WorkerError
+
+SECRET = "api_"
+"""How the name of an option begins that is not to be shown (`api_key`)."""
+
+
+def shown(options: Mapping[str, str]) -> dict[str, str]:
+    """Options as they may be written into a result; what is secret is left out of it."""
+    return {k: "(secret)" if k.startswith(SECRET) else value for k, value in options.items()}
 
 
 def one_of(name: str, value: str, allowed: Sequence[str]) -> str:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from hypothesis import given
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 from vla_zenoh.bench.statistics import wilson_95
 from vla_zenoh.bench.task import BASELINES, Asked, Ended, Plan, Score
 from vla_zenoh.bench.task_sheet import TEXT_HEIGHT, TILE_HEIGHT, TILE_WIDTH, failure_sheet
-from vla_zenoh.cli.bench_task import _varied, _with_bricks
+from vla_zenoh.cli.bench_task import _named, _varied, _with_bricks, task
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.profile import load_profile
 from vla_zenoh.tasks import COLOURS, FAMILIES, Episode, Order, Verdict, brick
@@ -172,6 +175,11 @@ def test_of_pairs_the_other_brick_is_told_apart() -> None:
     assert result["pairs"]["other_brick"]["failures"] == {"wrong_brick": 1}
 
 
+def test_a_result_says_with_which_options_it_was_made_and_keeps_secrets() -> None:
+    made = Score(Plan("m", 0, SEED), "lockstep", "p", options={"file": "a", "api_key": "hush"})
+    assert made.to_dict()["options"] == {"file": "a", "api_key": "(secret)"}
+
+
 def test_the_sheet_shows_the_failures_alone() -> None:
     assert failure_sheet([ended("put")]) is None
     sheet = failure_sheet([ended("put"), *(ended("push", "off_course") for _ in range(4))])
@@ -186,3 +194,40 @@ def test_the_profile_gets_the_scene_the_worker_and_what_is_varied() -> None:
     assert profile.sim.vary == ("lights", "camera")
     assert profile.task.worker == "brick"
     assert [host.workers for host in profile.hosts.values()] == [("brick",)]
+
+
+@pytest.mark.parametrize("own", ["nod.py", "nod/model.py", "nod"])
+def test_a_model_of_ones_own_is_a_worker_of_the_profile_by_its_name(
+    tmp_path: Path, own: str
+) -> None:
+    file = tmp_path / ("nod.py" if own == "nod.py" else "nod/model.py")
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("class Nod: ...\n")
+    name, path = _named(str(tmp_path / own))
+    assert (name, path) == ("nod", str(file))
+    profile = _with_bricks(load_profile("panda_sim"), name, [], path)
+    assert profile.models == {"nod": path}
+    assert profile.task.worker == "nod"
+    assert [host.workers for host in profile.hosts.values()] == [("nod",)]
+
+
+BENCH = typer.Typer()
+BENCH.command()(task)
+
+
+def told(*words: str) -> str:
+    """What the command says before anything runs."""
+    found = CliRunner().invoke(BENCH, [*words, "--episodes", "1"], env={"COLUMNS": "200"})
+    assert found.exit_code != 0
+    return f"{found.output} {found.exception}"
+
+
+@pytest.mark.parametrize("how", [(), ("--lockstep",)])
+def test_what_cannot_run_is_told_before_anything_starts(
+    tmp_path: Path, how: tuple[str, ...]
+) -> None:
+    assert "no model called 'brik'; did you mean 'brick'?" in told("--model", "brik", *how)
+    assert "--set wants name=value" in told("--model", "brick", "--set", "file", *how)
+    (tmp_path / "hold.py").write_text("")
+    said = told("--model", str(tmp_path / "hold.py"), *how)
+    assert "hold is what the others are held against" in said

@@ -11,9 +11,12 @@ import numpy as np
 
 from vla_zenoh.bench.statistics import wilson_95
 from vla_zenoh.errors import ResourceError
+from vla_zenoh.model_options import shown
 from vla_zenoh.tasks import COLOURS, FAMILIES, LIMIT_S, Episode, Verdict, draw_episode, draw_stay
 from vla_zenoh.types import ObjectPoses
 
+SCENE = "bricks"
+"""The scene that has what tasks are about."""
 STAY = "stay"
 NOT_OBEYED, ARM_LOST, NO_STATE = "not_obeyed", "arm_lost", "no_state"
 CHAIN_FAILURES: Mapping[str, str] = {
@@ -177,6 +180,7 @@ class Score:
         ended: the outcomes.
         latency_ms: stage -> ``[p50, p95]``.
         wall_s: how long it all took.
+        options: of the model, in force.
     """
 
     plan: Plan
@@ -186,6 +190,7 @@ class Score:
     ended: list[Ended] = field(default_factory=list)
     latency_ms: dict[str, tuple[float, float]] = field(default_factory=dict)
     wall_s: float = 0.0
+    options: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain types."""
@@ -193,11 +198,14 @@ class Score:
         families = sorted({each.episode.order.family for each in self.ended})
         out: dict[str, Any] = {
             "model": plan.model,
+            "options": shown(self.options),
             "mode": self.mode,
             "profile": self.profile,
+            "scene": SCENE,
             "seed": plan.seed,
             "family": plan.family or "all",
             "held_out": plan.held_out,
+            "prompt": plan.prompt,
             "vary": list(self.vary),
             "delay_ms": plan.delay_ms,
             "rate_hz": plan.rate_hz,

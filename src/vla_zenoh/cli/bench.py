@@ -8,6 +8,7 @@ import typer
 
 from vla_zenoh.cli.bench_codec import codec
 from vla_zenoh.cli.bench_command import command
+from vla_zenoh.cli.bench_compare import compare
 from vla_zenoh.cli.bench_file import JsonFileOption, write_json
 from vla_zenoh.cli.bench_load import load
 from vla_zenoh.cli.bench_motion import motion
@@ -23,6 +24,7 @@ bench_app.command("load")(load)
 bench_app.command("codec")(codec)
 bench_app.command("command")(command)
 bench_app.command("task")(task)
+bench_app.command("compare")(compare)
 bench_app.command("openvla")(openvla)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,14 +15,16 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from vla_zenoh.bench.task import Plan, Score
-from vla_zenoh.cli.bench_file import JsonFileOption, write_json
-from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, model_options
+from vla_zenoh.bench.task import BASELINES, SCENE, Plan, Score
+from vla_zenoh.cli.bench_file import LAST_LINES, JsonFileOption, write_json
+from vla_zenoh.cli.chosen import chosen_worker
+from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile
 from vla_zenoh.cli.output import console, errors
+from vla_zenoh.loader import find_model
 from vla_zenoh.profile import Profile, override
+from vla_zenoh.resources import is_path
 from vla_zenoh.tasks import FAMILIES, LIMIT_S
 
-SCENE = "bricks"
 VARIATIONS = ("lights", "table", "camera", "distractors")
 UNSEEN_SEED = 1_000_000
 """Layouts from here on are for measuring; data for training are made from smaller seeds."""
@@ -29,7 +32,13 @@ UNSEEN_SEED = 1_000_000
 
 def task(
     model: Annotated[
-        str, typer.Option("--model", "-m", help="A worker; or hold, scripted: what gives nothing.")
+        str,
+        typer.Option(
+            "--model",
+            "-m",
+            help="A worker of the profile, name of a model, or path to one; or hold, scripted: "
+            "what gives nothing.",
+        ),
     ],
     episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, max=100_000)] = 30,
     seed: Annotated[
@@ -76,7 +85,7 @@ def task(
         typer.Option("--set", help="Option of the model as name=value; may be repeated."),
     ] = None,
     python: Annotated[
-        str | None, typer.Option("--python", help="Interpreter of the worker's environment.")
+        str | None, typer.Option("--python", help="Interpreter of a prepared environment.")
     ] = None,
     profile: Annotated[
         str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
@@ -92,13 +101,15 @@ def task(
     The judge looks at the true poses of the objects. Tasks come from the scene's layouts: put a
     brick in the box, stack it on another one, push it somewhere.
     """
+    from vla_zenoh.nodes.environment import run_in_own_environment
     from vla_zenoh.nodes.process import stop_on_signals
 
     if family not in (None, "stay", *FAMILIES):
         raise typer.BadParameter(f"--family is one of {', '.join(FAMILIES)}, stay")
     varied = _varied([*(vary or []), *(["camera"] if camera_jitter else [])])
+    named, path = _named(model)
     plan = Plan(
-        model,
+        named,
         episodes,
         seed,
         family=family,
@@ -109,15 +120,19 @@ def task(
         rate_hz=rate_hz,
         delay_ms=delay_ms,
     )
+    loaded = _with_bricks(effective_profile(profile), plan.worker, varied, path)
+    chosen = chosen_worker(loaded, plan.worker, options or [])
+    if lockstep:  # the model is made here; comes back only where that can be done
+        run_in_own_environment(chosen.model, python, extra="sim")
     stop = stop_on_signals()
-    loaded = _with_bricks(effective_profile(profile), plan.worker, varied)
     camera = "front" if "front" in loaded.cameras else next(iter(loaded.cameras), None)
-    score = Score(plan, "lockstep" if lockstep else "real_time", loaded.name, varied)
+    mode = "lockstep" if lockstep else "real_time"
+    score = Score(plan, mode, loaded.name, varied, options=chosen.options)
     began_s = time.monotonic()
     try:
         with _bar(episodes) as advance:
             if lockstep:
-                _lockstep(loaded, profile, score, options or [], camera, stop, processes, advance)
+                _lockstep(loaded, profile, score, camera, stop, processes, advance)
             else:
                 _real_time(loaded, score, options or [], python, camera, stop, out, advance)
     finally:
@@ -137,14 +152,28 @@ def _varied(names: list[str]) -> list[str]:
     return [name for name in VARIATIONS if name in names]
 
 
-def _with_bricks(profile: Profile, worker: str, vary: list[str]) -> Profile:
-    """The profile with the scene of the tasks and the worker in it."""
+def _named(model: str) -> tuple[str, str]:
+    """What a model is called, and where it is if that was given."""
+    if not is_path(model):
+        return model, ""
+    found = find_model(model)
+    if found.name in BASELINES:
+        raise typer.BadParameter(
+            f"--model {model}: {found.name} is what the others are held against; call the file "
+            "otherwise"
+        )
+    return found.name, str(found.path)
+
+
+def _with_bricks(profile: Profile, worker: str, vary: list[str], path: str = "") -> Profile:
+    """The profile with the scene of the tasks and the worker in it, at `path` if it has one."""
     workers = [*dict.fromkeys([worker, *profile.workers])]
     return override(
         profile,
         {
             "sim": {"scene": SCENE, "vary": vary},
             "workers": workers,
+            "models": {worker: path} if path else {},
             "task": {"worker": worker, "prompt": "hold"},
             "hosts": {
                 name: host.model_dump(mode="json", exclude_none=True) | {"workers": [worker]}
@@ -183,7 +212,6 @@ def _lockstep(
     profile: Profile,
     named: str,
     score: Score,
-    options: list[str],
     camera: str | None,
     stop: threading.Event,
     processes: int | None,
@@ -194,7 +222,7 @@ def _lockstep(
     for ended, latency_ms in run_in_lockstep(
         profile,
         score.plan,
-        model_options(options),
+        score.options,
         camera,
         stop,
         processes or os.cpu_count() or 1,
@@ -222,16 +250,17 @@ def _real_time(
     from vla_zenoh.nodes.process import die_with_parent
 
     die_with_parent()
-    model_options(options)  # a slip is told before anything starts
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     plan = score.plan
     arguments = [*(["--delay", f"{plan.delay_ms:g}"] if plan.delay_ms else [])]
     arguments += ["--python", python] if python else []
+    last: deque[str] = deque(maxlen=LAST_LINES)
     with Path(os.devnull if out is None else out / "nodes.log").open("w", encoding="utf-8") as log:
 
         def write(node: str, line: str) -> None:
-            log.write(f"{node:>16} | {line}\n")
+            last.append(f"{node:>16} | {line}")
+            log.write(f"{last[-1]}\n")
             log.flush()
 
         host = Host(
@@ -243,15 +272,18 @@ def _real_time(
             worker_options={plan.worker: options},
             worker_arguments=arguments,
         )
-        with host as running:
-            run = TaskRun(running, plan, stop, camera)
-            try:
+        try:
+            with host as running:
+                run = TaskRun(running, plan, stop, camera)
                 for ended in run.run():
                     score.ended.append(ended)
                     score.latency_ms = run.latency_ms()
                     advance(score)
-            except Interrupted:
-                pass
+        except Interrupted:
+            pass
+        except Exception:
+            errors().print("\n".join(last), style="dim")
+            raise
 
 
 def _write(score: Score, json_file: Path | None, out: Path | None) -> None:

@@ -14,10 +14,11 @@ from rich.text import Text
 from vla_zenoh.check.examine import DEFAULT_RUNS, Examination
 from vla_zenoh.check.finding import Finding, error
 from vla_zenoh.check.report import Report
-from vla_zenoh.cli.options import JsonOption, model_options
+from vla_zenoh.cli.chosen import Chosen, chosen_worker
+from vla_zenoh.cli.options import PROFILE_VARIABLE, JsonOption
 from vla_zenoh.cli.output import console, print_json, styled
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.loader import ModelFile, find_model, make_policy
+from vla_zenoh.loader import make_policy
 from vla_zenoh.nodes.check_bench import CheckBench
 from vla_zenoh.nodes.environment import run_in_own_environment
 from vla_zenoh.profile import Profile, load_profile
@@ -26,14 +27,21 @@ STYLES = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
 
 def check(
-    model: Annotated[str, typer.Argument(help="Name of a model, or path to a file with one.")],
+    model: Annotated[
+        str, typer.Argument(help="A worker of the profile, name of a model, or path to one.")
+    ],
     options: Annotated[
         list[str] | None,
         typer.Option("--set", help="Option of the model as name=value; may be repeated."),
     ] = None,
     profile: Annotated[
         str | None,
-        typer.Option("--profile", "-p", help="Also hold it against this profile."),
+        typer.Option(
+            "--profile",
+            "-p",
+            envvar=PROFILE_VARIABLE,
+            help="Also hold it against this profile, with its options.",
+        ),
     ] = None,
     name: Annotated[
         str | None, typer.Option("--name", help="What the worker is called; the model's name else.")
@@ -65,16 +73,12 @@ def check(
 
     Exits with 0 when nothing is wrong, 1 when something is.
     """
-    found = find_model(model)
     against = load_profile(profile) if profile is not None else None
-    usual = against.options.get(name or found.name, {}) if against is not None else {}
-    chosen = {**usual, **model_options(options or [])}
-    run_in_own_environment(found, python)
+    chosen = chosen_worker(against, model, options or [], name)
+    run_in_own_environment(chosen.model, python)
     with contextlib.redirect_stdout(sys.stderr):  # a model's own words are not the result
         report = _examine(
-            found,
             chosen,
-            name or found.name,
             profile,
             against,
             rate_hz,
@@ -94,9 +98,7 @@ def check(
 
 
 def _examine(
-    found: ModelFile,
-    options: dict[str, str],
-    worker: str,
+    chosen: Chosen,
     named: str | None,
     profile: Profile | None,
     rate_hz: float | None,
@@ -106,12 +108,12 @@ def _examine(
     patience_s: float,
 ) -> Report:
     try:
-        policy = make_policy(found, options, profile=named)
+        policy = make_policy(chosen.model, chosen.options, profile=named)
     except WorkerError as fault:
-        return Report(worker, findings=[error("cannot_be_made", str(fault))])
+        return Report(chosen.name, findings=[error("cannot_be_made", str(fault))])
     return Examination(
         policy,
-        worker,
+        chosen.name,
         CheckBench(patience_s),
         profile=profile,
         rate_hz=rate_hz,

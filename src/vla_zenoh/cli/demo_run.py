@@ -15,7 +15,7 @@ from vla_zenoh.demo.analysis import Outcome, latencies
 from vla_zenoh.demo.plot import plot_run
 from vla_zenoh.demo.segments import Segment
 from vla_zenoh.demo.tables import write_chunks, write_commands, write_poses
-from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.loader import find_worker, make_policy
 from vla_zenoh.nodes.demo import DemoResult, DemoRun
 from vla_zenoh.nodes.listener import Listener
 from vla_zenoh.profile import Profile
@@ -117,8 +117,8 @@ def _write_tables(stage: Stage, run: Run) -> None:
     folder, profile = stage.folder, stage.profile
     write_commands(folder / "commands.csv", run.commands)
     write_poses(folder / "poses.csv", run.poses)
-    spec = make_policy(find_model(profile.task.worker)).spec
     worker = profile.task.worker
+    spec = make_policy(find_worker(worker, profile.models)[1], profile.options.get(worker)).spec
     first = run.first_commands()
     obeyed = {cause.chunk_seq for cause, _ in first if cause.worker == worker}
     chunks = [

@@ -11,7 +11,7 @@ import typer
 import zenoh
 from rich.table import Table
 
-from vla_zenoh.cli.options import effective_profile
+from vla_zenoh.cli.options import PROFILE_VARIABLE, effective_profile
 from vla_zenoh.cli.output import console, errors, print_json, styled
 from vla_zenoh.doctor import Finding, Needs, examine, needs_of
 from vla_zenoh.doctor.access import access
@@ -37,7 +37,10 @@ def try_zenoh(profile: SessionProfile, endpoint: str) -> str:
 
 def doctor(
     profile: Annotated[
-        str | None, typer.Option("--profile", "-p", help="Look for what this profile needs.")
+        str | None,
+        typer.Option(
+            "--profile", "-p", envvar=PROFILE_VARIABLE, help="Look for what this profile needs."
+        ),
     ] = None,
     host: Annotated[
         str | None, typer.Option("--host", help="Only what this host of the profile needs.")

@@ -267,10 +267,21 @@ class Host:
         """
         while not stop.wait(0.1):
             self._end_what_hangs()
-            if not self.supervisor.watch(spare=EXPENDABLE):
-                given_up = self.supervisor.given_up
-                name = given_up.command.name if given_up else "a node"
-                raise NodeError(f"{name} dies again and again; its last lines above say why")
+            self.watch(spare=EXPENDABLE)
+
+    def watch(self, spare: Sequence[str] = ()) -> None:
+        """Start again what died.
+
+        Args:
+            spare: kinds without which the others go on.
+
+        Raises:
+            NodeError: another node dies again and again.
+        """
+        if not self.supervisor.watch(spare=spare):
+            given_up = self.supervisor.given_up
+            name = given_up.command.name if given_up else "a node"
+            raise NodeError(f"{name} dies again and again; its last lines above say why")
 
     def _end_what_hangs(self) -> None:
         if self.client is None:

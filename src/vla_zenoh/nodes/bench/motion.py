@@ -54,11 +54,6 @@ def run_in_real_time(
     """
     assert host.session is not None and host.client is not None
     profile = host.profile
-
-    def watch() -> None:
-        if not host.supervisor.watch():
-            raise NodeError("a node dies again and again; look into nodes.log")
-
     for each in conditions:
         for trial in trials:
             listener = Listener(host.session, profile.keys, profile.task.worker)
@@ -66,7 +61,7 @@ def run_in_real_time(
                 host.client,
                 listener,
                 stop,
-                watch,
+                host.watch,
                 lambda _, done, trial=trial, each=each: progress(trial, each, done),
             )
             run.wait_until_ready()

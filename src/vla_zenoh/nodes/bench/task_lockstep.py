@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,12 +22,12 @@ from numpy.typing import NDArray
 from vla_zenoh.bench.task import ARM_LOST, NOT_OBEYED, SAY_IT_IS_OVER_S, Asked, Ended, Plan
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.control.arm import make_shadow
-from vla_zenoh.errors import NodeError, SpecError
-from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.errors import NodeError, SpecError, VlaZenohError, WorkerError
+from vla_zenoh.loader import find_worker, make_policy
 from vla_zenoh.lockstep import Delays, Lockstep
 from vla_zenoh.nodes.process import die_with_parent
 from vla_zenoh.nodes.sim import build_world
-from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy
+from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.backend import AUTO, choose_backend
 from vla_zenoh.simulation.render import Renderer
@@ -64,7 +65,7 @@ def run_in_lockstep(
         named: name or path of the profile, for a model that takes one.
 
     Raises:
-        NodeError: a process was killed.
+        NodeError: world or model cannot be made or loaded, says why; or a process was killed.
     """
     with ProcessPoolExecutor(
         processes,
@@ -73,18 +74,18 @@ def run_in_lockstep(
         initargs=(profile, plan, dict(options), camera, named),
     ) as pool:
         futures: list[Future[Any]] = [pool.submit(_one, asked) for asked in plan.asked()]
-        for future in futures:
-            while not future.done():
-                if stop.wait(POLL_S):
-                    pool.shutdown(wait=True, cancel_futures=True)
-                    return
-            try:
-                ended = future.result()
-            except BrokenProcessPool as error:
-                raise NodeError(
-                    "a process of the bench was killed; is there enough memory for --processes?"
-                ) from error
-            yield ended
+        try:
+            for future in futures:
+                while not future.done():
+                    if stop.wait(POLL_S):
+                        return
+                yield future.result()
+        except BrokenProcessPool as error:
+            raise NodeError(
+                "a process of the bench was killed; is there enough memory for --processes?"
+            ) from error
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 @dataclass(slots=True)
@@ -130,42 +131,49 @@ class _Loaded:
     def __init__(self, policy: Policy) -> None:
         self.spec: ModelSpec = policy.spec
         self._policy = policy
-        self.refused = ""
         self.took_ms: list[float] = []
-        getattr(policy, "load", lambda: None)()
+        with _told("cannot be loaded"):
+            getattr(policy, "load", lambda: None)()
 
     def reset(self) -> None:
-        getattr(self._policy, "reset", lambda: None)()
+        with _told("cannot be reset"):
+            (reset_of(self._policy) or (lambda: None))()
 
     def infer(self, observation: Observation) -> ActionSteps:
         began_s = time.perf_counter()
-        try:
+        with _told("failed"):
             result = self._policy.infer(observation)
-        except SpecError as error:
-            self.refused = str(error)
-            raise
         self.took_ms.append((time.perf_counter() - began_s) * 1e3)
         return result if isinstance(result, ActionSteps) else ActionSteps(result)
 
 
-_bench: _Bench | None = None
+_bench: _Bench | NodeError | None = None
 
 
 def _begin(
     profile: Profile, plan: Plan, options: dict[str, str], camera: str | None, named: str | None
 ) -> None:
+    """Make what the process keeps. What raises here would end the pool without a word of it."""
     global _bench
     die_with_parent()
-    world = build_world(profile)
-    wanted = profile.sim.renderer
-    renderer = Renderer(
-        profile.sim.scene, world.robot, choose_backend(None if wanted == AUTO else wanted)
-    )
-    policy = _Loaded(make_policy(find_model(plan.worker), options, profile=named))
-    _bench = _Bench(profile, plan, camera, world, renderer, policy)
+    try:
+        world = build_world(profile)
+        wanted = profile.sim.renderer
+        renderer = Renderer(
+            profile.sim.scene, world.robot, choose_backend(None if wanted == AUTO else wanted)
+        )
+        _, model = find_worker(plan.worker, profile.models)
+        policy = _Loaded(make_policy(model, options, profile=named))
+    except Exception as error:
+        # Not as it is: some errors take more than a text, and cannot go from process to process.
+        _bench = NodeError(_in_words(error))
+    else:
+        _bench = _Bench(profile, plan, camera, world, renderer, policy)
 
 
 def _one(asked: Asked) -> tuple[Ended, dict[str, tuple[float, float]]]:
+    if isinstance(_bench, NodeError):
+        raise _bench
     assert _bench is not None
     ended = _episode(_bench, asked)
     p50, p95 = np.percentile(_bench.policy.took_ms or [0.0], (50, 95))
@@ -217,7 +225,7 @@ def _episode(bench: _Bench, asked: Asked) -> Ended:
             if verdict is not None:
                 pictures = None if verdict.success else _pictures(bench, beginning)
                 return Ended.by(verdict, episode, prompt, pictures)
-    except SpecError as error:
+    except (SpecError, WorkerError) as error:
         return Ended(episode, prompt, False, NOT_OBEYED, 0.0, str(error))
 
 
@@ -238,6 +246,21 @@ def _pictures(bench: _Bench, beginning: NDArray[np.uint8] | None) -> tuple[bytes
         return None
     end = bench.draw(bench.camera, bench.world.qpos())
     return encode_jpeg(Image(beginning)), encode_jpeg(Image(end))
+
+
+@contextmanager
+def _told(what: str) -> Iterator[None]:
+    """What a model raises, as a `WorkerError`; what ours say is said already."""
+    try:
+        yield
+    except VlaZenohError as error:
+        raise WorkerError(str(error)) from error
+    except Exception as error:
+        raise WorkerError(f"the model {what}: {_in_words(error)}") from error
+
+
+def _in_words(error: Exception) -> str:
+    return str(error) if isinstance(error, VlaZenohError) else f"{type(error).__name__}: {error}"
 
 
 def _objects(world: World) -> ObjectPoses:
