@@ -13,6 +13,7 @@ from vla_zenoh.cli.profile import profile_app
 from vla_zenoh.control.arm import make_kinematics, make_shadow
 from vla_zenoh.loader import make_robot
 from vla_zenoh.profile import load_profile
+from vla_zenoh.resources import robot_urdf
 from vla_zenoh.types import JointCommand
 
 TEXT = (Path(__file__).parents[2] / "docs" / "robots.md").read_text("utf-8")
@@ -20,6 +21,8 @@ HOME_M = (0.49, 0.11, 0.43)
 TEXT_M = 0.005
 """The text rounds to centimetres."""
 DOWN = -0.999
+MESHES = "package://ur_description/"
+"""How drivers of ROS name the folder of a robot's shapes."""
 
 
 @pytest.fixture
@@ -56,6 +59,24 @@ def test_at_home_its_arm_is_where_the_text_says_and_free_to_move(file: Path) -> 
     margins = make_shadow(profile, kinematics).margins
     assert margins.singular_value > reach.singularity_slow
     assert margins.self_m > reach.collision_slow_m
+
+
+def test_a_description_of_the_robots_own_driver_needs_its_meshes_beside_it(folder: Path) -> None:
+    shipped = robot_urdf(load_profile(str(folder / "ur5.yaml")).robot.description)
+    package = shipped.parents[1]
+    assert package.name == "ur_description"
+    text, changed = re.subn(r"package://[^\"]*?/ur_description/", MESHES, shipped.read_text())
+    assert changed
+    (folder / "ur5e.urdf").write_text(text)
+    (folder / "ur5e.yaml").write_text("extends: ur5\nrobot: {name: ur5e, description: ur5e.urdf}\n")
+    words = ["check", str(folder / "ur5e.yaml")]
+    result = CliRunner().invoke(profile_app, words)
+    assert result.exit_code == 1
+    assert "looked for as NAME/... beside the URDF" in result.stderr
+
+    (folder / "ur_description").symlink_to(package)
+    result = CliRunner().invoke(profile_app, words)
+    assert (result.exit_code, result.stderr) == (0, "")
 
 
 def test_its_own_arm_is_right_and_goes_where_it_is_told_to(folder: Path) -> None:
