@@ -13,13 +13,13 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
+    HostOption,
     JsonOption,
     ProfileOption,
-    client,
-    effective_profile,
 )
 from vla_zenoh.cli.output import console, errors, fail, print_json, printable
 from vla_zenoh.evaluation.trial.folder import TrialFolder
@@ -60,6 +60,7 @@ def trial(
     ] = False,
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Try models on a real arm, where you say whether each episode succeeded.
@@ -67,7 +68,7 @@ def trial(
     Every setup is done by every worker, in an order that you are not told. Enter ends an episode,
     Ctrl-C ends the trial, the arm brakes first; the same command goes on with it.
     """
-    folder = TrialFolder(out)
+    folder, aim = TrialFolder(out), Aim(profile, connect, host)
     if report:
         plan = folder.plan()
         if plan is None:
@@ -76,7 +77,7 @@ def trial(
         _warn_of_peeking(plan, found)
     else:
         asked = {
-            "robot": effective_profile(profile, connect).robot.name,
+            "robot": aim.load().robot.name,
             "workers": None if workers is None else _names(workers),
             "prompt": None if prompt is None else prompt.strip(),
             "setups": _setups(episodes, setups),
@@ -91,7 +92,7 @@ def trial(
                 said = "the last line of trials.jsonl was cut off; its episode is done again"
                 errors().print(said, style="yellow", markup=False)
             if plan.next_due(found) is not None:
-                found = _run(folder, plan, found, profile, connect, yes_setup)
+                found = _run(folder, plan, found, aim, yes_setup)
     result = score(plan, found)
     if as_json:
         print_json(_mapping(plan, result, found))
@@ -144,8 +145,7 @@ def _run(
     folder: TrialFolder,
     plan: Plan,
     found: list[Judged],
-    profile: str,
-    connect: list[str] | None,
+    aim: Aim,
     yes_setup: bool,
 ) -> list[Judged]:
     from vla_zenoh.cli.trial_person import TrialPerson
@@ -154,15 +154,16 @@ def _run(
     from vla_zenoh.nodes.trial import TrialRun
 
     stop = stop_on_signals()
-    # A terminal that is closed must not leave a moving arm behind.
+    # Neither a terminal that is closed nor Ctrl-Z may leave a moving arm behind.
     signal.signal(signal.SIGHUP, lambda *_: stop.set())
+    signal.signal(signal.SIGTSTP, signal.SIG_IGN)
     done = score(plan, found).done
     blind = "; the order is not told" if plan.blind else ""
     said = f"{folder.path}: {plan.prompt!r}, {done} of {plan.episodes} episodes done{blind}"
     errors().print(said, markup=False)
     person = TrialPerson(plan, sys.stdin.fileno(), stop, lays=yes_setup)
     try:
-        with client(profile, connect) as robot:
+        with aim.client() as robot:
             return TrialRun(robot, plan, folder, person, stop).run()
     except Interrupted:
         done = score(plan, folder.episodes()).done

@@ -192,7 +192,7 @@ class TrialPerson:
     def tell(self, text: str) -> None:
         """See `vla_zenoh.nodes.trial.Person`."""
         self._calm()
-        self._say(self._plan.hide(text), style="yellow")
+        self._say(text, style="yellow")
 
     def _calm(self) -> None:
         if self._live is not None:

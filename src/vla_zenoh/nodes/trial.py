@@ -35,13 +35,16 @@ STAND_PATIENCE_S = 5.0
 SPEC_PATIENCE_S = 3.0
 """A spec is said once a second, and a recording without it cannot become a dataset."""
 HEAR_PATIENCE_S = 5.0
+LET_GO_S = 0.5
+GRACE_S = 2.0
+"""An episode that goes on for so long after its time is ended by the guard."""
 FURTHER_M = 0.01
 """Where an arm begins may differ by this much before it is told."""
 DOES_NOT_STAND = "the command node does not say that the arm stands; look at `vla-zenoh status`"
 
 
 class Person(Protocol):
-    """Who lays setups and judges. What it says of the robot has the workers' names in it."""
+    """Who lays setups and judges."""
 
     def ask(self, conduct: Conduct) -> str:
         """A line for phase LAY, REPAIR or JUDGE; waits for it.
@@ -97,6 +100,7 @@ class TrialRun:
         self._recorder: Recorder | None = None
         self._number = 0
         self._task: Task | None = None
+        self._guarded = threading.Event()
         self._holds, self._deactivated = 0, False
         self._pose = Latest()
         self._subscriber = client.session.declare_subscriber(
@@ -172,6 +176,8 @@ class TrialRun:
     def _give(self, conduct: Conduct) -> None:
         """Worker, prompt and arm, as any other operator."""
         client, worker = self._client, conduct.due.worker
+        # The task of the last episode may be a little older than the status that it ended.
+        client.wait_for(lambda: client.task is None or not client.task.active, LET_GO_S)
         task = client.task
         if task is not None and task.active:
             conduct.refused(
@@ -196,6 +202,16 @@ class TrialRun:
             conduct.refused(str(error))
             return
         conduct.given(time.monotonic(), began_ns, start_m)
+        self._guarded = threading.Event()
+        threading.Thread(target=self._guard, args=(self._guarded,), daemon=True).start()
+
+    def _guard(self, over: threading.Event) -> None:
+        """Brakes by itself: a terminal that takes no output would hold up everything else."""
+        end_s = time.monotonic() + self._plan.seconds + GRACE_S
+        while not over.wait(LOOK_S):
+            if self._stop.is_set() or time.monotonic() > end_s:
+                self._client.put(self._client.keys.active, "false")
+                return
 
     def _watch(self, conduct: Conduct) -> None:
         conduct.look(self._look(), time.monotonic())
@@ -239,6 +255,7 @@ class TrialRun:
     def _brake(self) -> bool:
         """Deactivate; whether the arm stands."""
         stands = self._client.deactivate(STAND_PATIENCE_S)
+        self._guarded.set()
         if self._recorder is not None:
             self._recorder.stop_listening()
         return stands
