@@ -6,10 +6,11 @@ import json
 from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import RecordError, RecordingError
@@ -284,11 +285,10 @@ def test_a_trial_is_gone_on_with_where_it_was_broken_off(tmp_path: Path) -> None
     assert again.next_number(again.episodes()) == 8
 
 
+@settings(max_examples=20)  # each of them waits for the disk
 @given(st.integers(1, 400))
 def test_a_line_that_was_cut_off_is_as_if_it_had_never_been_written(cut: int) -> None:
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as name:
+    with TemporaryDirectory() as name:
         trial = begun(Path(name))
         first, second = judged(1, "a"), judged(1, "b", note="x" * 200)
         trial.append(first)
