@@ -13,15 +13,17 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
+    HostOption,
     JsonOption,
     ProfileOption,
-    client,
+    RobotOption,
 )
 from vla_zenoh.cli.output import console, fail, print_json, styled
-from vla_zenoh.nodes.client import Client
+from vla_zenoh.nodes.client import LEFT_OUT, Client
 from vla_zenoh.printable import one_line
 from vla_zenoh.types import Event, Header, NodeStatus
 
@@ -59,21 +61,24 @@ STYLES = {
 def status(
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
     as_json: JsonOption = False,
     once: Annotated[bool, typer.Option("--once", help="Print the table once and end.")] = False,
 ) -> None:
     """Show every node: state, rates, ages, latencies, counters, and what happened last."""
-    with client(profile, connect) as robot:
+    aim = Aim(profile, connect, host, robot)
+    with aim.client() as client:
         if as_json or once or not console().is_terminal:
             time.sleep(LISTEN_S)
             if as_json:
-                print_json(_plain(robot))
+                print_json(_plain(client))
             else:
-                console().print(_now(robot, robot.take_events()))
-            if not robot.statuses:
-                fail(f"no node of robot {robot.keys.robot!r} says anything")
+                console().print(_now(client, client.take_events()))
+            if not client.snapshot():
+                fail(aim.silent(client, "status"))
             return
-        _live(robot)
+        _live(client)
 
 
 def _live(robot: Client) -> None:
@@ -93,8 +98,13 @@ def _plain(robot: Client) -> dict[str, object]:
 
 
 def _now(robot: Client, events: Sequence[tuple[str, Header, Event]]) -> Group:
-    insecure = robot.profile.session.insecure
-    return picture(robot.keys.robot, robot.snapshot(), events, insecure=insecure)
+    return picture(
+        robot.keys.robot,
+        robot.snapshot(),
+        events,
+        insecure=robot.profile.session.insecure,
+        left_out=robot.left_out,
+    )
 
 
 def picture(
@@ -103,6 +113,7 @@ def picture(
     events: Sequence[tuple[str, Header, Event]],
     *,
     insecure: bool = False,
+    left_out: int = 0,
 ) -> Group:
     """What a person sees. Warnings stand first: no table can push them from the screen.
 
@@ -111,6 +122,7 @@ def picture(
         nodes: what each said of itself. A node is who its key says it is.
         events: oldest first.
         insecure: the profile says that strangers may command the robot.
+        left_out: statuses of strangers that were not kept.
     """
     table = Table(header_style="bold", title=f"robot {robot}", title_justify="left")
     for column in ("node", "state", "age", "rate", "refused", "what it says"):
@@ -128,6 +140,9 @@ def picture(
     lines = [_latency(name, found) for name, (found, _, _) in nodes.items()]
     news = [_event(*happened) for happened in events[-MAX_EVENTS:]]
     warnings = _open_to_all(nodes, insecure=insecure)
+    warnings += _ending(nodes)
+    if left_out:
+        warnings.append(styled(f"{left_out} {LEFT_OUT}", "yellow"))
     return Group(*warnings, table, *(line for line in lines if line), *news)
 
 
@@ -148,6 +163,28 @@ def _open_to_all(nodes: Heard, *, insecure: bool) -> list[Text]:
     words = "insecure: everybody on the network can command this robot"
     more = f" ({one_line(where, MAX_WORDS)})" if where else ""
     return [styled(f"{words}{more}", "bold red")]
+
+
+def _ending(nodes: Heard) -> list[Text]:
+    """What routers say of certificates that are of no use, or soon are."""
+    out: list[Text] = []
+    for name, (found, _, _) in nodes.items():
+        said = found.detail.get("certificates")
+        wrong = said.get("wrong") if isinstance(said, dict) else None
+        if isinstance(wrong, (list, tuple)) and wrong:
+            words = f"{name} on {found.host}: {'; '.join(map(str, wrong))}"
+            out.append(styled(one_line(words, MAX_WORDS), "bold yellow"))
+    return out
+
+
+def _days_left(said: object) -> str:
+    """Of a router's certificates."""
+    if not isinstance(said, dict):
+        return ""
+    days, unknown = said.get("days"), said.get("unknown")
+    if isinstance(days, (int, float)):
+        return f"certificates last {days:g} days"
+    return one_line(unknown, MAX_WORDS) if isinstance(unknown, str) else ""
 
 
 def _latency(name: str, found: NodeStatus) -> Text | None:
@@ -191,7 +228,7 @@ def _word(name: str, found: NodeStatus) -> str:
     word = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
     if not word and "obeyed" in detail:
         return "obeyed" if detail["obeyed"] else "in the shadow"
-    return one_line(word, MAX_WORDS)
+    return one_line(word or _days_left(detail.get("certificates")), MAX_WORDS)
 
 
 def _event(node: str, header: Header, event: Event) -> Text:

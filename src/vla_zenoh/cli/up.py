@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import threading
 import zlib
 from typing import Annotated
 
 import typer
 
+from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     PROFILE_VARIABLE,
@@ -19,11 +19,10 @@ from vla_zenoh.cli.options import (
     effective_profile,
 )
 from vla_zenoh.cli.output import console, styled
-from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.nodes.launch import Host
 from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
-from vla_zenoh.profile import Profile
-from vla_zenoh.security.store import Store
+from vla_zenoh.profile import load_profile, profile_file
+from vla_zenoh.resources import is_path
 
 COLOURS = ("cyan", "magenta", "green", "yellow", "blue", "bright_cyan", "bright_magenta")
 
@@ -61,20 +60,16 @@ def up(
         tell("up", f"profile {loaded.name}, host {running.host}, router at {where}")
         if dry_run:
             tell("up", "dry run: the robot is commanded nothing")
-        for sentence in _soon(running.profile, running.host):
-            tell("up", sentence)
-        tell("up", "look: vla-zenoh status; drive: vla-zenoh prompt/activate; end: Ctrl-C")
+        aim = _aim(profile, running)
+        look, drive, end = (aim.typed(word) for word in ("status", "activate", "stop"))
+        tell("up", f"look: {look}; drive: {drive}, likewise prompt; stop: {end}; end: Ctrl-C")
         running.serve(stop)
         tell("up", "braking the arm, then ending every node")
     tell("up", "all nodes have ended")
 
 
-def _soon(profile: Profile, host: str) -> list[str]:
-    """What is to be done soon about the certificates of this host."""
-    if profile.session.security is None:
-        return []
-    try:
-        entries = Store(profile.session.security.folder).entries(dt.datetime.now(dt.UTC), host)
-    except MissingExtraError:
-        return []  # a host that only uses certificates need not be able to read them
-    return [f"certificate {entry.path} {entry.warning}" for entry in entries if entry.warning]
+def _aim(profile: str, running: Host) -> Aim:
+    """What leads other commands to this robot, from any folder and terminal of this computer."""
+    there = running.profile.session.connect
+    name = str(profile_file(profile)) if is_path(profile) else profile
+    return Aim(name, None if there == load_profile(profile).session.connect else there)

@@ -74,11 +74,10 @@ def certificates(host: str, entries: Sequence[Entry]) -> Finding:
     if not entries:
         return Finding(name, "fail", "there are none", f"vla-zenoh secure add {host}")
     faults = [f"{entry.path.name} {fault}" for entry in entries for fault in entry.faults]
-    if faults:
-        return Finding(
-            name, "fail", "; ".join(faults), f"vla-zenoh secure add {host} --renew, and copy them"
-        )
     soon = [f"{entry.path.name} {entry.warning}" for entry in entries if entry.warning]
+    if faults:
+        said = "; ".join((*faults, *soon))
+        return Finding(name, "fail", said, f"vla-zenoh secure add {host} --renew, and copy them")
     if soon:
         return Finding(name, "warn", "; ".join(soon), f"vla-zenoh secure add {host} --renew")
     end = min(entry.certificate.not_after for entry in entries if entry.certificate)

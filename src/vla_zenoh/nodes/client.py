@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import zenoh
@@ -14,13 +15,23 @@ import zenoh
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.keys import Kind, last
+from vla_zenoh.nodes.attendance import MAX_STATUS_BYTES, Attendance
 from vla_zenoh.nodes.bounded import bytes_of, header_of
 from vla_zenoh.nodes.session import QOS
 from vla_zenoh.profile import Profile
+from vla_zenoh.security.identity import identities
 from vla_zenoh.types import Event, Header, NodeStatus, Task
 
 Value = TypeVar("Value")
 POLL_S = 0.02
+MAX_EVENTS, MAX_REFUSALS = 4096, 256
+MAX_EVENT_BYTES = 64 * 1024
+MAX_WHAT, MAX_WHY = 128, 1000
+"""Characters of an event that are kept; nodes of ours write no more."""
+LEFT_OUT = (
+    "statuses or tokens left out, of more names than are kept or too large: somebody who is no "
+    "node of ours writes them"
+)
 
 
 class Client:
@@ -34,12 +45,11 @@ class Client:
     def __init__(self, profile: Profile, session: zenoh.Session) -> None:
         self.profile, self.session, self.keys = profile, session, profile.keys
         self._lock = threading.Lock()
-        self.statuses: dict[str, tuple[NodeStatus, float]] = {}
-        self.alive: set[str] = set()
-        self.events: deque[tuple[str, Header, Event]] = deque(maxlen=4096)
+        self._nodes = Attendance(one.node for one in identities(profile))
+        self.events: deque[tuple[str, Header, Event]] = deque(maxlen=MAX_EVENTS)
         self.task: Task | None = None
         self._task_heard_s = -1e9
-        self._refusals: deque[tuple[float, Event]] = deque(maxlen=256)
+        self._refusals: deque[tuple[float, Event]] = deque(maxlen=MAX_REFUSALS)
         self._subscriptions: list[Any] = []
 
     def follow(self) -> Client:
@@ -63,25 +73,28 @@ class Client:
         )
 
     @staticmethod
-    def _decode(kind: type[Value], sample: zenoh.Sample) -> tuple[Header, Value] | None:
+    def _decode(
+        kind: type[Value], sample: zenoh.Sample, limit: int = records.SMALL_BYTES
+    ) -> tuple[Header, Value] | None:
         try:
-            return header_of(sample), records.decode(kind, bytes_of(sample.payload))
+            return header_of(sample), records.decode(kind, bytes_of(sample.payload, limit))
         except CodecError:
             return None  # a stranger's bytes; the nodes count and tell them
 
     def _on_status(self, sample: zenoh.Sample) -> None:
-        found = self._decode(NodeStatus, sample)
+        found = self._decode(NodeStatus, sample, MAX_STATUS_BYTES)
         if found is not None:
-            with self._lock:
-                self.statuses[last(str(sample.key_expr))] = (found[1], time.monotonic())
+            self._nodes.said(last(str(sample.key_expr)), found[1], len(sample.payload))
 
     def _on_event(self, sample: zenoh.Sample) -> None:
-        found = self._decode(Event, sample)
+        found = self._decode(Event, sample, MAX_EVENT_BYTES)
         if found is not None:
+            header, event = found
+            event = replace(event, what=event.what[:MAX_WHAT], why=event.why[:MAX_WHY])
             with self._lock:
-                self.events.append((last(str(sample.key_expr)), *found))
-                if found[1].kind == "refusal":
-                    self._refusals.append((time.monotonic(), found[1]))
+                self.events.append((last(str(sample.key_expr))[:MAX_WHAT], header, event))
+                if event.kind == "refusal":
+                    self._refusals.append((time.monotonic(), event))
 
     def _on_task(self, sample: zenoh.Sample) -> None:
         found = self._decode(Task, sample)
@@ -91,29 +104,33 @@ class Client:
 
     def _on_alive(self, sample: zenoh.Sample) -> None:
         name = last(str(sample.key_expr))
-        with self._lock:
-            if sample.kind == zenoh.SampleKind.PUT:
-                self.alive.add(name)
-            else:
-                self.alive.discard(name)
-                if name == "command":  # nobody keeps the task any more
-                    self.task = None
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._nodes.came(name)
+            return
+        self._nodes.went(name)
+        if name == "command":  # nobody keeps the task any more
+            with self._lock:
+                self.task = None
 
     # -- reading ------------------------------------------------------------------------------
+    @property
+    def alive(self) -> frozenset[str]:
+        """Names of the nodes that are alive."""
+        return self._nodes.alive
+
+    @property
+    def left_out(self) -> int:
+        """How often strangers' names, or statuses, were not kept for their number or size."""
+        return self._nodes.left_out
+
     def status(self, node: str) -> NodeStatus | None:
         """The newest status of a node, None before the first."""
-        with self._lock:
-            found = self.statuses.get(node)
+        found = self._nodes.status(node)
         return found[0] if found else None
 
     def snapshot(self) -> dict[str, tuple[NodeStatus, float, bool]]:
         """Node -> (status, seconds since it came, alive)."""
-        now = time.monotonic()
-        with self._lock:
-            return {
-                name: (status, now - heard, name in self.alive)
-                for name, (status, heard) in sorted(self.statuses.items())
-            }
+        return self._nodes.snapshot()
 
     def take_events(self) -> list[tuple[str, Header, Event]]:
         """Events since the last call, oldest first."""
@@ -179,8 +196,7 @@ class Client:
 
     def _stands(self, since_s: float) -> bool:
         """By a status that is younger than the order: an older one says nothing about it."""
-        with self._lock:
-            status, heard_s = self.statuses.get("command", (None, 0.0))
+        status, heard_s = self._nodes.status("command") or (None, 0.0)
         return (
             status is not None
             and heard_s > since_s

@@ -16,7 +16,8 @@ import zenoh
 
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import NodeError, ProfileError, SessionError
-from vla_zenoh.nodes.client import Client
+from vla_zenoh.nodes.client import LEFT_OUT, Client
+from vla_zenoh.nodes.expiry import Expiry
 from vla_zenoh.nodes.hang import Said, hanging
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.supervisor import NodeCommand, Supervisor
@@ -29,6 +30,8 @@ EXPENDABLE = ("worker",)
 ROUTER_PATIENCE_S = 10.0
 BRAKE_PATIENCE_S = 1.0
 STOP_BUDGET_S = 2.9
+STRANGERS_PERIOD_S = 600.0
+"""What strangers write is told of no more often."""
 
 
 def choose_host(profile: Profile, host: str | None) -> tuple[str, HostProfile]:
@@ -174,6 +177,8 @@ class Host:
             folder=Path(self._folder.name),
         )
         self._own_router = own_router
+        self._expiry = Expiry(profile.session.security)
+        self._left_out, self._strangers_told_s = 0, -1e9
         self.session: zenoh.Session | None = None
         self.client: Client | None = None
 
@@ -259,6 +264,8 @@ class Host:
     def serve(self, stop: threading.Event) -> None:
         """Watch over the nodes until `stop` is set: what dies or hangs is started again.
 
+        Tells once a day what is wrong with the certificates of this host, or is soon.
+
         A worker that dies again and again is left alone: somebody's broken model must not end the
         robot's nodes beside it.
 
@@ -267,6 +274,9 @@ class Host:
         """
         while not stop.wait(0.1):
             self._end_what_hangs()
+            for sentence in self._expiry.due():
+                self._tell("up", sentence)
+            self._tell_of_strangers()
             self.watch(spare=EXPENDABLE)
 
     def watch(self, spare: Sequence[str] = ()) -> None:
@@ -282,6 +292,13 @@ class Host:
             given_up = self.supervisor.given_up
             name = given_up.command.name if given_up else "a node"
             raise NodeError(f"{name} dies again and again; its last lines above say why")
+
+    def _tell_of_strangers(self) -> None:
+        left_out = self.client.left_out if self.client is not None else 0
+        now_s = time.monotonic()
+        if left_out > self._left_out and now_s - self._strangers_told_s > STRANGERS_PERIOD_S:
+            self._tell("up", f"{left_out} {LEFT_OUT}")
+            self._left_out, self._strangers_told_s = left_out, now_s
 
     def _end_what_hangs(self) -> None:
         if self.client is None:

@@ -7,10 +7,12 @@ import os
 import shutil
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
 
 from vla_zenoh.errors import NodeError
+from vla_zenoh.nodes.expiry import Expiry
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.session import config, open_session
 from vla_zenoh.nodes.sockets import Impatience
@@ -52,11 +54,19 @@ def run_router(
         profile.session, mode="router", connect=links, identity=name, access=access
     ) as session:
         node = Node(name, profile, session)
-        detail = {"listen": list(profile.session.listen), "security": security_of(profile)}
-        impatience = Impatience(profile.session.lease_ms / 1e3)
+        detail: dict[str, Any] = {
+            "listen": list(profile.session.listen),
+            "security": security_of(profile),
+        }
+        impatience, expiry = (
+            Impatience(profile.session.lease_ms / 1e3),
+            Expiry(profile.session.security),
+        )
         while not stop.wait(POLL_S):
             impatience.look()
             links_now = len(list(session.info.links()))
+            if profile.session.security is not None:
+                detail["certificates"] = asdict(expiry.outlook)
             node.report("routing", detail={**detail, "links": links_now})
         node.close()
 

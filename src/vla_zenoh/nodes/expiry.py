@@ -1,0 +1,96 @@
+"""What is wrong with this computer's certificates, and how long they last, while nodes run.
+
+A lab is up for months, and a certificate ends at some night. Zenoh closes the link then, and the
+arm stands.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from vla_zenoh.errors import MissingExtraError, SecurityError
+from vla_zenoh.profile.session import SecurityProfile
+from vla_zenoh.security.store import Store
+
+LOOK_PERIOD_S = 3600.0
+TELL_PERIOD_S = 24 * 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """What a look at the certificates came to.
+
+    Args:
+        days: until the first of them ends, negative when it has; None: not known.
+        wrong: sentences on each that is of no use, or is soon.
+        unknown: why they could not be looked at; empty: they could.
+    """
+
+    days: int | None = None
+    wrong: tuple[str, ...] = ()
+    unknown: str = ""
+
+
+def outlook(security: SecurityProfile, now: dt.datetime) -> Outlook:
+    """Looks at the certificates of this computer.
+
+    Args:
+        security: of the profile; its host says which computer this is.
+        now: UTC.
+    """
+    store = Store(security.folder)
+    try:
+        entries = store.entries(now, store.this_host(security.host))
+    except MissingExtraError as error:  # who only uses certificates need not be able to read them
+        return Outlook(unknown=f"nobody looks here when certificates end: {error}")
+    except SecurityError as error:
+        return Outlook(unknown=str(error))
+    wrong = tuple(
+        f"certificate {entry.path} {what}"
+        for entry in entries
+        for what in (*entry.faults, entry.warning)
+        if what
+    )
+    days = [entry.certificate.days_left(now) for entry in entries if entry.certificate]
+    return Outlook(min(days, default=None), wrong)
+
+
+class Expiry:
+    """Looks once an hour; what is wrong is due when it is new, and once a day.
+
+    Args:
+        security: of the profile; None: there are no certificates, and nothing is wrong with them.
+        clock: seconds that only go up.
+        now: UTC.
+    """
+
+    def __init__(
+        self,
+        security: SecurityProfile | None,
+        clock: Callable[[], float] = time.monotonic,
+        now: Callable[[], dt.datetime] = lambda: dt.datetime.now(dt.UTC),
+    ) -> None:
+        self._security, self._clock, self._now = security, clock, now
+        self._looked_s = self._told_s = -1e9
+        self._outlook = self._told = Outlook()
+
+    @property
+    def outlook(self) -> Outlook:
+        """Not older than an hour."""
+        if self._security is not None and self._clock() - self._looked_s >= LOOK_PERIOD_S:
+            self._looked_s = self._clock()
+            self._outlook = outlook(self._security, self._now())
+        return self._outlook
+
+    def due(self) -> tuple[str, ...]:
+        """Sentences to be told now."""
+        found = self.outlook
+        new = (found.wrong, found.unknown) != (self._told.wrong, self._told.unknown)
+        again = bool(found.wrong) and self._clock() - self._told_s >= TELL_PERIOD_S
+        if not (new or again):
+            return ()
+        self._told, self._told_s = found, self._clock()
+        return (*found.wrong, *([found.unknown] if found.unknown and new else []))
