@@ -71,9 +71,10 @@ def test_the_host_that_was_noted_goes_before_all_others_but_a_viewer_not_for_a_s
     assert people_hosts(lab, stop=True) == ["robot", "desk", "gpu"]
 
 
-def test_who_says_which_host_it_is_is_obeyed(made: Store) -> None:
+def test_who_says_which_host_it_is_is_obeyed_and_can_stop_as_anybody_here(made: Store) -> None:
     lab = profile(made, PEOPLE, host="wall")
-    assert people_hosts(lab) == people_hosts(lab, stop=True) == ["wall"]
+    assert people_hosts(lab) == ["wall"]
+    assert people_hosts(lab, stop=True) == ["desk", "robot", "wall", "gpu"]
 
 
 def test_a_computer_with_one_folder_uses_that_also_when_its_profile_is_an_old_one(

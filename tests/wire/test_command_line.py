@@ -43,10 +43,12 @@ def test_a_session_from_prompt_to_reset(chain: Chain) -> None:
 
     assert "active: worker scripted, prompt 'HARD: go up', 5 Hz" in ok(chain, "activate")
     chain.until("it moves", chain.moves)
-    assert "inactive, the arm stands" in ok(chain, "deactivate")
+    assert "inactive, the arm stands: robot panda" in ok(chain, "deactivate")
     assert not chain.moves()
 
-    assert "stopped; `vla-zenoh reset` clears it" in ok(chain, "stop")
+    named = f"robot panda (profile {chain.profile_file})"
+    how = f"`vla-zenoh reset --profile {chain.profile_file}` clears it"
+    assert f"stopped: {named}; {how}" in ok(chain, "stop")
     refused = run(chain, "activate")
     assert refused.returncode == REFUSED
     assert "the state is stopped (emergency stop); put anything on reset" in refused.stderr

@@ -37,15 +37,15 @@ class Aim:
     host: str | None = None
     robot: str | None = None
 
-    def typed(self, command: str, *, host: str | None = None, robot: str | None = None) -> str:
+    def typed(self, *command: str, host: str | None = None, robot: str | None = None) -> str:
         """The whole of another command that means the same.
 
         Args:
-            command: such as ``status``.
+            command: its words, such as ``status``.
             host: in place of its own.
             robot: likewise.
         """
-        words = ["vla-zenoh", *command.split()]
+        words = ["vla-zenoh", *command]
         if self.profile != DEFAULT_PROFILE or PROFILE_VARIABLE in os.environ:
             words += ["--profile", self.profile]
         for endpoint in self.connect or ():
@@ -89,38 +89,42 @@ class Aim:
             yield Client(profile, session).follow()
 
     @contextmanager
-    def driver(self, command: str) -> Iterator[Client]:
+    def driver(self, *command: str) -> Iterator[Client]:
         """Likewise, to put a setting; an error names the robot and tells of others.
 
         Args:
-            command: what is done, as it is typed.
+            command: what is done, in words as they are typed.
 
         Raises:
             SecurityError: people here may not drive.
             SessionError: what goes wrong in the block, as well.
         """
         with self.client() as client:
-            if why := self.powerless(client.profile, command):
+            if why := self.powerless(client.profile, *command):
                 raise SecurityError(why)
             try:
                 yield client
             except SessionError as error:
                 if "command" in client.alive:
                     raise
-                raise SessionError(self.absent(client, command)) from error
+                raise SessionError(self.absent(client, *command)) from error
 
     # -- words --------------------------------------------------------------------------------
     def named(self, client: Client) -> str:
         """Robot and profile."""
         return f"robot {client.keys.robot} (profile {self.profile})"
 
-    def absent(self, client: Client, command: str) -> str:
+    def absent(self, client: Client, *command: str) -> str:
         """That nobody obeys for this robot, and what to type for those that are there."""
-        return f"no command node of {self.named(client)} is alive. {self.there(client, command)}"
+        return f"no command node of {self.named(client)} is alive. {self.there(client, *command)}"
 
-    def there(self, client: Client, command: str) -> str:
+    def silent(self, client: Client, *command: str) -> str:
+        """That nothing is heard of this robot, and what to type for those that are there."""
+        return f"nothing is heard of {self.named(client)}. {self.there(client, *command)}"
+
+    def there(self, client: Client, *command: str) -> str:
         """Which other robots are alive on this router, with what to type."""
-        others = [self._typed_for(name, command) for name in self.others(client)]
+        others = [f"{name} (`{self.typed(*command, robot=name)}`)" for name in self.others(client)]
         if not others:
             return "Nor is that of any other robot on this router, as far as one may know here"
         return f"Alive on this router: {', '.join(others)}"
@@ -131,7 +135,7 @@ class Aim:
             name for name in robots_alive(client.session, client.keys) if name != client.keys.robot
         ]
 
-    def powerless(self, profile: Profile, command: str) -> str:
+    def powerless(self, profile: Profile, *command: str) -> str:
         """Why people here drive no robot, empty where they may, with what to type if that helps."""
         role = role_here(profile)
         if role is None or role is Role.OPERATOR:
@@ -144,7 +148,7 @@ class Aim:
             if person(profile, host) is Role.OPERATOR
         ]
         what = (
-            f"here lies that of an operator: `{self.typed(command, host=able[0])}`"
+            f"here lies that of an operator: `{self.typed(*command, host=able[0])}`"
             if able
             else "`vla-zenoh secure add HOST --role operator` makes one of somebody who may"
         )
@@ -152,9 +156,6 @@ class Aim:
             f"the certificate of people here is {who}, and the router drops what a {role.value} "
             f"says; {what}"
         )
-
-    def _typed_for(self, robot: str, command: str) -> str:
-        return f"{robot} (`{self.typed(command, robot=robot)}`)"
 
 
 def _with_host(profile: Profile, host: str | None) -> Profile:

@@ -11,12 +11,13 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
+from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
+    HostOption,
     JsonOption,
     ProfileOption,
-    effective_profile,
 )
 from vla_zenoh.cli.output import console, fail, print_json
 from vla_zenoh.control.disagreement import (
@@ -51,6 +52,7 @@ def compare(
     ] = DEFAULT_TOLERANCE_S,
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show how far two workers are apart, of a live run or a recording.
@@ -58,7 +60,7 @@ def compare(
     Both may run in the shadow; one of them may be obeyed. Chunks are paired by the time of their
     observation and carried out in thought from where the arm then was.
     """
-    loaded = effective_profile(profile, connect)
+    loaded = Aim(profile, connect, host).load()
     if recording is not None:
         found = _recorded(recording, loaded, a, b, tolerance_s)
     else:

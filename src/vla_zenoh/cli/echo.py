@@ -11,12 +11,13 @@ import zenoh
 from rich.pretty import pretty_repr
 
 from vla_zenoh.cli import decode
+from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
+    HostOption,
     JsonOption,
     ProfileOption,
-    effective_profile,
 )
 from vla_zenoh.cli.output import console, fail, styled
 from vla_zenoh.codec.image import MAX_PICTURE_BYTES
@@ -33,6 +34,7 @@ def echo(
     ],
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
     count: Annotated[int | None, typer.Option("--count", "-n", help="End after so many.")] = None,
     seconds: Annotated[
         float | None, typer.Option("--seconds", "-s", help="End after so long.")
@@ -40,7 +42,7 @@ def echo(
     as_json: JsonOption = False,
 ) -> None:
     """Print what is written on a key, decoded."""
-    loaded = effective_profile(profile, connect)
+    loaded = Aim(profile, connect, host).load()
     whole = key if key.startswith(f"{loaded.root}/") else f"{loaded.root}/{loaded.robot.name}/{key}"
     inbox, seen = Inbox(256, MAX_PICTURE_BYTES), 0
     with open_session(loaded.session) as session:

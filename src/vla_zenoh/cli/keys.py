@@ -13,12 +13,14 @@ import zenoh
 from rich.table import Table
 
 from vla_zenoh.cli import decode
+from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
+    HostOption,
     JsonOption,
     ProfileOption,
-    client,
+    RobotOption,
 )
 from vla_zenoh.cli.output import console, fail, print_json
 from vla_zenoh.errors import ProfileError
@@ -47,6 +49,8 @@ class Seen:
 def keys(
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
     seconds: Annotated[float, typer.Option("--seconds", "-s", help="How long to listen.")] = 2.0,
     pictures: Annotated[
         bool,
@@ -57,18 +61,20 @@ def keys(
     as_json: JsonOption = False,
 ) -> None:
     """Show which keys exist, who writes them, their type and rate."""
-    with client(profile, connect) as robot:
-        found = _listen(robot, seconds, pictures)
-        found += _settings(robot)
+    aim = Aim(profile, connect, host, robot)
+    with aim.client() as client:
+        found = _listen(client, seconds, pictures)
+        found += _settings(client)
         if not pictures:
-            found += pictures_of(robot.keys, robot.snapshot())
+            found += pictures_of(client.keys, client.snapshot())
+        why = "" if found else aim.silent(client, "keys")
     found.sort(key=lambda seen: seen.key)
     if as_json:
         print_json([asdict(seen) for seen in found])
     else:
         console().print(table(found))
-    if not found:
-        fail("nothing is written; is a robot up? (`vla-zenoh up`)")
+    if why:
+        fail(why)
 
 
 def table(found: Iterable[Seen]) -> Table:

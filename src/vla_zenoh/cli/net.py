@@ -10,7 +10,15 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from vla_zenoh.cli.options import DEFAULT_PROFILE, ConnectOption, JsonOption, ProfileOption, client
+from vla_zenoh.cli.aim import Aim
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    ConnectOption,
+    HostOption,
+    JsonOption,
+    ProfileOption,
+    RobotOption,
+)
 from vla_zenoh.cli.output import console, fail, print_json, styled
 from vla_zenoh.nodes.clock import Clock
 from vla_zenoh.nodes.offsets import Clocks
@@ -72,38 +80,42 @@ class Line:
 def net(
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
     seconds: Annotated[
         float, typer.Option("--seconds", "-s", min=1.0, help="How long to listen.")
     ] = 3.0,
     as_json: JsonOption = False,
 ) -> None:
     """Show every pair of hosts: link, round trip, clock offset; and what each key costs."""
-    with client(profile, connect) as robot:
+    aim = Aim(profile, connect, host, robot)
+    with aim.client() as client:
         clocks = Clocks(
-            robot.session,
-            robot.keys,
+            client.session,
+            client.keys,
             Clock(),
             HERE,
-            robot.profile.timing.max_clock_offset_s,
+            client.profile.timing.max_clock_offset_s,
         )
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
-            for node in tuple(robot.alive):
+            for node in tuple(client.alive):
                 clocks.follow(node)
             clocks.tick()
             time.sleep(POLL_S)
-        statuses = {name: found for name, (found, _, alive) in robot.snapshot().items() if alive}
-        own_links = tuple(sorted(str(link.dst) for link in robot.session.info.links()))
+        statuses = {name: found for name, (found, _, alive) in client.snapshot().items() if alive}
+        own_links = tuple(sorted(str(link.dst) for link in client.session.info.links()))
         pairs = pairs_of(statuses, _own(clocks, statuses, own_links))
         lines = lines_of(statuses)
-    bound_ms = robot.profile.timing.max_clock_offset_s * 1e3
+        why = "" if statuses else aim.silent(client, "net")
+    bound_ms = client.profile.timing.max_clock_offset_s * 1e3
     if as_json:
         print_json({"hosts": pairs, "keys": lines, "max_clock_offset_ms": bound_ms})
     else:
-        for table in tables(robot.keys.robot, pairs, lines, bound_ms):
+        for table in tables(client.keys.robot, pairs, lines, bound_ms):
             console().print(table)
-    if not statuses:
-        fail(f"no node of robot {robot.keys.robot!r} says anything")
+    if why:
+        fail(why)
 
 
 def _own(clocks: Clocks, statuses: Mapping[str, NodeStatus], links: tuple[str, ...]) -> list[Pair]:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
 
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile, load_profile, override
 
 DEFAULT_PROFILE = "panda_sim"
@@ -98,18 +94,6 @@ def effective_profile(
     if listen:
         changes["listen"] = listen
     return override(profile, {"session": changes}) if changes else profile
-
-
-@contextmanager
-def client(profile_name: str, connect: list[str] | None) -> Iterator[Client]:
-    """A connected client that already hears the nodes.
-
-    Raises:
-        SessionError: no router answers.
-    """
-    profile = effective_profile(profile_name, connect)
-    with open_session(profile.session) as session:
-        yield Client(profile, session).follow()
 
 
 def number_list(option: str, text: str, low: float, high: float) -> list[float]:

@@ -8,12 +8,13 @@ from typing import Annotated
 
 import typer
 
+from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
+    HostOption,
     JsonOption,
     ProfileOption,
-    effective_profile,
 )
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.nodes.process import run_node
@@ -40,6 +41,7 @@ def record(
     ] = None,
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
     name: Annotated[
         str, typer.Option("--name", help="Node name; a second recorder needs another one.")
     ] = "recorder",
@@ -52,7 +54,7 @@ def record(
     """
     from vla_zenoh.nodes.recorder import Recorded, Recorder, to_record
 
-    loaded = effective_profile(profile, connect)
+    loaded = Aim(profile, connect, host).load()
     path = out or Path("runs") / time.strftime("record-%Y%m%d-%H%M%S.mcap")
     expressions = to_record(loaded.keys, keys or (), raw=raw)
     done: list[Recorded] = []

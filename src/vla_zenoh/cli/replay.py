@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
+from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
+    HostOption,
     JsonOption,
     ProfileOption,
-    effective_profile,
 )
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.nodes.process import run_node
@@ -38,6 +39,7 @@ def replay(
     ] = None,
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Put a recorded run on keys again, with its own timing.
@@ -50,7 +52,7 @@ def replay(
 
     groups = chosen_groups(only or ())
     run_file = open_recording(file)
-    loaded = effective_profile(profile, connect)
+    loaded = Aim(profile, connect, host).load()
     loaded = as_robot(loaded, robot or run_file.keys.robot)
     _refuse_without_the_right(loaded)
     done: list[Replayed] = []
@@ -86,10 +88,18 @@ def _refuse_without_the_right(profile: Profile) -> None:
     security = profile.session.security
     if security is None:
         return
-    who = Store(security.folder).identity_files(security.host, None).certificate.stem
-    if who != Role.REPLAY.value:
-        fail(
-            f"this computer has the certificate of the role {who}, which may not play the part of "
-            f"others: `vla-zenoh secure add HOST --role {Role.REPLAY.value}` makes one that may, "
-            "for a computer of its own"
-        )
+    store = Store(security.folder)
+    who = store.identity_files(security.host, None).certificate.stem
+    if who == Role.REPLAY.value:
+        return
+    able = [host for host in store.hosts() if store.has(host, Role.REPLAY.value)]
+    how = (
+        f"--host {able[0]} is one that may, and lies here"
+        if able
+        else f"`vla-zenoh secure add HOST --role {Role.REPLAY.value}` makes one that may, for a "
+        "computer of its own"
+    )
+    fail(
+        f"this computer has the certificate of the role {who}, which may not play the part of "
+        f"others: {how}"
+    )

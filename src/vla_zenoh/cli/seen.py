@@ -7,21 +7,24 @@ import time
 from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.live import Live
 from rich.table import Table
 
+from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
+    HostOption,
     ProfileOption,
-    client,
+    RobotOption,
 )
 from vla_zenoh.cli.output import console, errors, fail
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
+from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.seen import SeenListener, Sight
 from vla_zenoh.printable import one_line
 
@@ -51,6 +54,8 @@ def seen(
     ] = False,
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
 ) -> None:
     """Show or save what models see: pictures as they got them, prompt, raw output, final action.
 
@@ -59,8 +64,9 @@ def seen(
     live = console().is_terminal and not as_json
     if not live and seconds is None and count is None:
         count = 1
-    with client(profile, connect) as robot:
-        listener = SeenListener(robot.session, robot.keys, worker)
+    aim = Aim(profile, connect, host, robot)
+    with aim.client() as client:
+        listener = SeenListener(client.session, client.keys, worker)
         began_s = time.monotonic()
         told = 0
         newest: dict[str, Sight] = {}
@@ -82,12 +88,25 @@ def seen(
                     screen.update(table(newest), refresh=True)
                 time.sleep(POLL_S)
         listener.close()
-    if not told:
-        fail(f"{worker or 'no worker'} shows nothing; does it infer? (`vla-zenoh status`)")
+        if not told:
+            _complain(aim, client, worker)
     if not live and not as_json:
         console().print(table(newest))
     if out is not None:
         errors().print(f"{told} inferences in {out}")
+
+
+def _complain(aim: Aim, client: Client, worker: str | None) -> NoReturn:
+    """Ends the command: nobody showed anything."""
+    words = ("seen",) if worker is None else ("seen", worker)
+    if "command" not in client.alive:
+        fail(aim.absent(client, *words))
+    if why := aim.powerless(client.profile, *words):
+        fail(f"what models see is shown to operators: {why}")
+    fail(
+        f"{worker or 'no worker'} of {aim.named(client)} shows nothing; does it infer? "
+        f"(`{aim.typed('status')}`)"
+    )
 
 
 def _plain(sight: Sight) -> dict[str, Any]:

@@ -6,7 +6,14 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import DEFAULT_PROFILE, ConnectOption, ProfileOption, client
+from vla_zenoh.cli.aim import Aim
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    ConnectOption,
+    HostOption,
+    ProfileOption,
+    RobotOption,
+)
 from vla_zenoh.cli.output import console
 
 
@@ -14,8 +21,15 @@ def prompt(
     text: Annotated[str, typer.Argument(help="What the model is asked to do.")],
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
 ) -> None:
     """Put a prompt. The same from any Zenoh client: put the text on <root>/<robot>/prompt."""
-    with client(profile, connect) as robot:
-        task = robot.set_prompt(text)
-        console().print(f"prompt: {task.prompt!r} (worker {task.worker}, {task.rate_hz:g} Hz)")
+    aim = Aim(profile, connect, host, robot)
+    with aim.driver("prompt", text) as client:
+        task = client.set_prompt(text)
+        console().print(
+            f"prompt: {task.prompt!r} (worker {task.worker}, {task.rate_hz:g} Hz), "
+            f"{aim.named(client)}",
+            soft_wrap=True,
+        )

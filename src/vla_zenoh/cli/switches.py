@@ -2,79 +2,187 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import time
+from collections.abc import Callable
+from typing import Annotated, NoReturn
 
 import typer
 
-from vla_zenoh.cli.options import DEFAULT_PROFILE, ConnectOption, ProfileOption, client
-from vla_zenoh.cli.output import console, fail, styled
+from vla_zenoh.cli.aim import Aim
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    ConnectOption,
+    HostOption,
+    ProfileOption,
+    RobotOption,
+)
+from vla_zenoh.cli.output import complain, console, errors, fail, styled
+from vla_zenoh.keys import Keys
+from vla_zenoh.nodes.alive import robots_alive
+from vla_zenoh.nodes.client import Client
+from vla_zenoh.profile import as_robot
 
 STOP_PATIENCE_S = 3.0
+ABSENT_PATIENCE_S = 1.5
+"""So long a command node that lives may take to be seen."""
 
 
-def activate(profile: ProfileOption = DEFAULT_PROFILE, connect: ConnectOption = None) -> None:
+def activate(
+    profile: ProfileOption = DEFAULT_PROFILE,
+    connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
+) -> None:
     """Give the arm to the worker. Refused with every reason while something is not right."""
-    with client(profile, connect) as robot:
-        task = robot.activate()
+    aim = Aim(profile, connect, host, robot)
+    with aim.driver("activate") as client:
+        task = client.activate()
         console().print(
-            f"active: worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz"
+            f"active: worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz, "
+            f"{aim.named(client)}",
+            soft_wrap=True,
         )
 
 
-def deactivate(profile: ProfileOption = DEFAULT_PROFILE, connect: ConnectOption = None) -> None:
+def deactivate(
+    profile: ProfileOption = DEFAULT_PROFILE,
+    connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
+) -> None:
     """Brake, and obey nobody."""
-    with client(profile, connect) as robot:
-        if not robot.deactivate(STOP_PATIENCE_S):
-            fail("the command node does not say that the arm stands; look at `vla-zenoh status`")
-        console().print("inactive, the arm stands")
+    aim = Aim(profile, connect, host, robot)
+    with aim.client(stop=True) as client:
+        if not client.deactivate(STOP_PATIENCE_S):
+            _complain(aim, client, "deactivate", "say that the arm stands")
+        console().print(f"inactive, the arm stands: {aim.named(client)}", soft_wrap=True)
 
 
 def use(
     worker: Annotated[str, typer.Argument(help="Worker whose chunks are to be obeyed.")],
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
 ) -> None:
     """Choose the worker that is obeyed; the others go on beside it."""
-    with client(profile, connect) as robot:
-        task = robot.set_worker(worker)
-        console().print(f"worker: {task.worker}")
+    aim = Aim(profile, connect, host, robot)
+    with aim.driver("use", worker) as client:
+        task = client.set_worker(worker)
+        console().print(f"worker: {task.worker}, {aim.named(client)}", soft_wrap=True)
 
 
 def rate(
     rate_hz: Annotated[float, typer.Argument(help="Chunks per second.")],
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
 ) -> None:
     """Choose how often the workers infer."""
-    with client(profile, connect) as robot:
-        task = robot.set_rate(rate_hz)
-        console().print(f"rate: {task.rate_hz:g} Hz")
+    aim = Aim(profile, connect, host, robot)
+    with aim.driver("rate", f"{rate_hz:g}") as client:
+        task = client.set_rate(rate_hz)
+        console().print(f"rate: {task.rate_hz:g} Hz, {aim.named(client)}", soft_wrap=True)
 
 
-def stop(profile: ProfileOption = DEFAULT_PROFILE, connect: ConnectOption = None) -> None:
+def stop(
+    profile: ProfileOption = DEFAULT_PROFILE,
+    connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
+    every: Annotated[
+        bool, typer.Option("--all", help="Every robot on this router that one may know of.")
+    ] = False,
+) -> None:
     """Emergency stop: brake now, and stay stopped until `vla-zenoh reset`."""
-    with client(profile, connect) as robot:
-        robot.put(robot.keys.stop, "stop")
+    aim = Aim(profile, connect, host, robot)
+    with aim.client(stop=True) as client:
+        client.put(client.keys.stop, "stop")
+        if every:
+            _stop_all(aim, client)
+            return
+        if not _stops(client):
+            _complain(aim, client, "stop", "say that it stopped")
+        _tell_stopped(aim, client, client.profile.robot.name)
+        if others := aim.others(client):
+            more = f"not stopped: {', '.join(others)}; `{aim.typed('stop', '--all')}` stops all"
+            errors().print(styled(more, "yellow"), soft_wrap=True)
 
-        def stopped() -> bool:
-            status = robot.status("command")
-            return status is not None and status.state == "stopped"
 
-        if not robot.wait_for(stopped, STOP_PATIENCE_S):
-            fail("no command node says that it stopped; look at `vla-zenoh status`")
-        console().print(styled("stopped", "bold red"), "`vla-zenoh reset` clears it", sep="; ")
-
-
-def reset(profile: ProfileOption = DEFAULT_PROFILE, connect: ConnectOption = None) -> None:
+def reset(
+    profile: ProfileOption = DEFAULT_PROFILE,
+    connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
+) -> None:
     """Clear an emergency stop or a fault. The arm stays inactive."""
-    with client(profile, connect) as robot:
-        robot.put(robot.keys.reset, "reset")
+    aim = Aim(profile, connect, host, robot)
+    with aim.driver("reset") as client:
+        client.put(client.keys.reset, "reset")
+        if not _heeded(client, lambda: _state(client) not in ("", "stopped", "fault")):
+            status = client.status("command")
+            if status is None or "command" not in client.alive:
+                _complain(aim, client, "reset", "answer")
+            fail(f"not cleared: {status.detail.get('why', '')}: {aim.named(client)}")
+        console().print(f"reset; inactive: {aim.named(client)}", soft_wrap=True)
 
-        def cleared() -> bool:
-            status = robot.status("command")
-            return status is not None and status.state not in ("stopped", "fault")
 
-        if not robot.wait_for(cleared, STOP_PATIENCE_S):
-            status = robot.status("command")
-            fail(f"not cleared: {status.detail.get('why', '') if status else 'no command node'}")
-        console().print("reset; inactive")
+def _state(client: Client) -> str:
+    status = client.status("command")
+    return status.state if status is not None else ""
+
+
+def _stops(client: Client) -> bool:
+    return _heeded(client, lambda: _state(client) == "stopped")
+
+
+def _heeded(client: Client, done: Callable[[], bool]) -> bool:
+    """Whether the command node did it; gives up sooner where there is none."""
+    absent_s = time.monotonic() + ABSENT_PATIENCE_S
+
+    def settled() -> bool:
+        return done() or ("command" not in client.alive and time.monotonic() > absent_s)
+
+    client.wait_for(settled, STOP_PATIENCE_S)
+    return done()
+
+
+def _complain(aim: Aim, client: Client, command: str, what: str) -> NoReturn:
+    """Ends the command: the command node did not do `what`."""
+    if why := aim.powerless(client.profile, command):
+        fail(f"{aim.named(client)} does not {what}: {why}")
+    if "command" not in client.alive:
+        fail(aim.absent(client, command))
+    fail(
+        f"the command node of {aim.named(client)} does not {what}; look at `{aim.typed('status')}`"
+    )
+
+
+def _stop_all(aim: Aim, own: Client) -> None:
+    robots = robots_alive(own.session, own.keys)
+    for robot in robots:
+        own.put(Keys(robot, own.keys.root).stop, "stop")
+    if not robots:
+        why = aim.powerless(own.profile, "stop")
+        fail(f"no robot on this router is alive, as far as one may know here. {why}".rstrip(". "))
+    clients = [Client(as_robot(own.profile, robot), own.session).follow() for robot in robots]
+    done = [_stops(client) for client in clients]
+    for client, stopped in zip(clients, done, strict=True):
+        if stopped:
+            _tell_stopped(aim, client, own.keys.robot)
+        else:
+            complain(f"{aim.named(client)} does not say that it stopped")
+    if not all(done):
+        fail(aim.powerless(own.profile, "stop", "--all") or "not every robot has stopped")
+
+
+def _tell_stopped(aim: Aim, client: Client, meant: str) -> None:
+    robot = client.keys.robot
+    how = aim.typed("reset", robot=None if robot == meant else robot)
+    console().print(
+        styled("stopped", "bold red"),
+        f": {aim.named(client)}; `{how}` clears it",
+        sep="",
+        soft_wrap=True,
+    )

@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import typer
 import zenoh
 
-from vla_zenoh.cli.options import DEFAULT_PROFILE, ConnectOption, ProfileOption, effective_profile
+from vla_zenoh.cli.aim import Aim
+from vla_zenoh.cli.options import DEFAULT_PROFILE, ConnectOption, HostOption, ProfileOption
 from vla_zenoh.cli.output import errors
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import SecurityError
@@ -28,6 +29,7 @@ def teleop(
     speed: Annotated[int, typer.Option("--speed", min=1, max=5, help="Level at first.")] = 3,
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
     name: Annotated[str, typer.Option("--name", help="What the worker is called.")] = "teleop",
 ) -> None:
     """Drive the arm by hand: a worker like any other, whose model is you.
@@ -38,7 +40,7 @@ def teleop(
     from vla_zenoh.nodes.teleop.node import Teleop
     from vla_zenoh.nodes.teleop.sticks import DEVICES
 
-    loaded = effective_profile(profile, connect)
+    loaded = Aim(profile, connect, host).load()
     with ExitStack() as stack:
         stick = DEVICES[device]() if device in DEVICES else None
         if stick is not None:

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
+    HostOption,
     ProfileOption,
-    effective_profile,
 )
 from vla_zenoh.cli.output import errors, fail
 from vla_zenoh.errors import MissingExtraError, ProfileError, RecordingError
@@ -59,6 +60,7 @@ def view(
     ] = PAGE_PORT,
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
+    host: HostOption = None,
 ) -> None:
     """Look at a robot and its model in Rerun, live or from a recording.
 
@@ -70,7 +72,7 @@ def view(
     except ImportError as error:
         raise MissingExtraError("rerun", "view") from error
     if file is None:
-        _live(effective_profile(profile, connect), serve, save, seconds, bind, port)
+        _live(Aim(profile, connect, host).load(), serve, save, seconds, bind, port)
     else:
         _recorded(file, profile, serve, save, bind, port)
 
@@ -137,7 +139,7 @@ def _profile_of(file: RunFile, name: str) -> Profile:
     except ProfileError as error:
         why = f"{error}; --profile {name} says what the robot looks like"
         errors().print(why, style="yellow")
-        return effective_profile(name)
+        return Aim(name).load()
 
 
 @contextmanager

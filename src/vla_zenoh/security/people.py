@@ -25,16 +25,16 @@ def people_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
 
     Returns:
         This computer's own host first where it is known, then operators before viewers, in the
-        order of the profile. Only that which ``session.security.host`` names, if it names one.
-        Empty where nobody's certificate for people lies here.
+        order of the profile. But for a stop, only that which ``session.security.host`` names, if it
+        names one. Empty where nobody's certificate for people lies here.
     """
     security = profile.session.security
     if security is None:
         return []
-    if security.host is not None:
+    if security.host is not None and not stop:
         return [security.host]
     store = Store(security.folder)
-    own = store.known_host()
+    own = security.host or store.known_host()
     ranks: dict[str, int] = {}
     for host in dict.fromkeys([*security.people, *profile.hosts]):
         role = person(profile, host)
