@@ -20,6 +20,7 @@ from vla_zenoh.cli.options import (
     HostOption,
     JsonOption,
     ProfileOption,
+    RobotOption,
 )
 from vla_zenoh.cli.output import console, errors, fail, print_json, printable
 from vla_zenoh.evaluation.trial.folder import TrialFolder
@@ -61,6 +62,7 @@ def trial(
     profile: ProfileOption = DEFAULT_PROFILE,
     connect: ConnectOption = None,
     host: HostOption = None,
+    robot: RobotOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Try models on a real arm, where you say whether each episode succeeded.
@@ -68,7 +70,7 @@ def trial(
     Every setup is done by every worker, in an order that you are not told. Enter ends an episode,
     Ctrl-C ends the trial, the arm brakes first; the same command goes on with it.
     """
-    folder, aim = TrialFolder(out), Aim(profile, connect, host)
+    folder, aim = TrialFolder(out), Aim(profile, connect, host, robot)
     if report:
         plan = folder.plan()
         if plan is None:
@@ -163,8 +165,8 @@ def _run(
     errors().print(said, markup=False)
     person = TrialPerson(plan, sys.stdin.fileno(), stop, lays=yes_setup)
     try:
-        with aim.client() as robot:
-            return TrialRun(robot, plan, folder, person, stop).run()
+        with aim.driver("trial", "--out", str(folder.path)) as client:
+            return TrialRun(client, plan, folder, person, stop).run()
     except Interrupted:
         done = score(plan, folder.episodes()).done
         errors().print(f"{done} of {plan.episodes} done; the same command goes on", markup=False)
