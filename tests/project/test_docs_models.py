@@ -92,6 +92,20 @@ def test_the_model_passes_the_check(model: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_the_model_with_weights_says_what_it_needs_and_which_options_it_takes(
+    tmp_path: Path,
+) -> None:
+    model = find_model(str(written(tmp_path, "reach.py", 1)))
+    assert [one.partition("=")[0] for one in model.dependencies] == ["numpy", "torch"]
+    tree = ast.parse(model.path.read_text())
+    (reach,) = [
+        part for part in tree.body if isinstance(part, ast.ClassDef) and part.name == "Reach"
+    ]
+    makers = {part.name: part for part in reach.body if isinstance(part, ast.FunctionDef)}
+    assert [one.arg for one in makers["__init__"].args.args] == ["self", "checkpoint", "device"]
+    assert {"load", "infer"} < set(makers)
+
+
 def test_every_preset_and_option_is_told() -> None:
     for presets in (OPENPI, GROOT, OPENVLA_REST, ORIGAMI):
         for preset in presets:
@@ -107,6 +121,8 @@ def test_its_profiles_are_right_and_each_host_knows_what_it_runs(tmp_path: Path)
     profiles = {name: load_profile(str(tmp_path / name)) for _, name in blocks}
     openvla = profiles["openvla.yaml"]
     assert openvla.options["openvla"]["unnorm_key"] == "bridge_orig"
+    assert profiles["lift.yaml"].models["lift"] == str(tmp_path / "lift.py")
+    assert profiles["reach.yaml"].models["reach"] == str(tmp_path / "reach.py")
     left, right = profiles["left.yaml"], profiles["right.yaml"]
     assert left.serves == right.serves
     assert left.session.connect == left.session.listen
@@ -151,7 +167,7 @@ def test_the_adapter_asks_its_server_and_finds_it_again(tmp_path: Path) -> None:
     with socketserver.TCPServer(("127.0.0.1", 0), Up) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         options = {"port": str(server.server_address[1])}
-        policy: Any = make_policy(find_model(str(written(tmp_path, "lines.py", 1))), options)
+        policy: Any = make_policy(find_model(str(written(tmp_path, "lines.py", 2))), options)
 
         def asked(prompt: str) -> Any:
             return policy.infer(example_observation(policy.spec, prompt=prompt)).steps
