@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import NoReturn
 
 PROGRAM = "zenoh-bridge-ros2dds"
 PLUGIN = "zenoh-plugin-ros2dds"
@@ -72,7 +73,7 @@ def say(message: str) -> None:
     print("ros2-bridge: " + message, flush=True)
 
 
-def fail(message: str) -> None:
+def fail(message: str) -> NoReturn:
     """Ends the program with a message for people."""
     sys.exit("ros2-bridge: " + message)
 
@@ -118,8 +119,15 @@ def build() -> Path:
 
 
 def main() -> None:
-    """Build unless there is one, and print its path; ``--packages``: what Debian lacks for it."""
+    """Build unless there is one, and say where it is.
+
+    ``--path``: print the path of the one that is there, alone. ``--packages``: what Debian lacks
+    for building one.
+    """
     found = find_bridge()
+    if sys.argv[1:] == ["--path"]:
+        print(found or fail(f"there is no {PROGRAM} here: make ros2-bridge"))
+        return
     if sys.argv[1:] == ["--packages"]:
         print("" if found else " ".join(missing().values()))
         return

@@ -38,6 +38,9 @@ def test_a_bridge_on_path_is_taken(tmp_path: Path) -> None:
     assert done.returncode == 0
     assert done.stdout == f"ros2-bridge: the bridge is {program}\n"
     assert run_script("--packages", PATH=str(tmp_path)).stdout.strip() == ""
+    assert run_script("--path", PATH=str(tmp_path)).stdout == f"{program}\n"
+    lacking = run_script("--path", PATH="", XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert (lacking.returncode, lacking.stdout) == (1, "")
 
 
 def test_what_is_missing_for_building_is_named_with_its_debian_package(tmp_path: Path) -> None:

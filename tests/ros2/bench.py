@@ -29,7 +29,7 @@ import zenoh
 # Run as a program, and not by pytest, which knows where the rest of the tests' own code is.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from bridge import Bridge, load_script
+from bridge import Bridge, generated, load_script
 from camera_rig import free_endpoint
 from chain import Chain, running_chain
 from panda_robot import CAMERAS, DESIRED_POSE
@@ -56,6 +56,7 @@ PROFILE = """\
 extends: panda_ros2
 cameras: {{front: {{rate_hz: 200}}, wrist: null}}
 ros2:
+  domain: {domain}
   cameras: {{wrist: null}}
   pose_command: {{topic: {poses}, type: geometry_msgs/msg/PoseStamped}}
 task: {{prompt: hold, rate_hz: 100, worker: scripted}}
@@ -204,8 +205,8 @@ def lab() -> Iterator[tuple[Camera, RosNode, Bridge, Chain]]:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-ros2-")))
         profile = folder / "bench_ros2.yaml"
-        profile.write_text(PROFILE.format(endpoint=endpoint, poses=POSES))
-        bridge = Bridge(program, folder, domain, connect=endpoint).start()
+        profile.write_text(PROFILE.format(endpoint=endpoint, poses=POSES, domain=domain))
+        bridge = Bridge(program, folder, generated(profile, beside=True)).start()
         stack.callback(bridge.kill)
         robot = Robot(domain, "--no-cameras")
         stack.callback(robot.end)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
 import subprocess
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
-import zenoh
 from ros_node import LOOPBACK_XML
+
+from vla_zenoh.interop.ros2.bridge import bridge_config, bridge_text
+from vla_zenoh.profile import load_profile
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -28,49 +28,35 @@ def load_script() -> ModuleType:
     return module
 
 
+def generated(profile_file: Path, *, beside: bool = False, all_names: bool = False) -> str:
+    """The bridge's settings as ``vla-zenoh ros2 bridge-config`` gives them.
+
+    Args:
+        profile_file: of a profile whose bridge is reached without certificates.
+        beside: the bridge is a client of our router.
+        all_names: without the list of what is let through, for tests of the bridge itself.
+    """
+    profile = load_profile(str(profile_file))
+    config = bridge_config(profile, beside=beside)
+    if all_names:
+        del config["plugins"]["ros2dds"]["allow"]
+    return bridge_text(profile, config)
+
+
 class Bridge:
-    """The bridge between a DDS domain and a Zenoh router.
+    """The bridge between a DDS domain and Zenoh.
 
     Args:
         program: the bridge.
         folder: for its settings and what it says.
-        domain: ROS domain id.
-        connect: the router; None: it is the router itself and listens at `listen`.
-        listen: its own address as a router.
-        settings: a file whose section for the plugin it takes; None: the plugin's own.
+        settings: text of its configuration.
     """
 
-    def __init__(
-        self,
-        program: Path,
-        folder: Path,
-        domain: int,
-        *,
-        connect: str | None = None,
-        listen: str | None = None,
-        settings: Path | None = None,
-    ) -> None:
+    def __init__(self, program: Path, folder: Path, settings: str) -> None:
         self._program = program
         self._settings = folder / "bridge.json5"
+        self._settings.write_text(settings)
         self.log = folder / "bridge.log"
-        plugin: dict[str, Any] = {}
-        if settings is not None:
-            plugin = json.loads(zenoh.Config.from_file(str(settings)).get_json("plugins/ros2dds"))
-        plugin |= {"domain": domain, "ros_automatic_discovery_range": "LOCALHOST"}
-        config: dict[str, Any] = {
-            "mode": "router" if connect is None else "client",
-            "listen": {"endpoints": [listen] if listen else []},
-            "connect": {"endpoints": [connect] if connect else []},
-            "scouting": {"multicast": {"enabled": False}},
-            "plugins": {"ros2dds": plugin},
-        }
-        if connect is not None:
-            config["connect"] |= {
-                "timeout_ms": -1,
-                "exit_on_failure": False,
-                "retry": {"period_init_ms": 100, "period_max_ms": 500},
-            }
-        self._settings.write_text(json.dumps(config))
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> Bridge:
@@ -78,6 +64,7 @@ class Bridge:
         environment = {
             **os.environ,
             "CYCLONEDDS_URI": LOOPBACK_XML,
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "ROS_DISTRO": "jazzy",
             "RUST_LOG": os.environ.get("RUST_LOG", "info"),
         }

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from bridge import Bridge
+from bridge import Bridge, generated
 from camera_rig import free_endpoint
 from chain import Chain, running_chain
 from ros_node import free_domain
@@ -35,6 +35,7 @@ session:
   listen: ["{endpoint}"]
   connect: ["{endpoint}"]
 ros2:
+  domain: {domain}
   cameras: {{wrist: null}}
 """
 APART = """\
@@ -154,7 +155,6 @@ def running_lab(
     topology: Topology = "beside",
     state_hz: int = STATE_HZ,
     watch_goals: bool = True,
-    bridge_settings: Path | None = None,
 ) -> Iterator[Lab]:
     """Everything up while the block lasts.
 
@@ -165,20 +165,20 @@ def running_lab(
             our nodes are clients of the bridge, which is a router when it is started as it comes;
             ``apart``: it is one, but only the node ``ros2`` speaks to it, and we have our own.
         state_hz: rate of the robot's joint states.
-        bridge_settings: file of the bridge's settings for ROS.
         watch_goals: the witness listens to what the robot is told, too.
     """
     domain, ours = free_domain(), free_endpoint()
     theirs = free_endpoint() if topology == "apart" else ours
     profile = folder / "ros2_lab.yaml"
-    text = PROFILE.format(width=WIDTH, height=HEIGHT, camera_hz=CAMERA_HZ, endpoint=ours)
+    sizes = {"width": WIDTH, "height": HEIGHT, "camera_hz": CAMERA_HZ}
+    text = PROFILE.format(**sizes, endpoint=ours, domain=domain)
     if topology == "apart":
         text += APART.format(endpoint=theirs)
     profile.write_text(text)
     pictures = ("--width", WIDTH, "--height", HEIGHT, "--camera-hz", CAMERA_HZ)
     with ExitStack() as stack:
-        at = {"connect": ours} if topology == "beside" else {"listen": theirs}
-        bridge = Bridge(program, folder, domain, settings=bridge_settings, **at).start()
+        settings = generated(profile, beside=topology == "beside")
+        bridge = Bridge(program, folder, settings).start()
         stack.callback(bridge.kill)
         robot = Robot(domain, "--camera", "front", "--state-hz", str(state_hz), *map(str, pictures))
         stack.callback(robot.end)

@@ -14,6 +14,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from cyclonedds.core import (
@@ -32,14 +33,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 from ros_messages import Gid, NodeEntitiesInfo, ParticipantEntitiesInfo
 
-LOOPBACK_XML = (
-    "<CycloneDDS><Domain><General><Interfaces>"
-    '<NetworkInterface address="127.0.0.1" multicast="false"/></Interfaces>'
-    "<AllowMulticast>false</AllowMulticast></General>"
-    "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
-    "<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
-    '<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>'
-)
+LOOPBACK_XML = Path(__file__).with_name("loopback.xml").read_text("utf-8")
 """Cyclone DDS's settings for one computer by itself; for programs in C as ``CYCLONEDDS_URI``."""
 
 DOMAIN_PORTS, FIRST_PORT, FIRST_UNICAST = 250, 7400, 10

@@ -29,6 +29,11 @@ ros = pytest.importorskip("ros_messages", exc_type=ImportError)
 pytestmark = pytest.mark.ros2
 
 PATIENCE_S = 10.0
+PROFILE = """\
+extends: panda_ros2
+session: {{listen: ["{endpoint}"], connect: ["{endpoint}"]}}
+ros2: {{domain: {domain}}}
+"""
 STAMP_NS = 1_700_000_000_123_456_789
 
 
@@ -58,14 +63,17 @@ class Border:
 
 @pytest.fixture(scope="module")
 def border(tmp_path_factory: pytest.TempPathFactory, bridge_program: Path) -> Iterator[Border]:
-    from bridge import Bridge
+    from bridge import Bridge, generated
     from ros_node import RosNode, free_domain
 
     domain, endpoint = free_domain(), free_endpoint()
     profile = SessionProfile(listen=(endpoint,), connect=(endpoint,))
     folder = tmp_path_factory.mktemp("bridge")
     with open_session(profile, mode="router"), open_session(profile) as session:
-        bridge = Bridge(bridge_program, folder, domain, connect=endpoint).start()
+        file = folder / "lab.yaml"
+        file.write_text(PROFILE.format(endpoint=endpoint, domain=domain))
+        settings = generated(file, beside=True, all_names=True)
+        bridge = Bridge(bridge_program, folder, settings).start()
         node = RosNode("peer", domain)
         messages = Messages("jazzy")
         yield Border(node, session, messages, Ros2Dds(str(session.zid()), messages.hash))
