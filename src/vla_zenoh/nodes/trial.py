@@ -17,7 +17,7 @@ import zenoh
 
 from vla_zenoh.codec import records
 from vla_zenoh.control.names import worker_node
-from vla_zenoh.errors import CodecError, NodeError, SessionError
+from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.evaluation.trial.conduct import Conduct, Look, Phase
 from vla_zenoh.evaluation.trial.folder import TrialFolder
 from vla_zenoh.evaluation.trial.judged import FACT, Judged
@@ -112,15 +112,13 @@ class TrialRun:
 
         Raises:
             Interrupted: Ctrl-C; the arm stands.
-            NodeError: there is no command node, or another recorder is at work.
+            SessionError: there is no command node.
+            NodeError: another recorder is at work.
             RecordingError: the disk takes no more.
         """
         try:
             if not self._client.wait_for(lambda: self._client.task is not None, HEAR_PATIENCE_S):
-                raise NodeError(
-                    f"no command node of robot {self._client.keys.robot!r} is heard; is it up? "
-                    "(`vla-zenoh up`, `vla-zenoh status`)"
-                )
+                raise SessionError("no command node is heard")
             for worker in self._plan.workers:
                 if worker_node(worker) not in self._client.alive:
                     self._person.tell(f"worker {worker!r} is not alive")
