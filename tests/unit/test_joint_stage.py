@@ -12,7 +12,7 @@ from vla_zenoh.control.joint_reference import joint_motion_limits
 from vla_zenoh.control.joint_stage import JointStage
 from vla_zenoh.control.mover import Mover
 from vla_zenoh.control.ports import Outputs
-from vla_zenoh.control.smoothing import Motion
+from vla_zenoh.control.smoothing import Smoother, motion_limits
 from vla_zenoh.control.so3 import quat_from_rotation
 from vla_zenoh.control.states import State
 from vla_zenoh.profile import load_profile, override
@@ -34,9 +34,9 @@ MOVING_RAD_S = 0.05
 def test_the_elbow_sets_out_and_stops_within_the_jerk_limit(
     phases: list[tuple[bool, int]],
 ) -> None:
-    stage, still = JointStage(PROFILE, KINEMATICS), np.zeros(6)
+    stage = JointStage(PROFILE, KINEMATICS)
     stage.restart(ELBOW_OUT_RAD)
-    standing = Motion(KINEMATICS.forward(ELBOW_OUT_RAD), still, still)
+    standing = Smoother(KINEMATICS.forward(ELBOW_OUT_RAD), TICK_S, motion_limits(PROFILE.limits))
     before = np.zeros(len(HOME_RAD))
     for braking, ticks in [*phases, (True, 250)]:
         for _ in range(ticks):

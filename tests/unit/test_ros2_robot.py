@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 
-from vla_zenoh.control.hold import MOVED_M, SETTLE_NS, Hold
+from vla_zenoh.control.arm_guard import Measured
+from vla_zenoh.control.hold import MOVED_M, MOVED_RAD, SETTLE_NS, Hold
 from vla_zenoh.control.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.arm_state import BEYOND, ArmState, Newness, pose_state
@@ -359,8 +360,9 @@ def test_there_are_never_two_goals_and_the_last_wish_is_never_lost(steps: list[s
 
 
 # -- where the controller holds the arm -----------------------------------------------------------
-def at(x_m: float) -> Pose:
-    return Pose(np.array([x_m, 0.0, 0.0]), np.eye(3))
+def at(x_m: float, elbow_rad: float = 0.0) -> Measured:
+    pose = Pose(np.array([x_m, 0.0, 0.0]), np.eye(3))
+    return Measured(pose, np.array([elbow_rad, 0.0]), np.zeros(2))
 
 
 def test_what_was_sent_last_counts_until_somebody_moves_the_arm() -> None:
@@ -374,3 +376,11 @@ def test_what_was_sent_last_counts_until_somebody_moves_the_arm() -> None:
     assert not hold.held
     hold.sent(4 * SETTLE_NS)
     assert hold.held
+
+
+def test_an_elbow_that_somebody_moved_while_the_tcp_stayed_is_not_held_any_more() -> None:
+    hold = Hold()
+    hold.sent(0)
+    assert hold.look(at(0.1), SETTLE_NS)
+    assert hold.look(at(0.1, 0.9 * MOVED_RAD), 2 * SETTLE_NS)
+    assert not hold.look(at(0.1, 1.1 * MOVED_RAD), 3 * SETTLE_NS)

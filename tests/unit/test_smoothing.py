@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.smoothing import Motion, MotionLimits, Smoother
+from vla_zenoh.control.smoothing import Motion, MotionLimits, Shares, Smoother
 from vla_zenoh.control.so3 import Pose, angle_between, exp3, log3, norm3
 
 DT_S = 0.004
@@ -26,20 +26,23 @@ SLOWEST, REACH_M = 0.1, 0.15
 
 offsets = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
 targets = st.tuples(offsets, offsets).map(lambda pair: (REACH_M * pair[0], 0.6 * pair[1]))
-orders = st.lists(st.tuples(st.integers(1, 90), st.none() | targets), min_size=1, max_size=12)
+shares = st.builds(Shares, *[st.floats(0.1, 1.0)] * 3)
+orders = st.lists(
+    st.tuples(st.integers(1, 90), st.none() | shares | targets), min_size=1, max_size=12
+)
 
 
 def smoother() -> Smoother:
     return Smoother(START, DT_S, LIMITS)
 
 
-def ordered(motion: Smoother, order: tuple[np.ndarray, np.ndarray] | None) -> None:
-    if order is None:
-        motion.brake()
+def ordered(motion: Smoother, order: tuple[np.ndarray, np.ndarray] | Shares | None) -> None:
+    if order is None or isinstance(order, Shares):
+        motion.brake(order)
         return
     here = motion.motion.pose
     speed = SLOWEST + (1 - SLOWEST) * abs(order[0][0]) / REACH_M
-    motion.target(Pose(START.position_m + order[0], exp3(order[1]) @ here.rotation), speed)
+    motion.target(Pose(START.position_m + order[0], exp3(order[1]) @ here.rotation), Shares(speed))
 
 
 def check_tick(before: Motion, now: Motion) -> None:
@@ -59,7 +62,7 @@ def check_tick(before: Motion, now: Motion) -> None:
 @settings(max_examples=40)
 @given(orders)
 def test_limits_hold_and_the_pose_is_the_integral_of_the_twist_whatever_is_ordered_when(
-    given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | None]],
+    given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | Shares | None]],
 ) -> None:
     motion = smoother()
     for ticks, order in given_orders:
@@ -74,7 +77,7 @@ def test_limits_hold_and_the_pose_is_the_integral_of_the_twist_whatever_is_order
 @example([(3, (np.array([0.0, 0.0, 0.15]), np.array([0.0, 0.0, 0.6])))], (np.zeros(3), np.zeros(3)))
 @given(orders, targets)
 def test_it_ends_exactly_on_its_last_target(
-    given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | None]],
+    given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | Shares | None]],
     last: tuple[np.ndarray, np.ndarray],
 ) -> None:
     motion = smoother()
@@ -94,7 +97,7 @@ def test_it_ends_exactly_on_its_last_target(
 @settings(max_examples=40)
 @given(orders)
 def test_a_brake_ends_where_it_was_foretold_and_stays_there(
-    given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | None]],
+    given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | Shares | None]],
 ) -> None:
     motion = smoother()
     for ticks, order in given_orders:
@@ -105,7 +108,9 @@ def test_a_brake_ends_where_it_was_foretold_and_stays_there(
     longest_s = max(
         limit[0] / limit[1] + 2 * limit[1] / limit[2] for limit in (LIMITS.translation, LIMITS[1])
     )
-    for _ in range(round(2 * longest_s / DT_S)):
+    for _ in range(round(20 * longest_s / DT_S)):
+        if motion.at_rest:
+            break
         before = motion.motion
         check_tick(before, motion.tick())
     assert motion.at_rest
@@ -197,7 +202,7 @@ def test_who_is_given_less_speed_in_motion_slows_down_to_it_and_keeps_to_it() ->
     for _ in range(80):
         motion.tick()
     assert motion.motion.twist[0] > 2 * share * LIMITS.translation[0]
-    motion.target(far, share)
+    motion.target(far, Shares(share))
     speeds: list[float] = []
     for _ in range(150):
         before = motion.motion

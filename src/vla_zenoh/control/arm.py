@@ -33,13 +33,17 @@ def make_shadow(profile: Profile, kinematics: Kinematics | None = None) -> Shado
         ProfileError: frames or joints that the description does not have.
     """
     kinematics = kinematics or make_kinematics(profile)
-    home_rad = kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
+    names = profile.robot.arm_joints
+    home_rad = kinematics.ordered(names, profile.robot.home_rad)
+    # Its joints are ours to command, and to hold back, only where the profile says so.
+    commanded = profile.robot.command == "joint"
+    most_rad_s = profile.limits.joint.of("velocity_rad_s", len(names))
     return Shadow(
         kinematics,
         home_rad,
         profile.limits,
-        # Its joints are ours to command only where the profile says so.
-        free_elbow=profile.robot.command == "joint",
+        free_elbow=commanded,
         posture_rad=home_rad,
         known_good_rad=[home_rad],
+        velocity_rad_s=kinematics.ordered(names, most_rad_s) if commanded else None,
     )

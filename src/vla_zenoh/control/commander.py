@@ -17,13 +17,10 @@ from vla_zenoh.control.acceptance import Lease, Refusal, refuse
 from vla_zenoh.control.compose import Goal
 from vla_zenoh.control.composer import Composer
 from vla_zenoh.control.gripper import GripperArbiter
+from vla_zenoh.control.joint_fit import reasons_joints_do_not_fit
 from vla_zenoh.control.mover import Mover
 from vla_zenoh.control.ports import Inputs, Outputs, Setting
-from vla_zenoh.control.preflight import (
-    Surroundings,
-    reasons_joints_do_not_fit,
-    reasons_not_to_activate,
-)
+from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
 from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.so3 import held_pose, pose_of
 from vla_zenoh.control.states import OBEYING, State, Trigger, after

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from vla_zenoh.control.so3 import Pose, distance
+import numpy as np
+
+from vla_zenoh.control.arm_guard import Measured
+from vla_zenoh.control.so3 import distance
 
 SETTLE_NS = 500_000_000
 """After the last command the arm comes to rest within this time."""
 MOVED_M, MOVED_RAD = 0.005, 0.02
-"""An arm at rest that is moved by more than this is moved by somebody else."""
+"""An arm at rest that is moved by more than this, TCP or any joint, is moved by somebody else: its
+elbow may be, while the TCP stays."""
 
 
 class Hold:
@@ -20,7 +24,7 @@ class Hold:
 
     def __init__(self) -> None:
         self._sent_ns: int | None = None
-        self._settled: Pose | None = None
+        self._settled: Measured | None = None
 
     @property
     def held(self) -> bool:
@@ -35,13 +39,14 @@ class Hold:
         """Nobody knows what became of the last commands: the robot is not heard."""
         self._sent_ns = self._settled = None
 
-    def look(self, measured: Pose, now_ns: int) -> bool:
+    def look(self, measured: Measured, now_ns: int) -> bool:
         """Whether `held` still; call it while nothing is sent."""
         if self._sent_ns is None or now_ns - self._sent_ns < SETTLE_NS:
             return self.held
         if self._settled is None:
             self._settled = measured
-        apart_m, apart_rad = distance(self._settled, measured)
-        if apart_m > MOVED_M or apart_rad > MOVED_RAD:
+        apart_m, apart_rad = distance(self._settled.pose, measured.pose)
+        turned_rad = float(np.abs(measured.position_rad - self._settled.position_rad).max())
+        if apart_m > MOVED_M or max(apart_rad, turned_rad) > MOVED_RAD:
             self.lose()
         return self.held

@@ -13,7 +13,7 @@ from vla_zenoh.control.limits import leash
 from vla_zenoh.control.ports import Outputs
 from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.slowdown import Slowdown
-from vla_zenoh.control.smoothing import Motion, Smoother, motion_limits
+from vla_zenoh.control.smoothing import Motion, Shares, Smoother, motion_limits
 from vla_zenoh.control.so3 import Pose, held_pose, pose_of, quat_from_rotation
 from vla_zenoh.control.states import OBEYING, State
 from vla_zenoh.errors import ProfileError
@@ -165,9 +165,10 @@ class Mover:
         failures = self._smoother.failures
         # A stream that begins has nothing to make up for: the robot takes one that begins at rest.
         for _ in range(ticks if went_on else 1):
-            motion = self._smoother.tick()
-            if self._joints is not None:
-                self._joints.tick(motion, braking=state is not State.ACTIVE)
+            if self._joints is None:
+                self._smoother.tick()
+            else:
+                self._joints.tick(self._smoother, braking=state is not State.ACTIVE)
         return self._smoother.failures == failures
 
     def command(
@@ -196,10 +197,17 @@ class Mover:
                 goal = self._shorten(plans, goal, pose, now_ns)
                 out.tell("warning", "limit", hits[0].name, "leash", hits[0].value, hits[0].limit)
             self._slow_down(goal.slowdown, out)
-            smoother.target(goal.pose, self.speed)
+            smoother.target(goal.pose, self._shares(smoother, goal.pose))
             self.goal = goal
             self.gripper.want(goal.width_m)
         return timeline.plan.cause
+
+    def _shares(self, smoother: Smoother, goal: Pose) -> Shares:
+        """Parts of its limits that the arm has on the way to a goal."""
+        if self._joints is None:
+            return Shares(velocity=self.speed)
+        joints = self._joints.shares(smoother.motion, goal, smoother.box)
+        return joints._replace(velocity=min(joints.velocity, self.speed))
 
     def _slow_down(self, slower: Slowdown | None, out: Outputs) -> None:
         """Take over the speed of a goal; tell each reason once in every activation."""
@@ -226,7 +234,10 @@ class Mover:
 
     def _brake(self, smoother: Smoother, timeline: GoalTimeline, now_ns: int) -> None:
         """Stop, and let the goal be where the arm stops, so that nothing pulls it further."""
-        smoother.brake()
+        if self._joints is None:
+            smoother.brake()
+        else:
+            self._joints.brake(smoother)
         self.goal = None
         if timeline.plan.cause is not None and smoother.at_rest:
             timeline.hold(Goal(smoother.motion.pose, timeline.at(now_ns).width_m), now_ns)

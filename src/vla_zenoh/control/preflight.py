@@ -8,15 +8,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from vla_zenoh.check import fit, plausible
-from vla_zenoh.control.kinematics import Kinematics
 from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.names import worker_node
-from vla_zenoh.control.so3 import distance, pose_of
-from vla_zenoh.errors import SpecError, VlaZenohError
+from vla_zenoh.errors import SpecError
 from vla_zenoh.offset import Offset
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped
+from vla_zenoh.types import ActionChunk, GripperState, PoseState, Stamped
 
 CHUNK_PATIENCE_S = 2.0
 """A worker that runs beside the robot publishes chunks all the time; the newest may be this old,
@@ -24,9 +22,6 @@ and one period more."""
 CLOCK_TOLERANCE_S = 0.02
 """A state may seem to come from the future by this much before clocks are said to differ."""
 CAMERA_PATIENCE_S = 1.0
-JOINT_PATIENCE_S = 0.1
-SAME_TCP_M, SAME_TCP_RAD = 0.005, 0.02
-"""Kinematics and the robot's own word on its TCP may differ by this much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,40 +85,6 @@ def reasons_not_to_activate(
         *_chunk(profile, worker, around, chunk, now_ns, rate_hz),
         *_cameras(profile, worker, around),
         *_clocks(profile, worker, around),
-    ]
-
-
-def reasons_joints_do_not_fit(
-    profile: Profile,
-    kinematics: Kinematics,
-    joint: Stamped[JointState] | None,
-    pose: Stamped[PoseState],
-    now_ns: int,
-) -> list[str]:
-    """Whether the kinematics know this robot: joints heard, and their TCP where it is said to be.
-
-    Args:
-        profile: the effective profile.
-        kinematics: of the robot it describes.
-        joint: newest joint state.
-        pose: newest TCP pose.
-        now_ns: same clock as the records' ``received_ns``.
-    """
-    if joint is None:
-        return ["the joints are not known: nothing was heard on state/joint"]
-    age_s = (now_ns - joint.received_ns) / 1e9
-    if age_s > profile.timing.state_timeout_s + JOINT_PATIENCE_S:
-        return [f"the joint state is {age_s:.2f} s old"]
-    try:
-        joints_rad = kinematics.joints_of(joint.record)
-    except VlaZenohError as error:
-        return [str(error)]
-    apart_m, apart_rad = distance(kinematics.forward(joints_rad), pose_of(pose.record))
-    if apart_m <= SAME_TCP_M and apart_rad <= SAME_TCP_RAD:
-        return []
-    return [
-        f"the joints put the TCP {apart_m * 1e3:.1f} mm and {apart_rad:.3f} rad from where "
-        "the robot says it is: robot.description or robot.tcp_frame is another robot's"
     ]
 
 

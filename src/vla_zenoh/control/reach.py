@@ -65,6 +65,7 @@ class Shadow:
         posture_rad: (n,) what the robot's controller pulls a redundant arm to; None: where the
             robot stood at the last `reset`.
         known_good_rad: configurations known to be free, besides `joints_rad`.
+        velocity_rad_s: (n,) how fast the joints may be; None: as the description has it.
 
     Raises:
         RecordError: joints of the wrong number.
@@ -80,6 +81,7 @@ class Shadow:
         free_elbow: bool = False,
         posture_rad: ArrayLike | None = None,
         known_good_rad: Sequence[FloatArray] = (),
+        velocity_rad_s: FloatArray | None = None,
     ) -> None:
         self.kinematics = kinematics
         self._limits = limits = limits or Limits()
@@ -89,6 +91,8 @@ class Shadow:
         )
         self._solver = InverseKinematics(kinematics, posture_rad, settings)
         self._follow_posture = posture_rad is None
+        most = kinematics.velocity_rad_s
+        self._velocity_rad_s = most if velocity_rad_s is None else np.minimum(velocity_rad_s, most)
         self.barriers = Barriers(kinematics, limits.reach, known_good_rad)
         self.reset(joints_rad)
 
@@ -250,8 +254,8 @@ class Shadow:
             float(np.linalg.norm(error[3:])) / self._limits.rotation.velocity_rad_s,
         )
         speed = np.abs(end.joints_rad - start.joints_rad) / time_s
-        joint = int(np.argmax(speed / self.kinematics.velocity_rad_s))
-        limit = float(self.kinematics.velocity_rad_s[joint])
+        joint = int(np.argmax(speed / self._velocity_rad_s))
+        limit = float(self._velocity_rad_s[joint])
         if speed[joint] <= limit:
             return []
         name = self.kinematics.arm_joints[joint]

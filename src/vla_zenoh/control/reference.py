@@ -129,9 +129,9 @@ class ReferenceGuard:
         ):
             return "jump"
         for values, order in ((record.twist, 0), (record.acceleration, 1)):
-            if float(np.abs(values[:3]).max()) > 2 * self._brake_limits.translation[order]:
+            if float(np.abs(values[:3]).max()) > self._brake_limits.translation[order]:
                 return "too_fast"
-            if float(np.linalg.norm(values[3:])) > 2 * self._brake_limits.rotation[order]:
+            if float(np.linalg.norm(values[3:])) > self._brake_limits.rotation[order]:
                 return "too_fast"
         if not self.following and (
             norm3(record.twist[:3]) > limits.begin_m_s

@@ -55,6 +55,17 @@ def motion_limits(limits: Limits) -> MotionLimits:
     )
 
 
+class Shares(NamedTuple):
+    """Parts of the limits of velocity, acceleration and jerk, each above 0 and at most 1."""
+
+    velocity: float = 1.0
+    acceleration: float = 1.0
+    jerk: float = 1.0
+
+
+FULL = Shares()
+
+
 class Motion(NamedTuple):
     """One point of the smoothed motion, base frame.
 
@@ -79,12 +90,12 @@ class Smoother:
     """
 
     def __init__(self, pose: Pose, dt_s: float, limits: MotionLimits) -> None:
+        self._dt_s = dt_s
         self._otg = Ruckig(AXES, dt_s)
         self._input = InputParameter(AXES)
         self._output = OutputParameter(AXES)
-        self._full_speed = self._box(limits, 0)
-        self._input.max_acceleration = self._box(limits, 1)
-        self._input.max_jerk = self._box(limits, 2)
+        self.box = np.array([self._box(limits, order) for order in range(3)])
+        """(3, 6) limits of velocity, acceleration and jerk of every axis at full shares."""
         self.failures = 0
         self.reset(pose)
 
@@ -97,7 +108,7 @@ class Smoother:
         self._anchor = orthonormal(pose.rotation)
         zeros = [0.0] * AXES
         self._otg.reset()
-        self._input.max_velocity = self._full_speed
+        self._take(FULL)
         self._input.control_interface = ControlInterface.Position
         self._input.synchronization = Synchronization.Phase
         self._input.current_position = [*pose.position_m.tolist(), 0.0, 0.0, 0.0]
@@ -113,15 +124,23 @@ class Smoother:
             np.zeros(6),
         )
 
-    def target(self, pose: Pose, speed: float = 1.0) -> None:
+    def _take(self, shares: Shares) -> None:
+        velocity, acceleration, jerk = (
+            [share * limit for limit in row] for share, row in zip(shares, self.box, strict=True)
+        )
+        self._input.max_velocity = velocity
+        self._input.max_acceleration = acceleration
+        self._input.max_jerk = jerk
+
+    def target(self, pose: Pose, shares: Shares = FULL) -> None:
         """Head for `pose` from the present state, without a step in velocity or acceleration.
 
         Args:
             pose: where to.
-            speed: share of the velocity limits; who is faster slows down within the other limits.
+            shares: of the limits; who is faster slows down within them.
         """
         self._anchor_here()
-        self._input.max_velocity = [speed * limit for limit in self._full_speed]
+        self._take(shares)
         self.braking = False
         self._input.control_interface = ControlInterface.Position
         self._input.synchronization = Synchronization.Phase
@@ -130,14 +149,20 @@ class Smoother:
             *log3(self._anchor.T @ pose.rotation).tolist(),
         ]
 
-    def brake(self) -> None:
-        """Come to rest as fast as the limits allow, each axis by itself."""
+    def brake(self, shares: Shares | None = None) -> None:
+        """Come to rest as fast as the limits allow, each axis by itself.
+
+        Args:
+            shares: of the limits, where not all can be had; all axes then stop together, for what
+                bounds them is bound to the direction. Not looked at while it brakes already.
+        """
         if self.braking:
             return
         self._anchor_here()
+        self._take(shares or FULL)
         self.braking = True
         self._input.control_interface = ControlInterface.Velocity
-        self._input.synchronization = Synchronization.No
+        self._input.synchronization = Synchronization.Phase if shares else Synchronization.No
 
     def resting_pose(self) -> Pose:
         """Brake, and foretell where that ends."""
@@ -169,8 +194,14 @@ class Smoother:
         self.motion = motion
         self.brake()
 
-    def tick(self) -> Motion:
-        """Advance by one tick."""
+    def tick(self, pace: float = 1.0) -> Motion:
+        """Advance by one tick.
+
+        Args:
+            pace: part of the tick by which the motion goes on: who follows it may be slow. Twist
+                and acceleration are those of the motion at its own pace.
+        """
+        self._otg.delta_time = pace * self._dt_s
         try:
             self._otg.update(self._input, self._output)
         except (RuckigError, ValueError):

@@ -140,7 +140,7 @@ class Lead:
             self._hold.sent(mono_ns)
             self._send(self._target(reference), now_ns)
         else:
-            self._hold.look(measured.pose, mono_ns)
+            self._hold.look(measured, mono_ns)
 
     def _target(self, reference: Reference | JointReference) -> PoseCommand | JointCommand:
         if isinstance(reference, JointReference):

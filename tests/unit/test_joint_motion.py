@@ -1,0 +1,146 @@
+"""Joints that follow a pose stream: near to it, within their limits, and standing in time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vla_zenoh.control.arm import make_kinematics
+from vla_zenoh.control.joint_reference import joint_motion_limits
+from vla_zenoh.control.joint_stage import FAR, NEAR_M, NEAR_RAD, JointStage
+from vla_zenoh.control.smoothing import Smoother, motion_limits
+from vla_zenoh.control.so3 import Pose, distance, exp3
+from vla_zenoh.profile import Profile, load_profile, override
+from vla_zenoh.types import FloatArray
+
+BASE = load_profile("panda_sim")
+KINEMATICS = make_kinematics(BASE)
+HOME_RAD = KINEMATICS.ordered(BASE.robot.arm_joints, BASE.robot.home_rad)
+TICK_S = 1 / BASE.timing.command_hz
+STEP_TICKS = 25
+MOST_LAG_M, MOST_LAG_RAD = 1.25 * FAR * NEAR_M, 1.25 * FAR * NEAR_RAD
+STRAIGHT_M = 0.001
+RTOL = 1e-6
+# Straight on, and not quite as fast as each joint could by itself.
+LONGER, SETTLING_S = 1.5, 0.12
+STANDING_M_S = 0.002
+
+
+def profile(**joint: float) -> Profile:
+    limits = {"limits": {"joint": joint}} if joint else {}
+    return override(BASE, {"robot": {"command": "joint"}, **limits})
+
+
+class Arm:
+    """A pose stream, and joints that follow it perfectly timed."""
+
+    def __init__(self, of: Profile) -> None:
+        self.limits = joint_motion_limits(of)
+        self.stage = JointStage(of, KINEMATICS)
+        self.stage.restart(HOME_RAD)
+        self.goal = KINEMATICS.forward(HOME_RAD)
+        self.smoother = Smoother(self.goal, TICK_S, motion_limits(of.limits))
+        self.joints_rad, self.rate_rad_s = HOME_RAD, np.zeros(len(HOME_RAD))
+        self.acceleration = np.zeros(len(HOME_RAD))
+        self.jerk = 0.0
+
+    def step(self, way_m: FloatArray, turn_rad: FloatArray, ticks: int = STEP_TICKS) -> None:
+        """One step of a chunk, and the time it has."""
+        here = self.smoother.motion
+        goal = Pose(self.goal.position_m + way_m, exp3(turn_rad) @ self.goal.rotation)
+        if distance(here.pose, goal)[0] < BASE.limits.lead_m:
+            self.goal = goal
+        self.smoother.target(self.goal, self.stage.shares(here, self.goal, self.smoother.box))
+        for _ in range(ticks):
+            self.tick()
+
+    def tick(self, *, braking: bool = False) -> None:
+        if braking:
+            self.stage.brake(self.smoother)
+        self.stage.tick(self.smoother, braking=braking)
+        told = self.stage.command("active", None)
+        assert (np.abs(told.velocity_rad_s) <= self.limits.velocity_rad_s * (1 + RTOL)).all()
+        most = self.limits.acceleration_rad_s2 * (1 + RTOL)
+        assert (np.abs(told.acceleration_rad_s2) <= most).all()
+        change = np.abs(told.acceleration_rad_s2 - self.acceleration) / TICK_S
+        self.jerk = max(self.jerk, float((change / self.limits.jerk_rad_s3).max()))
+        self.joints_rad, self.rate_rad_s = told.position_rad, told.velocity_rad_s
+        self.acceleration = told.acceleration_rad_s2
+
+    def lag(self) -> tuple[float, float]:
+        return distance(KINEMATICS.forward(self.joints_rad), self.smoother.motion.pose)
+
+    def speed_m_s(self) -> float:
+        return float(np.linalg.norm((KINEMATICS.jacobian(self.joints_rad) @ self.rate_rad_s)[:3]))
+
+    def stop_s(self) -> float:
+        """How long it takes until the TCP stands."""
+        last = 0
+        for n in range(1, 400):
+            self.tick(braking=True)
+            if self.speed_m_s() > STANDING_M_S:
+                last = n
+            if self.stage.at_rest and self.smoother.at_rest:
+                break
+        return last * TICK_S
+
+    def shortest_stop_s(self) -> float:
+        """What the slowest joint needs for it."""
+        _, most, jerk = self.limits
+        return float((np.abs(self.rate_rad_s) / most + most / jerk).max())
+
+
+ways = st.tuples(*[st.floats(-0.03, 0.03)] * 3, *[st.floats(-0.1, 0.1)] * 3).map(np.array)
+
+
+@given(
+    st.lists(st.tuples(ways, st.integers(1, 8)), min_size=1, max_size=4),
+    st.sampled_from([{}, {"velocity_rad_s": 0.3}, {"acceleration_rad_s2": 0.7}]),
+)
+@settings(max_examples=5, deadline=None)
+def test_joints_are_never_far_from_the_pose_and_stop_when_told_whatever_they_can(
+    orders: list[tuple[FloatArray, int]], joint: dict[str, float]
+) -> None:
+    arm = Arm(profile(**joint))
+    for way, times in orders:
+        for _ in range(times):
+            arm.step(way[:3], way[3:])
+            apart_m, apart_rad = arm.lag()
+            assert apart_m <= MOST_LAG_M
+            assert apart_rad <= MOST_LAG_RAD
+    allowed_s = LONGER * arm.shortest_stop_s() + SETTLING_S
+    assert arm.stop_s() <= allowed_s
+    assert arm.stage.at_rest
+    assert arm.smoother.at_rest
+    assert arm.lag()[0] <= NEAR_M
+
+
+@pytest.mark.parametrize("speed_m_s", [0.1, 0.2, 0.3, 0.4])
+@pytest.mark.parametrize("axis", ["down", "aside"])
+def test_a_straight_motion_is_straight_smooth_and_stopped_as_fast_as_the_joints_can(
+    axis: str, speed_m_s: float
+) -> None:
+    arm = Arm(profile())
+    way_m = np.array([0.0, 0.0, -0.1] if axis == "down" else [0.0, 0.1, 0.0]) * speed_m_s
+    for _ in range(5):
+        arm.step(way_m, np.zeros(3))
+        assert arm.lag()[0] < STRAIGHT_M
+    allowed_s = LONGER * arm.shortest_stop_s() + SETTLING_S
+    assert arm.stop_s() <= allowed_s
+    assert arm.jerk <= 1.0
+
+
+def test_an_arm_that_was_held_back_is_stopped_where_it_is_and_not_where_it_was_to_be() -> None:
+    arm = Arm(profile())
+    for _ in range(4):
+        arm.step(np.array([0.0, 0.0, -0.02]), np.zeros(3))
+    # As a pose stream that was planned without the joints: far ahead of them at once.
+    arm.smoother.reset(Pose(arm.smoother.motion.pose.position_m - [0, 0, 0.04], arm.goal.rotation))
+    before_m, allowed_s = KINEMATICS.forward(arm.joints_rad).position_m, arm.shortest_stop_s()
+    rate = arm.speed_m_s()
+    assert arm.stop_s() <= allowed_s + SETTLING_S
+    way_m = float(np.linalg.norm(KINEMATICS.forward(arm.joints_rad).position_m - before_m))
+    assert way_m <= rate * allowed_s
+    assert arm.smoother.at_rest
