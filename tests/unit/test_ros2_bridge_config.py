@@ -184,6 +184,12 @@ def test_who_needs_no_bridge_is_told(tmp_path: Path) -> None:
         bridge_config(load_profile("panda_sim"))
     with pytest.raises(ProfileError, match=r"ros2\.bridge is rmw_zenoh"):
         bridge_config(lab(tmp_path, "ros2: {bridge: rmw_zenoh}\n"))
+    elsewhere = (
+        "session: {listen: [tls/10.0.0.2:7447], connect: [tls/10.0.0.2:7447], security: {}}\n"
+        "hosts: {gpu: {nodes: [worker]}}\n"
+    )
+    with pytest.raises(ProfileError, match=r"ros2\.connect is missing: in a secured lab"):
+        bridge_config(lab(tmp_path, elsewhere))
     with pytest.raises(ProfileError, match="leave that out where it is beside our router"):
         bridge_config(lab(tmp_path, "ros2: {connect: [tcp/127.0.0.1:7450]}\n"), beside=True)
 

@@ -61,6 +61,11 @@ def bridge_config(
             f"profile {profile.name}: ros2.connect says that the bridge is at "
             f"{', '.join(ros2.connect)}; leave that out where it is beside our router"
         )
+    if profile.session.security is not None and ros2.connect is None:
+        raise ProfileError(
+            f"profile {profile.name}: ros2.connect is missing: in a secured lab the bridge has a "
+            "router of its own, as tcp/127.0.0.1:7450"
+        )
     places = ros2.connect or profile.session.connect
     config: dict[str, Any] = {
         "mode": "client" if beside else "router",
