@@ -231,6 +231,12 @@ def test_a_script_gets_json_and_the_same_exit_code(say: Callable[..., Any]) -> N
     assert json.loads(found.stdout)["only_a"] == 9
 
 
+def test_a_narrow_screen_loses_no_figure(say: Callable[..., Any]) -> None:
+    found = say(written([True] * 300), written([False] * 300), "--tasks")
+    assert "…" not in found.stdout
+    assert "-100.0%" in found.stdout
+
+
 def test_tasks_have_rows_when_they_are_asked_for(say: Callable[..., Any]) -> None:
     assert "push red left" not in say(written(A), written(A)).stdout
     assert "push red left" in say(written(A), written(A), "--tasks").stdout

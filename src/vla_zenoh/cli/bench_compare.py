@@ -16,7 +16,7 @@ from vla_zenoh.errors import ResourceError
 
 B_IS_WORSE = 3
 """Exit code; 1 and 2 are those of every command for what it refuses."""
-LEAST_WIDTH = 100
+LEAST_WIDTH = 120
 DISAGREEMENTS = 10
 
 
