@@ -250,19 +250,6 @@ def test_a_profile_that_cannot_be_secured_leaves_nothing_behind(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_profile_of_ones_own_is_copied_with_the_secured_one_that_extends_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    (tmp_path / "mine.yaml").write_text("extends: panda_sim\n")
-    done = runner.invoke(secure_app, ["init", "--profile", "mine.yaml"])
-    assert done.exit_code == 0, done.output
-    assert f"  scp mine_secure.yaml {tmp_path / 'mine.yaml'} here:\n" in done.output
-    folder = tmp_path / ".config/vla-zenoh/lab"
-    assert f"  scp -rp {folder}/here here:.config/vla-zenoh/lab/\n" in done.output
-
-
 def test_a_lab_is_secured_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "keys"

@@ -1,8 +1,10 @@
-"""A profile at an address of its own: what is only tried must never reach a lab's real robot."""
+"""Addresses of this computer: a profile at one of its own, and which are."""
 
 from __future__ import annotations
 
+import ipaddress
 import socket
+from typing import Any
 
 import typer
 
@@ -12,8 +14,28 @@ from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile, SessionProfile, override
 
 
+def is_own(address: str) -> bool:
+    """Whether `address`, or what that name means, is this computer's."""
+    try:
+        found = socket.getaddrinfo(address, 0, type=socket.SOCK_DGRAM)
+    except OSError:
+        return False
+    return any(_can_bind(family, place) for family, _, _, _, place in found)
+
+
+def _can_bind(family: int, place: tuple[Any, ...]) -> bool:
+    if ipaddress.ip_address(str(place[0]).partition("%")[0]).is_unspecified:
+        return False  # is everybody's
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(place)
+        except OSError:
+            return False
+    return True
+
+
 def own_address(profile: Profile) -> Profile:
-    """The profile where nobody answers.
+    """The profile where nobody answers: what is only tried must never reach a lab's real robot.
 
     Raises:
         BadParameter: it is of a real robot.

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import datetime as dt
-import shlex
-from collections.abc import Collection, Sequence
+import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 from rich.table import Table
 
-from vla_zenoh import resources
-from vla_zenoh.cli.options import DEFAULT_PROFILE, JsonOption, ProfileOption
+from vla_zenoh.cli.aim import Aim
+from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, ProfileOption
 from vla_zenoh.cli.output import console, errors, fail, print_json, styled
+from vla_zenoh.cli.own_address import is_own
+from vla_zenoh.cli.secure_copying import copying
 from vla_zenoh.errors import SecurityError, VlaZenohError
 from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.profile.session import DEFAULT_FOLDER
+from vla_zenoh.resources import is_path
 from vla_zenoh.security.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
 from vla_zenoh.security.bridge import bridges
 from vla_zenoh.security.identity import PEOPLE, Role, identities, identities_of, people_at
@@ -61,9 +64,15 @@ def init(
     ] = None,
     address: AddressOption = None,
     days: DaysOption = CERTIFICATE_DAYS,
+    host: HostOption = None,
 ) -> None:
     """Make the lab's authority, certificates for all hosts of a profile, and a secured profile."""
     plain = load_profile(profile)
+    if host is not None and host not in plain.hosts:
+        raise typer.BadParameter(
+            f"profile {plain.name} has no host {host!r}, it has: {', '.join(plain.hosts)}. A "
+            "computer of people alone is named afterwards, with `vla-zenoh secure add` and `here`"
+        )
     if plain.session.security is not None:
         fail(f"profile {plain.name} is secured already; `vla-zenoh secure add HOST` adds to it")
     file = output or Path(f"{plain.name}_secure.yaml")
@@ -80,6 +89,9 @@ def init(
         serving = serving_addresses(plain, (*addresses.values(), *(address or ())))
         everybody = [*identities(plain), *bridges(plain)]
         made += store.add(everybody, now, days=days, addresses=serving)
+        here = host or _this_host(plain, addresses)
+        if here is not None:
+            store.note_this_host(here)
     except VlaZenohError:
         file.unlink()
         raise
@@ -87,8 +99,13 @@ def init(
     for path in made:
         out.print(f"made {path}", highlight=False, soft_wrap=True)
     out.print(f"made {file}", highlight=False, soft_wrap=True)
-    out.print("\nGive each host but this one its own folder, and all of them the profile:")
-    _print_copying(written.hosts, store, written, file, _own_base(profile))
+    others = [name for name in written.hosts if name != here]
+    if others:
+        which = "each of the others" if here is not None else "each host but this one"
+        out.print(f"\nGive {which} its own folder, and all of them the profile:")
+    for line in copying(written, file, store, others):
+        out.print(line, soft_wrap=True)
+    _print_here(here, Aim(_typed(file)))
     out.print(f"Keep {store.folder / 'ca.key'} here: who has it can make certificates.")
     _complain_about_places(written)
 
@@ -137,10 +154,31 @@ def add(
     out = console()
     for path in made:
         out.print(f"made {path}", highlight=False, soft_wrap=True)
-    _print_copying([host], store, loaded, profile_file(profile))
+    here, file = store.known_host(), profile_file(profile)
+    routers = [name for name, part in loaded.hosts.items() if "router" in part.nodes]
+    told = [name for name in routers if new and name not in (host, here)]
+    for line in copying(loaded, file, store, [name for name in (host,) if name != here], told):
+        out.print(line, soft_wrap=True)
+    if here is None:
+        out.print(f"Is {host} this computer? Then instead: vla-zenoh secure here {host}")
     if new:
-        told = f"{host} is in {profile_file(profile)} now: copy it to the router's host as well"
-        out.print(f"{told}, and start the router again", highlight=False, soft_wrap=True)
+        words = f"{host} is in {file} now, which {' and '.join(routers)} of the lab read: start the"
+        out.print(f"{words} router there again", soft_wrap=True)
+
+
+@secure_app.command("here")
+def here(
+    host: Annotated[str, typer.Argument(help="Host that certificates here are of.")],
+    profile: ProfileOption = DEFAULT_PROFILE,
+    folder: FolderOption = None,
+) -> None:
+    """Say which host this computer is, where the certificates of several are."""
+    security = load_profile(profile).session.security
+    store = Store(folder or (security.folder if security is not None else DEFAULT_FOLDER))
+    if host not in store.hosts():
+        known = ", ".join(store.hosts()) or "none"
+        fail(f"{store.folder} has no certificates of {host!r}; it has those of: {known}")
+    console().print(f"this computer is {host}, says {store.note_this_host(host)}", soft_wrap=True)
 
 
 @secure_app.command("show")
@@ -174,41 +212,32 @@ def _places(given: Sequence[str]) -> dict[str, str]:
     return out
 
 
-def _own_base(name: str) -> tuple[Path, ...]:
-    """The file of a profile that other computers do not have from the package."""
-    path = profile_file(name)
-    return () if path.parent == resources.shipped("profiles") else (path,)
+def _this_host(profile: Profile, addresses: dict[str, str]) -> str | None:
+    """Which host this computer is, as far as that can be known."""
+    found = [name for name, address in addresses.items() if is_own(address)]
+    if not addresses and len(profile.hosts) == 1:
+        found = list(profile.hosts)
+    return found[0] if len(found) == 1 else None
 
 
-def _print_copying(
-    hosts: Collection[str], store: Store, profile: Profile, file: Path, more: Sequence[Path] = ()
-) -> None:
-    """How certificates and profile get to other computers, and what is said there.
+def _typed(file: Path) -> str:
+    """A profile's file as it is named on the command line."""
+    return str(file) if "/" in str(file) else f"./{file}"
 
-    Args:
-        hosts: those computers.
-        store: of the certificates.
-        profile: the secured one.
-        file: of that profile.
-        more: files that it extends.
-    """
-    assert profile.session.security is not None
-    # ssh and scp begin at home.
-    target = profile.session.security.folder.removeprefix("~/")
-    files = " ".join(shlex.quote(str(path)) for path in (file, *more))
-    lines: list[str] = []
-    for host in hosts:
-        source = shlex.quote(str(store.folder / host))
-        lines += [
-            f"  ssh {host} mkdir -p {shlex.quote(target)}",
-            f"  scp -rp {source} {host}:{shlex.quote(target)}/",
-            f"  scp {files} {host}:",
-        ]
-    if any(host in profile.hosts for host in hosts):
-        lines.append(f"There: vla-zenoh up ./{file.name} --host NAME")
-    lines.append(f"For people, there: vla-zenoh status --profile ./{file.name}")
-    for line in lines:
-        console().print(line, highlight=False, markup=False, soft_wrap=True)
+
+def _print_here(host: str | None, aim: Aim) -> None:
+    out = console()
+    if host is not None:
+        out.print(
+            f"This computer is {host}: vla-zenoh up {aim.profile} --host {host}", soft_wrap=True
+        )
+    else:
+        out.print(
+            "Which host this computer is was not said (--host): `vla-zenoh secure here HOST` notes "
+            "it. Until then people here drive with the certificate of any operator.",
+            soft_wrap=True,
+        )
+    out.print(f"For people, here: {aim.typed('status')}", soft_wrap=True)
 
 
 def _now() -> dt.datetime:
@@ -216,11 +245,11 @@ def _now() -> dt.datetime:
 
 
 def _extends(name: str, output: Path) -> str:
-    """How the new profile names the one it stands on."""
-    path = profile_file(name)
-    if path.stem == name:
+    """How the new profile names the one it stands on: by its name, or its way from there."""
+    if not is_path(name):
         return name
-    return path.stem if path.absolute().parent == output.absolute().parent else str(path.absolute())
+    way = os.path.relpath(profile_file(name), output.resolve().parent)
+    return Path(way).stem if "/" not in way else way
 
 
 def _write(file: Path, text: str) -> None:
