@@ -37,6 +37,8 @@ class OwnArm:
         self._lock, self._end = threading.Lock(), threading.Event()
         self._target: Reference | JointReference | None = None
         self._state: tuple[JointState, GripperState, int] | None = None
+        self._reflex: tuple[JointState, GripperState, int] | None = None
+        self._moves_to_fail = 1
         self._thread = threading.Thread(target=self._control, daemon=True)
 
     # -- what vla-zenoh calls -----------------------------------------------------------------
@@ -55,7 +57,9 @@ class OwnArm:
             raise ConnectionError("the cable is out")
         if trouble == "frozen":
             return None
-        joints, gripper, measured_ns = state
+        # Its library goes on giving the state in which it was.
+        self._reflex = (self._reflex or state) if trouble == "reflex" else None
+        joints, gripper, measured_ns = self._reflex or state
         position_rad = joints.position_rad * (float("nan") if trouble == "nan" else 1.0)
         return Reading(
             position_rad,
@@ -64,13 +68,16 @@ class OwnArm:
             width_m=gripper.width_m,
             moving=gripper.moving,
             holding=gripper.holding,
-            fault="the user stop is pressed" if trouble == "fault" else "",
+            fault="the user stop is pressed" if trouble in ("fault", "reflex") else "",
             measured_ns=measured_ns,
         )
 
     def move(self, command: Command) -> None:
         if self._now() == "slow":
             time.sleep(0.3)
+        if self._now() == "raise once" and self._moves_to_fail:
+            self._moves_to_fail -= 1
+            raise ConnectionError("the cable is out")
         if isinstance(command, JointCommand):
             target = JointReference(
                 command.position_rad, command.velocity_rad_s, command.acceleration_rad_s2

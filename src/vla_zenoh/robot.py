@@ -12,9 +12,9 @@
         def move(self, command: Command) -> None:
             self._arm.servo_joints(command.position_rad)
 
-The profile says ``robot: {driver: python, file: my_arm.py, options: {address: 10.0.0.3}}``. Limits,
-smoothing, watchdogs and brakes are before it: what `move` is given is jerk-limited, and comes to
-rest by itself when those who command fall silent.
+The profile says ``robot: {driver: arm}`` and ``arm: {file: my_arm.py, options: {address:
+10.0.0.3}}``. Limits, smoothing, watchdogs and brakes are before it: what `move` is given is
+jerk-limited, and comes to rest by itself when those who command fall silent.
 """
 
 from __future__ import annotations
@@ -40,6 +40,9 @@ Command = PoseCommand | JointCommand
 class Reading:
     """What the robot measured last.
 
+    It is taken whole, or, where anything in it is no number or nothing this arm can be, refused,
+    counted and told; but its fault counts all the same.
+
     Args:
         position_rad: (n,) of the joints, in the order of ``robot.arm_joints``; m where they slide.
         velocity_rad_s: (n,); None: the robot does not say, they are made of differences.
@@ -50,7 +53,8 @@ class Reading:
         holding: it holds something.
         wrench: (6,) external N and Nm in the base frame; None: not measured.
         fault: why the robot does not move (emergency stop, reflex, protective stop); the arm is
-            then stopped until it is gone and a person has put ``reset``.
+            then stopped until it is gone and a person has put ``reset``. Say it however briefly it
+            lasts, and also where nothing else is new.
         measured_ns: on the clock of `time.monotonic_ns`; None: just now. Say it where a library
             keeps the newest state for you: else an arm that fell silent looks like one that stands.
     """
@@ -77,8 +81,9 @@ class Robot(Protocol):
     ``grip(width_m, speed_m_s, force_n)`` asks for an absolute opening; it returns at once.
     ``close()`` runs at the end, when the arm stands, also where ``connect()`` failed.
 
-    What any of them raises ends the node, after what can be braked has been braked; under ``up`` it
-    is started again, and begins with ``connect()``.
+    What any of them raises ends the node, after the motion was braked by further calls of `move`,
+    unless that raises three times in a row; under ``up`` it is started again, and begins with
+    ``connect()``.
     """
 
     def read(self) -> Reading | None:

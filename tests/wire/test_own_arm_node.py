@@ -127,11 +127,12 @@ def width_m(lab: Lab) -> float:
     return float(lab.chain.detail("width_m", "arm"))
 
 
-def test_a_fault_of_the_robot_stops_it_until_it_is_gone_and_reset(lab: Lab) -> None:
+@pytest.mark.parametrize("what", ["fault", pytest.param("reflex", marks=pytest.mark.slow)])
+def test_a_fault_of_the_robot_stops_it_until_it_is_gone_and_reset(lab: Lab, what: str) -> None:
     chain = lab.chain
     chain.move()
     since_ns = newest_ns(lab)
-    lab.trouble("fault")
+    lab.trouble(what)
     chain.until("fault", lambda: chain.state() == "fault")
     lab.stands(since_ns)  # by what the robot itself does
     assert any("user stop" in event.why for event in chain.events("robot_fault"))
@@ -155,11 +156,12 @@ def test_without_a_state_that_can_be_believed_the_arm_brakes(lab: Lab, what: str
     assert (chain.refused().get("arm.invalid", 0) > 0) == (what == "nan")
 
 
-def test_an_arm_that_raises_is_braked_and_started_again(lab: Lab) -> None:
+@pytest.mark.parametrize("what", ["raise", pytest.param("raise once", marks=pytest.mark.slow)])
+def test_an_arm_that_raises_is_braked_and_started_again(lab: Lab, what: str) -> None:
     chain = lab.chain
     chain.move()
     pid = chain.pid("arm")
-    lab.trouble("raise")
+    lab.trouble(what)
     chain.until("its node ends", lambda: chain.host.supervisor.pids().get("arm") != pid)
     lab.trouble("")
     chain.until("it is back", lambda: chain.state("arm") == "running", AGAIN_S)

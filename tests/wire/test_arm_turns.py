@@ -1,0 +1,279 @@
+"""An arm of one's own, turn by turn: what its file says and raises, and what that does to it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
+from vla_zenoh.errors import NodeError
+from vla_zenoh.interop.arm_reading import FAULT_NS
+from vla_zenoh.nodes import arm_hearing, slots
+from vla_zenoh.nodes.arm import FAILURES, ArmNode
+from vla_zenoh.nodes.clock import Tick
+from vla_zenoh.profile import load_profile
+from vla_zenoh.types import Event, FloatArray, GripperState, Header, JointCommand, JointState
+
+TICK_S, TICK_NS = 0.004, 4_000_000
+SPEED_RAD_S, RAMP_S = 0.3, 0.1
+JOINT = 2
+MOVING = 100
+"""Turns after which the arm is in full motion."""
+BRAKED_RAD = 1e-5
+JERKED_RAD = 2.5e-4
+"""Two steps differ by less: a tick of twice the acceleration of `limits.joint`."""
+FAULT = "protective stop"
+ALONE = """{
+  mode: "peer", scouting: {multicast: {enabled: false}}, listen: {endpoints: []}
+}"""
+ARM = """
+from vla_zenoh.robot import Reading
+
+class Arm:
+    def __init__(self):
+        self.position_rad, self.said, self.moves, self.failing, self.tried = None, {}, [], 0, 0
+
+    def read(self):
+        if "raise" in self.said:
+            raise OSError("the cable is out")
+        return Reading(**{"position_rad": self.position_rad, **self.said})
+
+    def move(self, command):
+        self.tried += 1
+        if self.failing:
+            self.failing -= 1
+            raise OSError("the cable is out")
+        self.moves.append(command.position_rad)
+        self.position_rad = command.position_rad
+"""
+PROFILE = """
+extends: panda_sim
+robot: {driver: arm, command: joint}
+arm: {file: my_arm.py}
+cameras: {front: null, wrist: null}
+hosts: {here: {nodes: [router, arm, command, worker]}}
+"""
+
+
+@dataclass
+class Turns:
+    """An arm whose time passes as fast as it can; `script` is called before each turn."""
+
+    node: ArmNode
+    session: zenoh.Session
+    home_rad: FloatArray
+    heard: dict[type, list[Any]]
+    mono_ns: int = 10**12
+    turn: int = 0
+    script: dict[int, Callable[[], None]] = field(default_factory=dict)
+    last: int = 2 * MOVING
+    stop: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def arm(self) -> Any:
+        return self.node._file._robot
+
+    def wait(self) -> Tick:
+        self.mono_ns += TICK_NS
+        self.script.get(self.turn, lambda: None)()
+        self.turn += 1
+        if self.turn > self.last:
+            self.stop.set()
+        self.lead()
+        return Tick(1, self.mono_ns, 0.0, 0.0)
+
+    def lead(self) -> None:
+        """A joint is led at a speed that it reached from rest."""
+        time_s = self.turn * TICK_S
+        ramp_s = min(time_s, RAMP_S)
+        way_rad = SPEED_RAD_S * (ramp_s * ramp_s / (2 * RAMP_S) + time_s - ramp_s)
+        names = self.node.node.profile.robot.arm_joints
+        columns = np.zeros((3, len(names)))
+        columns[0] = self.home_rad
+        columns[:, JOINT] += (
+            way_rad,
+            SPEED_RAD_S * ramp_s / RAMP_S,
+            SPEED_RAD_S / RAMP_S if time_s < RAMP_S else 0.0,
+        )
+        header = Header(self.node.node.clock.wall_at(self.mono_ns), self.turn, "command#1")
+        self.session.put(
+            self.node.node.keys.command_joint,
+            records.encode(JointCommand(names, columns[0], columns[1], columns[2], "active")),
+            attachment=header_codec.encode(header),
+        )
+
+    def run(self) -> None:
+        self.node._loop(self, self.stop)  # pyright: ignore[reportArgumentType]
+
+    def say(self, **said: Any) -> Callable[[], None]:
+        return lambda: self.arm.said.update(said)
+
+    def refused(self, reason: str) -> int:
+        return self.node.node.counters[f"refused.{reason}"]
+
+    @property
+    def steps_rad(self) -> FloatArray:
+        return np.diff([move[JOINT] for move in self.arm.moves])
+
+    @property
+    def faults(self) -> list[tuple[str, ...]]:
+        return [state.faults for state in self.heard[GripperState]]
+
+    def told(self, what: str) -> list[Event]:
+        return [event for event in self.heard[Event] if event.what == what]
+
+
+@pytest.fixture
+def turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Turns]:
+    (tmp_path / "my_arm.py").write_text(ARM)
+    (tmp_path / "lab.yaml").write_text(PROFILE)
+    profile = load_profile(str(tmp_path / "lab.yaml"))
+    with zenoh.open(zenoh.Config.from_json5(ALONE)) as session:
+        node = ArmNode(profile, session)
+        home_rad = np.array(profile.robot.home_rad)
+        heard: dict[type, list[Any]] = {}
+        keys, subscribers = profile.keys, []
+        for key, kind in (
+            (keys.state_joint, JointState),
+            (keys.state_gripper, GripperState),
+            (keys.event("arm"), Event),
+        ):
+            into = heard.setdefault(kind, [])
+
+            def keep(sample: zenoh.Sample, kind: type = kind, into: list[Any] = into) -> None:
+                into.append(records.decode(kind, sample.payload.to_bytes()))
+
+            handler = zenoh.handlers.Callback(keep, indirect=False)
+            subscribers.append(session.declare_subscriber(key, handler))
+        turns = Turns(node, session, home_rad, heard)
+        turns.arm.position_rad = home_rad
+        clock = SimpleNamespace(monotonic_ns=lambda: turns.mono_ns)
+        for module in (slots, arm_hearing):
+            monkeypatch.setattr(module, "time", clock)
+        yield turns
+        node._close()
+
+
+def braked(turns: Turns) -> None:
+    """The motion was led to rest, and not cut."""
+    full_rad = SPEED_RAD_S * TICK_S
+    assert turns.steps_rad.max() > 0.9 * full_rad
+    assert abs(turns.steps_rad[-1]) < BRAKED_RAD
+    assert turns.refused("joint_foreign") == 0
+
+
+def test_whatever_is_not_raised_the_motion_is_led_to_the_end(turns: Turns) -> None:
+    turns.run()
+    braked(turns)
+    assert np.abs(np.diff(turns.steps_rad)).max() < JERKED_RAD
+
+
+# -- what is raised ---------------------------------------------------------------------------
+def test_one_move_that_fails_brakes_the_arm_by_those_that_follow(turns: Turns) -> None:
+    turns.script[MOVING] = lambda: setattr(turns.arm, "failing", 1)
+    with pytest.raises(NodeError, match=r"my_arm\.py: move: OSError: the cable is out"):
+        turns.run()
+    assert turns.turn < turns.last
+    braked(turns)
+    assert turns.refused("robot_failed") == 1
+    assert not turns.told("not_braked")
+
+
+def test_an_arm_that_cannot_be_moved_any_more_is_given_up_and_that_is_told(turns: Turns) -> None:
+    turns.script[MOVING] = lambda: setattr(turns.arm, "failing", 1000)
+    with pytest.raises(NodeError, match="move"):
+        turns.run()
+    assert turns.arm.tried - len(turns.arm.moves) == 1 + FAILURES
+    assert turns.told("not_braked")
+
+
+def test_a_read_that_raises_brakes_the_arm(turns: Turns) -> None:
+    turns.script[MOVING] = turns.say(**{"raise": True})
+    with pytest.raises(NodeError, match="read: OSError"):
+        turns.run()
+    braked(turns)
+
+
+def test_what_breaks_in_the_loop_itself_brakes_the_arm(
+    turns: Turns, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unforeseen() -> None:
+        raise RuntimeError("unforeseen")
+
+    turns.script[MOVING] = lambda: monkeypatch.setattr(turns.node, "_watch", unforeseen)
+    with pytest.raises(RuntimeError, match="unforeseen"):
+        turns.run()
+    braked(turns)
+    assert turns.told("broken")
+
+
+# -- what is read -----------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    "nonsense",
+    [{"width_m": float("nan")}, {"measured_ns": 0.5}, {"position_rad": [float("nan")] * 7}],
+    ids=str,
+)
+def test_of_a_reading_that_does_not_hold_nothing_is_told_and_the_loop_goes_on(
+    turns: Turns, nonsense: dict[str, Any]
+) -> None:
+    turns.script[MOVING] = turns.say(**nonsense)
+    turns.script[MOVING + 10] = turns.arm.said.clear
+    turns.run()
+    assert turns.refused("invalid") == 10
+    assert len(turns.heard[JointState]) == len(turns.heard[GripperState])
+    assert turns.turn > turns.last
+    braked(turns)
+
+
+def once(turns: Turns, **said: Any) -> None:
+    """It is in a fault for one reading, in full motion."""
+    turns.script[MOVING] = turns.say(fault=FAULT, **said)
+    turns.script[MOVING + 1] = turns.arm.said.clear
+
+
+@pytest.mark.parametrize(
+    "said",
+    [{}, {"measured_ns": 10**12 + MOVING * TICK_NS}, {"position_rad": [float("nan")] * 7}],
+    ids=["new", "old", "invalid"],
+)
+def test_a_fault_of_one_reading_is_told_for_a_while_whatever_else_it_says(
+    turns: Turns, said: dict[str, Any]
+) -> None:
+    once(turns, **said)
+    turns.run()
+    told = [index for index, faults in enumerate(turns.faults) if faults == (FAULT,)]
+    assert len(told) > 0.3 * FAULT_NS / TICK_NS
+    assert turns.faults[-1] == ()
+    assert len(turns.told("robot_fault")) == 1
+    assert turns.refused("joint_fault") > 0
+
+
+@pytest.mark.parametrize(
+    "said", [{"measured_ns": 1}, {"position_rad": [float("nan")] * 7}], ids=["old", "invalid"]
+)
+def test_a_fault_that_stands_is_told_again_and_again_without_a_reading_that_holds(
+    turns: Turns, said: dict[str, Any]
+) -> None:
+    turns.script[0] = turns.say(fault=FAULT, **said)
+    turns.run()
+    assert len(turns.faults) > 2
+    assert set(turns.faults) == {(FAULT,)}
+    assert turns.node.state == "fault"
+    assert turns.arm.moves == []
+
+
+def test_a_fault_is_told_in_words_that_everybody_can_read(turns: Turns) -> None:
+    turns.script[0] = turns.say(fault="\udc80\x1b[2J" + "very long " * 100)
+    turns.last = 10
+    turns.run()
+    assert turns.node.state == "fault"
+    assert "\x1b" not in turns.faults[-1][0]
