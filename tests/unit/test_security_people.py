@@ -47,8 +47,8 @@ def test_where_nobody_said_which_host_it_is_an_operator_goes_before_a_viewer(
     made: Store,
 ) -> None:
     assert people_hosts(profile(made, {})) == ["robot", "gpu"]
-    assert people_hosts(profile(made, {"wall": "viewer"})) == ["robot", "wall", "gpu"]
-    assert people_hosts(profile(made, {"desk": "operator"})) == ["desk", "robot", "gpu"]
+    assert people_hosts(profile(made, {"wall": "viewer"})) == ["robot", "gpu", "wall"]
+    assert people_hosts(profile(made, {"desk": "operator"})) == ["robot", "desk", "gpu"]
 
 
 def test_whom_the_profile_does_not_name_and_who_plays_recordings_are_never_chosen(
@@ -65,16 +65,16 @@ def test_the_host_that_was_noted_goes_before_all_others_but_a_viewer_not_for_a_s
     here = only(made, tmp_path / "here", "robot", "gpu", "desk")
     here.note_this_host("gpu")
     lab = profile(here, {"desk": "operator"})
-    assert people_hosts(lab) == ["gpu", "desk", "robot"]
-    assert people_hosts(lab, stop=True) == ["desk", "robot", "gpu"]
-    here.note_this_host("robot")
+    assert people_hosts(lab) == ["gpu", "robot", "desk"]
     assert people_hosts(lab, stop=True) == ["robot", "desk", "gpu"]
+    here.note_this_host("desk")
+    assert people_hosts(lab, stop=True) == ["desk", "robot", "gpu"]
 
 
 def test_who_says_which_host_it_is_is_obeyed_and_can_stop_as_anybody_here(made: Store) -> None:
     lab = profile(made, PEOPLE, host="wall")
     assert people_hosts(lab) == ["wall"]
-    assert people_hosts(lab, stop=True) == ["desk", "robot", "wall", "gpu"]
+    assert people_hosts(lab, stop=True) == ["robot", "desk", "wall", "gpu"]
 
 
 def test_a_computer_with_one_folder_uses_that_also_when_its_profile_is_an_old_one(

@@ -25,8 +25,9 @@ def people_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
 
     Returns:
         This computer's own host first where it is known, then operators before viewers, in the
-        order of the profile. But for a stop, only that which ``session.security.host`` names, if it
-        names one. Empty where nobody's certificate for people lies here.
+        order of the profile, where hosts stand before people, who are sooner taken out of it. But
+        for a stop, only that which ``session.security.host`` names, if it names one. Empty where
+        nobody's certificate for people lies here.
     """
     security = profile.session.security
     if security is None:
@@ -36,7 +37,7 @@ def people_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
     store = Store(security.folder)
     own = security.host or store.known_host()
     ranks: dict[str, int] = {}
-    for host in dict.fromkeys([*security.people, *profile.hosts]):
+    for host in dict.fromkeys([*profile.hosts, *security.people]):
         role = person(profile, host)
         if role in RANK and store.has(host, role.value):
             ranks[host] = RANK[role]
