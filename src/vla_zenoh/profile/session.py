@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
 from collections.abc import Sequence
 from typing import Annotated, Literal
@@ -15,7 +16,6 @@ IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
 FILE_PROTOCOLS = ("unixsock-stream",)
 TRUSTED_PROTOCOLS = ("tls", "quic")
 """What certificates are checked on."""
-LOOPBACK = ("127.", "localhost", "[::1]")
 DEFAULT_FOLDER = "~/.config/vla-zenoh/lab"
 ANYWHERE = ("0.0.0.0", "[::]")
 
@@ -57,8 +57,14 @@ def address_of(endpoint: str) -> str:
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether only this computer can be meant."""
-    return endpoint.startswith(FILE_PROTOCOLS) or address_of(endpoint).startswith(LOOPBACK)
+    """Whether only this computer can be meant: a file, ``localhost``, or an address of loopback."""
+    if endpoint.startswith(FILE_PROTOCOLS):
+        return True
+    host = host_of(endpoint).partition("%")[0]
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a name, which leads wherever its resolver says
+        return host == "localhost"
 
 
 def host_of(endpoint: str) -> str:
@@ -116,7 +122,7 @@ class SecurityProfile(Section):
     Args:
         folder: a folder for each host in it, with its certificates: ``HOST/ca.pem``,
             ``HOST/NODE.pem`` and ``HOST/NODE.key``.
-        host: which host this computer is; None: the only one in the folder.
+        host: which host this computer is; None: as noted in the folder, or the only one there.
         people: computer -> what a person there may do. A host that runs the command node may
             drive the robot, the others of the profile may look. Who may replay may say all that
             a recording holds, commands too.
@@ -131,9 +137,7 @@ class SessionProfile(Section):
     """How nodes of this profile reach each other.
 
     Args:
-        mode: ``client`` of a router (peers are not forwarded to each other by a router), or
-            ``peer`` for a direct pair on one host.
-        connect: where clients look for the router, the first that answers is taken; when it is
+        connect: where nodes look for the router, the first that answers is taken; when it is
             gone, the next.
         listen: where the router listens.
         router: ``own``: in a Python process of ours; ``zenohd``: the program of that name, with
@@ -147,7 +151,6 @@ class SessionProfile(Section):
         insecure: listen on a network without certificates all the same.
     """
 
-    mode: Literal["client", "peer"] = "client"
     connect: Endpoints = ("tcp/127.0.0.1:7447",)
     listen: Endpoints = ("tcp/127.0.0.1:7447",)
     router: Literal["own", "zenohd"] = "own"
@@ -160,8 +163,8 @@ class SessionProfile(Section):
     @model_validator(mode="after")
     def _somewhere_to_meet(self) -> SessionProfile:
         faults = []
-        if self.mode == "client" and not self.connect:
-            faults.append((("connect",), "is empty: a client needs a router, as tcp/10.0.0.2:7447"))
+        if not self.connect:
+            faults.append((("connect",), "is empty: nodes need a router, as tcp/10.0.0.2:7447"))
         if not self.listen:
             faults.append((("listen",), "is empty: the router needs an address, as tcp/[::]:7447"))
         faults += [
@@ -174,8 +177,6 @@ class SessionProfile(Section):
                 ((name, str(index)), why)
                 for index, why in endpoint_faults(endpoints, self, listen=name == "listen")
             ]
-        if self.security is not None and self.mode == "peer":
-            faults.append((("mode",), "is peer: only a router controls access; write client"))
         if self.security is not None and self.insecure:
             faults.append((("insecure",), "is true, beside a section security: leave one out"))
         refuse(faults)
