@@ -60,7 +60,7 @@ def up(
         tell("up", f"profile {loaded.name}, host {running.host}, router at {where}")
         if dry_run:
             tell("up", "dry run: the robot is commanded nothing")
-        aim = _aim(profile, running)
+        aim = aim_of(profile, running)
         look, drive, end = (aim.typed(word) for word in ("status", "activate", "stop"))
         tell("up", f"look: {look}; drive: {drive}, likewise prompt; stop: {end}; end: Ctrl-C")
         running.serve(stop)
@@ -68,7 +68,7 @@ def up(
     tell("up", "all nodes have ended")
 
 
-def _aim(profile: str, running: Host) -> Aim:
+def aim_of(profile: str, running: Host) -> Aim:
     """What leads other commands to this robot, from any folder and terminal of this computer."""
     there = running.profile.session.connect
     name = str(profile_file(profile)) if is_path(profile) else profile
