@@ -241,4 +241,5 @@ def test_a_worker_that_is_not_there_cannot_be_compared(chain: Chain) -> None:
 def test_who_shows_nothing_is_named(chain: Chain) -> None:
     said = command_line("seen", "ghost", "--json", profile=chain.profile_file)
     assert said.returncode == 1
-    assert "ghost shows nothing; does it infer?" in said.stderr
+    assert "ghost of robot panda" in said.stderr
+    assert "shows nothing; does it infer?" in said.stderr
