@@ -134,6 +134,8 @@ def test_a_fault_of_the_robot_stops_it_until_it_is_gone_and_reset(lab: Lab, what
     since_ns = newest_ns(lab)
     lab.trouble(what)
     chain.until("fault", lambda: chain.state() == "fault")
+    if what == "reflex":  # else nobody sees how the arm moves
+        lab.trouble("")
     lab.stands(since_ns)  # by what the robot itself does
     assert any("user stop" in event.why for event in chain.events("robot_fault"))
     lab.trouble("")

@@ -124,38 +124,22 @@ def test_a_wall_clock_that_is_set_does_not_give_up_a_goal(rig: Rig) -> None:
     assert rig.node.counters["ros2.gripper_timeouts"] == 0
 
 
-@pytest.mark.parametrize(
-    ("rig", "at_m", "to_m", "action"),
-    [
-        (WITH_GRASP, 0.0, 0.08, "Move"),
-        (WITH_GRASP, 0.08, 0.08, "Move"),
-        (WITH_GRASP, 0.04, 0.0, "Grasp"),
-        (WITH_GRASP, None, 0.08, "Move"),
-        (WITH_GRASP, None, 0.02, "Grasp"),
-        ("", 0.04, 0.0, "Move"),
-    ],
-    indirect=["rig"],
-)
-def test_the_first_order_grasps_only_where_the_fingers_have_to_close(
-    rig: Rig, at_m: float | None, to_m: float, action: str
-) -> None:
-    rig.width_m = at_m
-    rig.command.put(GripperCommand(to_m, 0.05, 10.0))
-    rig.turn_until("the goal", "ros2.gripper_goals", 1)
-    until("the robot hears it", lambda: rig.actions)
-    assert rig.actions == [action]
-
-
 @pytest.mark.parametrize("rig", [WITH_GRASP], indirect=True)
-@pytest.mark.parametrize(("at_m", "action"), [(0.04, "Grasp"), (None, "Move"), (0.0, "Move")])
-def test_fingers_that_stand_apart_of_what_was_ordered_are_closed_from_where_they_are(
-    rig: Rig, at_m: float | None, action: str
-) -> None:
+def test_what_closes_the_fingers_from_where_they_are_is_a_grasp_and_nothing_else(rig: Rig) -> None:
     rig.over.set()
-    rig.command.put(GripperCommand(0.0, 0.05, 10.0))
-    rig.turn_until("the first goal", "ros2.gripper_goals", 1)
-    rig.width_m = at_m  # something is between them
-    rig.command.put(GripperCommand(0.02, 0.05, 10.0))
-    rig.turn_until("the second goal", "ros2.gripper_goals", 2)
-    until("the robot hears it", lambda: len(rig.actions) == 2)
-    assert rig.actions == ["Grasp", action]
+    expected: list[str] = []
+    for at_m, to_m, action in (
+        (None, 0.08, "Move"),  # the first order of all: nothing is known
+        (0.0, 0.08, "Move"),
+        (0.08, 0.08, "Move"),
+        (0.04, 0.0, "Grasp"),
+        (0.04, 0.02, "Grasp"),  # something is between them; the last order was 0
+        (None, 0.08, "Move"),  # from where they were sent last
+        (None, 0.02, "Grasp"),
+    ):
+        rig.width_m = at_m
+        rig.command.put(GripperCommand(to_m, 0.05, 10.0))
+        expected.append(action)
+        rig.turn_until("the goal", "ros2.gripper_goals", len(expected))
+        until("the robot hears it", lambda: len(rig.actions) == len(expected))
+        assert rig.actions == expected

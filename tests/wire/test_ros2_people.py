@@ -132,8 +132,9 @@ def test_what_comes_last_in_a_request_is_not_done_after_a_stop_in_between(rig: R
     header = header_codec.encode(Header(time.time_ns(), 1, "command#1"))
     rig.operator.put(rig.keys.task, task, attachment=header)
     until("the rate is agreed to", lambda: rig.people._client.task)
-    rig.ask("stop")
+    stop = rig.ask("stop")
     rig.expect(("rate", "5"), ("stop", ""))
     rig.agreed.set()
+    assert stop.result().success
     assert TOO_LATE in call.result().message
     assert len(rig.heard) == 2
