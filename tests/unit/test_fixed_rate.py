@@ -55,6 +55,9 @@ def test_a_late_turn_says_by_how_much_and_how_many_it_stands_for() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux says how long it was suspended")
 def test_the_time_asleep_is_that_of_the_kernel() -> None:
-    truth_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
+    # Read in the other order it is never less than the truth.
+    most_ns = min(
+        -time.monotonic_ns() + time.clock_gettime_ns(time.CLOCK_BOOTTIME) for _ in range(TRIES)
+    )
     said_ns = max(clock.suspended_ns() for _ in range(TRIES))
-    assert abs(said_ns - truth_ns) < READ_APART_NS
+    assert 0 <= most_ns - said_ns < READ_APART_NS
