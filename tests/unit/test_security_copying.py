@@ -210,6 +210,7 @@ def test_where_it_is_not_known_people_drive_all_the_same_until_it_is_said(world:
     assert people_hosts(profile) == ["robot", "gpu"]
     world.secure("here", "gpu", "-p", "panda_sim_two_hosts_secure.yaml")
     assert people_hosts(profile) == ["gpu", "robot"]
+    assert "this computer is gpu" in world.secure("show", "-p", "panda_sim_two_hosts_secure.yaml")
 
 
 def test_only_a_host_whose_certificates_are_here_can_be_this_computer(world: World) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import zenoh
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, PROFILE_VARIABLE, effective_profile
-from vla_zenoh.cli.output import errors
+from vla_zenoh.cli.output import errors, styled
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.nodes.alive import robots_alive
 from vla_zenoh.nodes.client import Client
@@ -168,10 +168,26 @@ def _with_host(profile: Profile, host: str | None) -> Profile:
 
 
 def _first(choices: Sequence[Profile]) -> tuple[Profile, zenoh.Session]:
-    """A session with the first certificate that the router takes."""
-    for profile in choices[:-1]:
+    """A session with the first certificate that the router takes.
+
+    Raises:
+        SecurityError: as the first of them, where none is taken.
+        SessionError: likewise.
+    """
+    failed: list[SecurityError | SessionError] = []
+    for profile in choices:
         try:
             return profile, open_session(profile.session)
         except (SecurityError, SessionError) as error:
-            errors().print(f"{error}; trying the next certificate here", soft_wrap=True)
-    return choices[-1], open_session(choices[-1].session)
+            failed.append(error)
+            if profile is not choices[-1]:
+                _tell_next(profile, error)
+    raise failed[0]
+
+
+def _tell_next(profile: Profile, error: SecurityError | SessionError) -> None:
+    security = profile.session.security
+    assert security is not None
+    why = error if isinstance(error, SecurityError) else "there is no router that takes it"
+    told = f"not with the certificate of {security.host} ({why}); trying the next one here"
+    errors().print(styled(told, "yellow"), soft_wrap=True)

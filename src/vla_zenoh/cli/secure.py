@@ -106,7 +106,8 @@ def init(
     for line in copying(written, file, store, others):
         out.print(line, soft_wrap=True)
     _print_here(here, Aim(_typed(file)))
-    out.print(f"Keep {store.folder / 'ca.key'} here: who has it can make certificates.")
+    kept = f"Keep {store.folder / 'ca.key'} here: who has it can make certificates."
+    out.print(kept, soft_wrap=True)
     _complain_about_places(written)
 
 
@@ -162,8 +163,8 @@ def add(
     if here is None:
         out.print(f"Is {host} this computer? Then instead: vla-zenoh secure here {host}")
     if new:
-        words = f"{host} is in {file} now, which {' and '.join(routers)} of the lab read: start the"
-        out.print(f"{words} router there again", soft_wrap=True)
+        where = " and ".join(routers)
+        out.print(f"{host} is in {file} now: start the router of {where} again", soft_wrap=True)
 
 
 @secure_app.command("here")
@@ -196,6 +197,8 @@ def show(
         print_json([_plain(entry, now) for entry in entries])
     else:
         _print(entries, now)
+        if (host := store.known_host()) is not None:
+            console().print(f"this computer is {host}")
     if not entries:
         fail(f"{store.folder} has no certificates; `vla-zenoh secure init` makes them")
     if any(entry.faults for entry in entries):
