@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 
 import pytest
 
 from vla_zenoh.bench.task import BASELINES, Ended, Plan
 from vla_zenoh.cli.bench_task import _with_bricks
+from vla_zenoh.errors import NodeError
+from vla_zenoh.nodes.bench import task_lockstep
 from vla_zenoh.nodes.bench.task_lockstep import run_in_lockstep
 from vla_zenoh.profile import load_profile, override
 
@@ -15,15 +18,82 @@ SEED = 1_000_000
 LIMIT_S = 4.0
 
 
-def outcomes(plan: Plan) -> list[Ended]:
-    profile = _with_bricks(load_profile("panda_sim"), plan.worker, [])
+MODEL = """\
+from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec
+
+
+class Nod:
+    spec = ModelSpec(name="nod", action=ActionSpec(horizon=1, dt_s=0.1))
+
+    def __init__(self, step_m="0.0"):
+        self.step_m = float(step_m)
+
+    def load(self):
+        pass
+
+    def infer(self, observation):
+        return ActionSteps([[0, 0, self.step_m, 0, 0, 0, 0]])
+"""
+
+
+def outcomes(
+    plan: Plan, path: str = "", options: dict[str, str] | None = None, processes: int = 1
+) -> list[Ended]:
+    profile = _with_bricks(load_profile("panda_sim"), plan.worker, [], path)
     small = {
         name: {**camera.model_dump(mode="json"), "width": 64, "height": 48}
         for name, camera in profile.cameras.items()
     }
     profile = override(profile, {"cameras": small})
-    found = run_in_lockstep(profile, plan, {}, "front", threading.Event(), 1)
+    event = threading.Event()
+    found = run_in_lockstep(profile, plan, options or {}, "front", event, processes)
     return [each for each, _ in found]
+
+
+@pytest.mark.slow
+def test_a_model_of_ones_own_is_run_with_its_options(tmp_path: Path) -> None:
+    (tmp_path / "nod.py").write_text(MODEL)
+    plan = Plan("nod", 1, SEED, family="stay", limit_s=LIMIT_S)
+    (still,) = outcomes(plan, str(tmp_path / "nod.py"))
+    (moved,) = outcomes(plan, str(tmp_path / "nod.py"), {"step_m": "0.02"})
+    assert (still.success, moved.failure) == (True, "moved")
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "told"),
+    [
+        (MODEL, {"colour": "red"}, r"unexpected keyword .* \(options it takes: step_m\)"),
+        ("import nowhere\n" + MODEL, {}, "No module named 'nowhere'"),
+        (MODEL.replace("pass", "raise OSError('no weights')"), {}, "loaded: OSError: no weights"),
+    ],
+)
+def test_why_a_model_cannot_be_made_is_told_by_the_first_that_asks(
+    tmp_path: Path, text: str, options: dict[str, str], told: str
+) -> None:
+    (tmp_path / "nod.py").write_text(text)
+    plan = Plan("nod", 1, SEED)
+    profile = _with_bricks(load_profile("panda_sim"), "nod", [], str(tmp_path / "nod.py"))
+    task_lockstep._begin(profile, plan, options, None, None)
+    with pytest.raises(NodeError, match=told):
+        task_lockstep._one(next(plan.asked()))
+
+
+@pytest.mark.slow
+def test_a_model_that_cannot_be_made_ends_the_bench_with_its_reason(tmp_path: Path) -> None:
+    (tmp_path / "nod.py").write_text(MODEL)
+    with pytest.raises(NodeError, match="options it takes: step_m"):
+        outcomes(Plan("nod", 40, SEED), str(tmp_path / "nod.py"), {"colour": "red"}, 2)
+
+
+@pytest.mark.slow
+def test_a_model_that_raises_fails_its_episode_and_its_words_are_told(tmp_path: Path) -> None:
+    text = MODEL.replace(
+        "return ActionSteps", "raise KeyError('front')\n        return ActionSteps"
+    )
+    (tmp_path / "nod.py").write_text(text)
+    ends = outcomes(Plan("nod", 2, SEED, limit_s=LIMIT_S), str(tmp_path / "nod.py"))
+    assert [end.failure for end in ends] == ["not_obeyed"] * 2
+    assert ends[0].why == "the model failed: KeyError: 'front'"
 
 
 @pytest.mark.slow
