@@ -126,7 +126,10 @@ class Aim:
         """Which other robots are alive on this router, with what to type."""
         others = [f"{name} (`{self.typed(*command, robot=name)}`)" for name in self.others(client)]
         if not others:
-            return "Nor is that of any other robot on this router, as far as one may know here"
+            return (
+                "Nor is another robot alive on this router, as far as one may know here; "
+                "`vla-zenoh up` starts one"
+            )
         return f"Alive on this router: {', '.join(others)}"
 
     def others(self, client: Client) -> list[str]:
