@@ -19,7 +19,7 @@ from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
 from vla_zenoh.keys import Kind
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.offsets import MAX_PEERS
+from vla_zenoh.nodes.offsets import MAX_HEARD
 from vla_zenoh.nodes.rehearsal import rehearse
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.slots import Latest
@@ -125,7 +125,7 @@ def test_a_source_that_cannot_be_a_node_is_not_asked() -> None:
         assert near.clocks._peers == {}
         for number in range(500):
             near.clocks.here(Header(0, 0, f"stranger{number}#1"), None)
-        assert len(near.clocks._peers) == MAX_PEERS
+        assert len(near.clocks._peers) == MAX_HEARD
 
 
 def test_commands_and_pictures_travel_on_links_of_their_own() -> None:
@@ -287,6 +287,50 @@ def test_every_role_does_its_part_and_nothing_else_with_real_sessions(lab: Profi
         assert one.faults == ()
         assert one.must > 0
         assert one.must_not > 0
+
+
+@pytest.mark.slow
+def test_a_rule_that_lets_a_viewer_delete_is_named(lab: Profile) -> None:
+    rules: dict[str, Any] = access_control([lab])
+    reset = lab.keys.reset
+    more = {
+        "id": "too much",
+        "messages": ["delete"],
+        "flows": ["ingress"],
+        "permission": "allow",
+        "key_exprs": [reset],
+    }
+    rules["rules"].append(more)
+    for policy in rules["policies"]:
+        if policy["subjects"] == ["viewer@wall"]:
+            policy["rules"].append("too much")
+    faults = {one.identity.node: one.faults for one in rehearse(lab, rules)}
+    assert faults.pop("viewer") == (
+        f"viewer@wall can delete {reset} and must not: rule 'too much' allows it",
+    )
+    assert not any(faults.values())
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(180)
+def test_everybody_of_every_robot_of_a_router_tries_the_keys_of_all(lab: Profile) -> None:
+    other = override(
+        lab,
+        {
+            "robot": {"name": "second"},
+            "session": {"security": {"people": {"wall": "operator"}}},
+        },
+    )
+    verdicts = rehearse(lab, also=[other])
+    named = {one.identity.common_name: one for one in verdicts}
+    assert {"viewer@wall", "operator@wall", "sim@here"} <= set(named)
+    assert [fault for one in verdicts for fault in one.faults] == []
+    alone = {one.identity.common_name: one for one in rehearse(lab)}
+    assert named["viewer@wall"].must == alone["viewer@wall"].must  # of its own robot alone
+    assert named["viewer@wall"].must_not > 2 * alone["viewer@wall"].must_not
+    missing = rehearse(lab, access_control([lab]), also=[other])
+    faults = {one.identity.common_name: one.faults for one in missing}
+    assert any("vla/second/" in fault and "no rule allows" in fault for fault in faults["sim@here"])
 
 
 @pytest.mark.slow

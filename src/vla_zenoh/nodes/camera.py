@@ -8,6 +8,8 @@ from collections.abc import Callable
 
 import zenoh
 
+from vla_zenoh.keys import last
+from vla_zenoh.nodes.camera_sources.asked import MAX_MODELS, Asked
 from vla_zenoh.nodes.camera_sources.choose import SIM, choose_cameras, make_source
 from vla_zenoh.nodes.camera_sources.grabber import Grabber
 from vla_zenoh.nodes.camera_sources.opencv import prepare
@@ -24,6 +26,8 @@ from vla_zenoh.types import Event, SceneState, Stamped
 
 TICK_S = 0.05
 SPECS_A_TICK = 8
+SIZES_PERIOD_S = 0.5
+"""The sizes that models want are looked at so often, however often they change their minds."""
 GOODBYE_S = 0.3
 """Threads get this long to end; one that hangs in a driver is left behind."""
 
@@ -68,6 +72,8 @@ class CameraNode:
             for camera, settings in chosen.items()
             if not settings.source.startswith(SIM)
         ]
+        self._asked = Asked()
+        self._sized_s = -1e9
         self._specs: Mailbox | None = None
         if any(settings.fit_for_workers for settings in chosen.values()):
             self._specs = self.node.listen(self.node.keys.all_specs, Mailbox(SPECS_A_TICK))
@@ -118,13 +124,22 @@ class CameraNode:
 
     def _hear_models(self) -> None:
         """Serve the sizes that models want, where the profile says so."""
-        for arrival in self._specs.take_all() if self._specs is not None else ():
+        if self._specs is None:
+            return
+        now_s = time.monotonic()
+        for arrival in self._specs.take_all():
+            worker = last(str(arrival.sample.key_expr))
             with self._voice:
                 stamped = self.node.read(ModelSpec, arrival)
-            for wanted in stamped.record.observation.cameras if stamped is not None else ():
-                outlet = self._outlets.get(wanted.camera)
-                if outlet is not None and outlet.profile.fit_for_workers:
-                    outlet.fit_for(wanted)
+                if stamped is not None and not self._asked.hear(worker, stamped.record, now_s):
+                    why = f"specs of {MAX_MODELS} workers are known; that of {worker!r} is not read"
+                    self.node.refuse("too_many_models", why)
+        if now_s - self._sized_s < SIZES_PERIOD_S:
+            return
+        self._sized_s = now_s
+        for name, outlet in self._outlets.items():
+            if outlet.profile.fit_for_workers:
+                outlet.forms.serve(self._asked.sizes(name, now_s))
 
     # -- status -------------------------------------------------------------------------------
     def _watch(self) -> None:

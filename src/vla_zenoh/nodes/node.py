@@ -74,6 +74,10 @@ class Stream:
         self.sent_bytes += len(payload)
         return header
 
+    def close(self) -> None:
+        """No more is written."""
+        self._publisher.undeclare()
+
 
 class Node:
     """A process on the bus.
@@ -97,6 +101,7 @@ class Node:
         self._declared: list[Any] = []
         self._streams: list[Stream] = []
         self._slots: list[Slot] = []
+        self._subscribers: list[tuple[Slot, Any]] = []
         self._pictures: zenoh.Session | None = None
         self.traffic = Traffic(session)
         self._last_status = 0.0
@@ -128,6 +133,11 @@ class Node:
         made = Stream(self._session_for(kind), key, kind, self.source, self.clock)
         self._streams.append(made)
         return made
+
+    def end(self, stream: Stream) -> None:
+        """Nothing is written there any more."""
+        self._streams.remove(stream)
+        stream.close()
 
     def _session_for(self, kind: Kind) -> zenoh.Session:
         """Pictures have a connection of their own where the profile says so."""
@@ -231,11 +241,20 @@ class Node:
         if isinstance(slot, Mailbox):
             subscriber = session.declare_subscriber(key, slot.channel())
             slot.take_from(subscriber.try_recv)
-            self._declared.append(subscriber)
+            self._subscribers.append((slot, subscriber))
             return slot
         handler = zenoh.handlers.Callback(slot, indirect=False)
-        self._declared.append(session.declare_subscriber(key, handler))
+        self._subscribers.append((slot, session.declare_subscriber(key, handler)))
         return slot
+
+    def unlisten(self, slot: Slot) -> None:
+        """Let no more samples fall into `slot`."""
+        for found, subscriber in self._subscribers:
+            if found is slot:
+                subscriber.undeclare()
+        self._subscribers = [pair for pair in self._subscribers if pair[0] is not slot]
+        self._tell_of_refused()
+        self._slots.remove(slot)
 
     def watch(self, slot: Slot) -> None:
         """Count and tell what `slot` does not take."""
@@ -328,9 +347,10 @@ class Node:
     def close(self) -> None:
         """Say goodbye: the liveliness token goes first, so that others notice at once."""
         self._token.undeclare()
-        for declared in self._declared:
+        for declared in (*self._declared, *(subscriber for _, subscriber in self._subscribers)):
             declared.undeclare()
         self._declared.clear()
+        self._subscribers.clear()
         if self._pictures is not None:
             self._pictures.close()
             self._pictures = None

@@ -1,6 +1,7 @@
 """Clocks of other nodes: asks them over Zenoh, and puts their stamps on our own clock.
 
-A node asks those whose streams it reads, and whom it was told of. It never waits for an answer.
+A node asks those whom it was told of, and those whose streams it reads. It never waits for an
+answer. A header may name whom it likes, so names that only headers say have a place of their own.
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ FIRST_ASKS, FIRST_PERIOD_S = 8, 0.1
 PATIENCE_S = 2.0
 FORGET_S = 30.0
 """Who has not answered for so long has no clock we know of."""
-MAX_PEERS = 64
+HEARD_PATIENCE_S = 2.0
+"""A name that only a header says, and that never answered, makes room after so long."""
+MAX_PEERS, MAX_HEARD = 64, 32
+"""Clocks of nodes that we were told of, and of names that only a header says."""
 MAX_STAMPS_BYTES = 1024
 Record = TypeVar("Record")
 
@@ -37,9 +41,16 @@ class _Peer:
     key: str
     filter: OffsetFilter
     since_s: float
+    told: bool
     asks: int = 0
     next_ask_s: float = 0.0
     answered_s: float = -1e9
+
+    def forgotten(self, now_s: float) -> bool:
+        """It has been silent for so long that others may have its place."""
+        real = self.told or self.answered_s > 0
+        silent_s = now_s - max(self.answered_s, self.since_s)
+        return silent_s > (FORGET_S if real else HEARD_PATIENCE_S)
 
 
 class Clocks:
@@ -64,15 +75,26 @@ class Clocks:
 
     # -- asking -------------------------------------------------------------------------------
     def follow(self, node: str) -> None:
-        """From now on know the clock of `node`; what cannot be a node's name is left out."""
-        if node == self._name or node in self._peers or len(self._peers) >= MAX_PEERS:
+        """From now on know the clock of `node`, which lives.
+
+        What cannot be a node's name is left out.
+        """
+        self._follow(node, told=True)
+
+    def _follow(self, node: str, *, told: bool) -> None:
+        known = self._peers.get(node)
+        if known is not None:
+            known.told = known.told or told
+            return
+        others = sum(peer.told is told for peer in list(self._peers.values()))
+        if node == self._name or others >= (MAX_PEERS if told else MAX_HEARD):
             return
         try:
             key = self._keys.clock(node)
         except ProfileError:
             return
         with self._lock:
-            self._peers[node] = _Peer(key, OffsetFilter(self._bound_s), time.monotonic())
+            self._peers[node] = _Peer(key, OffsetFilter(self._bound_s), time.monotonic(), told)
         self._next_look_s = 0.0
 
     def tick(self) -> None:
@@ -88,7 +110,7 @@ class Clocks:
                     FIRST_PERIOD_S if peer.asks <= FIRST_ASKS else ASK_PERIOD_S
                 )
                 self._ask(peer)
-            if now_s - max(peer.answered_s, peer.since_s) > FORGET_S:
+            if peer.forgotten(now_s):
                 with self._lock:  # room for others; who is still heard comes back
                     del self._peers[node]
 
@@ -137,7 +159,7 @@ class Clocks:
     def _ahead_ns(self, node: str) -> int:
         peer = self._peers.get(node)
         if peer is None:
-            self.follow(node)
+            self._follow(node, told=False)
             return 0
         with self._lock:
             return peer.filter.applied_ns(self._clock.offset_ns, time.monotonic_ns())

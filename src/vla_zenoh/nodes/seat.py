@@ -22,13 +22,14 @@ from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import CodecError, PeerError, SpecError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.bounded import bytes_of
+from vla_zenoh.nodes.camera_input import STREAM_PATIENCE_S, Heard, listen_to
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.seen import SeenOutlet
-from vla_zenoh.nodes.slots import Arrival, Inbox, Latest
+from vla_zenoh.nodes.slots import Inbox, Latest
 from vla_zenoh.nodes.speaker import Speaker
-from vla_zenoh.observe import History, NotYet, assemble, form_for, form_of
-from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps, reset_of
+from vla_zenoh.observe import History, NotYet, assemble
+from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, reset_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
@@ -42,8 +43,6 @@ from vla_zenoh.types import (
 
 SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5
-STREAM_PATIENCE_S = 0.5
-"""Another camera or robot is believed when the one before it was silent for so long."""
 AFTER_A_FAILURE_S = 0.5
 FRESH_PATIENCE_S = 0.05
 FRESH_TOLERANCE_S = 0.005
@@ -93,30 +92,16 @@ class Seat:
         )
         self._task_slot = node.listen(keys.task, Latest(SMALL_BYTES))
         self._jpeg = images == "jpeg"
-
-        def key_of(camera: CameraSpec) -> str:
-            settings, part = profile.cameras.get(camera.camera), profile.hosts.get(host or "")
-            form = form_of(camera) if settings is not None and settings.fit_for_workers else None
-            if self._jpeg and host is not None and part is not None and part.pictures is not None:
-                form = form_for(host, form)
-            if self._jpeg and form is not None:
-                return keys.camera_fitted(camera.camera, form)
-            return (keys.camera_jpeg if self._jpeg else keys.camera_raw)(camera.camera)
-
-        self._image_slots = {
-            camera.camera: node.listen(
-                key_of(camera), Latest(MAX_PICTURE_BYTES, changed), Kind.FRAME
-            )
-            for camera in self.spec.observation.cameras
+        self._cameras = {
+            one.camera: listen_to(one, node, jpeg=self._jpeg, host=host, changed=changed)
+            for one in self.spec.observation.cameras
         }
         self._state_slots = {
             part: node.listen(self._state_key(part), Inbox(256, SMALL_BYTES))
             for part in self.spec.observation.state
         }
         self._task_speaker = Speaker(TASK_PATIENCE_S)
-        self._speakers = {
-            name: Speaker(STREAM_PATIENCE_S) for name in (*self._image_slots, *self._state_slots)
-        }
+        self._speakers = {part: Speaker(STREAM_PATIENCE_S) for part in self._state_slots}
         self._images: dict[str, Stamped[Image]] = {}
         self._pictures_s: dict[str, float] = {}
         self._states = {part: History() for part in self.spec.observation.state}
@@ -142,13 +127,13 @@ class Seat:
     @property
     def news(self) -> bool:
         """Whether the slowest input has something that was not looked at."""
-        slot = next(iter(self._image_slots.values()), None)
-        return slot is not None and slot.full
+        slowest = next(iter(self._cameras.values()), None)
+        return slowest is not None and slowest.full
 
     @property
     def sees(self) -> bool:
         """Whether the model wants pictures."""
-        return bool(self._image_slots)
+        return bool(self._cameras)
 
     def listen(self) -> None:
         """Take in what came."""
@@ -157,12 +142,12 @@ class Seat:
             task = self.node.read(Task, arrival, self._task_speaker)
             if task is not None:
                 self._take_task(task)
-        for camera, slot in self._image_slots.items():
-            arrival = slot.take()
-            image = self._read_image(camera, arrival) if arrival is not None else None
-            if arrival is not None and image is not None:
-                self._images[camera] = image
-                self._pictures_s[camera] = arrival.mono_ns / 1e9
+        for name, camera in self._cameras.items():
+            heard = camera.take()
+            image = self._read_image(name, heard) if heard is not None else None
+            if heard is not None and image is not None:
+                self._images[name] = image
+                self._pictures_s[name] = heard.arrival.mono_ns / 1e9
         self.listen_to_states()
 
     def listen_to_states(self) -> None:
@@ -187,11 +172,12 @@ class Seat:
             except Exception as error:
                 self.failed(error, "reset_failed")
 
-    def _read_image(self, camera: str, arrival: Arrival) -> Stamped[Image] | None:
+    def _read_image(self, camera: str, heard: Heard) -> Stamped[Image] | None:
+        arrival, speaker = heard
         sample = arrival.sample
         try:
             header = self.node.header(arrival)
-            self._speakers[camera].check(header, arrival.mono_ns)
+            speaker.check(header, arrival.mono_ns)
             payload = bytes_of(sample.payload, MAX_PICTURE_BYTES)
             if self._jpeg:
                 image = image_codec.decode_jpeg(payload)
@@ -201,7 +187,7 @@ class Seat:
         except CodecError as error:
             self.node.refuse(error.reason, f"camera {camera}: {error}")
             return None
-        self._speakers[camera].heard(header, arrival.mono_ns)
+        speaker.heard(header, arrival.mono_ns)
         self.node.traffic.heard(str(sample.key_expr), header, arrival.nth)
         header, image = self.node.clocks.here(header, image)
         return Stamped(header, image, self.node.wall_of(arrival))

@@ -10,10 +10,12 @@ from typing import Any
 from vla_zenoh import keys as key_names
 from vla_zenoh.control.names import worker_node
 from vla_zenoh.control.preflight import Surroundings
+from vla_zenoh.errors import CodecError
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.slots import Arrival, Mailbox
 from vla_zenoh.policy import ModelSpec
-from vla_zenoh.types import NodeStatus, Stamped
+from vla_zenoh.profile.servers import camera_servers
+from vla_zenoh.types import NodeStatus
 
 MAX_WORKERS = 32
 CLOCKS_PERIOD_S = 0.25
@@ -33,7 +35,8 @@ class Neighbours:
         self._spec_sources: dict[str, str] = {}
         self._voices: dict[str, str] = {}
         self._complaints: dict[str, str] = {}
-        self._cameras: dict[str, tuple[str, float, int]] = {}
+        self._servers = camera_servers(node.profile)
+        self._cameras: dict[str, tuple[float, int]] = {}
         self._hosts: dict[str, str] = {}
         self._next_clocks_s = 0.0
         self._statuses = node.listen(node.keys.all_status, Mailbox(STATUSES_A_TICK))
@@ -57,14 +60,9 @@ class Neighbours:
     def look(self, now_ns: int) -> Surroundings | None:
         """The surroundings now, or None when nothing changed."""
         for arrival in self._statuses.take_all():
-            stamped = self._node.read(NodeStatus, arrival)
-            if stamped is not None and self._speaks_for_itself(stamped, arrival):
-                self._take_status(stamped.record, now_ns)
+            self._hear_status(arrival, now_ns)
         for arrival in self._new_specs.take_all():
-            stamped = self._node.read(ModelSpec, arrival)
-            if stamped is not None:
-                worker = key_names.last(str(arrival.sample.key_expr))
-                self._take_spec(worker, stamped.record, stamped.header.source)
+            self._hear_spec(arrival)
         self._follow_clocks()
         with self._lock:
             if not self._changed:
@@ -78,9 +76,9 @@ class Neighbours:
                 dict(self._complaints),
                 {
                     camera: age_s + (now_ns - heard_ns) / 1e9
-                    for camera, (_, age_s, heard_ns) in self._cameras.items()
+                    for camera, (age_s, heard_ns) in self._cameras.items()
                 },
-                {camera: node for camera, (node, _, _) in self._cameras.items()},
+                {camera: self._servers[camera] for camera in self._cameras},
                 socket.gethostname(),
                 dict(self._hosts),
                 self._node.clocks.known(),
@@ -101,47 +99,85 @@ class Neighbours:
         with self._lock:
             return self._spec_sources.get(worker)
 
-    def _speaks_for_itself(self, status: Stamped[NodeStatus], arrival: Arrival) -> bool:
+    # Who speaks is looked at before what is said: a stranger's words are not decoded, and nobody
+    # is asked for the clock of a name that he made up.
+    def _hear_status(self, arrival: Arrival, now_ns: int) -> None:
         """A node's status counts on its own key, while it is alive, by the first who wrote it."""
-        name, source = status.record.node, status.header.source
+        name, source = self._said(arrival)
+        if source is None:
+            return
         with self._lock:
-            ours = name == key_names.last(str(arrival.sample.key_expr)) and name in self._alive
-            if ours and self._voices.setdefault(name, source) == source:
-                return True
-        self._node.counters["refused.foreign_status"] += 1
-        return False
+            ours = name in self._alive and self._voices.get(name, source) == source
+        stamped = self._node.read(NodeStatus, arrival) if ours else None
+        if ours and stamped is None:
+            return  # refused for what it is
+        status = stamped.record if stamped is not None and stamped.record.node == name else None
+        with self._lock:
+            # Who has left meanwhile does not keep the place of who comes back in his name.
+            if status is not None and name in self._alive:
+                self._voices[name] = source
+                self._take_status(status)
+            else:
+                self._node.counters["refused.foreign_status"] += 1
+                return
+        cameras = status.detail.get("cameras")
+        for camera, fields in cameras.items() if isinstance(cameras, dict) else ():
+            if camera in self._servers and isinstance(fields, dict):
+                self._take_camera(name, camera, fields.get("age_s"), now_ns)
 
-    def _take_spec(self, worker: str, spec: ModelSpec, source: str) -> None:
+    def _hear_spec(self, arrival: Arrival) -> None:
+        """Likewise for the spec of a worker."""
+        worker, source = self._said(arrival)
+        if source is None:
+            return
+        node = worker_node(worker)
         with self._lock:
             known = self._spec_sources.get(worker)
-            if worker_node(worker) not in self._alive or (known is not None and known != source):
-                self._node.counters["refused.foreign_spec"] += 1
+            ours = node in self._alive and known in (None, source)
+            if ours and known is None and len(self._specs) >= MAX_WORKERS:
                 return
-            if known is None and len(self._specs) >= MAX_WORKERS:
+        stamped = self._node.read(ModelSpec, arrival) if ours else None
+        if ours and stamped is None:
+            return
+        with self._lock:
+            if stamped is not None and node in self._alive:
+                if self._specs.get(worker) != stamped.record:
+                    self._specs[worker] = stamped.record
+                    self._spec_sources[worker] = source
+                    self._changed = True
                 return
-            if self._specs.get(worker) != spec:
-                self._specs[worker] = spec
-                self._spec_sources[worker] = source
+        self._node.counters["refused.foreign_spec"] += 1
+
+    def _said(self, arrival: Arrival) -> tuple[str, str | None]:
+        """Whom it is about, by its key, and its source where it has one."""
+        key = str(arrival.sample.key_expr)
+        try:
+            return key_names.last(key), self._node.header(arrival).source
+        except CodecError as error:
+            short = self._node.keys.short(key)
+            self._node.refuse(error.reason, f"{short}: {error}", short)
+            return key_names.last(key), None
+
+    def _take_status(self, status: NodeStatus) -> None:
+        self._hosts[status.node] = status.host
+        if status.node.startswith("worker-"):
+            complaint = status.detail.get("complaint", "")
+            worker = status.node.removeprefix("worker-")
+            if isinstance(complaint, str) and len(self._complaints) < MAX_WORKERS:
+                self._complaints[worker] = complaint[:300]
                 self._changed = True
 
-    def _take_status(self, status: NodeStatus, now_ns: int) -> None:
-        with self._lock:
-            self._hosts[status.node] = status.host
-            if status.node.startswith("worker-"):
-                complaint = status.detail.get("complaint", "")
-                worker = status.node.removeprefix("worker-")
-                if isinstance(complaint, str) and len(self._complaints) < MAX_WORKERS:
-                    self._complaints[worker] = complaint[:300]
-                    self._changed = True
-            cameras = status.detail.get("cameras")
-            if isinstance(cameras, dict):
-                for camera, fields in cameras.items():
-                    self._take_camera(status.node, camera, fields, now_ns)
-
-    def _take_camera(self, node: str, camera: Any, fields: Any, now_ns: int) -> None:
-        if camera not in self._node.profile.cameras or not isinstance(fields, dict):
+    def _take_camera(self, node: str, camera: str, age_s: Any, now_ns: int) -> None:
+        """The age of a camera's newest picture, as the node says that serves it by the profile."""
+        server = self._servers[camera]
+        if node != server:
+            self._node.refuse(
+                "foreign_camera",
+                f"node {node!r} speaks for camera {camera!r}, which node {server!r} serves by the "
+                "profile (hosts.HOST.cameras; --name of `vla-zenoh camera`)",
+                node,
+            )
             return
-        age_s = fields.get("age_s")
         if isinstance(age_s, (int, float)) and not isinstance(age_s, bool):
-            self._cameras[camera] = (node, float(age_s), now_ns)
+            self._cameras[camera] = (max(float(age_s), 0.0), now_ns)
             self._changed = True

@@ -6,7 +6,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,38 +14,14 @@ from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import encode_jpeg, encode_raw, raw_schema
 from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.camera_sources.forms import Forms, narrowed
 from vla_zenoh.nodes.camera_sources.pace import Pace
 from vla_zenoh.nodes.camera_sources.picture import fit, to_rgb
 from vla_zenoh.nodes.camera_sources.source import Pixels
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
-from vla_zenoh.nodes.node import Node, Stream
-from vla_zenoh.observe import form_for, form_of, prepare
-from vla_zenoh.policy import CameraSpec
+from vla_zenoh.nodes.node import Node
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Event, Image
-
-MAX_FORMS = 8
-"""Sizes in which pictures are made for models; those of more models are served as JPEG."""
-
-
-@dataclass(frozen=True, slots=True)
-class Form:
-    """A way in which pictures are made for others.
-
-    Args:
-        stream: where they go.
-        quality: of JPEG.
-        pace: None: all of them.
-        spec: whose size they have, None: their own.
-        width: wider ones are made smaller.
-    """
-
-    stream: Stream
-    quality: int
-    pace: Pace | None
-    spec: CameraSpec | None = None
-    width: int | None = None
-
 
 WAITING, OK, LOST, ENDED = "waiting", "ok", "lost", "ended"
 _SOURCE_LIMIT = 200
@@ -79,20 +54,7 @@ class Outlet:
         self._shown, self._clock, self._tell = shown[:_SOURCE_LIMIT], node.clock, tell
         self._raw = node.stream(node.keys.camera_raw(name), Kind.FRAME)
         self._jpeg = node.stream(node.keys.camera_jpeg(name), Kind.FRAME)
-        self._fitted: dict[str, Form] = {}
-        self._stream_of = node.stream
-        self._keys = node.keys
-        self._hosts = {
-            host: part.pictures
-            for host, part in node.profile.hosts.items()
-            if part.pictures is not None
-        }
-        for host, settings in self._hosts.items():
-            form = form_for(host)
-            pace = None if settings.rate_hz is None else Pace(settings.rate_hz)
-            self._fitted[form] = Form(
-                self._form_stream(form), settings.quality, pace, width=settings.width
-            )
+        self.forms = Forms(name, profile, node, tell)
         self._jpeg_pace = None if profile.jpeg_rate_hz is None else Pace(profile.jpeg_rate_hz)
         self._seq = 0
         self._newest_mono_ns: int | None = None
@@ -152,27 +114,7 @@ class Outlet:
     @property
     def wanted(self) -> bool:
         """Somebody listens."""
-        fitted = any(form.stream.wanted for form in self._fitted.values())
-        return self._raw.wanted or self._jpeg.wanted or fitted
-
-    def fit_for(self, spec: CameraSpec) -> None:
-        """From now on serve pictures as this model wants them, while it listens."""
-        name, most = form_of(spec), MAX_FORMS * (1 + len(self._hosts))
-        if name is None or name in self._fitted or len(self._fitted) >= most:
-            return
-        rgb = spec.model_copy(update={"colour": "rgb"})
-        rate_hz = self.profile.jpeg_rate_hz
-        made = {name: (self.profile.jpeg_quality, rate_hz)}
-        for host, settings in self._hosts.items():
-            made[form_for(host, name)] = (settings.quality, settings.rate_hz)
-        # Replaced whole: the thread that draws reads it meanwhile.
-        self._fitted = self._fitted | {
-            form: Form(self._form_stream(form), quality, None if rate is None else Pace(rate), rgb)
-            for form, (quality, rate) in made.items()
-        }
-
-    def _form_stream(self, form: str) -> Stream:
-        return self._stream_of(self._keys.camera_fitted(self.name, form), Kind.FRAME)
+        return self._raw.wanted or self._jpeg.wanted or self.forms.wanted
 
     def put(self, picture: Pixels, mono_ns: int) -> None:
         """Write what OpenCV gave, captured at `mono_ns`, in the profile's size.
@@ -189,11 +131,7 @@ class Outlet:
     def put_rgb(self, rgb: NDArray[np.uint8], mono_ns: int, stamp_wall_ns: int) -> None:
         """Write a finished picture, in each form that somebody listens to."""
         raw, jpeg = self._raw.wanted, self._jpeg.wanted
-        fitted = [
-            form
-            for form in self._fitted.values()
-            if form.stream.wanted and (form.pace is None or form.pace.due(mono_ns))
-        ]
+        fitted = self.forms.due(mono_ns)
         thinned = self._jpeg_pace is not None
         if jpeg and self._jpeg_pace is not None and not self._jpeg_pace.due(mono_ns):
             jpeg = False
@@ -206,43 +144,18 @@ class Outlet:
                 encode_raw(image), stamp_wall_ns=stamp_wall_ns, seq=self._seq, encoding=schema
             )
         if jpeg:
-            narrow = self._narrowed(image, self.profile.jpeg_width)
-            seq = None if thinned else self._seq
-            self._put_jpeg(self._jpeg, narrow, stamp_wall_ns, self.profile.jpeg_quality, seq)
-        for form in fitted:
-            made = (
-                self._narrowed(image, form.width)
-                if form.spec is None
-                else Image(prepare(image, form.spec))
+            # Where not all of them go out, those that do have numbers of their own.
+            self._jpeg.put(
+                encode_jpeg(narrowed(image, self.profile.jpeg_width), self.profile.jpeg_quality),
+                stamp_wall_ns=stamp_wall_ns,
+                seq=None if thinned else self._seq,
+                encoding=zenoh.Encoding.IMAGE_JPEG,
             )
-            self._put_jpeg(form.stream, made, stamp_wall_ns, form.quality, None)
+        for form in fitted:
+            self.forms.put(form, image, stamp_wall_ns)
         self._seq += 1
         with self._lock:
             self._latency_ms.add((time.monotonic_ns() - mono_ns) / 1e6)
-
-    @staticmethod
-    def _put_jpeg(
-        stream: Stream, image: Image, stamp_wall_ns: int, quality: int, seq: int | None
-    ) -> None:
-        """Write a picture; where not all of them go out they have numbers of their own."""
-        stream.put(
-            encode_jpeg(image, quality),
-            stamp_wall_ns=stamp_wall_ns,
-            seq=seq,
-            encoding=zenoh.Encoding.IMAGE_JPEG,
-        )
-
-    def _narrowed(self, image: Image, widest: int | None) -> Image:
-        height, width = image.rgb.shape[:2]
-        if widest is None or width <= widest:
-            return image
-        smaller = CameraSpec(
-            camera=self.name,
-            width=widest,
-            height=max(8, round(height * widest / width)),
-            resize="stretch",
-        )
-        return Image(prepare(image, smaller))
 
     def _count_size(self, size: tuple[int, ...]) -> None:
         self.counts["resized"] += 1

@@ -1,0 +1,233 @@
+"""Pictures in a model's own size: for the ninth model too, and plain ones where there are none."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+import zenoh
+from camera_rig import Rig, camera_rig, free_endpoint, grey, until
+
+from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
+from vla_zenoh.keys import Kind
+from vla_zenoh.nodes import camera as camera_node
+from vla_zenoh.nodes.camera_input import CameraInput, Heard, listen_to
+from vla_zenoh.nodes.camera_sources import asked
+from vla_zenoh.nodes.camera_sources.forms import MAX_SIZES
+from vla_zenoh.nodes.node import Node, Stream
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.observe import form_for, form_of
+from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
+from vla_zenoh.profile import load_profile, override
+from vla_zenoh.profile.schema import CameraProfile
+from vla_zenoh.types import Image
+
+SILENCE_S, PATIENCE_S = 1.0, 0.3
+"""Of models and of a worker, in these tests."""
+TURN_S = 0.15
+"""Long enough for a spec to be heard; where it is not the thief changes his mind less often."""
+
+
+def sized(width: int) -> CameraSpec:
+    return CameraSpec(camera="front", width=width, height=width, resize="pad")
+
+
+def spec(width: int) -> ModelSpec:
+    return ModelSpec(
+        name="any",
+        observation=ObservationSpec(cameras=(sized(width),)),
+        action=ActionSpec(horizon=1, dt_s=0.2, frame="tcp", rotation="rpy", gripper="none"),
+    )
+
+
+class Models:
+    """Workers that say their specs again and again until they leave."""
+
+    def __init__(self, rig: Rig) -> None:
+        node = Node("worker-test", rig.profile, rig.watcher)
+        self._node, self._widths = node, dict[str, int]()
+        self._outs: dict[str, Stream] = {}
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def come(self, worker: str, width: int) -> None:
+        out = self._outs.get(worker) or self._node.stream(self._node.keys.spec(worker), Kind.NEWS)
+        until("the camera node", lambda: out.wanted)
+        self._outs[worker] = out
+        self._widths[worker] = width
+
+    def leave(self, worker: str) -> None:
+        del self._widths[worker]
+
+    def _run(self) -> None:
+        while not self._stop.wait(TURN_S / 3):
+            for worker, width in list(self._widths.items()):
+                self._outs[worker].put(spec(width))
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._node.close()
+
+
+@contextmanager
+def stage(folder: Path) -> Iterator[tuple[Rig, Models, Callable[[int], list[Any]]]]:
+    """A camera node that fits pictures, models, and who listens to one size."""
+    assert cv2.imwrite(str(folder / "grey.png"), grey(99))
+    camera = CameraProfile(
+        source=f"file:{folder}", width=64, height=48, rate_hz=20, fit_for_workers=True
+    )
+    with camera_rig({"front": camera}) as rig:
+        models, kept = Models(rig), []
+
+        def listen(width: int) -> list[Any]:
+            form = form_of(sized(width))
+            assert form is not None
+            frames, subscriber = rig.listen(rig.profile.keys.camera_fitted("front", form))
+            kept.append(subscriber)
+            return frames
+
+        try:
+            yield rig, models, listen
+        finally:
+            models.close()
+
+
+def test_the_ninth_size_is_told_and_made_as_soon_as_another_one_is_not_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(asked, "SILENCE_S", SILENCE_S)
+    with stage(tmp_path) as (rig, models, listen):
+        heard = [listen(16 + 2 * number) for number in range(MAX_SIZES)]
+        for number in range(MAX_SIZES):
+            models.come(f"w{number}", 16 + 2 * number)
+        until("all of them", lambda: all(heard))
+        ninth = listen(100)
+        models.come("w8", 100)
+        (event,) = until("it is told", lambda: rig.happened("front:too_many_sizes"))
+        assert "100x100-pad" in event.why
+        assert not ninth
+        models.leave("w0")  # and its listener stays
+        until("the ninth", lambda: ninth)
+        assert decode_jpeg(ninth[-1].payload).rgb.shape == (100, 100, 3)
+        (event,) = until("it is told", lambda: rig.happened("front:size_given_back"))
+        assert "16x16-pad" in event.why
+
+
+def test_who_changes_his_mind_takes_one_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(asked, "SILENCE_S", SILENCE_S)
+    monkeypatch.setattr(camera_node, "SIZES_PERIOD_S", TURN_S / 4)
+    with stage(tmp_path) as (rig, models, listen):
+        for number in range(MAX_SIZES + 4):
+            models.come("thief", 16 + 2 * number)
+            time.sleep(TURN_S)
+        honest = listen(200)
+        models.come("honest", 200)
+        until("pictures for who asks honestly", lambda: honest)
+        assert not rig.happened("front:too_many_sizes")
+        assert rig.happened("front:size_given_back")
+
+
+@contextmanager
+def two_nodes() -> Iterator[tuple[Node, Node]]:
+    """A camera node's and a worker's, on a host with a say in what travels there."""
+    endpoint = free_endpoint()
+    profile = override(
+        load_profile("panda_sim_two_hosts"),
+        {
+            "session": {"listen": [endpoint], "connect": [endpoint]},
+            "cameras": {"front": {"source": "sim:front", "fit_for_workers": True}},
+            "workers": ["scripted", "replay"],
+            "hosts": {
+                "gpu": {"nodes": ["worker"], "workers": ["scripted"]},
+                "edge": {
+                    "nodes": ["worker"],
+                    "workers": ["replay"],
+                    "pictures": {"rate_hz": 10},
+                },
+            },
+        },
+    )
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as there,
+        open_session(profile.session) as here,
+    ):
+        camera, worker = Node("camera", profile, there), Node("worker-far", profile, here)
+        yield camera, worker
+        camera.close()
+        worker.close()
+
+
+def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer() -> None:
+    jpeg = encode_jpeg(Image(grey(50)), 90)
+    with two_nodes() as (camera, worker):
+        keys = worker.keys
+        own = camera.stream(keys.camera_fitted("front", "32x32-pad"), Kind.FRAME)
+        plain = camera.stream(keys.camera_jpeg("front"), Kind.FRAME)
+        changed = threading.Condition()
+        ears = CameraInput(
+            worker, "front", own.key, plain.key, patience_s=PATIENCE_S, changed=changed
+        )
+
+        def put(stream: Stream) -> Heard | None:
+            stream.put(jpeg, encoding=zenoh.Encoding.IMAGE_JPEG)
+            return ears.take()
+
+        def key_of(heard: Heard) -> str:
+            heard.speaker.check(worker.header(heard.arrival), heard.arrival.mono_ns)
+            heard.speaker.heard(worker.header(heard.arrival), heard.arrival.mono_ns)
+            return str(heard.arrival.sample.key_expr)
+
+        until("a reader", lambda: own.wanted)
+        assert not plain.wanted
+        plain.seq = 1000  # its numbers are its own, and far ahead
+        assert key_of(until("a plain one", lambda: put(plain))) == plain.key
+        assert key_of(until("the next", lambda: put(plain))) == plain.key
+        while True:
+            heard = until("its own", lambda: put(own))
+            if key_of(heard) == own.key:
+                break
+        until("plain ones do not travel any more", lambda: not plain.wanted)
+        assert key_of(until("the next", lambda: put(own))) == own.key
+        assert key_of(until("plain ones once more", lambda: put(plain))) == plain.key
+
+
+@pytest.mark.parametrize(
+    ("host", "own", "plain"),
+    [
+        ("gpu", "32x32-pad", None),
+        ("edge", form_for("edge", "32x32-pad"), form_for("edge")),
+    ],
+)
+def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all(
+    host: str, own: str, plain: str | None
+) -> None:
+    with two_nodes() as (camera, worker):
+        keys = worker.keys
+        sizes = [own, "32x32-pad", form_for("edge", "32x32-pad")]
+        outs = {
+            size: camera.stream(keys.camera_fitted("front", size), Kind.FRAME) for size in sizes
+        }
+        key = keys.camera_jpeg("front") if plain is None else keys.camera_fitted("front", plain)
+        for_all = camera.stream(key, Kind.FRAME)
+        wanted = CameraSpec(camera="front", width=32, height=32, resize="pad")
+        changed = threading.Condition()
+        ears = listen_to(wanted, worker, jpeg=True, host=host, changed=changed)
+        until("its own", lambda: outs[own].wanted)
+        assert not any(out.wanted for size, out in outs.items() if size != own)
+
+        def takes_plain() -> bool:
+            assert ears.take() is None
+            return for_all.wanted
+
+        until("plain ones", takes_plain)

@@ -1,0 +1,149 @@
+"""What the command node believes of what others say: of themselves, and of nobody else."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from camera_rig import await_match, free_endpoint, until
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
+from vla_zenoh.control.preflight import Surroundings
+from vla_zenoh.nodes import offsets
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.offsets import MAX_HEARD, MAX_PEERS
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.nodes.surroundings import Neighbours
+from vla_zenoh.profile import load_profile, override
+from vla_zenoh.types import Header, NodeStatus
+
+ROOM_S = 0.3
+"""How long a made-up name keeps its place in this test."""
+AGE_TOLERANCE_S = 5.0
+
+
+class Scene:
+    """The command node's ears, a camera node, and a worker that lies in its role."""
+
+    def __init__(self, command: Node, camera: Node, thief: Node) -> None:
+        self.command, self.camera, self.thief = command, camera, thief
+        self.ears = Neighbours(command)
+        self.around = Surroundings()
+        self.nodes = (command, camera, thief)
+        for node in (camera, thief):
+            await_match(node.session, node.keys.status(node.name))
+        until("both are alive", lambda: {camera.name, thief.name} <= self.look().alive)
+
+    def look(self) -> Surroundings:
+        self.command.clocks.tick()
+        self.around = self.ears.look(self.command.clock.wall_ns()) or self.around
+        return self.around
+
+    def says(self, node: Node, age_s: Any) -> None:
+        """A status of `node` that tells of the front camera, and is heard."""
+        count = self.command.counters["refused.foreign_camera"]
+        node.report("running", detail={"cameras": {"front": {"age_s": age_s}}}, now=True)
+        if node is self.thief:
+            until(
+                "it is refused",
+                lambda: self.look() and self.command.counters["refused.foreign_camera"] > count,
+            )
+
+    def refused(self, reason: str) -> int:
+        return self.command.counters[f"refused.{reason}"]
+
+
+@pytest.fixture
+def scene() -> Iterator[Scene]:
+    with made() as found:
+        yield found
+
+
+@contextmanager
+def made() -> Iterator[Scene]:
+    endpoint = free_endpoint()
+    profile = override(
+        load_profile("panda_sim"), {"session": {"listen": [endpoint], "connect": [endpoint]}}
+    )
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as here,
+        open_session(profile.session) as there,
+        open_session(profile.session) as elsewhere,
+    ):
+        found = Scene(
+            Node("command", profile, here),
+            Node("camera", profile, there),
+            Node("worker-scripted", profile, elsewhere),
+        )
+        yield found
+        for node in found.nodes:
+            node.close()
+
+
+def test_a_camera_is_believed_by_the_node_that_serves_it_and_by_no_other(scene: Scene) -> None:
+    scene.says(scene.thief, -1e9)
+    assert scene.look().camera_nodes == {}
+    assert scene.around.camera_ages_s == {}
+
+    scene.says(scene.camera, 3.0)
+    until("the camera's own word", lambda: scene.look().camera_nodes == {"front": "camera"})
+    assert 3.0 <= scene.around.camera_ages_s["front"] < 3.0 + AGE_TOLERANCE_S
+
+    scene.says(scene.thief, -1e9)
+    assert scene.look().camera_nodes == {"front": "camera"}
+    assert scene.around.camera_ages_s["front"] >= 3.0
+
+
+def test_no_picture_is_younger_than_now(scene: Scene) -> None:
+    for nth, age_s in enumerate([True, "0", None, -1e9], 1):
+        scene.says(scene.camera, 7.0)
+        until("an age", lambda: scene.look().camera_ages_s.get("front", 0.0) >= 7.0)
+        scene.says(scene.camera, age_s)
+        other = {"wrist": {"age_s": 100.0 * nth}}
+        scene.camera.report("running", detail={"cameras": other}, now=True)
+        until(
+            "all of it is heard",
+            lambda nth=nth: scene.look().camera_ages_s.get("wrist", 0.0) >= 100.0 * nth,
+        )
+        assert scene.around.camera_ages_s["front"] >= (0.0 if age_s == -1e9 else 7.0), age_s
+
+
+def test_made_up_names_do_not_keep_out_a_clock_that_is_there(scene: Scene) -> None:
+    status = records.encode(
+        NodeStatus("worker-scripted", "running", "gpu", 1, 1, {}, {}, {}, {}, {})
+    )
+    key = scene.thief.keys.status("worker-scripted")
+    for number in range(2 * MAX_PEERS):
+        header = header_codec.encode(Header(time.time_ns(), number, f"ghost{number}#1"))
+        scene.thief.session.put(key, status, attachment=header)
+        scene.look()
+    until("all were heard", lambda: scene.look() and scene.refused("foreign_status"))
+    names = ("camera", "worker-scripted")
+    until("their clocks", lambda: all(name in scene.look().clocks for name in names))
+
+
+def test_a_reader_who_is_told_of_nobody_measures_who_lives_among_made_up_names(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(offsets, "HEARD_PATIENCE_S", ROOM_S)
+    reader, number = scene.thief, 0
+    for number in range(2 * MAX_HEARD):
+        reader.clocks.here(Header(0, 0, f"ghost{number}#1"), None)
+
+    def measured() -> bool:
+        nonlocal number
+        number += 1
+        reader.clocks.here(Header(0, 0, f"ghost{number}#1"), None)
+        reader.clocks.here(Header(0, 0, scene.camera.source), None)
+        reader.clocks.tick()
+        return "camera" in reader.clocks.known()
+
+    until("the camera's clock", measured)
+    for number in range(2 * MAX_HEARD):
+        reader.clocks.here(Header(0, 0, f"stranger{number}#1"), None)
+    assert "camera" in reader.clocks.known()
