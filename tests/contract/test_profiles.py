@@ -68,7 +68,7 @@ def test_a_shipped_profile_is_not_questionable(profile: Profile) -> None:
 
 def test_zenoh_takes_the_session_of_every_host(profile: Profile) -> None:
     for host in profile.hosts.values():
-        for mode in ("client", "router", "peer"):
+        for mode in ("client", "router"):
             settings = config(profile.session, mode=mode, connect=host.connect)
             zenoh.Config.from_json5(json.dumps(settings))
 

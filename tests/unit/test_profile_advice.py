@@ -39,7 +39,6 @@ def test_two_hosts_with_real_addresses_need_no_advice() -> None:
         ),
         ({"hosts": gpu()}, "session.listen: the router on robot is heard on that computer only"),
         ({"hosts": gpu()}, "hosts.gpu: looks for the router on itself, and it runs on robot"),
-        ({"hosts": gpu(), "session": {"mode": "peer"}}, "session.mode: peers on several hosts"),
         ({"hosts": {"a": {"nodes": ["command"]}}}, "hosts: none runs the router"),
         ({"hosts": {"a": {"nodes": ["router"]}}}, "hosts: none runs the command node"),
         ({"hosts": {"a": {"nodes": ["router"]}}}, "hosts: none runs the simulator"),

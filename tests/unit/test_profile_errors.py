@@ -23,7 +23,7 @@ from vla_zenoh.profile import (
     override,
     profile_names,
 )
-from vla_zenoh.profile.session import SecurityProfile
+from vla_zenoh.profile.session import SecurityProfile, is_loopback
 
 Write = Callable[..., str]
 
@@ -125,7 +125,11 @@ def told(path: str) -> list[str]:
             "session: {shared_memory: yes}",
             "session.shared_memory: wants true or false (given: 'yes')",
         ),
-        ("session: {mode: pear}", "wants 'client' or 'peer'; did you mean 'peer'? (given: 'pear')"),
+        (
+            "session: {router: zenod}",
+            "wants 'own' or 'zenohd'; did you mean 'zenohd'? (given: 'zenod')",
+        ),
+        ("session: {mode: peer}", "session.mode: "),
         ("root: lab/*", "lab.yaml:2: root: root '*' cannot be part of a key"),
         (
             "limits:\n  workspace:\n    x_m: [200, 750]",
@@ -249,10 +253,6 @@ def told(path: str) -> list[str]:
             "session.insecure: is true, beside a section security: leave one out",
         ),
         (
-            "session: {security: {}, listen: [tls/a:1], connect: [tls/a:1], mode: peer}",
-            "session.mode: is peer: only a router controls access; write client",
-        ),
-        (
             "session: {security: {people: {desk: boss}}, listen: [tls/a:1], connect: [tls/a:1]}",
             "session.security.people.desk: wants 'operator', 'viewer' or 'replay'",
         ),
@@ -311,7 +311,7 @@ def told(path: str) -> list[str]:
             "ros2: {cameras: {frotn: {topic: /f}}}",
             "ros2.cameras: 'frotn' is not among cameras; did you mean 'front'?",
         ),
-        ("session: {connect: []}", "session.connect: is empty: a client needs a router"),
+        ("session: {connect: []}", "session.connect: is empty: nodes need a router"),
         ("session: {listen: []}", "session.listen: is empty: the router needs an address"),
         ("session: {connect: ['tcp/a:0']}", "session.connect.0: port 0 leads nowhere"),
         ("session: {lease_ms: 10}", "session.lease_ms: must be at least 200 (given: 10)"),
@@ -506,6 +506,32 @@ def test_values_given_otherwise_are_checked_as_a_whole() -> None:
 
 
 # -- endpoints --------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("endpoint", "here"),
+    [
+        ("tcp/127.0.0.1:7447", True),
+        ("tcp/127.8.9.1:7447", True),
+        ("tcp/localhost:7447#iface=lo", True),
+        ("tcp/[::1]:7447", True),
+        ("unixsock-stream/run/vla.sock", True),
+        ("tcp/localhost.lab.edu:7447", False),
+        ("tcp/127.lab:7447", False),
+        ("tcp/127.0.0.1.lab.edu:7447", False),
+        ("tcp/[::]:7447", False),
+        ("tcp/[::1234]:7447", False),
+        ("tcp/0.0.0.0:7447", False),
+        ("tcp/10.0.0.2:7447", False),
+    ],
+)
+def test_only_what_cannot_be_another_computer_is_loopback(endpoint: str, here: bool) -> None:
+    assert is_loopback(endpoint) is here
+    if here:
+        assert SessionProfile(listen=(endpoint,)).listen == (endpoint,)
+    else:
+        with pytest.raises(ValueError, match="lets everybody on that network command the robot"):
+            SessionProfile(listen=(endpoint,))
+
+
 @pytest.mark.parametrize(
     "endpoint",
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,7 @@ import typer
 import zenoh
 from rich.table import Table
 
-from vla_zenoh.cli.options import PROFILE_VARIABLE, effective_profile
+from vla_zenoh.cli.options import PROFILE_VARIABLE, AlsoOption, effective_profile
 from vla_zenoh.cli.output import console, errors, print_json, styled
 from vla_zenoh.doctor import Finding, Needs, examine, needs_of
 from vla_zenoh.doctor.access import access
@@ -27,7 +28,7 @@ COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
 def try_zenoh(profile: SessionProfile, endpoint: str) -> str:
     """Opens a Zenoh session at `endpoint` and closes it; returns the reason if it cannot."""
     try:
-        open_session(profile, mode="client", connect=(endpoint,)).close()
+        open_session(profile, connect=(endpoint,)).close()
     except SessionError as error:
         return str(error.__cause__ or error).split(" at ", maxsplit=1)[0].rstrip("! ")
     except SecurityError as error:
@@ -54,6 +55,7 @@ def doctor(
             "--rules", help="Try the rules of access in this configuration of Zenoh instead."
         ),
     ] = None,
+    also: AlsoOption = None,
 ) -> None:
     """Look at this computer: what is missing, and the package or setting that helps.
 
@@ -61,6 +63,8 @@ def doctor(
     """
     if host is not None and profile is None:
         raise typer.BadParameter("it is the name of a host in a profile: give --profile too")
+    if also and profile is None:
+        raise typer.BadParameter("--also names robots beside that of a profile: give --profile too")
     zenoh.init_log_from_env_or("off")
     needs, session, loaded = Needs(), SessionProfile(), None
     if profile is not None:
@@ -73,7 +77,7 @@ def doctor(
             findings += access(
                 loaded,
                 dt.datetime.now(dt.UTC),
-                functools.partial(_rehearse, loaded, rules),
+                functools.partial(_rehearse, loaded, rules, also or ()),
                 functools.partial(try_identity, loaded),
             )
     if as_json:
@@ -84,8 +88,9 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _rehearse(profile: Profile, rules: Path | None) -> list[Verdict]:
-    return rehearse(profile, None if rules is None else read_access(rules))
+def _rehearse(profile: Profile, rules: Path | None, also: Sequence[str]) -> list[Verdict]:
+    others = [effective_profile(name) for name in also]
+    return rehearse(profile, None if rules is None else read_access(rules), others)
 
 
 def show(findings: list[Finding]) -> None:

@@ -84,7 +84,7 @@ class CommandInputs:
         """What was put since the last tick, in the order in which the router saw it.
 
         Each setting has a mailbox of its own, so that a flood of one does not push out another.
-        Between peers without a router nobody stamps samples: each key's own order is kept then.
+        Where the router does not stamp samples, each key's own order is kept then.
         """
         arrivals = [
             (name, decode, arrival)

@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +29,13 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import SecurityProfile
 from vla_zenoh.security.identity import Identity, Role, identities
 from vla_zenoh.security.roles import TABLE, Act, Right, expressions, rights
-from vla_zenoh.security.rules import access_control, allowing, missing, passages
+from vla_zenoh.security.rules import EVERY_MESSAGE, access_control, allowing, missing, passages
 from vla_zenoh.security.store import Store
 
 Tried = frozenset[tuple[str, Act, str]]
 """(common name, act, key) of what went through."""
+Part = tuple[Keys, Identity]
+"""At which robot somebody is what."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,44 +55,68 @@ class Verdict:
     faults: tuple[str, ...]
 
 
-def rehearse(profile: Profile, access: Mapping[str, Any] | None = None) -> list[Verdict]:
+def rehearse(
+    profile: Profile,
+    access: Mapping[str, Any] | None = None,
+    also: Sequence[Profile] = (),
+) -> list[Verdict]:
     """Try everything; takes some seconds.
 
     Args:
         profile: the lab.
-        access: another section ``access_control`` than that which is made of the profile.
+        access: another section ``access_control`` than that which is made of the profiles.
+        also: other robots that the router serves. Everybody of each tries the keys of all.
 
     Raises:
         MissingExtraError: the library ``cryptography`` is not installed.
         SecurityError: certificates cannot be made.
         SessionError: no sessions could be opened here, or a certificate was not accepted.
     """
-    lab = [one for one in identities(profile) if one.role is not Role.ROUTER]
-    rules = dict(access_control([profile]) if access is None else access)
-    cast = probes(profile, lab)
+    profiles = (profile, *also)
+    parts = _parts(profiles)
+    lab = [played[0][1] for played in parts.values()]
+    rules = dict(access_control(profiles) if access is None else access)
+    cast = probes(profiles)
+    keys = [each.keys for each in profiles]
     with _stage(profile, lab, _with_witness(rules)) as (witness, sessions):
         went: Tried = frozenset().union(
             rehearsal_acts.puts(witness, sessions, cast[Act.PUT]),
+            rehearsal_acts.deletions(witness, sessions, cast[Act.DELETE]),
             rehearsal_acts.subscriptions(witness, sessions, cast[Act.SUBSCRIBE]),
             rehearsal_acts.questions(witness, sessions, cast[Act.ASK]),
             rehearsal_acts.answers(witness, sessions, cast[Act.ANSWER]),
-            rehearsal_acts.tokens(witness, sessions, cast[Act.ANNOUNCE], profile.keys),
-            rehearsal_acts.watching(witness, sessions, profile.keys),
+            rehearsal_acts.tokens(witness, sessions, cast[Act.ANNOUNCE], keys),
+            rehearsal_acts.watching(witness, sessions, keys),
         )
-    return [_judge(profile.keys, one, cast, rules, went) for one in lab]
+    return [_judge(played, cast, rules, went) for played in parts.values()]
 
 
-def probes(profile: Profile, lab: Sequence[Identity]) -> dict[Act, list[str]]:
-    """Act -> every key of the lab on which somebody may do it or its counterpart."""
+def _parts(profiles: Sequence[Profile]) -> dict[str, list[Part]]:
+    """Common name -> what it is at each robot where it is somebody; without routers."""
+    out: dict[str, list[Part]] = {}
+    for profile in profiles:
+        for one in identities(profile):
+            if one.role is not Role.ROUTER:
+                out.setdefault(one.common_name, []).append((profile.keys, one))
+    return out
+
+
+def probes(profiles: Sequence[Profile]) -> dict[Act, list[str]]:
+    """Act -> every key of the lab on which somebody may do it or its counterpart.
+
+    What is put may be tried to be deleted; tokens are watched all at once.
+    """
     made: dict[str, set[Act]] = {}
-    somewhere = next(iter(profile.cameras), "front")
-    for row in TABLE:
-        acts = {act for act in Act if row.roles(act)}
-        for identity in lab:
+    for profile in profiles:
+        somewhere = next(iter(profile.cameras), "front")
+        for row, identity in product(TABLE, identities(profile)):
+            acts = {act for act in Act if row.roles(act)}
             for act in acts & {Act.PUT, Act.ANSWER, Act.ANNOUNCE}:
                 for key in expressions(profile.keys, row.member, identity, act):
                     made.setdefault(key.replace("*", somewhere), set()).update(acts)
-    return {act: sorted(key for key, acts in made.items() if act in acts) for act in Act}
+    cast = {act: sorted(key for key, acts in made.items() if act in acts) for act in Act}
+    watched = [profile.keys.all_alive for profile in profiles]
+    return {**cast, Act.DELETE: cast[Act.PUT], Act.WATCH: watched}
 
 
 # -- the stage ------------------------------------------------------------------------------------
@@ -108,7 +135,6 @@ def _stage(
             update={
                 "connect": (endpoint,),
                 "listen": (endpoint,),
-                "mode": "client",
                 "separate_links": False,
                 "insecure": False,
             }
@@ -128,16 +154,7 @@ def _with_witness(rules: Mapping[str, Any]) -> dict[str, Any]:
     more = access_control([])
     everything = {
         "id": "witness",
-        "messages": [
-            "put",
-            "declare_subscriber",
-            "query",
-            "reply",
-            "declare_queryable",
-            "liveliness_token",
-            "liveliness_query",
-            "declare_liveliness_subscriber",
-        ],
+        "messages": list(EVERY_MESSAGE),
         "flows": ["ingress", "egress"],
         "permission": "allow",
         "key_exprs": ["**"],
@@ -163,18 +180,18 @@ def _free_port() -> int:
 
 # -- the verdict ----------------------------------------------------------------------------------
 def _judge(
-    keys: Keys,
-    one: Identity,
+    played: Sequence[Part],
     cast: Mapping[Act, Sequence[str]],
     rules: Mapping[str, Any],
     went: Tried,
 ) -> Verdict:
-    granted = rights(keys, one)
+    one = played[0][1]
+    granted = [right for keys, part in played for right in rights(keys, part)]
     faults: list[str] = []
     count = {True: 0, False: 0}
     for act in Act:
-        for key in [keys.all_alive] if act is Act.WATCH else cast[act]:
-            must = _must(keys, one, granted, act, key)
+        for key in cast[act]:
+            must = _must(played, granted, act, key)
             count[must] += 1
             done = (one.common_name, act, key) in went
             if done != must:
@@ -182,9 +199,11 @@ def _judge(
     return Verdict(one, count[True], count[False], tuple(faults))
 
 
-def _must(keys: Keys, one: Identity, granted: Sequence[Right], act: Act, key: str) -> bool:
-    if act is Act.SUBSCRIBE and Role.OPERATOR in one.roles:
-        return covers(keys.everything, key)
+def _must(played: Sequence[Part], granted: Sequence[Right], act: Act, key: str) -> bool:
+    if act is Act.SUBSCRIBE and any(
+        Role.OPERATOR in one.roles and covers(keys.everything, key) for keys, one in played
+    ):
+        return True
     return any(right.act is act and covers(right.key, key) for right in granted)
 
 

@@ -58,6 +58,26 @@ def puts(
     return heard & matching
 
 
+def deletions(
+    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
+) -> set[tuple[str, Act, str]]:
+    """Which of each session's deletions arrived at the witness. Nobody needs to be told of him."""
+    heard: set[tuple[str, Act, str]] = set()
+
+    def hear(sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.DELETE and sample.attachment is not None:
+            heard.add((sample.attachment.to_string(), Act.DELETE, str(sample.key_expr)))
+
+    listening = _listen(witness, keys, hear)
+    time.sleep(SETTLE_S)
+    for name, session in sessions.items():
+        for key in keys:
+            session.delete(key, attachment=name, congestion_control=zenoh.CongestionControl.BLOCK)
+    time.sleep(SETTLE_S)
+    _end(listening)
+    return set(heard)
+
+
 def subscriptions(
     witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
 ) -> set[tuple[str, Act, str]]:
@@ -134,31 +154,33 @@ def tokens(
     witness: zenoh.Session,
     sessions: Mapping[str, zenoh.Session],
     keys: Sequence[str],
-    of: Keys,
+    robots: Sequence[Keys],
 ) -> set[tuple[str, Act, str]]:
     """Which liveliness tokens of each session the witness sees."""
     found: set[tuple[str, Act, str]] = set()
     for name, session in sessions.items():
         tokens = [session.liveliness().declare_token(key) for key in keys]
         time.sleep(SETTLE_S)
-        found |= {(name, Act.ANNOUNCE, key) for key in alive(witness, of)}
+        found |= {(name, Act.ANNOUNCE, key) for of in robots for key in alive(witness, of)}
         _end(tokens)
         time.sleep(SETTLE_S)
     return found
 
 
 def watching(
-    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], of: Keys
+    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], robots: Sequence[Keys]
 ) -> set[tuple[str, Act, str]]:
-    """Whether each session sees the witness's liveliness token."""
-    token = witness.liveliness().declare_token(of.alive(WITNESS.node))
+    """Whether each session sees the witness's liveliness tokens."""
+    own = [of.alive(WITNESS.node) for of in robots]
+    tokens = [witness.liveliness().declare_token(key) for key in own]
     time.sleep(SETTLE_S)
     found = {
         (name, Act.WATCH, of.all_alive)
         for name, session in sessions.items()
-        if of.alive(WITNESS.node) in alive(session, of)
+        for of, key in zip(robots, own, strict=True)
+        if key in alive(session, of)
     }
-    token.undeclare()
+    _end(tokens)
     return found
 
 

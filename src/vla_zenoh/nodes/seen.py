@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES, encode_jpeg
-from vla_zenoh.errors import CodecError, RecordError
-from vla_zenoh.keys import Keys, Kind
+from vla_zenoh.errors import CodecError, ProfileError, RecordError
+from vla_zenoh.keys import Keys, Kind, chunk
 from vla_zenoh.nodes.bounded import bytes_of, check, header_of
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
@@ -155,12 +155,19 @@ class SeenListener:
         check(sample, MAX_JPEG_BYTES)
         header, payload = header_of(sample), bytes_of(sample.payload, MAX_JPEG_BYTES)
         _, worker, *camera = self._keys.short(str(sample.key_expr)).split("/")
+        try:  # folders and files are named by them
+            for name in (worker, *camera):
+                chunk(name, "name")
+        except ProfileError as error:
+            raise CodecError("malformed", str(error)) from error
         if camera:
             if len(self._pictures) > MAX_WAITING:
                 self._pictures.pop(next(iter(self._pictures)))
             self._pictures.setdefault((worker, header.seq), {})[camera[0]] = payload
             return None
         record = records.decode(Seen, payload)
+        if record.worker != worker:
+            raise CodecError("foreign", f"{worker} shows what {record.worker[:60]!r} saw")
         return Sight(record, self._pictures.pop((worker, header.seq), {}))
 
     def close(self) -> None:

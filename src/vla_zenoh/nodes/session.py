@@ -6,7 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import zenoh
 
@@ -16,6 +16,8 @@ from vla_zenoh.profile import SessionProfile
 from vla_zenoh.profile.session import SecurityProfile, second_link
 from vla_zenoh.security.store import Store
 
+Mode = Literal["client", "router"]
+"""Peers are none of ours: a router does not forward them to each other."""
 RETRY_S = 0.1
 CLIENT, LINKED, FIRST = 1, 2, 3
 """Leases that a client, a router that connects to others, and one that does not announce: so long
@@ -49,7 +51,7 @@ QOS: dict[Kind, dict[str, Any]] = {
 def config(
     profile: SessionProfile,
     *,
-    mode: str | None = None,
+    mode: Mode = "client",
     connect: tuple[str, ...] | None = None,
     identity: str | None = None,
     access: Mapping[str, Any] | None = None,
@@ -59,7 +61,7 @@ def config(
 
     Args:
         profile: the session section.
-        mode: overrides the profile's, for the router.
+        mode: of the session.
         connect: overrides the profile's endpoints; of a router: other routers.
         identity: which node's certificate is shown; None: that of the people at this computer.
         access: section ``access_control``, of a router.
@@ -68,7 +70,6 @@ def config(
     Raises:
         SecurityError: the certificate is not there.
     """
-    mode = mode or profile.mode
     routes = mode == "router"
     targets = (connect or ()) if routes else (connect or profile.connect)
     leases = (LINKED if targets else FIRST) if routes else CLIENT
@@ -87,7 +88,7 @@ def config(
                 "period_increase_factor": 2,
             },
         },
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": mode == "peer"}},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
             "shared_memory": {"enabled": profile.shared_memory},
             "link": {
@@ -131,7 +132,7 @@ def _tls(security: SecurityProfile, identity: str | None, routes: bool) -> dict[
 def open_session(
     profile: SessionProfile,
     *,
-    mode: str | None = None,
+    mode: Mode = "client",
     connect: tuple[str, ...] | None = None,
     identity: str | None = None,
     access: Mapping[str, Any] | None = None,
@@ -143,7 +144,7 @@ def open_session(
 
     Args:
         profile: the session section.
-        mode: overrides the profile's, for the router.
+        mode: of the session.
         connect: overrides the profile's endpoints; of a router: other routers.
         identity: which node this is, for its certificate; None: the people at this computer.
         access: who may do what, of a router.

@@ -28,8 +28,6 @@ def _network(profile: Profile) -> Iterator[str]:
         )
     if len(profile.hosts) < 2:
         return
-    if session.mode == "peer":
-        yield "session.mode: peers on several hosts must all name each other; client is simpler"
     routers = [name for name, host in profile.hosts.items() if "router" in host.nodes]
     if routers and all(is_loopback(endpoint) for endpoint in session.listen):
         yield (
@@ -52,7 +50,7 @@ def _is_anywhere(endpoint: str) -> bool:
 def _placement(profile: Profile) -> Iterator[str]:
     hosts = profile.hosts.values()
     running = {kind for host in hosts for kind in host.nodes}
-    if "router" not in running and profile.session.mode == "client":
+    if "router" not in running:
         yield "hosts: none runs the router; start one elsewhere, at session.connect"
     if "command" not in running:
         yield "hosts: none runs the command node; nothing will move"

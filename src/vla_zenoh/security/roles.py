@@ -38,6 +38,7 @@ class Act(Enum):
     """What is done on a key."""
 
     PUT = "put"
+    DELETE = "delete"  # says that there is nothing: nobody may, and nodes refuse it
     SUBSCRIBE = "subscribe"
     ANSWER = "answer"  # be asked by queries
     ASK = "ask"
@@ -55,6 +56,7 @@ class Row:
 
     member: str
     put: frozenset[Role] = NOBODY
+    delete: frozenset[Role] = NOBODY
     subscribe: frozenset[Role] = NOBODY
     answer: frozenset[Role] = NOBODY
     ask: frozenset[Role] = NOBODY

@@ -35,6 +35,7 @@ WISHES = ("declare_subscriber", "query", "declare_liveliness_subscriber", "livel
 MESSAGES: Mapping[Act, Sequence[tuple[str, str]]] = {
     # what is done: (way through the router, message)
     Act.PUT: ((IN, "put"), (OUT, "declare_subscriber")),
+    Act.DELETE: ((IN, "delete"),),
     Act.SUBSCRIBE: ((IN, "declare_subscriber"), (OUT, "put")),
     Act.ANSWER: ((IN, "declare_queryable"), (IN, "reply"), (OUT, "query")),
     Act.ASK: ((IN, "query"), (OUT, "declare_queryable"), (OUT, "reply")),

@@ -1,0 +1,104 @@
+"""A person's side of the bus, and `up`'s: strangers' names do not fill it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import zenoh
+from camera_rig import free_endpoint, until
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
+from vla_zenoh.nodes.attendance import MAX_OTHERS
+from vla_zenoh.nodes.client import MAX_WHY, Client
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.seen import SeenListener
+from vla_zenoh.nodes.session import open_session
+from vla_zenoh.profile import Profile, load_profile, override
+from vla_zenoh.types import Event, Header, NodeStatus, Seen
+
+STRANGERS = 2000
+TOKENS = 300
+MAX_SEEN = 5
+SURELY = zenoh.CongestionControl.BLOCK
+
+
+@pytest.fixture
+def profile() -> Iterator[Profile]:
+    endpoint = free_endpoint()
+    made = override(
+        load_profile("panda_sim"), {"session": {"listen": [endpoint], "connect": [endpoint]}}
+    )
+    with open_session(made.session, mode="router"):
+        yield made
+
+
+@pytest.mark.slow
+def test_names_of_strangers_neither_fill_a_client_nor_hide_a_node(profile: Profile) -> None:
+    keys, ghost = profile.keys, records.encode(NodeStatus("sim", "ok", "h", 1, 2))
+    who = header_codec.encode(Header(1, 2, "stranger#1"))
+    with open_session(profile.session) as here, open_session(profile.session) as there:
+        client = Client(profile, here).follow()
+        tokens = [
+            there.liveliness().declare_token(keys.alive(f"ghost{number}"))
+            for number in range(TOKENS)
+        ]
+        for number in range(STRANGERS):
+            there.put(
+                keys.status(f"ghost{number}"), ghost, attachment=who, congestion_control=SURELY
+            )
+        until("all have come", lambda: client.left_out > STRANGERS - 2 * MAX_OTHERS)
+        node = Node("sim", profile, there)
+        node.report("running", now=True)
+        until("the node is there", lambda: "sim" in client.alive and client.status("sim"))
+        found = client.snapshot()
+        assert found["sim"][0].state == "running"
+        assert found["sim"][2]
+        assert len(found) <= MAX_OTHERS + 1
+        assert len(client.alive) <= MAX_OTHERS + 1
+        node.close()
+        until("it is gone", lambda: "sim" not in client.alive)
+        assert client.snapshot()["sim"][2] is False
+        for token in tokens:
+            token.undeclare()
+
+
+@pytest.mark.slow
+def test_a_flood_of_long_events_is_kept_short(profile: Profile) -> None:
+    with open_session(profile.session) as here, open_session(profile.session) as there:
+        client = Client(profile, here).follow()
+        node = Node("sim", profile, there)
+
+        def told() -> bool:
+            node.tell(Event("warning", "notice", "w" * 4096, "w" * 4096))
+            return bool(client.events)
+
+        until("an event has come", told)
+        ((_, _, event), *_) = client.take_events()
+        assert len(event.why) == MAX_WHY
+        node.close()
+
+
+@pytest.mark.slow
+def test_nobody_shows_what_another_worker_saw_nor_names_a_folder_elsewhere(
+    profile: Profile,
+) -> None:
+    who = header_codec.encode(Header(1, 2, "stranger#1"))
+    key = profile.keys.seen_record("scripted")
+    with open_session(profile.session) as here, open_session(profile.session) as there:
+        listener = SeenListener(here, profile.keys)
+        seen: list[str] = []
+
+        def shown() -> bool:
+            for worker in ("../../scripted", "other", "scripted"):
+                record = Seen(worker, 1, "0" * 16, 1, 2, "up", np.zeros((1, 7), np.float32), 1.0)
+                there.put(key, records.encode(record), attachment=who)
+                there.put(f"{key}/..", b"", attachment=who)
+            seen.extend(sight.record.worker for sight in listener.take())
+            return len(seen) > MAX_SEEN
+
+        until("some are shown", shown)
+        assert set(seen) == {"scripted"}
+        listener.close()
