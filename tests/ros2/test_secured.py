@@ -199,10 +199,12 @@ def heard_by(secured: SecuredLab, host: str, node: str) -> tuple[bool, bool]:
         give_up = time.monotonic() + LOOK_S
         while not states and time.monotonic() < give_up:
             time.sleep(0.02)
-        tokens = list(session.liveliness().get(TOKENS))
+        replies = session.liveliness().get(TOKENS)
+        keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        others = [key for key in keys if key != wire.node_token()]
         subscriber.undeclare()
         mine.undeclare()
-    return bool(states), bool(tokens)
+    return bool(states), bool(others)
 
 
 def goes_through(secured: SecuredLab, host: str, node: str) -> bool:
