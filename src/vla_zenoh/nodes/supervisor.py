@@ -167,6 +167,8 @@ class Supervisor:
         environment = dict(os.environ)
         environment[PARENT_VARIABLE] = str(os.getpid())
         environment["PYTHONUNBUFFERED"] = "1"
+        # Zenoh colours its log also where it is read by us, and would look like a stranger's.
+        environment["NO_COLOR"] = "1"
         if self._folder is not None:
             environment[RUN_FOLDER_VARIABLE] = str(self._folder)
         child.process = subprocess.Popen(
