@@ -24,6 +24,8 @@ from vla_zenoh.dataset.success import succeeded
 from vla_zenoh.evaluation.trial.folder import TrialFolder
 from vla_zenoh.recording.run import load_run
 
+pytestmark = pytest.mark.slow
+
 WORKERS = ("scripted", "twin")
 SHORT, ENDLESS = "HARD: go up x3", "HARD: go up within 0.05"
 END_S = 30.0
@@ -118,7 +120,6 @@ def test_two_workers_are_tried_blind_and_their_verdicts_stand_in_table_and_recor
     assert chain.detail("at_rest")
 
 
-@pytest.mark.slow
 def test_ctrl_c_brakes_the_arm_and_the_same_command_goes_on(chain: Chain, tmp_path: Path) -> None:
     out, words = tmp_path / "ab", begin(ENDLESS, "--seconds", "3")
     with trial(chain, out, *words) as process:
@@ -147,7 +148,6 @@ def test_ctrl_c_brakes_the_arm_and_the_same_command_goes_on(chain: Chain, tmp_pa
     assert {each["void"] for each in json.loads(said)["workers"].values()} == {1}
 
 
-@pytest.mark.slow
 def test_an_arm_that_is_not_given_is_repaired_and_a_stopped_one_is_told(
     chain: Chain, tmp_path: Path
 ) -> None:
@@ -180,7 +180,6 @@ def test_an_arm_that_is_not_given_is_repaired_and_a_stopped_one_is_told(
     assert len(list(out.glob("*.mcap"))) == 1, "what was refused left no recording"
 
 
-@pytest.mark.slow
 def test_at_a_terminal_enter_ends_an_episode_and_nothing_tells_who_it_was(
     chain: Chain, tmp_path: Path
 ) -> None:

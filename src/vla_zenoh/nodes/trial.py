@@ -10,6 +10,7 @@ import threading
 import time
 from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +18,7 @@ import zenoh
 
 from vla_zenoh.codec import records
 from vla_zenoh.control.names import worker_node
-from vla_zenoh.errors import CodecError, SessionError
+from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.evaluation.trial.conduct import Conduct, Look, Phase
 from vla_zenoh.evaluation.trial.folder import TrialFolder
 from vla_zenoh.evaluation.trial.judged import FACT, Judged
@@ -36,6 +37,7 @@ SPEC_PATIENCE_S = 3.0
 """A spec is said once a second, and a recording without it cannot become a dataset."""
 HEAR_PATIENCE_S = 5.0
 LET_GO_S = 0.5
+GONE_PATIENCE_S = 2.0
 GRACE_S = 2.0
 """An episode that goes on for so long after its time is ended by the guard."""
 FURTHER_M = 0.01
@@ -263,11 +265,21 @@ class TrialRun:
         client = self._client
         self._number = self._folder.next_number(self._done)
         path = self._folder.recording(self._number)
-        self._recorder = recorder = Recorder(client.profile, client.session, path).start()
+        self._recorder = recorder = self._new_recorder(path).start()
         spec = client.keys.spec(worker)
         client.wait_for(
             lambda: recorder.recorded.samples[spec] or self._stop.is_set(), SPEC_PATIENCE_S
         )
+
+    def _new_recorder(self, path: Path) -> Recorder:
+        """Also where the router has not heard yet that the last one is gone."""
+        give_up_s = time.monotonic() + GONE_PATIENCE_S
+        while True:
+            try:
+                return Recorder(self._client.profile, self._client.session, path)
+            except NodeError:
+                if time.monotonic() > give_up_s or self._stop.wait(LOOK_S):
+                    raise
 
     def _discard(self) -> None:
         """Nothing of it is worth keeping: the arm was not given."""
