@@ -278,8 +278,10 @@ class TrialRun:
             try:
                 return Recorder(self._client.profile, self._client.session, path)
             except NodeError:
-                if time.monotonic() > give_up_s or self._stop.wait(LOOK_S):
+                if time.monotonic() > give_up_s:
                     raise
+            if self._stop.wait(LOOK_S):
+                raise Interrupted
 
     def _discard(self) -> None:
         """Nothing of it is worth keeping: the arm was not given."""
