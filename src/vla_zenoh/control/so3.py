@@ -31,6 +31,8 @@ class _Pinocchio:
 
 pin = _Pinocchio()
 
+_ORIGIN = np.zeros(3)
+
 
 class Pose(NamedTuple):
     """A pose in the base frame: position (3,) in m and rotation matrix (3, 3)."""
@@ -62,19 +64,22 @@ def rotation_from_quat(quat_xyzw: FloatArray) -> FloatArray:
     return quaternion.matrix()
 
 
+def _quaternion(rotation: FloatArray) -> Any:
+    # Not pin.Quaternion(rotation): that one keeps 80 bytes for ever, each time.
+    quaternion = pin.Quaternion(pin.SE3ToXYZQUAT(pin.SE3(rotation, _ORIGIN))[3:])
+    quaternion.normalize()
+    return quaternion
+
+
 def quat_from_rotation(rotation: FloatArray) -> FloatArray:
     """Unit quaternion x, y, z, w with w >= 0."""
-    quaternion = pin.Quaternion(rotation)
-    quaternion.normalize()
-    coefficients = np.array(quaternion.coeffs(), dtype=np.float64)
+    coefficients = np.array(_quaternion(rotation).coeffs(), dtype=np.float64)
     return -coefficients if coefficients[3] < 0 else coefficients
 
 
 def orthonormal(rotation: FloatArray) -> FloatArray:
     """A product of many rotation matrices without what rounding made of it."""
-    quaternion = pin.Quaternion(rotation)
-    quaternion.normalize()
-    return quaternion.matrix()
+    return _quaternion(rotation).matrix()
 
 
 def norm3(vector: FloatArray) -> float:
