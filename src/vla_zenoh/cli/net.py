@@ -216,7 +216,7 @@ def tables(robot: str, pairs: list[Pair], lines: list[Line], bound_ms: float) ->
     for column in ("from", "to", "round trip", "clock is ahead by", "link", "measured by"):
         hosts.add_column(column, overflow="fold")
     for pair in pairs:
-        wrong = abs(pair.offset_ms) - pair.uncertainty_ms > bound_ms
+        wrong = abs(pair.offset_ms) > bound_ms
         clock = f"{pair.offset_ms:+.2f} +- {pair.uncertainty_ms:.2f} ms"
         hosts.add_row(
             one_line(pair.seen_from),
