@@ -30,15 +30,16 @@ class Held(NamedTuple):
         age_s: since it was seen first.
         rss_mib: all its pages.
         pss_mib: those that it shares counted by its share, which grows when others end.
-        private_mib: those that it has to itself: what a leak is told by.
-        handles: open files, sockets and the like.
+        heap_mib: those that no file is behind: what a leak is told by. Shared memory is not in it,
+            whoever maps it.
+        handles: open files, sockets and the like, but for those of shared memory.
         threads: all of them.
     """
 
     age_s: float
     rss_mib: float
     pss_mib: float
-    private_mib: float
+    heap_mib: float
     handles: int
     threads: int
 
@@ -57,7 +58,7 @@ class Growth(NamedTuple):
         """What grew by more than it may, in words."""
         out: list[str] = []
         for name, most in (
-            ("private_mib", GROWTH_MIB),
+            ("heap_mib", GROWTH_MIB),
             ("handles", GROWTH_HANDLES),
             ("threads", GROWTH_THREADS),
         ):
@@ -85,10 +86,19 @@ def look(pid: int, age_s: float) -> Held:
         round(age_s, 1),
         round(found["Rss"] / 1024, 1),
         round(found["Pss"] / 1024, 1),
-        round((found["Private_Clean"] + found["Private_Dirty"]) / 1024, 1),
-        len(os.listdir(folder / "fd")),
+        round(found["Anonymous"] / 1024, 1),
+        sum(not _SEGMENT.match(target) for target in _targets(folder / "fd")),
         len(os.listdir(folder / "task")),
     )
+
+
+def _targets(handles: Path) -> list[str]:
+    """What the handles of a process are of."""
+    out: list[str] = []
+    for name in os.listdir(handles):
+        with suppress(OSError):  # closed meanwhile
+            out.append(os.readlink(handles / name))
+    return out
 
 
 class Segments(NamedTuple):
@@ -165,5 +175,5 @@ class Ledger:
 
 def _middle(entries: list[Held]) -> Held:
     columns = zip(*entries, strict=True)
-    age_s, rss, pss, private, handles, threads = (median(column) for column in columns)
-    return Held(age_s, rss, pss, private, int(handles), int(threads))
+    age_s, rss, pss, heap, handles, threads = (median(column) for column in columns)
+    return Held(age_s, rss, pss, heap, int(handles), int(threads))

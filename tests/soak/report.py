@@ -51,7 +51,7 @@ def table(found: Found) -> Table:
     for name in sorted(start["nodes"]) if start and end else ():
         if name in end["nodes"]:
             pair = [
-                "MiB {private_mib:g}, {pss_mib:g}, {rss_mib:g}; {handles}; {threads}".format(
+                "MiB {heap_mib:g}, {pss_mib:g}, {rss_mib:g}; {handles}; {threads}".format(
                     **held["nodes"][name]
                 )
                 for held in (start, end)

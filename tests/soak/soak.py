@@ -161,7 +161,7 @@ class Soak:
             {
                 "node": g.node,
                 "life_s": round(g.life_s),
-                "private_mib": [g.first.private_mib, g.last.private_mib],
+                "heap_mib": [g.first.heap_mib, g.last.heap_mib],
             }
             for g in self._ledger.growth()
         ]

@@ -83,18 +83,19 @@ def test_what_was_found_is_told_as_json() -> None:
 
 def test_growth_beyond_its_bound_is_a_leak() -> None:
     first = Held(20.0, 100.0, 90.0, 80.0, 30, 20)
-    little = first._replace(private_mib=80.0 + GROWTH_MIB, handles=30 + GROWTH_HANDLES)
-    much = little._replace(private_mib=little.private_mib + 1)
+    little = first._replace(heap_mib=80.0 + GROWTH_MIB, handles=30 + GROWTH_HANDLES)
+    much = little._replace(heap_mib=little.heap_mib + 1)
     assert Growth("sim", 1, 60.0, first, little).leaks == []
     (words,) = Growth("sim", 1, 60.0, first, much).leaks
-    assert "private_mib" in words
+    assert "heap_mib" in words
 
 
 def test_what_this_process_holds_is_seen() -> None:
     before = look(os.getpid(), 0.0)
     with open(os.devnull):
         assert look(os.getpid(), 0.0).handles == before.handles + 1
-    assert before.private_mib <= before.pss_mib <= before.rss_mib
+    assert before.heap_mib <= before.rss_mib
+    assert before.pss_mib <= before.rss_mib
     ledger = Ledger(lambda: {"me": os.getpid()})
     assert set(ledger.newest()) == {"me"}
     assert ledger.growth() == []

