@@ -80,8 +80,10 @@ def rehearse(
     keys = [each.keys for each in profiles]
     with _stage(profile, lab, _with_witness(rules)) as (witness, sessions):
         went: Tried = frozenset().union(
-            rehearsal_acts.puts(witness, sessions, cast[Act.PUT]),
+            # First: a session that has had a publisher knows where nobody listens to it, and sends
+            # nothing there, whatever the router would let through.
             rehearsal_acts.deletions(witness, sessions, cast[Act.DELETE]),
+            rehearsal_acts.puts(witness, sessions, cast[Act.PUT]),
             rehearsal_acts.subscriptions(witness, sessions, cast[Act.SUBSCRIBE]),
             rehearsal_acts.questions(witness, sessions, cast[Act.ASK]),
             rehearsal_acts.answers(witness, sessions, cast[Act.ANSWER]),
