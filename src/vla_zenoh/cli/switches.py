@@ -23,6 +23,8 @@ from vla_zenoh.nodes.client import Client
 from vla_zenoh.profile import as_robot
 
 STOP_PATIENCE_S = 3.0
+LOOK_S, POLL_S = 1.0, 0.05
+"""A router's first answers may lack robots that are alive: so long it is asked for more."""
 ABSENT_PATIENCE_S = 1.5
 """So long a command node that lives may take to be seen."""
 
@@ -160,9 +162,14 @@ def _complain(aim: Aim, client: Client, command: str, what: str) -> NoReturn:
 
 
 def _stop_all(aim: Aim, own: Client) -> None:
-    robots = robots_alive(own.session, own.keys)
-    for robot in robots:
-        own.put(Keys(robot, own.keys.root).stop, "stop")
+    robots: list[str] = []
+    give_up = time.monotonic() + LOOK_S
+    while time.monotonic() < give_up:
+        for robot in robots_alive(own.session, own.keys):
+            if robot not in robots:
+                own.put(Keys(robot, own.keys.root).stop, "stop")
+                robots.append(robot)
+        time.sleep(POLL_S)
     if not robots:
         why = aim.powerless(own.profile, "stop")
         fail(f"no robot on this router is alive, as far as one may know here. {why}".rstrip(". "))
