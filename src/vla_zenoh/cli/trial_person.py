@@ -99,7 +99,7 @@ class TrialPerson:
 
     # -- questions ----------------------------------------------------------------------------
     def ask(self, conduct: Conduct) -> str:
-        """See `vla_zenoh.nodes.trial.Person`."""
+        """See `vla_zenoh.evaluation.trial.person`."""
         phase = conduct.phase
         if phase is Phase.LAY:
             self._say(self._setup(conduct), style="bold")
@@ -135,7 +135,7 @@ class TrialPerson:
         return line
 
     def misunderstood(self, line: str, phase: Phase) -> None:
-        """See `vla_zenoh.nodes.trial.Person`.
+        """See `vla_zenoh.evaluation.trial.person`.
 
         Raises:
             NodeError: it is a line of a script.
@@ -147,7 +147,7 @@ class TrialPerson:
 
     # -- while the arm moves ------------------------------------------------------------------
     def typed(self) -> str | None:
-        """See `vla_zenoh.nodes.trial.Person`.
+        """See `vla_zenoh.evaluation.trial.person`.
 
         Raises:
             NodeError: a script has ended, so nobody would judge.
@@ -165,7 +165,7 @@ class TrialPerson:
         return None
 
     def watch(self, conduct: Conduct) -> None:
-        """See `vla_zenoh.nodes.trial.Person`."""
+        """See `vla_zenoh.evaluation.trial.person`."""
         if not (self._terminal and self._screen.is_terminal):
             return
         if self._live is None:
@@ -182,7 +182,7 @@ class TrialPerson:
             )
 
     def ended(self, conduct: Conduct) -> None:
-        """See `vla_zenoh.nodes.trial.Person`."""
+        """See `vla_zenoh.evaluation.trial.person`."""
         self._calm()
         assert conduct.end is not None
         why = self._plan.hide(conduct.why)
@@ -190,7 +190,7 @@ class TrialPerson:
         self._say(f"{said}; {conduct.time_s:.1f} s, {conduct.seen.chunks} chunks")
 
     def tell(self, text: str) -> None:
-        """See `vla_zenoh.nodes.trial.Person`."""
+        """See `vla_zenoh.evaluation.trial.person`."""
         self._calm()
         self._say(text, style="yellow")
 

@@ -11,7 +11,6 @@ import time
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import zenoh
@@ -22,6 +21,7 @@ from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.evaluation.trial.conduct import Conduct, Look, Phase
 from vla_zenoh.evaluation.trial.folder import TrialFolder
 from vla_zenoh.evaluation.trial.judged import FACT, Judged
+from vla_zenoh.evaluation.trial.person import Person
 from vla_zenoh.evaluation.trial.plan import Due, Plan
 from vla_zenoh.nodes.bounded import bytes_of
 from vla_zenoh.nodes.client import Client
@@ -43,38 +43,6 @@ GRACE_S = 2.0
 FURTHER_M = 0.01
 """Where an arm begins may differ by this much before it is told."""
 DOES_NOT_STAND = "the command node does not say that the arm stands; look at `vla-zenoh status`"
-
-
-class Person(Protocol):
-    """Who lays setups and judges."""
-
-    def ask(self, conduct: Conduct) -> str:
-        """A line for phase LAY, REPAIR or JUDGE; waits for it.
-
-        Raises:
-            Interrupted: Ctrl-C.
-        """
-        ...
-
-    def typed(self) -> str | None:
-        """A line that was typed while the arm moves; None: none was."""
-        ...
-
-    def misunderstood(self, line: str, phase: Phase) -> None:
-        """It means nothing in this phase."""
-        ...
-
-    def watch(self, conduct: Conduct) -> None:
-        """The arm moves; called often."""
-        ...
-
-    def ended(self, conduct: Conduct) -> None:
-        """The episode is over, and the arm was braked."""
-        ...
-
-    def tell(self, text: str) -> None:
-        """Something else that has to be known."""
-        ...
 
 
 class TrialRun:
