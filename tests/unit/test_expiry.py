@@ -161,9 +161,9 @@ def shown(detail: dict[str, object]) -> str:
 
 def test_status_shows_how_long_certificates_last_and_what_is_wrong_above_all() -> None:
     assert "certificates last 200 days" in shown({"certificates": {"days": 200, "wrong": []}})
-    wrong = ["certificate /a/camera.pem ends in 3 days; renew it"]
+    wrong = ["camera.pem ends in 3 days; renew it"]
     said = shown({"certificates": {"days": 3, "wrong": wrong}})
-    assert said.splitlines()[0] == f"router on robot: {wrong[0]}"
+    assert said.splitlines()[0] == f"certificates of router on robot: {wrong[0]}"
 
 
 @pytest.mark.parametrize("said", [5, "x", {"days": "[/x]", "wrong": 7}, {"wrong": [["\x1b[2J"]]}])

@@ -172,7 +172,7 @@ def _ending(nodes: Heard) -> list[Text]:
         said = found.detail.get("certificates")
         wrong = said.get("wrong") if isinstance(said, dict) else None
         if isinstance(wrong, (list, tuple)) and wrong:
-            words = f"{name} on {found.host}: {'; '.join(map(str, wrong))}"
+            words = f"certificates of {name} on {found.host}: {'; '.join(map(str, wrong))}"
             out.append(styled(one_line(words, MAX_WORDS), "bold yellow"))
     return out
 

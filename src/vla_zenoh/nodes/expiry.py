@@ -25,7 +25,7 @@ class Outlook:
 
     Args:
         days: until the first of them ends, negative when it has; None: not known.
-        wrong: sentences on each that is of no use, or is soon.
+        wrong: the file of each that is of no use, or soon is, and why.
         unknown: why they could not be looked at; empty: they could.
     """
 
@@ -49,7 +49,7 @@ def outlook(security: SecurityProfile, now: dt.datetime) -> Outlook:
     except SecurityError as error:
         return Outlook(unknown=str(error))
     wrong = tuple(
-        f"certificate {entry.path} {what}"
+        f"{entry.path.name} {what}"
         for entry in entries
         for what in (*entry.faults, entry.warning)
         if what
@@ -93,4 +93,5 @@ class Expiry:
         if not (new or again):
             return ()
         self._told, self._told_s = found, self._clock()
-        return (*found.wrong, *([found.unknown] if found.unknown and new else []))
+        wrong = [f"certificate {what}" for what in found.wrong]
+        return (*wrong, *([found.unknown] if found.unknown and new else []))
