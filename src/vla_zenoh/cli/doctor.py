@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import functools
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +13,12 @@ import typer
 import zenoh
 from rich.table import Table
 
-from vla_zenoh.cli.options import PROFILE_VARIABLE, AlsoOption, effective_profile
+from vla_zenoh.cli.options import (
+    HOST_VARIABLE,
+    PROFILE_VARIABLE,
+    AlsoOption,
+    effective_profile,
+)
 from vla_zenoh.cli.output import console, errors, print_json, styled
 from vla_zenoh.doctor import Finding, Needs, examine, needs_of
 from vla_zenoh.doctor.access import access
@@ -68,7 +74,8 @@ def doctor(
     zenoh.init_log_from_env_or("off")
     needs, session, loaded = Needs(), SessionProfile(), None
     if profile is not None:
-        loaded = effective_profile(profile, host=host)
+        # Whose certificates are looked at; a computer of people alone is no host of the profile.
+        loaded = effective_profile(profile, host=host or os.environ.get(HOST_VARIABLE))
         needs, session = needs_of(loaded, host), loaded.session
     with errors().status("Looking at this computer"):
         findings = list(examine(needs, functools.partial(try_zenoh, session)))
