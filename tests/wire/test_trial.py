@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -180,43 +181,86 @@ def test_an_arm_that_is_not_given_is_repaired_and_a_stopped_one_is_told(
     assert len(list(out.glob("*.mcap"))) == 1, "what was refused left no recording"
 
 
+class Terminal:
+    """A terminal, and what was shown on it; to be closed."""
+
+    def __init__(self) -> None:
+        self.shown = bytearray()
+        self._master, self.fd = pty.openpty()
+        self._over = threading.Event()
+        self._reading = threading.Thread(target=self._read)
+        self._reading.start()
+
+    def _read(self) -> None:
+        while not self._over.is_set():
+            if select.select([self._master], [], [], 0.05)[0]:
+                self.shown.extend(os.read(self._master, 4096))
+
+    def type(self, keys: bytes) -> None:
+        os.write(self._master, keys)
+
+    def close(self) -> None:
+        self._over.set()
+        self._reading.join()
+        os.close(self._master)
+        os.close(self.fd)
+
+
+@pytest.fixture
+def terminal() -> Iterator[Terminal]:
+    made = Terminal()
+    yield made
+    made.close()
+
+
+def lay_and_move(chain: Chain, terminal: Terminal, number: int) -> None:
+    """Answer the question for the setup of the episode with this number."""
+    asked = f"episode {number} of 2: setup 1".encode()
+    until("it asks", lambda: asked in terminal.shown, READY_PATIENCE_S)
+    until("for the setup", lambda: terminal.shown.count(b"lay it") == number)
+    terminal.type(b"\n")
+    chain.until("it moves", chain.moves, READY_PATIENCE_S)
+    until("it shows how it goes", lambda: b"Enter ends it" in terminal.shown)
+
+
 def test_at_a_terminal_enter_ends_an_episode_and_nothing_tells_who_it_was(
-    chain: Chain, tmp_path: Path
+    chain: Chain, tmp_path: Path, terminal: Terminal
 ) -> None:
-    master, slave = pty.openpty()
-    shown = bytearray()
-    over = threading.Event()
-
-    def read() -> None:
-        while not over.is_set():
-            if select.select([master], [], [], 0.05)[0]:
-                shown.extend(os.read(master, 4096))
-
-    reading = threading.Thread(target=read)
-    reading.start()
-    out = tmp_path / "ab"
-    try:
-        with trial(chain, out, *begin(ENDLESS), stdin=slave, err=slave) as process:
-            for number, verdict in enumerate((b"y\n", b"n dropped it\n"), 1):
-                question = f"episode {number} of 2: setup 1".encode()
-                until("it asks", lambda ask=question: ask in shown, READY_PATIENCE_S)
-                until("for the setup", lambda n=number: shown.count(b"lay it") == n)
-                os.write(master, b"\n")
-                chain.until("it moves", chain.moves, READY_PATIENCE_S)
-                until("it shows how it goes", lambda: b"Enter ends it" in shown)
-                os.write(master, b"\n")
-                until("it asks", lambda n=number: shown.count(b"did it succeed?") == n, END_S)
-                assert chain.state() == "inactive"
-                os.write(master, verdict)
-            process.wait(END_S)
-        assert process.returncode == 0, bytes(shown).decode()
-    finally:
-        over.set()
-        reading.join()
-        os.close(master)
-        os.close(slave)
+    out, shown = tmp_path / "ab", terminal.shown
+    with trial(chain, out, *begin(ENDLESS), stdin=terminal.fd, err=terminal.fd) as process:
+        for number, verdict in enumerate((b"y\n", b"n dropped it\n"), 1):
+            lay_and_move(chain, terminal, number)
+            terminal.type(b"\n")
+            until("it asks", lambda n=number: shown.count(b"did it succeed?") == n, END_S)
+            assert chain.state() == "inactive"
+            terminal.type(verdict)
+        process.wait(END_S)
+    assert process.returncode == 0, bytes(shown).decode()
     first, second = TrialFolder(out).episodes()
     assert (first.verdict, second.verdict) == ("success", "failure")
     assert {first.end, second.end} == {"person"}
     assert second.note == "dropped it"
     assert not any(worker.encode() in shown for worker in WORKERS)
+
+
+def test_a_terminal_that_takes_no_output_does_not_keep_an_arm_moving(
+    chain: Chain, tmp_path: Path, terminal: Terminal
+) -> None:
+    words = begin(ENDLESS)
+    with trial(chain, tmp_path / "ab", *words, stdin=terminal.fd, err=terminal.fd) as process:
+        lay_and_move(chain, terminal, 1)
+        terminal.type(b"\x13")  # Ctrl-S
+        shown = -1
+
+        def silent() -> bool:
+            nonlocal shown
+            before, shown = shown, len(terminal.shown)
+            time.sleep(1.0)  # it would show something five times meanwhile
+            return shown == before
+
+        until("nothing is shown", silent, END_S)
+        assert chain.state() in ("active", "holding")
+        process.send_signal(signal.SIGINT)
+        chain.until("the arm is braked", lambda: chain.state() == "inactive")
+        terminal.type(b"\x11")  # Ctrl-Q
+        assert process.wait(END_S) == 130
