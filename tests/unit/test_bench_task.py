@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +19,10 @@ from typer.testing import CliRunner
 from vla_zenoh.bench.statistics import wilson_95
 from vla_zenoh.bench.task import BASELINES, Asked, Ended, Plan, Score
 from vla_zenoh.bench.task_sheet import TEXT_HEIGHT, TILE_HEIGHT, TILE_WIDTH, failure_sheet
+from vla_zenoh.cli.bench_file import LAST_LINES, up_with_last_lines
 from vla_zenoh.cli.bench_task import _named, _varied, _with_bricks, task
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
+from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import load_profile
 from vla_zenoh.tasks import COLOURS, FAMILIES, Episode, Order, Verdict, brick
 from vla_zenoh.types import Image, ObjectPoses
@@ -231,3 +236,30 @@ def test_what_cannot_run_is_told_before_anything_starts(
     (tmp_path / "hold.py").write_text("")
     said = told("--model", str(tmp_path / "hold.py"), *how)
     assert "hold is what the others are held against" in said
+
+
+LONG = "worker-nod | " + "x" * 300 + " takes: step_m"
+
+
+@pytest.mark.parametrize("fails", ["before it is up", "at work"])
+def test_where_the_nodes_fail_their_last_lines_are_shown_whole_and_not_those_of_their_end(
+    fails: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines: deque[str] = deque(["old", *map(str, range(LAST_LINES - 1)), LONG], LAST_LINES)
+
+    @contextmanager
+    def nodes() -> Iterator[Any]:
+        if fails == "before it is up":
+            raise NodeError("a router answers already")
+        try:
+            yield None
+        finally:
+            lines.extend(["farewell"] * LAST_LINES)
+
+    host: Any = nodes()
+    with pytest.raises(NodeError), up_with_last_lines(host, lines):
+        raise NodeError("it dies again and again")
+    said = capsys.readouterr().err
+    assert LONG in said
+    assert "farewell" not in said
+    assert "old" not in said

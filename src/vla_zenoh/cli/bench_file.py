@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from vla_zenoh.cli.output import errors
+
+if TYPE_CHECKING:
+    from vla_zenoh.nodes.launch import Host
 
 JsonFileOption = Annotated[
     Path | None, typer.Option("--json", help="Write the result to this file.")
@@ -55,3 +58,29 @@ def kept_rows(json_file: Path | None) -> Iterator[Rows]:
         raise
     finally:
         write_json(json_file, rows)
+
+
+@contextmanager
+def up_with_last_lines(host: Host, lines: Collection[str]) -> Iterator[Host]:
+    """`host`, up; where what is done with it fails, the last of `lines` is shown.
+
+    Args:
+        host: not up yet.
+        lines: what its nodes write, growing.
+    """
+    from vla_zenoh.nodes.demo import Interrupted
+
+    failed_at: list[str] = []
+    try:
+        with host as running:
+            try:
+                yield running
+            except Exception:
+                failed_at += lines  # before the nodes take their leave
+                raise
+    except Interrupted:
+        raise
+    except Exception:
+        last = (failed_at or [*lines])[-LAST_LINES:]
+        errors().print("\n".join(last), style="dim", soft_wrap=True)
+        raise

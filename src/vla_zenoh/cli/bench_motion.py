@@ -18,7 +18,7 @@ from rich.progress import (
 )
 
 from vla_zenoh.bench.motion import PROTOCOL, STEPS, Conditions, Trial
-from vla_zenoh.cli.bench_file import JsonFileOption, write_json
+from vla_zenoh.cli.bench_file import JsonFileOption, up_with_last_lines, write_json
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
 from vla_zenoh.cli.output import console, errors
 from vla_zenoh.profile import Profile
@@ -148,7 +148,6 @@ def _with_one_worker(
 ) -> None:
     from vla_zenoh.demo.plot import plot_run
     from vla_zenoh.nodes.bench.motion import run_in_real_time
-    from vla_zenoh.nodes.demo import Interrupted
     from vla_zenoh.nodes.launch import Host
 
     everything, current = tasks
@@ -174,27 +173,21 @@ def _with_one_worker(
         own_router=True,
         worker_options={profile.task.worker: options},
     )
-    try:
-        with host as running:
-            for row, recording in run_in_real_time(running, trials, conditions, stop, progress):
-                rows.append(row)
-                bars.update(everything, advance=1)
-                if out is not None:
-                    out.mkdir(parents=True, exist_ok=True)
-                    name = f"{row['prompt']}_{row['rate_hz']:g}Hz_{row['horizon']}.png"
-                    plot_run(
-                        out / name.replace(" ", "_"),
-                        profile,
-                        recording.poses,
-                        recording.commands,
-                        recording.marks,
-                        [],
-                    )
-    except Interrupted:
-        raise
-    except Exception:
-        errors().print("\n".join(lines[-20:]), style="dim")
-        raise
+    with up_with_last_lines(host, lines) as running:
+        for row, recording in run_in_real_time(running, trials, conditions, stop, progress):
+            rows.append(row)
+            bars.update(everything, advance=1)
+            if out is not None:
+                out.mkdir(parents=True, exist_ok=True)
+                name = f"{row['prompt']}_{row['rate_hz']:g}Hz_{row['horizon']}.png"
+                plot_run(
+                    out / name.replace(" ", "_"),
+                    profile,
+                    recording.poses,
+                    recording.commands,
+                    recording.marks,
+                    [],
+                )
 
 
 def _trials(prompts: str) -> list[Trial]:

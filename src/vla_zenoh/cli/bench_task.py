@@ -16,7 +16,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from vla_zenoh.bench.task import BASELINES, SCENE, Plan, Score
-from vla_zenoh.cli.bench_file import LAST_LINES, JsonFileOption, write_json
+from vla_zenoh.cli.bench_file import (
+    LAST_LINES,
+    JsonFileOption,
+    up_with_last_lines,
+    write_json,
+)
 from vla_zenoh.cli.chosen import chosen_worker
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile
 from vla_zenoh.cli.output import console, errors
@@ -273,7 +278,7 @@ def _real_time(
             worker_arguments=arguments,
         )
         try:
-            with host as running:
+            with up_with_last_lines(host, last) as running:
                 run = TaskRun(running, plan, stop, camera)
                 for ended in run.run():
                     score.ended.append(ended)
@@ -281,9 +286,6 @@ def _real_time(
                     advance(score)
         except Interrupted:
             pass
-        except Exception:
-            errors().print("\n".join(last), style="dim")
-            raise
 
 
 def _write(score: Score, json_file: Path | None, out: Path | None) -> None:
