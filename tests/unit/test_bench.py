@@ -45,7 +45,7 @@ def peer_slot(values_ms: list[float], cpu_ms: float = 2.0) -> Slot:
 
 
 def shown(result: Result) -> str:
-    out = Console(file=io.StringIO(), width=160)
+    out = Console(file=io.StringIO(), width=160, markup=False)  # as the command line shows it
     out.print(report.main_table(result))
     stages = report.stage_table(result)
     if stages is not None:

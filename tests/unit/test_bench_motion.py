@@ -119,8 +119,8 @@ def test_the_tables_hold_what_was_measured_and_what_was_not() -> None:
     table = motion_table(rows)
     assert table.row_count == len(rows)
     assert [str(cell) for cell in table.columns[-1].cells] == [
-        "[green]ok[/]",
-        "[red]the arm is inactive[/]",
+        "ok",
+        "the arm is inactive",
     ]
     beside = thesis_table(rows, virtual=False)
     assert beside.row_count == 1

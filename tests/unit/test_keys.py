@@ -25,6 +25,7 @@ SELECTORS = (
     "all_status",
     "all_events",
     "all_alive",
+    "all_robots",
     "without_pictures",
     "without_raw_pictures",
 )

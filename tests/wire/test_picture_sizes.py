@@ -121,6 +121,7 @@ def test_the_ninth_size_is_told_and_made_as_soon_as_another_one_is_not_asked_for
         assert "16x16-pad" in event.why
 
 
+@pytest.mark.slow
 def test_who_changes_his_mind_takes_one_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

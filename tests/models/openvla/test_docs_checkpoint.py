@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+pytest.importorskip("torch", reason="needs OpenVLA's environment: make test-models")
 import torch
 
 from vla_zenoh.errors import SpecError, WorkerError

@@ -45,7 +45,7 @@ def bench_profile(command_hz: float) -> Profile:
     """The shipped profile at an address of its own, with the nodes that are measured."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     data = load_profile(PROFILE).model_dump()
-    data["session"].update(connect=(endpoint,), listen=(endpoint,), mode="client")
+    data["session"].update(connect=(endpoint,), listen=(endpoint,))
     data["timing"]["command_hz"] = command_hz
     data["task"].update(prompt=PROMPT, worker=WORKER, rate_hz=RATE_HZ)
     data["workers"] = (WORKER,)
