@@ -42,6 +42,7 @@ def camera(server: RtspServer, user: str = "") -> CameraProfile:
     return CameraProfile(source=source, width=160, height=120, rate_hz=60)
 
 
+@pytest.mark.slow
 def test_a_stream_is_shown_as_it_comes_and_survives_a_stall_and_a_restart(video: Path) -> None:
     with RtspServer(video, LENGTH_S) as server:
         rig_context = camera_rig({"net": camera(server)})

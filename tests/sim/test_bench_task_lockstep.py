@@ -103,6 +103,7 @@ def test_who_stands_still_does_no_task() -> None:
     assert end.pictures is not None
 
 
+@pytest.mark.slow
 def test_who_moves_when_nothing_is_asked_fails() -> None:
     (end,) = outcomes(Plan("scripted", 1, SEED, family="stay", limit_s=LIMIT_S))
     assert (end.success, end.failure) == (False, "moved")

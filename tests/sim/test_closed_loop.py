@@ -149,7 +149,7 @@ def check_translation(run: Run, axis: int, way_m: float, tolerance_m: float = RE
     ("rate_hz", "count"),
     [
         pytest.param(1.0, 50, marks=pytest.mark.slow),
-        (2.0, 10),
+        pytest.param(2.0, 10, marks=pytest.mark.slow),
         pytest.param(5.0, 50, marks=pytest.mark.slow),  # as below, but by an easier model
         (10.0, 50),
     ],
@@ -194,8 +194,8 @@ def test_every_direction_is_exact_and_moves_nothing_else() -> None:
 @pytest.mark.parametrize(
     ("there", "back", "axis", "count"),
     [
-        ("roll right", "roll left", 0, 12),
-        ("pitch down", "pitch up", 1, 12),
+        pytest.param("roll right", "roll left", 0, 12, marks=pytest.mark.slow),
+        pytest.param("pitch down", "pitch up", 1, 12, marks=pytest.mark.slow),
         ("yaw left", "yaw right", 2, 20),
     ],
 )

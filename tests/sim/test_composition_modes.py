@@ -121,7 +121,8 @@ def test_fifty_steps_are_counted_as_fifty(horizon: int) -> None:
     np.testing.assert_allclose(moved_m, [0, 0, 0.5], atol=REACHED_M)
 
 
-@pytest.mark.parametrize("horizon", [pytest.param(1, marks=pytest.mark.slow), 50])
+@pytest.mark.slow
+@pytest.mark.parametrize("horizon", [1, 50])
 def test_a_joint_limit_stops_a_turn_without_drift_and_the_way_back_is_free(horizon: int) -> None:
     loop = begin(changed(), 10.0, horizon=horizon)
     moved_m, turned_rad = carry_out(loop, "yaw right", 60)

@@ -122,7 +122,14 @@ def test_chunks_from_the_future_are_nothing_and_the_arm_stops() -> None:
     check_motion(loop)
 
 
-@pytest.mark.parametrize("kinds", [(ActionChunk,), (PoseCommand,), (PoseState, GripperState)])
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        (ActionChunk,),
+        pytest.param((PoseCommand,), marks=pytest.mark.slow),
+        (PoseState, GripperState),
+    ],
+)
 def test_duplicates_move_nothing(kinds: tuple[type, ...]) -> None:
     undisturbed = after(1.0)
     twice = after(1.0, lambda sent: [sent, sent] if sent.kind in kinds else [sent])

@@ -712,6 +712,7 @@ def test_activated_again_while_it_brakes_it_comes_to_rest_without_turning_back()
     assert rig.position_m[0] == pytest.approx(at_m + 0.02, abs=AT_GOAL_M)
 
 
+@pytest.mark.slow
 def test_a_minute_of_toggling_active_ten_times_a_second_stays_smooth() -> None:
     rig = Rig()
     rig.activate()

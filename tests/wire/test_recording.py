@@ -255,6 +255,7 @@ def test_what_the_queue_cannot_take_is_counted_and_said(chain: Chain, tmp_path: 
     assert f"the recorder dropped {recorded.dropped.total()} samples" in evaluate_run(path).problems
 
 
+@pytest.mark.slow
 def test_a_recorder_that_is_killed_leaves_a_readable_file(chain: Chain, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with process("record", "--out", str(path), profile=chain.profile_file) as child:

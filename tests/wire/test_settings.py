@@ -184,6 +184,7 @@ def objects_of(chain: Chain) -> np.ndarray:
     return found[-1].position_m
 
 
+@pytest.mark.slow
 def test_the_simulator_places_objects_by_seed_but_not_under_a_moving_arm(chain: Chain) -> None:
     def reset(seed: str) -> np.ndarray:
         count = chain.counter("sim.resets", "sim")
@@ -233,6 +234,7 @@ def test_a_slow_reader_has_the_newest_and_holds_nobody_up(chain: Chain) -> None:
             subscriber.undeclare()
 
 
+@pytest.mark.slow
 def test_a_slow_model_sees_the_newest_picture(tmp_path: Path) -> None:
     options = {"scripted": ("delay_ms=400",)}
     with running_chain(tmp_path, worker_options=options) as chain:

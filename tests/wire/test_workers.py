@@ -203,6 +203,7 @@ def test_what_a_model_sees_is_shown_with_its_prompt_raw_output_and_steps(
         assert len(list(out.glob("*/*.json"))) == 2
 
 
+@pytest.mark.slow
 def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
     chain: Chain, tmp_path: Path
 ) -> None:
@@ -232,12 +233,14 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
         assert "in the shadow" in shown
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_not_there_cannot_be_compared(chain: Chain) -> None:
     said = command_line("compare", "scripted", "ghost", profile=chain.profile_file)
     assert said.returncode == 1
     assert "worker 'ghost' tells no spec; is it alive?" in said.stderr
 
 
+@pytest.mark.slow
 def test_who_shows_nothing_is_named(chain: Chain) -> None:
     said = command_line("seen", "ghost", "--json", profile=chain.profile_file)
     assert said.returncode == 1
