@@ -26,6 +26,7 @@ RTOL = 1e-6
 # Straight on, and not quite as fast as each joint could by itself.
 LONGER, SETTLING_S = 1.5, 0.12
 STANDING_M_S = 0.002
+OVERSHOOT_M = 0.06  # of 0.2 m/s, with what the joints can
 
 
 def profile(**joint: float) -> Profile:
@@ -143,4 +144,22 @@ def test_an_arm_that_was_held_back_is_stopped_where_it_is_and_not_where_it_was_t
     assert arm.stop_s() <= allowed_s + SETTLING_S
     way_m = float(np.linalg.norm(KINEMATICS.forward(arm.joints_rad).position_m - before_m))
     assert way_m <= rate * allowed_s
+    assert arm.smoother.at_rest
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 10])
+def test_a_stop_of_the_joints_that_is_called_off_goes_on_from_where_they_are(ticks: int) -> None:
+    arm = Arm(profile())
+    for _ in range(4):
+        arm.step(np.array([0.0, 0.0, -0.02]), np.zeros(3))
+    arm.smoother.reset(Pose(arm.smoother.motion.pose.position_m - [0, 0, 0.04], arm.goal.rotation))
+    for _ in range(ticks):
+        arm.tick(braking=True)
+    arm.goal = arm.smoother.motion.pose
+    arm.step(np.zeros(3), np.zeros(3), 0)
+    furthest_m = 0.0
+    for _ in range(500):
+        arm.tick()
+        furthest_m = max(furthest_m, distance(arm.smoother.motion.pose, arm.goal)[0])
+    assert furthest_m < OVERSHOOT_M
     assert arm.smoother.at_rest

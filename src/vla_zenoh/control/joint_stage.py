@@ -181,9 +181,9 @@ class JointStage:
         self._now, self._acceleration = JointMotion(position, velocity), acceleration
         self._pull = self._pull_rate_1_s = 0.0
         pose, jacobian = self._kinematics.pose_and_jacobian(position)
-        twist = jacobian @ velocity
-        change = (twist - smoother.motion.twist) / self._dt_s if velocity.any() else np.zeros(6)
-        smoother.brake_from(Motion(pose, twist, change))
+        # Whoever takes this stop back plans from here: with no more than a plan may have.
+        change = np.clip(jacobian @ acceleration, -smoother.box[1], smoother.box[1])
+        smoother.brake_from(Motion(pose, jacobian @ velocity, change))
 
     def _pulled_to(self, share: float) -> FloatArray:
         """The posture (n,) of this tick: its pull comes and goes without a jerk of the elbow."""
