@@ -150,17 +150,17 @@ def test_a_profile_elsewhere_with_meshes_and_a_model_found_by_its_name_loads_as_
     write(lab / "base.yaml", WHOLE)
     write(own / "models/nod.py", "class Nod: ...\n")
     monkeypatch.setenv("VLA_ZENOH_PATH", str(own))
-    (world.here / "work").mkdir()
-    monkeypatch.chdir(world.here / "work")
+    (world.here / "desk").mkdir()
+    monkeypatch.chdir(world.here / "desk")
     said = world.secure("init", "--profile", "../lab/base.yaml")
-    assert "extends: ../lab/base.yaml" in (world.here / "work/base_secure.yaml").read_text()
+    assert "extends: ../lab/base.yaml" in (world.here / "desk/base_secure.yaml").read_text()
     world.type(said)
     there = world.home("gpu")
     assert "There, first: export VLA_ZENOH_PATH=~/vla-zenoh" in said
-    assert "There: vla-zenoh up ./work/base_secure.yaml --host NAME" in said
+    assert "There: vla-zenoh up ./desk/base_secure.yaml --host NAME" in said
     before = load_profile("base_secure.yaml")
     world.at("gpu", monkeypatch)
-    after = load_profile("./work/base_secure.yaml")
+    after = load_profile("./desk/base_secure.yaml")
     assert same_but_for_places(before, after)
     assert Path(after.robot.description) == there / "lab/arm/urdf/arm.urdf"
     assert (there / "lab/arm/meshes/a.stl").read_text() == "solid"
