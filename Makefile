@@ -30,9 +30,10 @@ demo: $(READY) ## Simulator, model and command node at work, no GPU needed
 	$(BIN)/vla-zenoh demo $(ARGS)
 
 # What depends on time runs alone, the rest on every core, in order of the folders: the long files of tests/sim are not
-# the last ones. 5 is pytest's word for "none of these".
+# the last ones. A process of theirs that dies ends the run: whoever is to take its place waits for its files for ever.
+# 5 is pytest's word for "none of these".
 test: $(READY) ## Run the tests
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "$(SUITE) and not realtime" $(ARGS) || [ $$? = 5 ]
+	$(BIN)/python -m pytest -n auto --max-worker-restart 0 --dist loadfile --no-loadscope-reorder -m "$(SUITE) and not realtime" $(ARGS) || [ $$? = 5 ]
 	$(BIN)/python -m pytest $(AGAIN) -m "$(SUITE) and realtime" $(ARGS) || [ $$? = 5 ]
 
 slow: $(READY) ## Run the tests that take long, too, and search for new examples
