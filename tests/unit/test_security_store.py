@@ -14,9 +14,10 @@ from typer.testing import CliRunner
 
 from vla_zenoh.cli.secure import secure_app
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.profile import load_profile
+from vla_zenoh.profile import load_profile, override
 from vla_zenoh.security import authority as ca
-from vla_zenoh.security.identity import Identity, Role
+from vla_zenoh.security.identity import Identity, Role, people_at
+from vla_zenoh.security.stale import stale
 from vla_zenoh.security.store import Store
 from vla_zenoh.security.written import moved, profile_text, with_person
 
@@ -153,6 +154,21 @@ def test_a_key_that_others_can_read_is_not_used(store: Store) -> None:
     assert any("chmod 600" in fault for entry in store.entries(NOW) for fault in entry.faults)
 
 
+def test_an_authority_whose_key_others_can_read_signs_nothing(store: Store) -> None:
+    (store.folder / "ca.key").chmod(0o644)
+    with pytest.raises(SecurityError, match=r"ca\.key can be read by others \(mode 644\)"):
+        store.add([WORKER], NOW)
+    assert not store.has("gpu", "worker-scripted")
+
+
+def test_a_router_that_is_renewed_serves_where_it_served(store: Store) -> None:
+    store.add([ROUTER], NOW, addresses=["10.0.0.2"])
+    store.add([ROUTER], NOW, addresses=["robot.lab"], renew=True)
+    (entry,) = store.entries(NOW, "robot")
+    assert entry.certificate is not None
+    assert sorted(entry.certificate.addresses) == ["10.0.0.2", "robot.lab"]
+
+
 def test_a_computer_knows_which_host_it_is_when_it_has_one_folder(store: Store) -> None:
     with pytest.raises(SecurityError, match="has no certificates"):
         store.this_host(None)
@@ -186,6 +202,24 @@ def test_people_are_the_operator_where_there_is_one_else_the_viewer(store: Store
     assert store.identity_files("desk", None).certificate.name == "operator.pem"
     with pytest.raises(SecurityError, match=r"camera\.pem is not there\. Make it with `vla-zenoh"):
         store.identity_files("desk", "camera")
+
+
+def test_people_who_were_given_less_show_that_and_are_told_what_else_lies_there(
+    store: Store,
+) -> None:
+    store.add([*people_at("desk", Role.OPERATOR), *people_at("desk", Role.VIEWER)], NOW)
+    security = {"folder": str(store.folder), "people": {"desk": "viewer"}}
+    tls = ["tls/10.0.0.2:7447"]
+    session = {"listen": tls, "connect": tls, "security": security}
+    lab = override(load_profile("panda_sim"), {"session": session})
+    found = store.identity_files("desk", None, {"desk": "viewer"})
+    assert found.certificate.name == "viewer.pem"
+    told = stale(lab, store.entries(NOW))
+    assert sorted(path.name for path in told) == ["operator.pem", "worker-teleop.pem"]
+    assert "where people at desk are viewer: delete it" in told[store.folder / "desk/operator.pem"]
+    found.certificate.unlink()
+    with pytest.raises(SecurityError, match=r"viewer\.pem is not there"):
+        store.identity_files("desk", None, {"desk": "viewer"})
 
 
 def test_what_is_wrong_with_each_file_is_told(store: Store) -> None:

@@ -89,7 +89,7 @@ def _refuse_without_the_right(profile: Profile) -> None:
     if security is None:
         return
     store = Store(security.folder)
-    who = store.identity_files(security.host, None).certificate.stem
+    who = store.identity_files(security.host, None, security.people).certificate.stem
     if who == Role.REPLAY.value:
         return
     able = [host for host in store.hosts() if store.has(host, Role.REPLAY.value)]

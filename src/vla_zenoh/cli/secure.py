@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,6 +24,7 @@ from vla_zenoh.resources import is_path
 from vla_zenoh.security.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
 from vla_zenoh.security.bridge import bridges
 from vla_zenoh.security.identity import PEOPLE, Role, identities, identities_of, people_at
+from vla_zenoh.security.stale import stale
 from vla_zenoh.security.store import Entry, Store
 from vla_zenoh.security.written import (
     moved,
@@ -151,10 +153,12 @@ def add(
     )
     if new:
         _write(profile_file(profile), new)
-        load_profile(profile)
+        loaded = load_profile(profile)
     out = console()
     for path in made:
         out.print(f"made {path}", highlight=False, soft_wrap=True)
+    for path, why in stale(loaded, store.entries(_now(), host)).items():
+        errors().print(f"{path} {why}", style="yellow", highlight=False, soft_wrap=True)
     here, file = store.known_host(), profile_file(profile)
     routers = [name for name, part in loaded.hosts.items() if "router" in part.nodes]
     told = [name for name in routers if new and name not in (host, here)]
@@ -189,10 +193,17 @@ def show(
     as_json: JsonOption = False,
 ) -> None:
     """Show every certificate here: whose, how long, and what is wrong. Exits with 1 if any is."""
-    security = load_profile(profile).session.security
+    loaded = load_profile(profile)
+    security = loaded.session.security
     store = Store(folder or (security.folder if security is not None else DEFAULT_FOLDER))
     now = _now()
     entries = store.entries(now)
+    if security is not None and folder is None:
+        why = stale(loaded, entries)
+        entries = [
+            entry if entry.faults else replace(entry, warning=why.get(entry.path, entry.warning))
+            for entry in entries
+        ]
     if as_json:
         print_json([_plain(entry, now) for entry in entries])
     else:

@@ -12,6 +12,7 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import is_loopback
 from vla_zenoh.security.bridge import NODE as BRIDGE
 from vla_zenoh.security.identity import Identity
+from vla_zenoh.security.stale import stale
 from vla_zenoh.security.store import Entry, Store
 
 SHOWN_FAULTS = 6
@@ -59,6 +60,8 @@ def access(
         yield Finding("certificates", "fail", str(error))
         return
     yield certificates(host, entries)
+    for path, why in stale(profile, entries).items():
+        yield Finding(f"certificate {path.name}", "warn", why)
     try:
         yield from map(rules, rehearse())
     except VlaZenohError as error:

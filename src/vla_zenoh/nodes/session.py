@@ -117,7 +117,7 @@ def _listening(profile: SessionProfile) -> list[str]:
 
 
 def _tls(security: SecurityProfile, identity: str | None, routes: bool) -> dict[str, Any]:
-    files = Store(security.folder).identity_files(security.host, identity)
+    files = Store(security.folder).identity_files(security.host, identity, security.people)
     own = {"private_key": str(files.key), "certificate": str(files.certificate)}
     sides = ("connect", "listen") if routes else ("connect",)
     return {

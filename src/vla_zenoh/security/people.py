@@ -54,7 +54,7 @@ def role_here(profile: Profile) -> Role | None:
     if security is None:
         return None
     try:
-        files = Store(security.folder).identity_files(security.host, None)
+        files = Store(security.folder).identity_files(security.host, None, security.people)
     except SecurityError:
         return None
     return next((role for role in PEOPLE if role.value == files.certificate.stem), None)

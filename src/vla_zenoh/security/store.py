@@ -15,7 +15,7 @@ from __future__ import annotations
 import datetime as dt
 import os
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,7 +97,8 @@ class Store:
             now: UTC.
             days: how long they are valid.
             addresses: under which routers among them serve.
-            renew: put new ones in place of those that are there.
+            renew: put new ones in place of those that are there; routers serve under what those
+                say as well.
 
         Raises:
             SecurityError: one is there already, the authority's key is not, or a file cannot be
@@ -116,7 +117,7 @@ class Store:
                     identity.common_name,
                     now,
                     days=days,
-                    addresses=serving
+                    addresses=(*serving, *self._served(identity))
                     if identity.role is Role.ROUTER
                     else identity.addresses or None,
                 ),
@@ -139,7 +140,16 @@ class Store:
                 f"{key} is not there: certificates are made on the computer where "
                 "`vla-zenoh secure init` was run"
             )
+        if fault := open_to_others(key):
+            raise SecurityError(f"{fault}. Whoever read it can make certificates of this lab")
         return Pair(_get(certificate), _get(key))
+
+    def _served(self, identity: Identity) -> tuple[str, ...]:
+        """What the certificate that is there says it serves as: only there it was ever written."""
+        try:
+            return ca.read(_get(self.files(identity.host, identity.node).certificate)).addresses
+        except SecurityError:
+            return ()
 
     def _write(self, folder: Path, name: str, pair: Pair, *, renew: bool) -> Path:
         files = Files(folder, folder / f"{name}.pem", folder / f"{name}.key")
@@ -219,14 +229,23 @@ class Store:
         files = self.files(host, node)
         return files.certificate.exists() and files.key.exists()
 
-    def identity_files(self, host: str | None, node: str | None) -> Files:
+    def identity_files(
+        self, host: str | None, node: str | None, people: Mapping[str, str] | None = None
+    ) -> Files:
         """The files of a node of this computer, or, without a node, of its people.
+
+        Args:
+            host: which host this computer is; None: what is known of it.
+            node: whose.
+            people: host -> role of its people, ``session.security.people``. Where it names the
+                host, no certificate but that role's is of use: the router drops what others say.
 
         Raises:
             SecurityError: they are not there, or others can read the key.
         """
         host = self.this_host(host)
-        names = [node] if node is not None else [role.value for role in PEOPLE]
+        role = (people or {}).get(host)
+        names = [node] if node is not None else [role] if role else [one.value for one in PEOPLE]
         for name in names:
             if self.has(host, name):
                 files = self.files(host, name)
