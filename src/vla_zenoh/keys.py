@@ -105,8 +105,12 @@ class Keys:
 
     @property
     def active(self) -> str:
-        """true / false, also 1/0, on/off."""
+        """true / false, also 1/0, on/off. ``true while NAME``: as long as `holding` NAME is."""
         return self._at("active")
+
+    def holding(self, holder: str) -> str:
+        """Liveliness token of whoever lets the arm obey only for as long as he is there himself."""
+        return self._at("holding", chunk(holder, "holder"))
 
     @property
     def worker(self) -> str:
@@ -256,6 +260,10 @@ class Keys:
     @property
     def all_alive(self) -> str:
         return self._at("alive", "*")
+
+    @property
+    def all_holding(self) -> str:
+        return self._at("holding", "*")
 
     @property
     def all_robots(self) -> str:

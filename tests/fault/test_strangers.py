@@ -60,6 +60,7 @@ OTHERS = (
     "seen",
     "seen_record",
     "alive",
+    "holding",
     "clock",
     "sim_step",
 )
@@ -72,7 +73,13 @@ SELDOM = {
     "task": Task(1 << 60, True, "HARD: yaw left", "scripted", 100.0),
 }
 """Not written all the time: true but for their writer."""
-NAMES = {"camera": "front", "form": "224x224-pad", "worker": "scripted", "node": "command"}
+NAMES = {
+    "camera": "front",
+    "form": "224x224-pad",
+    "worker": "scripted",
+    "node": "command",
+    "holder": "anna",
+}
 
 
 class Junk(NamedTuple):

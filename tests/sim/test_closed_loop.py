@@ -107,7 +107,7 @@ def carry_out(loop: Lockstep, prompt: str, count: int) -> Run:
     loop.put("prompt", f"HARD: {prompt} x{count}")
     loop.run(0.01)
     limit_s = 1.3 * count / commander.task.rate_hz + 3.0
-    assert loop.run_until(lambda: commander.policy_done, limit_s), loop.refused
+    assert loop.run_until(lambda: commander.progress.done, limit_s), loop.refused
     loop.run(SETTLE_S)
     assert commander.at_rest
     assert commander.state.value in ("active", "holding"), commander.why
@@ -158,7 +158,7 @@ def test_steps_up_add_up_to_their_whole_way_at_every_rate(rate_hz: float, count:
     run = carry_out(begin(rate_hz, make_world()), "go up", count)
     check_translation(run, 2, 0.01 * count)
     assert norm3(run.turned_rad) < DRIFT_RAD
-    assert run.loop.commander.accepted_steps >= count
+    assert run.loop.commander.progress.steps >= count
     check_stream(run.loop)
 
 

@@ -68,7 +68,7 @@ def carry_out(loop: Lockstep, prompt: str, count: int) -> tuple[FloatArray, Floa
     loop.put("prompt", f"HARD: {prompt} x{count}")
     loop.run(0.01)
     limit_s = 1.3 * count / loop.commander.task.rate_hz + 3.0
-    assert loop.run_until(lambda: loop.commander.policy_done, limit_s), loop.refused
+    assert loop.run_until(lambda: loop.commander.progress.done, limit_s), loop.refused
     loop.run(SETTLE_S)
     # The elbow of an arm that is commanded by joints takes its time to its posture.
     assert loop.commander.at_rest or loop.profile.robot.command == "joint"
@@ -106,7 +106,7 @@ def test_every_mode_ends_where_the_steps_end(mode: str, horizon: int, late: str)
     moved_m, turned_rad = carry_out(loop, "go up", count)
     np.testing.assert_allclose(moved_m, [0, 0, count * STEP_M], atol=REACHED_M)
     np.testing.assert_allclose(turned_rad, np.zeros(3), atol=TURNED_RAD)
-    assert loop.commander.accepted_steps == count
+    assert loop.commander.progress.steps == count
     check_seams(loop)
 
 
@@ -117,7 +117,7 @@ def test_every_mode_ends_where_the_steps_end(mode: str, horizon: int, late: str)
 def test_fifty_steps_are_counted_as_fifty(horizon: int) -> None:
     loop = begin(changed(), 7.0, horizon=horizon, delays=DELAYS["late"])
     moved_m, _ = carry_out(loop, "go up", 50)
-    assert loop.commander.accepted_steps == 50
+    assert loop.commander.progress.steps == 50
     np.testing.assert_allclose(moved_m, [0, 0, 0.5], atol=REACHED_M)
 
 

@@ -81,11 +81,11 @@ def after(seconds: float, tamper: Any = None) -> FloatArray:
 
 def test_late_chunks_cost_time_and_no_way() -> None:
     loop = moving(0.6)
-    start_m, steps = path_m(loop)[0, 2], loop.commander.accepted_steps
+    start_m, steps = path_m(loop)[0, 2], loop.commander.progress.steps
     assert steps >= 5
     loop.tamper = delayed(0.2, ActionChunk)
     loop.run(1.0)
-    steps = loop.commander.accepted_steps  # a new prompt counts anew
+    steps = loop.commander.progress.steps  # a new prompt counts anew
     loop.tamper = None
     assert settled_height_m(loop) - start_m == pytest.approx(STEP_M * steps, abs=EXACT_M)
     check_motion(loop)
@@ -150,7 +150,7 @@ def test_a_chunk_that_is_overtaken_is_left_out_and_nothing_jumps() -> None:
         lambda sent: [later(sent, 0.25) if sent.header.seq % 4 == 0 else sent]
     )
     loop.run(1.2)
-    steps = loop.commander.accepted_steps
+    steps = loop.commander.progress.steps
     loop.tamper = None
     assert loop.refused["replayed"] >= 2
     # One that was left out had been seen by no later one: its way is missing, and no more.

@@ -50,13 +50,13 @@ def held_m(loop: Lockstep) -> FloatArray:
 def test_a_worker_that_takes_over_in_motion_goes_on_without_a_jump() -> None:
     loop = begin(UP, others={"other": Asked("other")})
     loop.run(0.8)
-    steps = loop.commander.accepted_steps
+    steps = loop.commander.progress.steps
     since = mark(loop)
     loop.put("worker", "other")
     loop.run(0.8)
     assert loop.commander.task.worker == "other"
     assert speed_m_s(loop)[since:].min() > 0.3 * SPEED_M_S  # it does not stop in between
-    steps += loop.commander.accepted_steps
+    steps += loop.commander.progress.steps
     loop.put("prompt", HOLD)
     loop.run(1.2)
     way = path_m(loop)[-1] - path_m(loop)[0]
@@ -66,10 +66,10 @@ def test_a_worker_that_takes_over_in_motion_goes_on_without_a_jump() -> None:
 
 def test_a_prompt_that_changes_in_motion_turns_the_arm_without_a_jump() -> None:
     loop = moving(0.8)
-    steps = loop.commander.accepted_steps
+    steps = loop.commander.progress.steps
     loop.put("prompt", f"0 {STEP_M} 0")
     loop.run(0.8)
-    aside = loop.commander.accepted_steps
+    aside = loop.commander.progress.steps
     loop.put("prompt", HOLD)
     loop.run(1.2)
     way = path_m(loop)[-1] - path_m(loop)[0]
@@ -83,7 +83,7 @@ def test_a_rate_that_changes_in_motion_loses_no_step() -> None:
     for rate_hz in (10.0, 2.0, 20.0, 5.0):
         loop.put("rate", rate_hz)
         loop.run(0.8)
-    steps = loop.commander.accepted_steps
+    steps = loop.commander.progress.steps
     assert steps > 15
     loop.put("prompt", HOLD)
     loop.run(1.2)

@@ -91,7 +91,7 @@ def test_a_dry_run_computes_everything_and_streams_nothing() -> None:
         out = rig.send([[*UP[:6], -0.03]])
         assert out.accepted is not None
         rig.run(0.2)
-    assert rig.commander.accepted_steps == 5
+    assert rig.commander.progress.steps == 5
     assert rig.commander.goal is not None
     np.testing.assert_allclose(rig.commander.goal.pose.position_m, START_M + [0, 0, 0.05])
     assert rig.commands == []
@@ -139,7 +139,7 @@ def test_of_a_chunk_that_lasts_too_long_only_the_beginning_is_followed() -> None
     rig.run(3.0)
     rig.settle()
     np.testing.assert_allclose(rig.moved_m(), [0, 0, 5 * STEP_M], atol=AT_GOAL_M)
-    assert not rig.commander.policy_done
+    assert not rig.commander.progress.done
     assert rig.state == "holding"
 
 
@@ -678,7 +678,7 @@ def test_a_new_rate_in_motion_changes_nothing_but_the_task() -> None:
         ("prompt", 3.0),
         ("prompt", "\ud800"),
         ("worker", "x" * 200),
-        ("active", "false"),
+        ("active", math.nan),
         ("active", 1.0),
         ("colour", "red"),
     ],
@@ -723,7 +723,7 @@ def test_a_minute_of_toggling_active_ten_times_a_second_stays_smooth() -> None:
             rig.run(0.02)
     rig.put("active", False)
     rig.settle(1.0)
-    assert rig.commander.accepted_steps > 0
+    assert rig.commander.progress.steps > 0
     assert rig.commander.smoothing_failures == 0
     rig.assert_smooth()
 

@@ -25,6 +25,7 @@ SELECTORS = (
     "all_status",
     "all_events",
     "all_alive",
+    "all_holding",
     "all_robots",
     "without_pictures",
     "without_raw_pictures",
@@ -80,6 +81,7 @@ def test_selectors_find_their_own_keys_and_no_others() -> None:
         "all_status": named["status"],
         "all_events": named["event"],
         "all_alive": named["alive"],
+        "all_holding": named["holding"],
     }
     every = [*fixed_keys(KEYS).values(), *named.values()]
     for selector, key in own.items():

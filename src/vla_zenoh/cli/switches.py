@@ -9,6 +9,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from vla_zenoh.cli.aim import Aim
+from vla_zenoh.cli.held import hold
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
@@ -20,6 +21,7 @@ from vla_zenoh.cli.output import complain, console, errors, fail, styled
 from vla_zenoh.keys import Keys
 from vla_zenoh.nodes.alive import robots_alive
 from vla_zenoh.nodes.client import Client
+from vla_zenoh.nodes.process import stop_on_signals
 from vla_zenoh.profile import as_robot
 
 STOP_PATIENCE_S = 3.0
@@ -34,16 +36,23 @@ def activate(
     connect: ConnectOption = None,
     host: HostOption = None,
     robot: RobotOption = None,
+    while_here: Annotated[
+        bool,
+        typer.Option("--hold", help="Stay: the arm obeys only while this runs and is connected."),
+    ] = False,
 ) -> None:
     """Give the arm to the worker. Refused with every reason while something is not right."""
     aim = Aim(profile, connect, host, robot)
     with aim.driver("activate") as client:
-        task = client.activate()
+        stop = stop_on_signals() if while_here else None
+        task = client.activate() if stop is None else client.activate_while_here("person")
         console().print(
             f"active: worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz, "
             f"{aim.named(client)}",
             soft_wrap=True,
         )
+        if stop is not None:
+            hold(aim, client, task, stop)
 
 
 def deactivate(

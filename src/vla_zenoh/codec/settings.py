@@ -15,6 +15,7 @@ from vla_zenoh.types import MAX_TEXT
 MAX_SETTING_BYTES = 4 * MAX_TEXT
 TRUE_WORDS = frozenset({"true", "1", "on", "yes"})
 FALSE_WORDS = frozenset({"false", "0", "off", "no"})
+WHILE = "while"
 MIN_RATE_HZ, MAX_RATE_HZ = 0.05, 100.0
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?")
@@ -53,6 +54,24 @@ def decode_bool(payload: bytes) -> bool:
     if word in FALSE_WORDS:
         return False
     raise CodecError("invalid", f"{word[:40]!r} is neither true nor false (also 1/0, on/off)")
+
+
+def decode_activation(payload: bytes) -> bool | str:
+    """Likewise, or ``true while NAME``: the name of whoever holds the arm active.
+
+    Returns:
+        True or False; a name for the latter.
+
+    Raises:
+        CodecError: anything else.
+    """
+    words = decode_text(payload).split()
+    if len(words) != 3 or words[0].lower() not in TRUE_WORDS or words[1].lower() != WHILE:
+        return decode_bool(payload)
+    try:
+        return keys.chunk(words[2], "holder")
+    except ProfileError as error:
+        raise CodecError("invalid", str(error)) from error
 
 
 def decode_rate(payload: bytes) -> float:
@@ -97,6 +116,11 @@ def decode_seed(payload: bytes) -> int | None:
     if not _SEED.fullmatch(word):
         raise CodecError("invalid", f"{word[:40]!r} is not a seed: give nothing or a whole number")
     return int(word)
+
+
+def encode_held(holder: str) -> bytes:
+    """An activation that lasts as long as the token `vla_zenoh.keys.Keys.holding` of `holder`."""
+    return f"true {WHILE} {holder}".encode()
 
 
 def encode_bool(value: bool) -> bytes:

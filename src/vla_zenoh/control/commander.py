@@ -10,17 +10,18 @@ Here are states and settings. `composer` makes plans of chunks, `mover` makes co
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 from vla_zenoh.control.acceptance import Lease, Refusal, refuse
 from vla_zenoh.control.compose import Goal
 from vla_zenoh.control.composer import Composer
 from vla_zenoh.control.gripper import GripperArbiter
+from vla_zenoh.control.holding import Holding
 from vla_zenoh.control.joint_fit import reasons_joints_do_not_fit
 from vla_zenoh.control.mover import Mover
 from vla_zenoh.control.ports import Inputs, Outputs, Setting
 from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
+from vla_zenoh.control.progress import Progress
 from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.so3 import held_pose, pose_of
 from vla_zenoh.control.states import OBEYING, State, Trigger, after
@@ -38,9 +39,6 @@ from vla_zenoh.types import (
 )
 
 __all__ = ["Commander", "Inputs", "Outputs", "Setting"]
-
-WHOLE_STEP = 1e-6
-"""Parts of steps that sum up to all but this are a step."""
 
 
 class Commander:
@@ -69,9 +67,7 @@ class Commander:
         self.joint: Stamped[JointState] | None = None
         self.gripper_state: Stamped[GripperState] | None = None
         self.lease: Lease | None = None
-        self.accepted_chunks = 0
-        self.accepted_steps = 0
-        self.policy_done = False
+        self.progress, self.holding = Progress(), Holding()
         self._resumed_ns = 0
         self._around = Surroundings()
         self._shadow: dict[str, Stamped[ActionChunk]] = {}
@@ -103,8 +99,8 @@ class Commander:
         self._look_around(now_ns)
         if not self._mover.advance(self.state, now_ns, ticks, self._out):
             self._change(Trigger.FAULT, "no trajectory could be computed; braked")
-        if self.state is State.ACTIVE:
-            self._count_steps(now_ns)
+        if self.state is State.ACTIVE and self._mover.timeline is not None:
+            self.progress.look(self._mover.timeline, self.task.episode, now_ns)
         if not self.dry_run:
             self._mover.command(self.state, now_ns, self.gripper_state, self._out)
         if self.state is not state_before and self.task.active != (self.state in OBEYING):
@@ -170,7 +166,7 @@ class Commander:
 
     def _take_setting(self, setting: Setting, now_ns: int, stopped: bool) -> None:
         name, value = setting.name, setting.value
-        if stopped and (name == "reset" or (name == "active" and value is True)):
+        if stopped and (name == "reset" or (name == "active" and value is not False)):
             # Which of them was put first cannot be told within a tick: the stop wins.
             self._refuse_setting(name, ["an emergency stop came at the same time"])
             return
@@ -188,8 +184,8 @@ class Commander:
                 self._change_worker(value, now_ns)
         elif name == "rate" and isinstance(value, (int, float)):
             self.task = replace(self.task, rate_hz=value)
-        elif name == "active" and value is True:
-            self._activate(now_ns)
+        elif name == "active" and (value is True or isinstance(value, str)):
+            self._activate(now_ns, "" if value is True else value)
         elif name == "active" and value is False:
             self._change(Trigger.DEACTIVATE, "deactivated")
         elif name == "reset":
@@ -203,8 +199,7 @@ class Commander:
         # The wall clock, so that an episode number never comes again after a restart.
         episode = max(self.task.episode + 1, now_ns // 1_000_000)
         self.task = replace(self.task, episode=episode, **changes)  # pyright: ignore
-        self.accepted_chunks = self.accepted_steps = 0
-        self.policy_done = False
+        self.progress.begin()
         if self.state in OBEYING:
             self._watch.expect_first(now_ns, self.task.rate_hz)
 
@@ -217,8 +212,9 @@ class Commander:
             self.lease = lease
         self._new_episode(now_ns, worker=worker)
 
-    def _activate(self, now_ns: int) -> None:
+    def _activate(self, now_ns: int, holder: str) -> None:
         if self.state in OBEYING:
+            self._hold_as_well(holder)
             return
         if self.state is not State.INACTIVE:
             self._refuse_setting(
@@ -226,16 +222,28 @@ class Commander:
             )
             return
         lease, reasons = self._preflight(self.task.worker, now_ns)
-        if lease is None or self.pose is None or self.gripper_state is None:
+        reasons += self.holding.refused(holder, self._around.holders)
+        if lease is None or self.pose is None or self.gripper_state is None or reasons:
             self._refuse_setting("activate", reasons)
             return
         self.lease = lease
+        self.holding.begin(holder)
         self._resumed_ns = 0
         measured, joint = self.pose.record, self.joint.record if self.joint else None
         blocked = self._watch.begin(held_pose(measured), pose_of(measured))
         self._mover.anchor(measured, self.gripper_state.record, joint, now_ns, blocked=blocked)
-        self._change(Trigger.ACTIVATE, f"activated with worker {self.task.worker!r}")
+        held = f", while {holder!r} holds it" if holder else ""
+        self._change(Trigger.ACTIVATE, f"activated with worker {self.task.worker!r}{held}")
         self._new_episode(now_ns)
+
+    def _hold_as_well(self, holder: str) -> None:
+        """An arm that obeys already is held by one; nobody takes that away without a brake."""
+        reasons = self.holding.refused(holder, self._around.holders, obeying=True)
+        if reasons:
+            self._refuse_setting("activate", reasons)
+        elif holder not in ("", self.holding.name):
+            self.holding.begin(holder)
+            self._out.tell("info", "notice", "held", f"obeys from now on while {holder!r} holds it")
 
     def _preflight(self, worker: str, now_ns: int) -> tuple[Lease | None, list[str]]:
         chunk = self._shadow.get(worker)
@@ -315,7 +323,7 @@ class Commander:
             return
         self._shadow[worker] = chunk
         self.lease.last_observation_ns = chunk.record.observation_stamp_ns
-        self.accepted_chunks += 1
+        self.progress.chunks += 1
         self._change(Trigger.FRESH, "fresh chunk")
 
     def _carry_out(self, chunk: Stamped[ActionChunk], lease: Lease, now_ns: int) -> Refusal | None:
@@ -337,16 +345,6 @@ class Commander:
         self._out.accepted = plan.cause
         return None
 
-    def _count_steps(self, now_ns: int) -> None:
-        """Steps that have come in force, and whether they were the last ones."""
-        assert self._mover.timeline is not None
-        plan = self._mover.timeline.plan
-        if plan.episode != self.task.episode:
-            return
-        steps = math.floor(plan.steps_in_force(now_ns) + WHOLE_STEP)
-        self.accepted_steps = max(self.accepted_steps, steps)
-        self.policy_done = plan.done and plan.index_at(now_ns) == len(plan.goals) - 1
-
     # -- watching -----------------------------------------------------------------------------
     def _look_around(self, now_ns: int) -> None:
         if self.pose is not None:
@@ -361,6 +359,7 @@ class Commander:
             lost = self._watch.blocked()
         if not lost and self._watch.forsaken(now_ns):
             lost = f"held for {self.profile.timing.max_hold_s:g} s, no fresh chunk came"
+        lost = lost or self.holding.lost(self._around.holders)
         if lost:
             self._change(Trigger.LOSE, lost)
         elif self._watch.starved(now_ns):

@@ -39,6 +39,7 @@ class Surroundings:
         host: the computer of the command node.
         hosts: node -> its computer, as it says.
         clocks: node -> its clock minus that of the command node, where it was measured.
+        holders: who is there to hold the arm active.
     """
 
     alive: frozenset[str] = frozenset()
@@ -51,6 +52,7 @@ class Surroundings:
     host: str = ""
     hosts: Mapping[str, str] = field(default_factory=dict)
     clocks: Mapping[str, Offset] = field(default_factory=dict)
+    holders: frozenset[str] = frozenset()
 
 
 def reasons_not_to_activate(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import secrets
 import threading
 import time
 from collections import deque
@@ -13,6 +14,8 @@ from typing import Any, TypeVar
 import zenoh
 
 from vla_zenoh.codec import records
+from vla_zenoh.codec.settings import encode_held
+from vla_zenoh.control.holding import NOT_SEEN
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.keys import Kind, last
 from vla_zenoh.nodes.attendance import MAX_STATUS_BYTES, Attendance
@@ -23,7 +26,7 @@ from vla_zenoh.security.identity import identities
 from vla_zenoh.types import Event, Header, NodeStatus, Task
 
 Value = TypeVar("Value")
-POLL_S = 0.02
+POLL_S, HOLD_PATIENCE_S = 0.02, 1.0
 MAX_EVENTS, MAX_REFUSALS = 4096, 256
 MAX_EVENT_BYTES = 64 * 1024
 MAX_WHAT, MAX_WHY = 128, 1000
@@ -51,6 +54,7 @@ class Client:
         self._task_heard_s = -1e9
         self._refusals: deque[tuple[float, Event]] = deque(maxlen=MAX_REFUSALS)
         self._subscriptions: list[Any] = []
+        self._token: Any = None
 
     def follow(self) -> Client:
         """Begin to listen to status, events, liveliness and the task."""
@@ -186,13 +190,50 @@ class Client:
         Raises:
             SessionError: it was refused, with every reason.
         """
-        return self._set(self.keys.active, "true", lambda task: task.active, "activate", timeout_s)
+        return self._activate("true", timeout_s)
+
+    def activate_while_here(self, what: str, timeout_s: float = 3.0) -> Task:
+        """Likewise, and only for as long as this process lives and is connected.
+
+        Until `deactivate`. Whatever ends it, also kill -9 or a cable that is pulled, brakes the
+        arm: at once where the router sees the connection close, else when it gives up the link
+        (``session.lease_ms``).
+
+        Args:
+            what: who this is, for people.
+
+        Raises:
+            SessionError: it was refused, with every reason.
+        """
+        self.let_go()
+        holder = f"{what}-{secrets.token_hex(4)}"
+        self._token = self.session.liveliness().declare_token(self.keys.holding(holder))
+        text, give_up_s = encode_held(holder).decode(), time.monotonic() + HOLD_PATIENCE_S
+        while True:
+            try:
+                return self._activate(text, timeout_s)
+            except SessionError as error:
+                # The token may be on its way still: it does not go before what is put after it.
+                if NOT_SEEN not in str(error) or time.monotonic() > give_up_s:
+                    self.let_go()
+                    raise
+
+    def _activate(self, text: str, timeout_s: float) -> Task:
+        return self._set(self.keys.active, text, lambda task: task.active, "activate", timeout_s)
 
     def deactivate(self, timeout_s: float = 3.0) -> bool:
         """Deactivate; True when the arm stands within `timeout_s`."""
         began_s = time.monotonic()
         self.put(self.keys.active, "false")
-        return bool(self.wait_for(lambda: self._stands(began_s), timeout_s))
+        stands = bool(self.wait_for(lambda: self._stands(began_s), timeout_s))
+        self.let_go()
+        return stands
+
+    def let_go(self) -> None:
+        """Hold the arm active no more: if it still is, it brakes."""
+        token, self._token = self._token, None
+        if token is not None:
+            token.undeclare()
 
     def _stands(self, since_s: float) -> bool:
         """By a status that is younger than the order: an older one says nothing about it."""

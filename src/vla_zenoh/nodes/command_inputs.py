@@ -48,7 +48,7 @@ class CommandInputs:
             ("prompt", node.listen(keys.prompt, Mailbox(16, WORDS)), settings.decode_text),
             ("worker", node.listen(keys.worker, Mailbox(16, WORDS)), settings.decode_name),
             ("rate", node.listen(keys.rate, Mailbox(16, WORDS)), settings.decode_rate),
-            ("active", node.listen(keys.active, Mailbox(16, WORDS)), settings.decode_bool),
+            ("active", node.listen(keys.active, Mailbox(16, WORDS)), settings.decode_activation),
         ]
         self._speakers = {
             kind: Speaker(node.profile.timing.state_timeout_s)

@@ -269,13 +269,17 @@ class Node:
 
     def on_alive(self, callback: Callable[[str, bool], None]) -> None:
         """Call back with (node name, alive) now and at every change, on Zenoh's thread."""
+        self.on_tokens(self.keys.all_alive, callback)
+
+    def on_tokens(self, expression: str, callback: Callable[[str, bool], None]) -> None:
+        """Likewise with the last part of the key of every liveliness token."""
 
         def change(sample: zenoh.Sample) -> None:
             callback(str(sample.key_expr).rsplit("/", 1)[-1], sample.kind == zenoh.SampleKind.PUT)
 
         handler = zenoh.handlers.Callback(change, indirect=False)
         self._declared.append(
-            self.session.liveliness().declare_subscriber(self.keys.all_alive, handler, history=True)
+            self.session.liveliness().declare_subscriber(expression, handler, history=True)
         )
 
     def answer(self, key: str, reply: Callable[[zenoh.Query], None]) -> None:

@@ -117,7 +117,7 @@ def probes(profiles: Sequence[Profile]) -> dict[Act, list[str]]:
                 for key in expressions(profile.keys, row.member, identity, act):
                     made.setdefault(key.replace("*", somewhere), set()).update(acts)
     cast = {act: sorted(key for key, acts in made.items() if act in acts) for act in Act}
-    watched = [profile.keys.all_alive for profile in profiles]
+    watched = [one for profile in profiles for one in rehearsal_acts.tokens_of(profile.keys)]
     return {**cast, Act.DELETE: cast[Act.PUT], Act.WATCH: watched}
 
 

@@ -171,20 +171,33 @@ def watching(
     witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], robots: Sequence[Keys]
 ) -> set[tuple[str, Act, str]]:
     """Whether each session sees the witness's liveliness tokens."""
-    own = [of.alive(WITNESS.node) for of in robots]
-    tokens = [witness.liveliness().declare_token(key) for key in own]
+    own = {
+        expression: expression.replace("*", WITNESS.node)
+        for of in robots
+        for expression in tokens_of(of)
+    }
+    tokens = [witness.liveliness().declare_token(key) for key in own.values()]
     time.sleep(SETTLE_S)
     found = {
-        (name, Act.WATCH, of.all_alive)
+        (name, Act.WATCH, expression)
         for name, session in sessions.items()
-        for of, key in zip(robots, own, strict=True)
-        if key in alive(session, of)
+        for expression, key in own.items()
+        if key in _tokens(session, expression)
     }
     _end(tokens)
     return found
 
 
+def tokens_of(keys: Keys) -> tuple[str, ...]:
+    """Every selector of liveliness tokens of a robot."""
+    return keys.all_alive, keys.all_holding
+
+
 def alive(session: zenoh.Session, keys: Keys) -> set[str]:
-    """Keys of all liveliness tokens that this session sees."""
-    replies = session.liveliness().get(keys.all_alive, timeout=ANSWER_S)
+    """Keys of all liveliness tokens of a robot that this session sees."""
+    return {key for expression in tokens_of(keys) for key in _tokens(session, expression)}
+
+
+def _tokens(session: zenoh.Session, expression: str) -> set[str]:
+    replies = session.liveliness().get(expression, timeout=ANSWER_S)
     return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}

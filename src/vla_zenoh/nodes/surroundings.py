@@ -17,7 +17,7 @@ from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile.servers import camera_servers
 from vla_zenoh.types import NodeStatus
 
-MAX_WORKERS = 32
+MAX_WORKERS, MAX_HOLDERS = 32, 32
 CLOCKS_PERIOD_S = 0.25
 STATUSES_A_TICK, SPECS_A_TICK = 8, 4
 """What is more was not sent by any node of ours: each says something twice a second."""
@@ -30,6 +30,7 @@ class Neighbours:
         self._node = node
         self._lock = threading.Lock()
         self._alive: set[str] = set()
+        self._holders: set[str] = set()
         self._changed = True
         self._specs: dict[str, ModelSpec] = {}
         self._spec_sources: dict[str, str] = {}
@@ -42,6 +43,7 @@ class Neighbours:
         self._statuses = node.listen(node.keys.all_status, Mailbox(STATUSES_A_TICK))
         self._new_specs = node.listen(node.keys.all_specs, Mailbox(SPECS_A_TICK))
         node.on_alive(self._on_alive)
+        node.on_tokens(node.keys.all_holding, self._on_holding)
         self._robot_node = node.profile.robot.driver
 
     def _on_alive(self, name: str, alive: bool) -> None:
@@ -56,6 +58,16 @@ class Neighbours:
                 self._specs.pop(worker, None)
                 self._spec_sources.pop(worker, None)
                 self._complaints.pop(worker, None)
+
+    def _on_holding(self, name: str, there: bool) -> None:
+        with self._lock:
+            self._changed = True
+            if not there:
+                self._holders.discard(name)
+            elif len(self._holders) < MAX_HOLDERS:
+                self._holders.add(name)
+            else:
+                self._node.counters["refused.holder"] += 1
 
     def look(self, now_ns: int) -> Surroundings | None:
         """The surroundings now, or None when nothing changed."""
@@ -82,6 +94,7 @@ class Neighbours:
                 socket.gethostname(),
                 dict(self._hosts),
                 self._node.clocks.known(),
+                frozenset(self._holders),
             )
 
     def _follow_clocks(self) -> None:
@@ -135,6 +148,7 @@ class Neighbours:
             known = self._spec_sources.get(worker)
             ours = node in self._alive and known in (None, source)
             if ours and known is None and len(self._specs) >= MAX_WORKERS:
+                self._node.counters["refused.more_workers"] += 1
                 return
         stamped = self._node.read(ModelSpec, arrival) if ours else None
         if ours and stamped is None:

@@ -163,7 +163,7 @@ class TrialRun:
             client.take_events()
             self._holds, self._deactivated = 0, False
             began_ns, start_m = time.time_ns(), self._tcp_m()
-            self._task = client.activate()
+            self._task = client.activate_while_here("trial")
         except SessionError as error:
             self._brake()  # a late answer may still have given the arm
             self._discard()

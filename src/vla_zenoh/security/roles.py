@@ -95,6 +95,7 @@ TABLE = (
     _stream("state_gripper", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
     _setting("prompt"),
     _setting("active"),
+    Row("holding", announce=frozenset({OPERATOR}), watch=frozenset({COMMAND})),
     _setting("worker"),
     _setting("rate"),
     _stream("stop", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
@@ -171,7 +172,7 @@ def _choices(parameter: str, identity: Identity, act: Act) -> tuple[str, ...]:
         return (RECORDER if identity.role is OPERATOR else identity.node,)
     if parameter == "worker":
         return (identity.worker,) if identity.worker else ()
-    if parameter == "form":
+    if parameter in ("form", "holder"):
         return ("*",)
     if parameter == "camera":  # a worker shows what it saw of any camera
         return ("*",) if identity.role is Role.WORKER else identity.cameras

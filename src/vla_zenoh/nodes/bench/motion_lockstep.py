@@ -145,7 +145,7 @@ def _carry_out(loop: Lockstep, segment: Segment, rate_hz: float) -> int:
     episode = commander.task.episode
     loop.put("prompt", segment.prompt_with_count)
     ended = loop.run_until(
-        lambda: commander.task.episode != episode and commander.policy_done and commander.at_rest,
+        lambda: commander.task.episode != episode and commander.progress.done and commander.at_rest,
         limit_s,
     )
     if not ended or commander.state.value not in ("active", "holding"):
@@ -155,7 +155,7 @@ def _carry_out(loop: Lockstep, segment: Segment, rate_hz: float) -> int:
             f"{dict(loop.refused) or 'nothing'}"
         )
     loop.run(SETTLE_S)
-    return commander.accepted_steps
+    return commander.progress.steps
 
 
 def _standing(loop: Lockstep) -> Standing:

@@ -217,7 +217,7 @@ def _episode(bench: _Bench, asked: Asked) -> Ended:
             if verdict is None and not commander.task.active:
                 pictures = _pictures(bench, beginning)
                 return Ended(episode, prompt, False, ARM_LOST, time_s, commander.why, pictures)
-            over = commander.policy_done and commander.at_rest
+            over = commander.progress.done and commander.at_rest
             over_since_s = (over_since_s or time_s) if over else 0.0
             too_long = bool(over_since_s) and time_s - over_since_s > SAY_IT_IS_OVER_S
             if verdict is None and (too_long or time_s > plan.limit_s):
