@@ -19,7 +19,7 @@ from vla_zenoh.cli.trial_person import Lines, TrialPerson
 from vla_zenoh.errors import NodeError
 from vla_zenoh.evaluation.trial.conduct import Conduct, Look
 from vla_zenoh.evaluation.trial.folder import TrialFolder
-from vla_zenoh.evaluation.trial.judged import Judged
+from vla_zenoh.evaluation.trial.judged import End, Judged
 from vla_zenoh.evaluation.trial.plan import Due, Plan
 from vla_zenoh.nodes.demo import Interrupted
 
@@ -104,6 +104,19 @@ def test_setups_that_are_laid_already_are_not_asked_for(
     assert person(read, lays=True).ask(laid()) == ""
     assert "episode 1 of 4: setup 1, left" in capsys.readouterr().err
     os.close(write)
+
+
+@pytest.mark.parametrize("end", ["taken", "stopped", "lost"])
+def test_after_an_episode_that_was_taken_away_a_person_is_asked_whatever_was_said_before(
+    pipe: tuple[int, int], capsys: pytest.CaptureFixture[str], end: End
+) -> None:
+    read, write = pipe
+    os.write(write, b"\n")
+    assert person(read, lays=True).ask(Conduct(Due(1, 2, "bob"), 20.0, end)) == ""
+    assert "the arm was taken away" in capsys.readouterr().err
+    os.close(write)
+    with pytest.raises(NodeError, match="has ended before the trial"):
+        person(read, lays=True).ask(Conduct(Due(1, 2, "bob"), 20.0, end))
 
 
 def test_ctrl_c_ends_a_question(pipe: tuple[int, int]) -> None:

@@ -87,7 +87,8 @@ class TrialPerson:
         plan: of the trial.
         fd: where lines come from.
         stop: set by Ctrl-C.
-        lays: setups are laid by somebody else: nobody is asked whether they are.
+        lays: setups are laid by somebody else: nobody is asked whether they are, but after an
+            episode that somebody or something else has ended.
     """
 
     def __init__(self, plan: Plan, fd: int, stop: threading.Event, *, lays: bool) -> None:
@@ -103,9 +104,13 @@ class TrialPerson:
         phase = conduct.phase
         if phase is Phase.LAY:
             self._say(self._setup(conduct), style="bold")
-            if self._lays:
+            if self._lays and not conduct.needs_a_person:
                 return ""
             question = "lay it, then press Enter:"
+            if conduct.needs_a_person:
+                question = (
+                    "the arm was taken away before: lay it, see that it may move, then Enter:"
+                )
         elif phase is Phase.REPAIR:
             self._say(self._plan.hide(conduct.reasons), style="yellow")
             question = "repair it, then press Enter; or x (void, done again), and a note:"

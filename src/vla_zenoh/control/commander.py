@@ -24,7 +24,7 @@ from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
 from vla_zenoh.control.progress import Progress
 from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.so3 import held_pose, pose_of
-from vla_zenoh.control.states import OBEYING, State, Trigger, after
+from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watch import Watch
 from vla_zenoh.errors import RecordError
 from vla_zenoh.profile import Profile
@@ -187,7 +187,7 @@ class Commander:
         elif name == "active" and (value is True or isinstance(value, str)):
             self._activate(now_ns, "" if value is True else value)
         elif name == "active" and value is False:
-            self._change(Trigger.DEACTIVATE, "deactivated")
+            self._change(Trigger.DEACTIVATE, DEACTIVATED)
         elif name == "reset":
             self._reset()
         elif name == "lose":

@@ -58,6 +58,10 @@ OBEYING = frozenset({State.ACTIVE, State.HOLDING})
 """States in which a chunk of the leased worker is carried out."""
 
 
+DEACTIVATED = "deactivated"
+"""Why it is inactive when somebody said so."""
+
+
 def after(state: State, trigger: Trigger) -> State:
     """The state after `trigger`; unchanged where the table has no edge."""
     return TABLE.get((state, trigger), state)

@@ -219,7 +219,16 @@ class Client:
                     raise
 
     def _activate(self, text: str, timeout_s: float) -> Task:
-        return self._set(self.keys.active, text, lambda task: task.active, "activate", timeout_s)
+        return self._set(
+            self.keys.active, text, lambda task: task.active, "activate", timeout_s, undo="false"
+        )
+
+    def latched(self) -> str:
+        """Why nobody may activate before a person's reset, empty where there is no such reason."""
+        status = self.status("command")
+        if status is None or status.state not in ("stopped", "fault"):
+            return ""
+        return f"{status.state}: {status.detail.get('why', '')}"
 
     def deactivate(self, timeout_s: float = 3.0) -> bool:
         """Deactivate; True when the arm stands within `timeout_s`."""
@@ -246,9 +255,20 @@ class Client:
         )
 
     def _set(
-        self, key: str, text: str, taken: Callable[[Task], bool], what: str, timeout_s: float
+        self,
+        key: str,
+        text: str,
+        taken: Callable[[Task], bool],
+        what: str,
+        timeout_s: float,
+        *,
+        undo: str | None = None,
     ) -> Task:
-        """Put a setting, and wait for a task that says so or a refusal, both younger than it."""
+        """Put a setting, and wait for a task that says so or a refusal, both younger than it.
+
+        Where neither comes in time, `undo` is put behind it: what somebody was told that it failed
+        must not happen later.
+        """
         began_s = time.monotonic()
         self.put(key, text)
         self.wait_for(
@@ -261,6 +281,8 @@ class Client:
         task = self._taken(taken, began_s)
         if task is not None:
             return task
+        if undo is not None:
+            self.put(key, undo)
         if "command" not in self.alive:
             raise SessionError(f"{what}: no command node of robot {self.keys.robot!r} is alive")
         status = self.status("command")

@@ -123,7 +123,7 @@ class DemoRun:
                 self._client.activate()
                 return
             except SessionError:
-                if time.monotonic() > give_up:
+                if time.monotonic() > give_up or self._client.latched():
                     raise
                 self._pause(0.3)
 

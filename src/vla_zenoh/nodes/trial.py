@@ -20,7 +20,7 @@ from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.evaluation.trial.conduct import Conduct, Look, Phase
 from vla_zenoh.evaluation.trial.folder import TrialFolder
-from vla_zenoh.evaluation.trial.judged import FACT, Judged
+from vla_zenoh.evaluation.trial.judged import FACT, End, Judged
 from vla_zenoh.evaluation.trial.person import Person
 from vla_zenoh.evaluation.trial.plan import Due, Plan
 from vla_zenoh.nodes.bounded import bytes_of
@@ -69,6 +69,7 @@ class TrialRun:
         self._done = folder.episodes()
         self._recorder: Recorder | None = None
         self._number = 0
+        self._ended: End | None = None
         self._task: Task | None = None
         self._guarded = threading.Event()
         self._holds, self._deactivated = 0, False
@@ -100,7 +101,7 @@ class TrialRun:
 
     # -- one episode --------------------------------------------------------------------------
     def _episode(self, due: Due) -> None:
-        conduct = Conduct(due, self._plan.seconds)
+        conduct, self._ended = Conduct(due, self._plan.seconds, self._ended), None
         try:
             while conduct.phase is not Phase.OVER:
                 self._step(conduct)
@@ -119,6 +120,7 @@ class TrialRun:
             if not stands:
                 self._person.tell(DOES_NOT_STAND)
             raise
+        self._ended = conduct.end
         self._keep(conduct)
 
     def _step(self, conduct: Conduct) -> None:

@@ -20,6 +20,10 @@ DONE_S = 0.5
 """A policy that says it is done while the arm stands for so long means it."""
 
 
+TAKEN_AWAY: frozenset[End] = frozenset({"taken", "stopped", "lost"})
+"""Ends of which neither the trial, nor its person, nor the model was the cause."""
+
+
 class Phase(StrEnum):
     """See the module."""
 
@@ -65,10 +69,11 @@ class Conduct:
     Args:
         due: which episode.
         seconds: it lasts at most so long.
+        after: what ended the one before, in the same run.
     """
 
-    def __init__(self, due: Due, seconds: float) -> None:
-        self.due, self.seconds = due, seconds
+    def __init__(self, due: Due, seconds: float, after: End | None = None) -> None:
+        self.due, self.seconds, self.after = due, seconds, after
         self.phase = Phase.LAY
         self.reasons = ""
         """Why the arm was not given the last time."""
@@ -87,6 +92,12 @@ class Conduct:
     def end(self) -> End | None:
         """What ended it; None: nothing yet."""
         return self._end
+
+    @property
+    def needs_a_person(self) -> bool:
+        """Something else than this trial took the arm away before: whoever it was may have his
+        hands at it, so that somebody has to say that it may move, whatever was said beforehand."""
+        return self.after in TAKEN_AWAY
 
     @property
     def why(self) -> str:

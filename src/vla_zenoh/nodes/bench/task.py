@@ -24,6 +24,7 @@ from vla_zenoh.bench.task import (
 )
 from vla_zenoh.codec import records
 from vla_zenoh.control.names import worker_node
+from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.nodes.bounded import header_of
 from vla_zenoh.nodes.demo import Interrupted
@@ -108,6 +109,7 @@ class TaskRun:
         prompt = self._plan.spoken(episode)
         refused = self._give_the_arm(prompt)
         if refused:
+            self._end_if_somebody_did()
             return Ended(episode, prompt, False, NOT_OBEYED, 0.0, refused, self._pictures())
         return self._watch_it(episode, prompt)
 
@@ -146,9 +148,19 @@ class TaskRun:
                 self._client.activate()
                 return ""
             except SessionError as error:
-                if time.monotonic() > give_up:
+                if time.monotonic() > give_up or self._client.latched():
                     return str(error)
                 self._pause(0.2)
+
+    def _end_if_somebody_did(self) -> None:
+        """No episode is lost, and no arm moved, against the will of a person.
+
+        Raises:
+            NodeError: it was stopped, or somebody deactivated it.
+        """
+        why = self._client.latched() or self._why_lost()
+        if self._client.latched() or why == DEACTIVATED:
+            raise NodeError(f"ended by somebody else: {why}")
 
     def _watch_it(self, episode: Episode, prompt: str) -> Ended:
         first, objects = self._newest(ObjectPoses)
@@ -170,6 +182,7 @@ class TaskRun:
             lost = self._why_lost()
             over_since_s = (over_since_s or time_s) if self._says_it_is_over() else 0.0
             if verdict is None and lost:
+                self._end_if_somebody_did()
                 return Ended(episode, prompt, False, ARM_LOST, time_s, lost, ended[2])
             silent_s = time.monotonic() - self._heard[ObjectPoses].mono_s
             if verdict is None and silent_s > HEARD_PATIENCE_S:
