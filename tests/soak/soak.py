@@ -77,6 +77,7 @@ FRESH_S = 1.5
 PATIENCE_S, RECOVER_S = 60.0, 90.0
 POLL_S = 0.1
 WARM_S = 15.0
+"""At 10 Hz all the chunks that a status tells latencies of were made meanwhile."""
 SPEED_TOLERANCE, ARM_TOLERANCE, COMMAND_TOLERANCE = 1.15, 2.7, 1.1
 """As in tests/fault/test_dead_nodes.py."""
 BOX_TOLERANCE_M = 0.005

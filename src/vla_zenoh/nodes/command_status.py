@@ -14,6 +14,8 @@ from vla_zenoh.types import Cause
 MAX_WHY = 2000
 SPREAD_S = 8.0
 """Status tells how cost and lateness of ticks were spread over so long."""
+CHUNKS = 128
+"""Status tells the latencies of so many: at 10 Hz of the last 13 s."""
 STAGES = ("capture_to_worker", "inference", "worker_to_command", "command_to_pose", "end_to_end")
 
 
@@ -28,7 +30,7 @@ class CommandStatus:
     def __init__(self, node: Node, mind: Commander) -> None:
         self._node, self._mind = node, mind
         ticks = round(SPREAD_S * node.profile.timing.command_hz)
-        self._latency = {stage: Percentiles() for stage in STAGES}
+        self._latency = {stage: Percentiles(CHUNKS) for stage in STAGES}
         self._cost_us, self._late_us = Percentiles(ticks), Percentiles(ticks)
         self._pose_age_ms = Percentiles(ticks)
         self._rate = RateMeter()
