@@ -37,7 +37,7 @@ class RateMeter:
 class Percentiles:
     """How the last values are spread."""
 
-    def __init__(self, size: int = 512) -> None:
+    def __init__(self, size: int) -> None:
         self._values: deque[float] = deque(maxlen=size)
 
     def add(self, value: float) -> None:
