@@ -17,8 +17,9 @@ from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes import arm_hearing, slots
-from vla_zenoh.nodes.arm import FAILURES, ArmNode
+from vla_zenoh.nodes.arm import ArmNode
 from vla_zenoh.nodes.clock import Tick
+from vla_zenoh.nodes.last_brake import FAILURES
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Event, FloatArray, GripperState, Header, JointCommand, JointState
 

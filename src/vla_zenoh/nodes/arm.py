@@ -22,7 +22,8 @@ from vla_zenoh.interop.arm_reading import MAX_WORDS
 from vla_zenoh.nodes.arm_file import ArmFile
 from vla_zenoh.nodes.arm_hearing import ArmHearing
 from vla_zenoh.nodes.arm_states import ArmStates
-from vla_zenoh.nodes.clock import FixedRate
+from vla_zenoh.nodes.clock import FixedRate, Tick
+from vla_zenoh.nodes.last_brake import LastBrake
 from vla_zenoh.nodes.lead import UNHEEDED_WHY, Lead
 from vla_zenoh.nodes.meter import RateMeter
 from vla_zenoh.nodes.node import Node
@@ -35,10 +36,7 @@ from vla_zenoh.types import Event, GripperCommand, GripperState
 
 NAME = "arm"
 SWITCH_INTERVAL_S = 5e-4
-BRAKE_BEFORE_EXIT_S = 1.0
 CLOCK_PERIOD_S = 0.1
-FAILURES = 3
-"""Once `move` has raised so often in a row, nothing brakes the arm any more."""
 MODES = ("braking", "stalled", "unheeded")
 """States in which the robot is not ready, though it is heard and well."""
 
@@ -68,6 +66,7 @@ class ArmNode:
         kinematics = make_kinematics(profile)
         self._heard, self._states = ArmHearing(node, self._file, kinematics), ArmStates(node)
         self._lead = Lead(node, kinematics, self._move)
+        self._last_brake = LastBrake(node, self._lead)
         self._orders = node.listen(node.keys.command_gripper, Inbox(16, SMALL_BYTES))
         self._gripper_guard = GripperGuard(robot.gripper)
         self._width_m = robot.gripper.max_width_m
@@ -109,7 +108,7 @@ class ArmNode:
         try:
             self._drive(pace, stop)
         except Exception as error:
-            self._wind_down(pace)
+            self._last_brake.wind_down(pace, self._brake_on)
             if isinstance(error, NodeError):
                 self.node.refuse("robot_failed", str(error))
             else:
@@ -117,17 +116,13 @@ class ArmNode:
             raise
 
     def _drive(self, pace: FixedRate, stop: threading.Event) -> None:
-        give_up_s = 0.0
         while True:
             tick = pace.wait()
             if tick.periods > 1:
                 self.node.counters["arm.missed_ticks"] += tick.periods - 1
             self._lead.woken(tick.nominal_ns, tick.stall_s)
-            if stop.is_set():
-                give_up_s = give_up_s or time.monotonic() + BRAKE_BEFORE_EXIT_S
-                self._lead.deafen()
-                if not self._lead.sending or time.monotonic() > give_up_s:
-                    return
+            if stop.is_set() and self._last_brake.over(tick.nominal_ns):
+                return
             self._read(tick.nominal_ns)
             self._take_widths()
             away = "fault" if self._heard.fault else ""
@@ -136,22 +131,10 @@ class ArmNode:
             self._rate.tick()
             self._watch()
 
-    def _wind_down(self, pace: FixedRate) -> None:
-        """Brake what moves, by nothing but `move`, which may fail now and then."""
-        self._lead.deafen()
-        give_up_s, failures = time.monotonic() + BRAKE_BEFORE_EXIT_S, 0
-        while self._lead.sending and time.monotonic() < give_up_s:
-            tick = pace.wait()
-            try:
-                self._lead.woken(tick.nominal_ns, tick.stall_s)
-                self._lead.turn(self.node.clock.wall_at(tick.nominal_ns), tick.nominal_ns)
-                failures = 0
-            except Exception as error:
-                failures += 1
-                if failures == FAILURES:
-                    why = f"it cannot be braked: {one_line(error, MAX_WORDS)}"
-                    self.node.tell(Event("error", "fault", "not_braked", why))
-                    return
+    def _brake_on(self, tick: Tick) -> None:
+        """A turn of nothing but `move`."""
+        self._lead.woken(tick.nominal_ns, tick.stall_s)
+        self._lead.turn(self.node.clock.wall_at(tick.nominal_ns), tick.nominal_ns)
 
     # -- state in, state out ------------------------------------------------------------------
     def _read(self, mono_ns: int) -> None:
