@@ -26,6 +26,7 @@ from vla_zenoh.printable import one_line
 from vla_zenoh.types import NodeStatus
 
 HERE = "this computer"
+NOBODY = "-"
 POLL_S = 0.05
 MAX_NUMBER = 40
 """Characters: anybody may say 1e308."""
@@ -62,7 +63,7 @@ class Line:
 
     Args:
         key: short.
-        node: who.
+        node: who; "-" where nobody writes there now, and some records were lost before.
         host: where.
         rate_hz: records a second.
         bytes_s: bytes a second, once, however many listen.
@@ -175,7 +176,7 @@ def _told(statuses: Mapping[str, NodeStatus]) -> list[Pair]:
 
 
 def lines_of(statuses: Mapping[str, NodeStatus]) -> list[Line]:
-    """What nodes say that they write, the most bytes first."""
+    """What nodes say that they write, the most bytes first, and what was lost of who is silent."""
     lost: dict[str, dict[str, int]] = {}
     for name, status in statuses.items():
         for key, count in _map(_map(status.detail.get("net")).get("lost")).items():
@@ -187,6 +188,8 @@ def lines_of(statuses: Mapping[str, NodeStatus]) -> list[Line]:
                 rate_hz, bytes_s = (_number(rate) or 0.0 for rate in rates)
                 line = Line(key, name, status.host, rate_hz, bytes_s, lost.get(key, {}))
                 out.append(line)
+    spoken = {line.key for line in out}
+    out += [Line(key, NOBODY, NOBODY, 0.0, 0.0, lost[key]) for key in sorted(lost.keys() - spoken)]
     return sorted(out, key=lambda line: -line.bytes_s)
 
 

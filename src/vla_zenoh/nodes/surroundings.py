@@ -177,9 +177,15 @@ class Neighbours:
         if status.node.startswith("worker-"):
             complaint = status.detail.get("complaint", "")
             worker = status.node.removeprefix("worker-")
-            if isinstance(complaint, str) and len(self._complaints) < MAX_WORKERS:
-                self._complaints[worker] = complaint[:300]
-                self._changed = True
+            if not isinstance(complaint, str):
+                return
+            known, self._changed = self._complaints, True
+            if not complaint:  # who has none takes no room
+                known.pop(worker, None)
+            elif worker in known or len(known) < MAX_WORKERS:
+                known[worker] = complaint[:300]
+            else:
+                self._node.counters["refused.more_workers"] += 1
 
     def _take_camera(self, node: str, camera: str, age_s: Any, now_ns: int) -> None:
         """The age of a camera's newest picture, as the node says that serves it by the profile."""
