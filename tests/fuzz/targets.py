@@ -331,7 +331,7 @@ def _targets() -> Iterator[Target]:
         )
     for name, words in (
         ("text", b"put the red brick in the box"),
-        ("bool", b"true"),
+        ("activation", b"true while anna"),
         ("rate", b"1e1"),
         ("name", b"scripted"),
         ("seed", b"17"),
