@@ -16,7 +16,7 @@ from vla_zenoh.control.arm_guard import Measured
 from vla_zenoh.control.hold import MOVED_M, MOVED_RAD, SETTLE_NS, Hold
 from vla_zenoh.control.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.errors import CodecError
-from vla_zenoh.interop.arm_state import BEYOND, ArmState, Newness, pose_state
+from vla_zenoh.interop.arm_state import BEYOND, RESTARTED_NS, ArmState, Newness, pose_state
 from vla_zenoh.interop.ros2.frames import FURTHEST_M, MAX_CHAIN, MAX_FRAMES, Frames
 from vla_zenoh.interop.ros2.goals import GoalKeeper, Step
 from vla_zenoh.interop.ros2.robot_clock import RobotClock
@@ -211,8 +211,8 @@ def test_a_chain_of_frames_is_followed_up_and_dated_by_its_oldest() -> None:
     frames.take([transform("hand", "tcp", 0)], static=True)
     found = frames.find("base", "tcp")
     assert found is not None
-    pose, stamp_ns = found
-    assert stamp_ns == 5
+    pose, oldest_ns, newest_ns = found
+    assert (oldest_ns, newest_ns) == (5, 7)
     assert pose.position_m == pytest.approx([0.1 - 0.1 - 0.1, 0, 0], abs=POSITION_TOLERANCE_M)
     assert pose.rotation == pytest.approx(exp3(np.array(half_turn)))
 
@@ -232,6 +232,23 @@ def test_an_older_transform_does_not_replace_a_newer_one() -> None:
     found = frames.find("base", "tcp")
     assert found is not None
     assert found[0].position_m[0] == 0.1
+
+
+def test_a_transform_that_is_older_by_far_is_of_a_clock_that_was_set() -> None:
+    frames = Frames()
+    now_ns = 10**18
+    frames.take([transform("base", "tcp", now_ns)], static=False)
+    before_ns = now_ns - RESTARTED_NS
+    frames.take([transform("base", "tcp", before_ns + 1, shift=(5, 0, 0))], static=False)
+    found = frames.find("base", "tcp")
+    assert found is not None
+    assert found[1] == now_ns, "that one was overtaken"
+    frames.take([transform("base", "tcp", before_ns, shift=(5, 0, 0))], static=False)
+    frames.take([transform("base", "tcp", before_ns + 1, shift=(6, 0, 0))], static=False)
+    found = frames.find("base", "tcp")
+    assert found is not None
+    assert found[1] == before_ns + 1
+    assert found[0].position_m[0] == 6
 
 
 def test_transforms_that_are_none_and_floods_of_frames_are_refused() -> None:

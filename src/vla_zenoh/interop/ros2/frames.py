@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 
 from vla_zenoh.control.so3 import Pose, norm3, rotation_from_quat
 from vla_zenoh.errors import CodecError, RecordError
+from vla_zenoh.interop.arm_state import RESTARTED_NS
 from vla_zenoh.interop.ros2.samples import Transform
 from vla_zenoh.types import unit_quaternion, vector
 
@@ -23,7 +23,7 @@ class Frames:
         self._parents: dict[str, tuple[str, int, Pose, bool]] = {}
 
     def take(self, transforms: Iterable[Transform], *, static: bool) -> None:
-        """Keep these transforms; an older one than what is known is passed over.
+        """Keep these transforms; one that was overtaken by what is known is passed over.
 
         Raises:
             CodecError: ``invalid`` (not finite, out of this world, no unit quaternion) or
@@ -31,7 +31,7 @@ class Frames:
         """
         for entry in transforms:
             known = self._parents.get(entry.child)
-            if known is not None and entry.stamp_ns < known[1] and not static:
+            if known is not None and not static and _overtaken(entry.stamp_ns, known[1]):
                 continue
             if known is None and len(self._parents) >= MAX_FRAMES:
                 raise CodecError("flood", f"more than {MAX_FRAMES} frames; {entry.child[:60]!r}")
@@ -49,12 +49,12 @@ class Frames:
                 )
             self._parents[entry.child] = (entry.parent, entry.stamp_ns, pose, static)
 
-    def find(self, base: str, tip: str) -> tuple[Pose, int] | None:
-        """Pose of `tip` in `base` and the oldest stamp it stands on, None where it is not known.
+    def find(self, base: str, tip: str) -> tuple[Pose, int, int] | None:
+        """Pose of `tip` in `base`, and the oldest and newest stamp it stands on; None: not known.
 
         The way is up from `tip`; static transforms have no age.
         """
-        stamp_ns: float = math.inf
+        stamps_ns: list[int] = []
         frame, position, rotation = tip, None, None
         for _ in range(MAX_CHAIN):
             if frame == base:
@@ -69,7 +69,12 @@ class Frames:
                 position = pose.position_m + pose.rotation @ position
                 rotation = pose.rotation @ rotation
             if not static:
-                stamp_ns = min(stamp_ns, at_ns)
-        if frame != base or position is None or rotation is None or math.isinf(stamp_ns):
+                stamps_ns.append(at_ns)
+        if frame != base or position is None or rotation is None or not stamps_ns:
             return None
-        return Pose(position, rotation), int(stamp_ns)
+        return Pose(position, rotation), min(stamps_ns), max(stamps_ns)
+
+
+def _overtaken(stamp_ns: int, known_ns: int) -> bool:
+    """It is older, and not by so much that the robot's clock was set."""
+    return known_ns - RESTARTED_NS < stamp_ns < known_ns

@@ -82,7 +82,7 @@ class Hearing:
         return self._take_joints()
 
     def tcp(self, stamp_ns: int) -> tuple[Pose | None, FloatArray]:
-        """The TCP and its (6,) twist; None where its transforms are not known, or too old."""
+        """The TCP and its (6,) twist; None where its transforms are not known, or not of then."""
         tcp, twist = self.state.tcp()
         return (tcp if self._frames is None else self._tcp_of(self._frames, stamp_ns)), twist
 
@@ -152,8 +152,14 @@ class Hearing:
             way = f"{profile.robot.base_frame} -> {profile.robot.tcp_frame}"
             self._refuse(TF, CodecError("no_transform", f"{way} is not known"))
             return None
-        late_s = (stamp_ns - found[1]) / 1e9
-        if late_s > profile.timing.state_timeout_s:
-            self._refuse(TF, CodecError("stale", f"the TCP is {late_s:.3f} s behind the joints"))
+        pose, oldest_ns, newest_ns = found
+        behind_s, ahead_s = (stamp_ns - oldest_ns) / 1e9, (newest_ns - stamp_ns) / 1e9
+        if max(behind_s, ahead_s) > profile.timing.state_timeout_s:
+            why = (
+                f"{behind_s:.3f} s behind the joints"
+                if behind_s > ahead_s
+                else f"{ahead_s:.3f} s ahead of the joints: was a clock set?"
+            )
+            self._refuse(TF, CodecError("stale", f"the TCP is {why}"))
             return None
-        return found[0]
+        return pose
