@@ -115,8 +115,9 @@ class Arm:
         self._lead_on(now_ns, mono_ns)
         self._tell()
 
-    def wind_down(self, now_ns: int, mono_ns: int) -> None:
+    def wind_down(self, now_ns: int, mono_ns: int, stall_s: float) -> None:
         """Nothing but braking: see `turn`, and `Lead.deafen`."""
+        self.lead.woken(mono_ns, stall_s)
         self._lead_on(now_ns, mono_ns)
 
     def _lead_on(self, now_ns: int, mono_ns: int) -> None:

@@ -17,9 +17,11 @@ from pathlib import Path
 import zenoh
 
 from vla_zenoh.errors import ProfileError
+from vla_zenoh.interop.arm_reading import MAX_WORDS
 from vla_zenoh.interop.ros2.graph import camera_topics
 from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.nodes.clock import FixedRate
+from vla_zenoh.nodes.clock import FixedRate, Tick
+from vla_zenoh.nodes.last_brake import LastBrake
 from vla_zenoh.nodes.meter import RateMeter
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.priority import realtime_thread
@@ -30,6 +32,7 @@ from vla_zenoh.nodes.ros2.gripper import Gripper
 from vla_zenoh.nodes.ros2.link import Link
 from vla_zenoh.nodes.ros2.people import People
 from vla_zenoh.nodes.session import open_session
+from vla_zenoh.printable import one_line
 from vla_zenoh.profile import Profile, SessionProfile
 from vla_zenoh.profile.ros2 import Ros2Profile
 from vla_zenoh.profile.session import TRUSTED_PROTOCOLS
@@ -37,7 +40,6 @@ from vla_zenoh.types import Event
 
 NAME = "ros2"
 SWITCH_INTERVAL_S = 5e-4
-BRAKE_BEFORE_EXIT_S = 1.0
 GOODBYE_S = 0.3
 CLOCK_PERIOD_S = 0.1
 MAX_DEFINITION_BYTES = 65_536
@@ -94,6 +96,7 @@ class Ros2Node:
         self._bridges = 0
         self._gripper: Gripper | None = None
         self._arm: Arm | None = None
+        self._last_brake: LastBrake | None = None
         if profile.robot.driver == NAME:
             gripper = self._gripper = Gripper(
                 node, self.link, messages, ros2.gripper, self._width_m
@@ -105,6 +108,7 @@ class Ros2Node:
                 ros2,
                 lambda: (gripper.busy, gripper.wanted_m, gripper.holding),
             )
+            self._last_brake = LastBrake(node, self._arm.lead)
         self._cameras = [
             Camera(name, topic, node, self.link, read_messages(ros2), self._tell, self._refuse)
             for name, topic in camera_topics(profile).items()
@@ -147,7 +151,7 @@ class Ros2Node:
         gc.freeze()
         try:
             with realtime_thread() as self._realtime:
-                self._loop(stop)
+                self._loop(FixedRate(self.node.profile.timing.command_hz), stop)
         finally:
             self._halt.set()
             give_up = time.monotonic() + GOODBYE_S
@@ -159,40 +163,35 @@ class Ros2Node:
             if self._own_session is not None:
                 self._own_session.close()
 
-    def _loop(self, stop: threading.Event) -> None:
+    def _loop(self, pace: FixedRate, stop: threading.Event) -> None:
         """Drive; whatever goes wrong in it, the arm is braked before this ends."""
         try:
-            self._drive(stop)
+            self._drive(pace, stop)
         except Exception as error:
-            if self._arm is not None:
-                self._wind_down(self._arm)
-            self.node.tell(Event("error", "fault", "broken", f"{error!r}: braked, and ends"))
+            last = self._last_brake
+            braked = last is None or last.wind_down(pace, self._brake_on)
+            how = f"{'braked' if braked else 'not braked'}, and ends"
+            why = f"{one_line(repr(error), MAX_WORDS)}: {how}"
+            self.node.tell(Event("error", "fault", "broken", why))
             raise
 
-    def _wind_down(self, arm: Arm) -> None:
-        arm.lead.deafen()
-        loop = FixedRate(self.node.profile.timing.command_hz)
-        give_up = time.monotonic() + BRAKE_BEFORE_EXIT_S
-        while arm.lead.sending and time.monotonic() < give_up:
-            tick = loop.wait()
-            arm.wind_down(self.node.clock.wall_at(tick.nominal_ns), tick.nominal_ns)
+    def _brake_on(self, tick: Tick) -> None:
+        assert self._arm is not None
+        now_ns = self.node.clock.wall_at(tick.nominal_ns)
+        self._arm.wind_down(now_ns, tick.nominal_ns, tick.stall_s)
 
-    def _drive(self, stop: threading.Event) -> None:
-        loop = FixedRate(self.node.profile.timing.command_hz)
-        give_up = 0.0
+    def _drive(self, pace: FixedRate, stop: threading.Event) -> None:
         while True:
-            tick = loop.wait()
+            tick = pace.wait()
             if tick.periods > 1:
                 self.node.counters["ros2.missed_ticks"] += tick.periods - 1
-            if stop.is_set():
-                give_up = give_up or time.monotonic() + BRAKE_BEFORE_EXIT_S
-                if self._arm is None or not self._arm.lead.sending or time.monotonic() > give_up:
-                    return
-                self._arm.lead.deafen()
             now_ns = self.node.clock.wall_at(tick.nominal_ns)
             if self._arm is not None:
                 self._arm.turn(now_ns, tick.nominal_ns, tick.stall_s)
-            if self._gripper is not None:
+            last = self._last_brake
+            if stop.is_set() and (last is None or last.over(tick.nominal_ns)):
+                return
+            if self._gripper is not None and not stop.is_set():
                 self._gripper.turn(now_ns, "" if self._arm is None else self._arm.lead.writer)
             while self._news:
                 self._news.popleft()()
