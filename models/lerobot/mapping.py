@@ -84,12 +84,13 @@ def pictures(
     return out
 
 
-def state_parts(features: Mapping[str, tuple[int, ...]], told: str) -> tuple[str, ...]:
+def state_parts(features: Mapping[str, tuple[int, ...]], told: str, joints: int) -> tuple[str, ...]:
     """Parts that make ``observation.state``, in order, see `vla_zenoh.state_vector`.
 
     Args:
         features: of the policy.
         told: the parts, joined by +.
+        joints: how many the arm has.
 
     Raises:
         WorkerError: the policy wants something else than pictures and a flat state.
@@ -101,7 +102,7 @@ def state_parts(features: Mapping[str, tuple[int, ...]], told: str) -> tuple[str
     shape = features.get(STATE, (0,))
     if len(shape) != 1:
         raise WorkerError(f"{STATE} has shape {shape}; wanted one row of numbers")
-    return read_state(told, shape[0])
+    return read_state(told, shape[0], joints)
 
 
 def one_by_one(config: Mapping[str, Any]) -> bool:

@@ -117,8 +117,8 @@ class LeRobot:
             raise WorkerError("how long is a step? Say --set dt_s=SECONDS, which is 1 / fps")
         inputs = features(self._folder, config, "input_features")
         self._pictures = pictures(inputs, cameras)
-        self._state = state_parts(inputs, state)
         self._profile = load_profile(profile)
+        self._state = state_parts(inputs, state, len(self._profile.robot.arm_joints))
         self._max_width_m = self._profile.robot.gripper.max_width_m
         self._one_by_one = one_by_one(config)
         most = 1 if self._one_by_one else horizon(config, steps)

@@ -124,13 +124,14 @@ class OpenVLA:
         steps = 1 if self._files is None else chunk_steps(chunk, self._key)
         self._state_range: Range | None = None
         self._state: tuple[str, ...] = ()
-        self._max_width_m = load_profile(profile).robot.gripper.max_width_m
+        robot = load_profile(profile).robot
+        self._max_width_m = robot.gripper.max_width_m
         if self._files is None and (len(self._cameras) > 1 or state):
             raise WorkerError("plain OpenVLA sees one camera and no state; camera= names one")
         if self._files is not None and self._files.state is not None:
             trained_on = read_range(found.statistics, self._key, "proprio", size=None)
             self._state_range = trained_on
-            self._state = read_state(state, len(trained_on.low))
+            self._state = read_state(state, len(trained_on.low), len(robot.arm_joints))
         self.spec = ModelSpec(
             name="openvla",
             observation=ObservationSpec(

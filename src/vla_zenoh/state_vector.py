@@ -2,7 +2,7 @@
 
 For model environments: numpy alone. Parts are joined by ``+``, as in ``position+rotvec+gripper_m``:
 
-    joint                           positions of the arm's joints, rad
+    joint                           positions of the arm's joints, rad: as many as it has
     position, x y z                 TCP in the base frame, m
     rpy, roll pitch yaw             its rotation: extrinsic x, y, z, rad
     rotvec, rx ry rz                likewise axis times angle, rad
@@ -31,8 +31,8 @@ COORDINATES: Mapping[str, tuple[str, ...]] = {
     "rotvec": ("rx", "ry", "rz"),
 }
 """Parts whose numbers have names of their own."""
-PARTS: Mapping[str, tuple[StatePart | None, int]] = {
-    "joint": ("joint", 7),
+PARTS: Mapping[str, tuple[StatePart | None, int | None]] = {
+    "joint": ("joint", None),
     **{whole: ("pose", 3) for whole in COORDINATES},
     **{name: ("pose", 1) for names in COORDINATES.values() for name in names},
     "quat_xyzw": ("pose", 4),
@@ -43,7 +43,8 @@ PARTS: Mapping[str, tuple[StatePart | None, int]] = {
     "gripper_closed": ("gripper", 1),
     "zero": (None, 1),
 }
-"""Name -> which part of the robot's state it is taken from, and how many numbers it has."""
+"""Name -> which part of the robot's state it is taken from, and how many numbers it has; None: as
+many as the arm has joints."""
 UPRIGHT = 1e-7
 """Cosine of a pitch so near to 90 degrees that roll and yaw turn about the same axis."""
 
@@ -64,29 +65,45 @@ def read_parts(text: str) -> tuple[str, ...]:
     for name in (part.strip() for part in text.split("+") if text.strip()):
         zeros = _ZEROS.fullmatch(name)
         if zeros is None and name not in PARTS:
-            raise SpecError(f"no part of the state is called {name!r}; there are: {_known()}")
+            raise SpecError(f"no part of the state is called {name!r}; there are: {known_parts()}")
         names += ["zero"] * int(zeros[1]) if zeros is not None else [name]
     return tuple(names)
 
 
-def read_state(text: str, size: int) -> tuple[str, ...]:
+def read_state(text: str, size: int, joints: int) -> tuple[str, ...]:
     """Names of the parts in `text`, whose numbers are `size` in all.
+
+    Args:
+        text: see `read_parts`.
+        size: how many numbers the model wants.
+        joints: how many the arm has.
 
     Raises:
         SpecError: a name that is not known, or another count; says what there is.
     """
     names = read_parts(text)
-    found = sum(PARTS[name][1] for name in names)
+    found = sum(size_of(name, joints) for name in names)
     if found != size:
         raise SpecError(
             f"the model's state has {size} numbers, {text!r} has {found}; "
-            f"join its parts by +, in order: {_known()}"
+            f"join its parts by +, in order: {known_parts(joints)}"
         )
     return names
 
 
-def _known() -> str:
-    return ", ".join(f"{name} ({count})" for name, (_, count) in PARTS.items())
+def size_of(name: str, joints: int) -> int:
+    """How many numbers a part has, of an arm with so many `joints`."""
+    count = PARTS[name][1]
+    return joints if count is None else count
+
+
+def known_parts(joints: int | None = None) -> str:
+    """All names with their counts, for people; `joints`: of the arm, where it is known."""
+    counts = {name: count for name, (_, count) in PARTS.items()}
+    of_arm = "one for each of the arm's" if joints is None else joints
+    return ", ".join(
+        f"{name} ({of_arm if count is None else count})" for name, count in counts.items()
+    )
 
 
 def parts_of(names: Sequence[str]) -> tuple[StatePart, ...]:
@@ -191,7 +208,7 @@ def state_of(
     Raises:
         SpecError: another count of numbers, or a part that cannot be read back.
     """
-    sizes = [joints if name == "joint" else PARTS[name][1] for name in names]
+    sizes = [size_of(name, joints) for name in names]
     if numbers.shape != (sum(sizes),):
         raise SpecError(
             f"{'+'.join(names)} has shape {numbers.shape}, wanted ({sum(sizes)},)", "shape"

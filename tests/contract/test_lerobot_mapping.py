@@ -73,7 +73,7 @@ def test_a_policy_that_plans_by_itself_gives_one_step(
         ({"dt_s": "fast"}, r"dt_s is 'fast'"),
         ({"state": ""}, r"state has 8 numbers, '' has 0"),
         ({"state": "joint"}, r"state has 8 numbers, 'joint' has 7"),
-        ({"state": "joint+grip"}, r"called 'grip'; there are: joint \(7\)"),
+        ({"state": "joint+grip"}, r"called 'grip'; there are: joint \(one"),
         ({"cameras": "wrist=observation.images.hand"}, r"which the policy does not know; its"),
         ({"cameras": "front=observation.images.gripper_cam"}, r"two pictures .* 'front'"),
         ({"steps": "101"}, r"steps is 101; the policy's chunks have 100"),
@@ -97,6 +97,25 @@ def test_joint_actions_become_poses_by_the_joints_that_are_measured(
     spec = make(tmp_path, joints, kind=kind, rotation="").spec
     assert (spec.action.kind, spec.action.rotation) == ("absolute", "quaternion")
     assert spec.observation.state == ("joint", "gripper")
+
+
+SIX_JOINTS = """
+extends: panda_sim
+robot:
+  arm_joints: [j1, j2, j3, j4, j5, j6]
+  home_rad: [0.0, -1.2, 1.5, -1.8, -1.57, 0.0]
+limits: {joint: {velocity_rad_s: 2.0, acceleration_rad_s2: 8.0, jerk_rad_s3: 400.0}}
+"""
+
+
+def test_an_arm_with_six_joints_has_a_state_of_six(tmp_path: Path) -> None:
+    (tmp_path / "six.yaml").write_text(SIX_JOINTS)
+    told = {"state": "joint+gripper_open", "profile": str(tmp_path / "six.yaml")}
+    state = {"observation.state": {"type": "STATE", "shape": [7]}}
+    six = {**CONFIG, "input_features": {**CONFIG["input_features"], **state}}
+    assert make(tmp_path, six, **told).spec.observation.state == ("joint", "gripper")
+    with pytest.raises(WorkerError, match=r"has 8 numbers, 'joint\+gripper_open' has 7"):
+        make(tmp_path, CONFIG, **told)
 
 
 def test_joints_of_another_arm_are_refused_with_the_reason(tmp_path: Path) -> None:

@@ -21,11 +21,13 @@ from vla_zenoh.policy import (
     ObservationSpec,
     example_observation,
 )
-from vla_zenoh.types import GripperState, PoseState
+from vla_zenoh.types import GripperState, JointState, PoseState
 
 ATOL = 1e-6
 """Of rotation matrices; extrinsic angles lose digits near a pitch of 90 degrees."""
 MAX_WIDTH_M = 0.08
+PANDA, UR = 7, 6
+"""Joints of arms."""
 
 
 def seen(quat_xyzw: Any = (0, 0, -(0.5**0.5), -(0.5**0.5)), width_m: float = 0.02) -> Observation:
@@ -63,7 +65,9 @@ def test_all_forms_of_a_rotation_are_the_same_rotation(numbers: list[float]) -> 
 
 
 def test_parts_come_in_the_order_they_are_named() -> None:
-    names = state_vector.read_state("gripper_closed+zero+fingers_m+position+rotvec+gripper_m", 11)
+    names = state_vector.read_state(
+        "gripper_closed+zero+fingers_m+position+rotvec+gripper_m", 11, PANDA
+    )
     numbers = state_vector.state_vector(names, seen(), MAX_WIDTH_M)
     wanted = [0.75, 0, 0.01, -0.01, 0.4, 0.1, 0.3, 0, 0, np.pi / 2, 0.02]
     np.testing.assert_allclose(numbers, wanted, atol=ATOL)
@@ -72,8 +76,22 @@ def test_parts_come_in_the_order_they_are_named() -> None:
 
 
 def test_every_part_has_as_many_numbers_as_it_says() -> None:
-    for name, (_, size) in state_vector.PARTS.items():
-        assert len(state_vector.state_vector([name], seen(), MAX_WIDTH_M)) == size
+    for name in state_vector.PARTS:
+        numbers = state_vector.state_vector([name], seen(), MAX_WIDTH_M)
+        assert len(numbers) == state_vector.size_of(name, PANDA)
+
+
+@pytest.mark.parametrize("joints", [UR, PANDA])
+def test_joints_are_as_many_as_the_arm_has(joints: int) -> None:
+    names = state_vector.read_state("joint+gripper_open", joints + 1, joints)
+    zeros = np.zeros(joints)
+    arm = JointState(tuple(f"j{n}" for n in range(joints)), np.arange(joints) / 10, zeros, zeros)
+    numbers = state_vector.state_vector(names, replace(seen(), joint=arm), MAX_WIDTH_M)
+    np.testing.assert_allclose(numbers, [*(np.arange(joints) / 10), 0.25], atol=ATOL)
+    back = state_vector.state_of(names, numbers.astype(float), joints, MAX_WIDTH_M)
+    np.testing.assert_allclose(back["joint"], arm.position_rad, atol=ATOL)
+    with pytest.raises(SpecError, match=rf"has 9 numbers, 'joint' has {joints}; .*\({joints}\)"):
+        state_vector.read_state("joint", 9, joints)
 
 
 @given(
@@ -115,7 +133,7 @@ def test_what_says_too_little_is_not_read_back() -> None:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("position+grip", r"called 'grip'; there are: joint \(7\)"),
+        ("position+grip", r"called 'grip'; there are: joint \(one for each"),
         ("position+", r"called ''; there are"),
         ("position", r"state has 8 numbers, 'position' has 3"),
         ("", r"state has 8 numbers, '' has 0"),
@@ -123,4 +141,4 @@ def test_what_says_too_little_is_not_read_back() -> None:
 )
 def test_a_state_that_does_not_fit_is_refused(text: str, match: str) -> None:
     with pytest.raises(SpecError, match=match):
-        state_vector.read_state(text, 8)
+        state_vector.read_state(text, 8, PANDA)
