@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, RecordError
+from vla_zenoh.nodes.seen import MAX_WAITING, Pictures
+from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.types import Seen
 from vla_zenoh.types.seen import plain_raw
 
@@ -82,3 +85,35 @@ def test_what_is_no_such_record_is_refused(fields: dict[str, Any]) -> None:
 def test_foreign_bytes_are_refused() -> None:
     with pytest.raises(CodecError):
         records.decode(Seen, b"\x81\xa1a\x01")
+
+
+def test_a_worker_that_names_more_cameras_than_a_model_can_have_is_refused() -> None:
+    kept = Pictures(Counter())
+    for number in range(MAX_CAMERAS):
+        kept.add("liar", 1, f"cam{number}", b"jpeg")
+    with pytest.raises(CodecError, match="more than 16"):
+        kept.add("liar", 1, "one_more", b"jpeg")
+    kept.add("liar", 1, "cam0", b"newer")
+    kept.add("liar", 2, "one_more", b"jpeg")
+    found = kept.take("liar", 1)
+    assert len(found) == MAX_CAMERAS
+    assert found["cam0"] == b"newer"
+
+
+def test_pictures_without_a_record_are_counted_and_fill_nothing() -> None:
+    left_out: Counter[str] = Counter()
+    kept = Pictures(left_out, limit=1000)
+    for seq in range(MAX_WAITING + 2):
+        kept.add("worker", seq, "front", b"x")
+    assert left_out == {"no_record": 2}
+    kept.add("worker", 100, "front", b"x" * 999)
+    assert left_out == {"no_record": 2 + MAX_WAITING - 1}
+    kept.add("worker", 100, "front", b"x" * 10)  # in place of the large one
+    kept.add("worker", 101, "front", b"x" * 989)
+    assert left_out == {"no_record": 2 + MAX_WAITING - 1}
+    assert {camera: len(jpeg) for camera, jpeg in kept.take("worker", 101).items()} == {
+        "front": 989
+    }
+    assert kept.take("worker", 101) == {}
+    kept.add("worker", 102, "front", b"x" * 989)
+    assert left_out == {"no_record": 2 + MAX_WAITING - 1}

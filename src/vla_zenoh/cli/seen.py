@@ -26,13 +26,14 @@ from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.seen import SeenListener, Sight
+from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.printable import one_line
 
 POLL_S = 0.05
 PATIENCE_S = 5.0
 MAX_RAW, MAX_PROMPT = 160, 1000
 """Characters."""
-MAX_NUMBERS, MAX_CAMERAS = 32, 16
+MAX_NUMBERS = 32
 
 
 def seen(
@@ -94,6 +95,9 @@ def seen(
         console().print(table(newest))
     if out is not None:
         errors().print(f"{told} inferences in {out}")
+    if left_out := listener.left_out:
+        why = ", ".join(f"{reason} {count}" for reason, count in sorted(left_out.items()))
+        errors().print(f"left out: {why}", style="yellow")
 
 
 def _complain(aim: Aim, client: Client, worker: str | None) -> NoReturn:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -17,12 +17,15 @@ from vla_zenoh.errors import CodecError, ProfileError, RecordError
 from vla_zenoh.keys import Keys, Kind, chunk
 from vla_zenoh.nodes.bounded import bytes_of, check, header_of
 from vla_zenoh.nodes.node import Node
-from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
+from vla_zenoh.policy import MAX_CAMERAS, ActionSteps, ModelSpec, Observation
 from vla_zenoh.types import Header, Image, Seen
 from vla_zenoh.types.seen import plain_raw
 
 JPEG_QUALITY = 95
-MAX_WAITING = 64
+MAX_WAITING, MAX_SAMPLES = 64, 256
+"""Inferences whose pictures wait for their record; samples that wait to be read."""
+MAX_WAITING_BYTES = 128 * 1024 * 1024
+"""Of either."""
 
 
 class SeenOutlet:
@@ -116,6 +119,40 @@ class Sight:
     jpegs: Mapping[str, bytes]
 
 
+class Pictures:
+    """Pictures that wait for the record of their inference, up to a bound.
+
+    Args:
+        left_out: counts by reason what is not kept.
+        limit: bytes of all of them.
+    """
+
+    def __init__(self, left_out: Counter[str], limit: int = MAX_WAITING_BYTES) -> None:
+        self._left_out, self._limit, self._bytes = left_out, limit, 0
+        self._kept: dict[tuple[str, int], dict[str, bytes]] = {}
+
+    def add(self, worker: str, seq: int, camera: str, jpeg: bytes) -> None:
+        """Keep one; who has waited longest makes room.
+
+        Raises:
+            CodecError: no model has so many cameras.
+        """
+        kept = self._kept.setdefault((worker, seq), {})
+        if camera not in kept and len(kept) >= MAX_CAMERAS:
+            raise CodecError("cameras", f"{worker} shows more than {MAX_CAMERAS} pictures at once")
+        self._bytes += len(jpeg) - len(kept.get(camera, b""))
+        kept[camera] = jpeg
+        while len(self._kept) > MAX_WAITING or self._bytes > self._limit:
+            oldest = self.take(*next(iter(self._kept)))
+            self._left_out["no_record"] += len(oldest)
+
+    def take(self, worker: str, seq: int) -> dict[str, bytes]:
+        """Those of an inference, camera -> JPEG."""
+        found = self._kept.pop((worker, seq), {})
+        self._bytes -= sum(map(len, found.values()))
+        return found
+
+
 class SeenListener:
     """Collects what workers show; they show it because this listens.
 
@@ -126,33 +163,50 @@ class SeenListener:
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys, worker: str | None = None) -> None:
+        self.left_out: Counter[str] = Counter()
+        """Samples by the reason why they are not shown; ``late``: `take` was called too seldom."""
         self._keys = keys
         self._lock = threading.Lock()
-        self._samples: deque[zenoh.Sample] = deque(maxlen=4 * MAX_WAITING)
-        self._pictures: dict[tuple[str, int], dict[str, bytes]] = {}
+        self._samples: deque[zenoh.Sample] = deque()
+        self._samples_bytes = 0
+        self._pictures = Pictures(self.left_out)
         selectors = (
             (keys.all_seen_records, keys.all_seen)
             if worker is None
             else (keys.seen_record(worker), keys.all_seen_of(worker))
         )
-        handler = zenoh.handlers.Callback(self._samples.append, indirect=False)
+        handler = zenoh.handlers.Callback(self._hear, indirect=False)
         self._subscribers = [session.declare_subscriber(key, handler) for key in selectors]
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        with self._lock:
+            try:
+                check(sample, MAX_JPEG_BYTES)
+            except CodecError as error:
+                self.left_out[error.reason] += 1
+                return
+            self._samples.append(sample)
+            self._samples_bytes += len(sample.payload)
+            while len(self._samples) > MAX_SAMPLES or self._samples_bytes > MAX_WAITING_BYTES:
+                self._samples_bytes -= len(self._samples.popleft().payload)
+                self.left_out["late"] += 1
 
     def take(self) -> list[Sight]:
         """All that came since the last call, oldest first; what cannot be read is left out."""
+        with self._lock:
+            samples, self._samples, self._samples_bytes = self._samples, deque(), 0
         out: list[Sight] = []
-        while self._samples:
-            sample = self._samples.popleft()
+        for sample in samples:
             try:
                 sight = self._read(sample)
-            except CodecError:
+            except CodecError as error:
+                self.left_out[error.reason] += 1
                 continue
             if sight is not None:
                 out.append(sight)
         return out
 
     def _read(self, sample: zenoh.Sample) -> Sight | None:
-        check(sample, MAX_JPEG_BYTES)
         header, payload = header_of(sample), bytes_of(sample.payload, MAX_JPEG_BYTES)
         _, worker, *camera = self._keys.short(str(sample.key_expr)).split("/")
         try:  # folders and files are named by them
@@ -161,14 +215,12 @@ class SeenListener:
         except ProfileError as error:
             raise CodecError("malformed", str(error)) from error
         if camera:
-            if len(self._pictures) > MAX_WAITING:
-                self._pictures.pop(next(iter(self._pictures)))
-            self._pictures.setdefault((worker, header.seq), {})[camera[0]] = payload
+            self._pictures.add(worker, header.seq, camera[0], payload)
             return None
         record = records.decode(Seen, payload)
         if record.worker != worker:
             raise CodecError("foreign", f"{worker} shows what {record.worker[:60]!r} saw")
-        return Sight(record, self._pictures.pop((worker, header.seq), {}))
+        return Sight(record, self._pictures.take(worker, header.seq))
 
     def close(self) -> None:
         """Stop listening."""
