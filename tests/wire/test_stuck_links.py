@@ -4,15 +4,28 @@ from __future__ import annotations
 
 import socket
 import sys
+import threading
+import time
 
+import numpy as np
 import pytest
+import zenoh
+from camera_rig import free_endpoint, until
 
-from vla_zenoh.nodes.session import config
+from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.session import config, open_session
 from vla_zenoh.nodes.sockets import Impatience
-from vla_zenoh.profile import SessionProfile
+from vla_zenoh.profile import SessionProfile, load_profile, override
 
 LEASE_MS = 700
 ROUTER = "tcp/127.0.0.1:7447"
+PICTURE = bytes(640 * 480 * 3)
+PICTURES_HZ, STATES_HZ = 30, 100
+MEASURED_S, TAKES_S = 4.0, 0.2
+"""The reader of pictures takes so long for each, and lets no more than a few wait."""
+SOONER = 5
+"""So many times sooner, at least, a state arrives that has a link of its own."""
 
 
 def lease_ms(mode: str, *connect: str) -> int:
@@ -53,3 +66,64 @@ def test_the_kernel_ends_connections_whose_data_nobody_acknowledges() -> None:
             near.sendall(b"still at work")
             assert far.recv(64) == b"still at work"
         assert impatience.look() == before
+
+
+def state_delays_ms(*, separate: bool) -> list[float]:
+    """How late states arrive at a node whose own reader of pictures is stuck."""
+    endpoint = free_endpoint()
+    session = {"listen": [endpoint], "connect": [endpoint], "separate_links": separate}
+    profile = override(load_profile("panda_sim"), {"session": session})
+    delays_ms: list[float] = []
+    stop = threading.Event()
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as eye,
+        open_session(profile.session) as arm,
+        open_session(profile.session) as far,
+    ):
+        camera, robot = Node("camera", profile, eye), Node("sim", profile, arm)
+        reader = Node("worker-far", profile, far)
+        pictures = camera.stream(profile.keys.camera_raw("front"), Kind.FRAME)
+        states = robot.stream(profile.keys.state_pose, Kind.STATE)
+
+        def heard(sample: zenoh.Sample) -> None:
+            delays_ms.append((time.monotonic_ns() - int(sample.payload.to_string())) / 1e6)
+
+        few = zenoh.handlers.FifoChannel(4)
+        stuck = reader._session_for(Kind.FRAME).declare_subscriber(pictures.key, few)
+        quick = far.declare_subscriber(states.key, zenoh.handlers.Callback(heard, indirect=False))
+
+        def see() -> None:
+            while not stop.is_set():
+                if stuck.try_recv() is not None:
+                    time.sleep(TAKES_S)
+
+        def show() -> None:
+            while not stop.wait(1 / PICTURES_HZ):
+                pictures.put(PICTURE)
+
+        threads = [threading.Thread(target=each) for each in (see, show)]
+        until("readers of both", lambda: pictures.wanted and states.wanted)
+        for thread in threads:
+            thread.start()
+        end_s = time.monotonic() + MEASURED_S
+        while time.monotonic() < end_s:
+            states.put(str(time.monotonic_ns()).encode())
+            time.sleep(1 / STATES_HZ)
+        stop.set()
+        for thread in threads:
+            thread.join()
+        quick.undeclare()
+        for node in (reader, robot, camera):
+            node.close()
+    return delays_ms
+
+
+@pytest.mark.slow
+def test_who_is_stuck_in_a_picture_hears_of_the_arm_at_once_by_a_link_of_its_own() -> None:
+    found = {separate: state_delays_ms(separate=separate) for separate in (False, True)}
+    for separate, delays_ms in found.items():
+        p50, p95 = np.percentile(delays_ms, [50, 95])
+        word = "of their own" if separate else "shared"
+        print(f"links {word}: {len(delays_ms)} states, p50 {p50:.1f}, p95 {p95:.1f} ms")
+    assert np.median(found[True]) * SOONER < np.median(found[False])
