@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
+from netns.layouts import SMALL_MTU
 from netns.rows import Fault
 from netns.site import compiler
 from netns.stage import Stage
@@ -14,9 +15,10 @@ LOSSES = (0.0, 0.01, 0.02, 0.05, 0.10)
 DELAYS_MS = ((20, 5), (50, 10), (100, 20), (200, 40))
 CUTS_S = (0.1, 0.5, 1.0, 5.0, 20.0, 60.0)
 CLOCK_STEP_S = 2.0
-SMALL_MTU = 1280
 SMALL = Shape(mtu=SMALL_MTU)
-"""What IPv6 asks of every link, and many a tunnel has."""
+TWIN_S = 30.0
+"""At least: a twin goes on trying for some 20 s, and its end is part of the fault."""
+REFUSED = "is alive already"
 
 
 def _nothing(_: Stage) -> None:
@@ -54,12 +56,37 @@ def _plug_eyes(stage: Stage) -> None:
     stage.site.hosts.cut("eyes", cable=False)
 
 
-def _second_gpu(stage: Stage) -> None:
-    stage.site.impostor("desk", "gpu")
+def _twin(name: str, about: str, host: str) -> Fault:
+    """The part of `host` a second time, by a computer that calls itself so, until it gives up."""
+
+    def start(stage: Stage) -> None:
+        stage.site.impostor("desk", host)
+
+    def given_up(stage: Stage) -> bool:
+        return stage.site.hosts["desk"].processes[-1].poll() is not None
+
+    def missing(stage: Stage) -> str:
+        said = stage.site.impostor_log.read_text()
+        return "" if REFUSED in said else f"no twin was told that it {REFUSED}: {said[-300:]!r}"
+
+    def end(stage: Stage) -> None:
+        stage.site.hosts["desk"].crash()
+
+    return Fault(
+        name, about, start, end, seconds=TWIN_S, over=given_up, missing=missing, goes_on=True
+    )
 
 
-def _end_impostor(stage: Stage) -> None:
-    stage.site.hosts["desk"].crash()
+def _set_clock(host: str, step_s: float, layout: str) -> Fault:
+    return Fault(
+        f"clock-{host}{step_s:+g}",
+        f"the clock of {host} is set by {step_s:+g} s",
+        partial(_step_clock, host, step_s),
+        partial(_step_clock, host, 0.0),
+        layout=layout,
+        needs="" if compiler() else "there is no C compiler",
+        seconds=4.0,
+    )
 
 
 def _small_link(stage: Stage) -> None:
@@ -94,25 +121,28 @@ def catalogue() -> Iterator[Fault]:
         _good,
         seconds=8.0,
     )
+    yield _twin(
+        "twin", "a second computer called gpu, with its certificates, starts the same worker", "gpu"
+    )
+    yield _twin(
+        "twin-robot",
+        "a second computer called robot, with its certificates, starts all of its nodes",
+        "robot",
+    )
     yield Fault(
-        "twin",
-        "a second computer called gpu, with its certificates, starts the same worker",
-        _second_gpu,
-        _end_impostor,
-        seconds=6.0,
+        "mtu-ever",
+        "every link of the lab has an MTU of 1280, always",
+        _nothing,
+        _nothing,
+        layout="narrow",
+        ever=True,
         goes_on=True,
     )
     for host in ("gpu", "robot"):
-        for sign in (1, -1):
-            yield Fault(
-                f"clock-{host}{sign * CLOCK_STEP_S:+g}",
-                f"the clock of {host} is set by {sign * CLOCK_STEP_S:+g} s",
-                partial(_step_clock, host, sign * CLOCK_STEP_S),
-                partial(_step_clock, host, 0.0),
-                layout="clocks",
-                needs="" if compiler() else "there is no C compiler",
-                seconds=4.0,
-            )
+        for step_s in (CLOCK_STEP_S, -CLOCK_STEP_S):
+            yield _set_clock(host, step_s, "clocks")
+    for step_s in (CLOCK_STEP_S, -CLOCK_STEP_S):
+        yield _set_clock("eyes", step_s, "eyes-clock")
     yield Fault(
         "router-killed",
         "the only router is killed (SIGKILL); its supervisor starts it again",

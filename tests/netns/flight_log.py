@@ -14,7 +14,7 @@ from vla_zenoh.profile import Profile
 
 FloatArray = NDArray[np.float64]
 
-COLUMNS = 14
+COLUMNS = 15
 STILL_M_S = 0.005
 """A measured arm that is slower stands: the impedance controller still settles."""
 STOOD_S = 0.2
@@ -35,6 +35,8 @@ class Flight:
         last: (n, 3) of the simulator: the position its controller follows, m; of the command node:
             the commanded acceleration, m/s^2.
         asked_s: (n,) of the command node: when the chunk that it carries out arrived, else NaN.
+        heard_s: (n,) of the simulator: when it last took a command; of the command node: when it
+            last heard of the arm; NaN before the first.
     """
 
     time_s: FloatArray
@@ -42,6 +44,7 @@ class Flight:
     twist: FloatArray
     last: FloatArray
     asked_s: FloatArray
+    heard_s: FloatArray
 
     @property
     def speed_m_s(self) -> FloatArray:
@@ -51,11 +54,26 @@ class Flight:
         chosen = (self.time_s >= since_s) & (self.time_s < until_s)
         return Flight(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
-    def last_asked_s(self, until_s: float) -> float | None:
-        """When the last chunk arrived that was carried out before `until_s`."""
-        asked_s = self.between(-np.inf, until_s).asked_s
-        known = asked_s[np.isfinite(asked_s)]
-        return float(known[-1]) if len(known) else None
+    def asked_at_s(self, times_s: FloatArray) -> FloatArray:
+        """When the last chunk had arrived that was carried out by each of these times, else NaN."""
+        known = np.flatnonzero(np.isfinite(self.asked_s))
+        at = np.searchsorted(self.time_s[known], times_s, side="right")
+        return np.concatenate([[np.nan], self.asked_s[known]])[at]
+
+    def longest_s(self, since_s: FloatArray) -> tuple[float, float] | None:
+        """The longest it moved on after something.
+
+        Args:
+            since_s: (n,) when that had last happened, for each row; NaN is left out.
+
+        Returns:
+            How long, and when it had happened; None: it never moved after it.
+        """
+        late_s = np.where(self.speed_m_s > STILL_M_S, self.time_s - since_s, np.nan)
+        if not np.isfinite(late_s).any():
+            return None
+        worst = int(np.nanargmax(late_s))
+        return float(late_s[worst]), float(since_s[worst])
 
     def stood_at_s(self, since_s: float, until_s: float = np.inf) -> float | None:
         """When the arm first stood after `since_s`, for at least `STOOD_S`; None: it never did."""
@@ -104,7 +122,7 @@ def read_flight(path: Path) -> Flight:
     numbers = np.frombuffer(path.read_bytes()[: path.stat().st_size // (8 * COLUMNS) * 8 * COLUMNS])
     rows = numbers.reshape(-1, COLUMNS)
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    return Flight(rows[:, 0], rows[:, 1:4], rows[:, 4:10], rows[:, 10:13], rows[:, 13])
+    return Flight(rows[:, 0], rows[:, 1:4], rows[:, 4:10], rows[:, 10:13], rows[:, 13], rows[:, 14])
 
 
 def brake_s(profile: Profile, velocity_m_s: FloatArray, acceleration_m_s2: FloatArray) -> float:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+SMALL_MTU = 1280
+"""What IPv6 asks of every link, and many a tunnel has."""
 FRONT = '{source: "sim:front", width: 160, height: 120, rate_hz: 20}'
 
 
@@ -17,6 +19,7 @@ class Layout:
         routers: those that run one, the first one first.
         shaped: whose link can be made bad.
         clocks: whose wall clock can be set.
+        mtu: of all its links, from the beginning; 0: the usual one.
     """
 
     plain: str
@@ -24,27 +27,34 @@ class Layout:
     routers: tuple[str, ...]
     shaped: tuple[str, ...] = ()
     clocks: tuple[str, ...] = ()
+    mtu: int = 0
 
 
 def _profile(extends: str, more: str = "") -> str:
     return f"extends: {extends}\ncameras:\n  front: {FRONT}\n  wrist: null\n{more}"
 
 
+EYES = (
+    _profile(
+        "panda_sim_lab",
+        "hosts:\n"
+        "  robot: {nodes: [router, sim, command]}\n"
+        "  eyes: {nodes: [camera], connect: [tcp/127.0.0.1:7447]}\n"
+        "  gpu: {nodes: [worker], connect: [tcp/127.0.0.1:7447]}\n",
+    ),
+    ("robot", "eyes", "gpu"),
+    ("robot",),
+)
+"""The cameras have a computer of their own."""
 LAYOUTS = {
     # The robot's computer, one for models, and a desk.
     "lab": Layout(_profile("panda_sim_lab"), ("robot", "gpu", "desk"), ("robot",), ("gpu",)),
-    # The cameras have a computer of their own.
-    "eyes": Layout(
-        _profile(
-            "panda_sim_lab",
-            "hosts:\n"
-            "  robot: {nodes: [router, sim, command]}\n"
-            "  eyes: {nodes: [camera], connect: [tcp/127.0.0.1:7447]}\n"
-            "  gpu: {nodes: [worker], connect: [tcp/127.0.0.1:7447]}\n",
-        ),
-        ("robot", "eyes", "gpu"),
-        ("robot",),
+    # The same, and no link carries more than IPv6 asks of every link.
+    "narrow": Layout(
+        _profile("panda_sim_lab"), ("robot", "gpu"), ("robot",), ("gpu",), mtu=SMALL_MTU
     ),
+    "eyes": Layout(*EYES),
+    "eyes-clock": Layout(*EYES, clocks=("eyes",)),
     # Robot and cameras each on the network, the router on neither.
     "apart": Layout(
         _profile(

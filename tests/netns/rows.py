@@ -10,6 +10,14 @@ if TYPE_CHECKING:
     from netns.stage import Stage
 
 
+def _always(_: Stage) -> bool:
+    return True
+
+
+def _nothing(_: Stage) -> str:
+    return ""
+
+
 @dataclass(frozen=True, slots=True)
 class Fault:
     """Something that goes wrong while the arm moves.
@@ -23,7 +31,9 @@ class Fault:
         needs: why it cannot be done here; empty: it can.
         ever: it is so before the motion begins, and does not come as a surprise.
         seconds: how long it lasts; None: until the motion has come to its end.
-        goes_on: the arm is to reach its goal all the same.
+        over: it lasts longer than `seconds`, until this says that it is over.
+        missing: what would have had to be seen of it and was not; empty: nothing.
+        goes_on: the arm is to reach its goal all the same, or not to stand on its way.
         from_fault: recovery counts from the fault itself, which ends without us.
         alone: the robot's side notices by itself, and brakes.
     """
@@ -36,6 +46,8 @@ class Fault:
     needs: str = ""
     ever: bool = False
     seconds: float | None = None
+    over: Callable[[Stage], bool] = _always
+    missing: Callable[[Stage], str] = _nothing
     goes_on: bool = False
     from_fault: bool = False
     alone: bool = False
@@ -49,9 +61,12 @@ class Row:
         name: of the fault.
         about: likewise.
         did: what the arm did, in words.
-        stood_s: from the fault until the arm stood.
-        braked_s: from the last chunk that came, if that was later, until the arm stood.
+        stood_s: from the fault until the arm stood on its way.
+        braked_s: the longest it moved on after a chunk that was carried out, or after the fault.
         braked_bound_s: what the watchdog and one Ruckig brake allow of that.
+        unheard_s: the longest it moved on after the simulator had last heard a command, and was
+            moved on after the command node had last heard of it, by node.
+        unheard_bound_s: what the profile's patience and one Ruckig brake allow of that.
         way_mm: how far it went meanwhile.
         acceleration: largest measured, as a share of the limit.
         jerk: largest commanded, likewise.
@@ -69,6 +84,8 @@ class Row:
     stood_s: float | None = None
     braked_s: float | None = None
     braked_bound_s: float | None = None
+    unheard_s: dict[str, float] = field(default_factory=dict)
+    unheard_bound_s: dict[str, float] = field(default_factory=dict)
     way_mm: float | None = None
     acceleration: float = 0.0
     jerk: float = 0.0

@@ -17,18 +17,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from netns.flight_log import Flight, brake_s, read_flight
+from netns.flight_log import Flight, read_flight
 from netns.layouts import LAYOUTS, Layout
+from netns.measure import RATE_HZ, STEP_M, STEPS, Span, judge, measure_motion
 from netns.rows import Fault, Row
 from netns.site import HERE, Site, secured_site
+from netns.wire import Shape
 
 from vla_zenoh.profile import Profile, load_profile
 
-RATE_HZ = 10.0
-STEP_S, STEP_M = 0.1, 0.01
-STEPS = 40
-"""Of a motion that is to reach its goal: 0.4 m."""
 MOVING_M_S = 0.05
+POLL_S = 0.1
 UNDER_WAY_S = 0.8
 ACCUSTOMED_S = 2.0
 """After which TCP has found out what a link is like."""
@@ -36,10 +35,8 @@ SEEN_S = 1.0
 """An arm that moves again is looked at for so long: it may stop once more."""
 ANSWER_S = 200.0
 RECOVERY_S = 60.0
-GOAL_M = 0.001
-MEASURED_SLACK, OWN_BRAKE_SLACK = 1.15, 2.0
-"""Share of the acceleration limit that the measured arm may take; where the robot brakes alone."""
-COMMANDED_SLACK = 1.001
+OVER_S = 120.0
+"""By then a fault that ends by itself has ended."""
 
 
 @dataclass
@@ -102,6 +99,8 @@ class Stage:
         else:
             finished = {}
             time.sleep(max(0.0, fault.seconds - (time.monotonic() - began_s)))
+            while not fault.over(self) and time.monotonic() - began_s < OVER_S:
+                time.sleep(POLL_S)
             ended_s = time.monotonic()
             fault.clear(self)
         recovered: dict[str, Any] = {}
@@ -112,44 +111,25 @@ class Stage:
         self.ask("rest")
         time.sleep(1.2)  # status comes twice a second
         after = self.ask("count")
-        self._measure_motion(row, fault, began_s, rest_s)
+        measure_motion(
+            row,
+            fault,
+            self.profile,
+            self.flight("sim"),
+            self.flight("command"),
+            Span(began_s, ended_s, rest_s),
+            done=bool(finished.get("done")),
+        )
         stood_s = began_s + (row.stood_s or 0.0)
         since_s = began_s if fault.from_fault else ended_s
         self._measure_recovery(row, fault, recovered, since_s, stood_s)
         self._measure_goal(row, moving, finished)
         self._count(row, before, after)
         self._tell(row, fault, finished, recovered, after["news"])
-        self._judge(row, fault, finished, recovered)
+        judge(row, fault, finished, recovered)
+        if missing := fault.missing(self):
+            row.wrong.append(missing)
         return row
-
-    def _measure_motion(self, row: Row, fault: Fault, began_s: float, rest_s: float) -> None:
-        profile, limits = self.profile, self.profile.limits.translation
-        measured, commanded = self.flight("sim"), self.flight("command")
-        # A motion that comes to its goal stands there, too: only who stops on the way was braked.
-        stood_s = measured.stood_at_s(began_s, rest_s)
-        if stood_s is not None and fault.seconds is not None:
-            row.stood_s = stood_s - began_s
-            way = measured.between(began_s, stood_s).position_m
-            row.way_mm = float(np.linalg.norm(way[-1] - way[0])) * 1e3
-            since_s = began_s
-            if not fault.alone:  # who goes on hearing chunks goes on
-                since_s = max(began_s, commanded.last_asked_s(stood_s) or began_s)
-            row.braked_s = stood_s - since_s
-            row.braked_bound_s = self._bound_s(fault, commanded, since_s)
-        row.acceleration = measured.between(began_s - 0.2).hardest_m_s2() / limits.acceleration_m_s2
-        period_s = 1.0 / profile.timing.command_hz
-        row.jerk = commanded.between(began_s - 0.2).jerk_m_s3(period_s) / limits.jerk_m_s3
-
-    def _bound_s(self, fault: Fault, commanded: Flight, began_s: float) -> float:
-        timing = self.profile.timing
-        around = commanded.between(began_s - 0.1, began_s + 0.1)
-        brake = max(
-            brake_s(self.profile, twist[:3], change)
-            for twist, change in zip(around.twist[::5], around.last[::5], strict=True)
-        )
-        if fault.alone:
-            return timing.command_timeout_s + brake
-        return STEP_S + 1.0 / RATE_HZ + timing.watchdog_s + brake
 
     def _measure_recovery(
         self,
@@ -204,25 +184,6 @@ class Stage:
         else:
             row.did = f"did not come back: {recovered.get('why', '')[:300]}"
 
-    def _judge(
-        self, row: Row, fault: Fault, finished: dict[str, Any], recovered: dict[str, Any]
-    ) -> None:
-        took_s, bound_s = row.braked_s, row.braked_bound_s
-        if took_s is not None and bound_s is not None and took_s > bound_s:
-            row.wrong.append(f"stood after {took_s:.3f} s, allowed {bound_s:.3f} s")
-        slack = OWN_BRAKE_SLACK if fault.alone else MEASURED_SLACK
-        if row.acceleration > slack:
-            row.wrong.append(f"acceleration {row.acceleration:.2f} of its limit")
-        if row.jerk > COMMANDED_SLACK:
-            row.wrong.append(f"commanded jerk {row.jerk:.3f} of its limit")
-        if recovered and not recovered.get("moves"):
-            row.wrong.append("did not come back")
-        if fault.goes_on and fault.seconds is None:
-            if not finished.get("done"):
-                row.wrong.append("did not reach its goal")
-            elif (row.off_mm or 0.0) > GOAL_M * 1e3:
-                row.wrong.append(f"{row.off_mm:.2f} mm beside its goal")
-
 
 @contextmanager
 def stage(name: str) -> Iterator[Stage]:
@@ -236,6 +197,11 @@ def stage(name: str) -> Iterator[Stage]:
         for host in layout.clocks:
             site.own_clock(host)
         parts = [host for host in layout.hosts if host in profile.hosts]
+        if layout.mtu:
+            for host in layout.hosts:
+                site.hosts.set_mtu(host, layout.mtu)
+            for host in layout.shaped:  # larger ones would not come through
+                site.hosts.shape(host, Shape(mtu=layout.mtu))
         site.equip(*parts)
         site.up(*layout.routers, *(host for host in parts if host not in layout.routers))
         found = Stage(site, layout, profile)

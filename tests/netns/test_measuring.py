@@ -81,7 +81,7 @@ def flown(speed_m_s: NDArray[Any], period_s: float = 0.005) -> Flight:
     twist[:, 2] = speed_m_s
     time_s = np.arange(count, dtype=np.float64) * np.float64(period_s)
     asked_s = np.where(time_s < 0.5, np.nan, np.floor(time_s * 10) / 10)
-    return Flight(time_s, np.zeros((count, 3)), twist, np.zeros((count, 3)), asked_s)
+    return Flight(time_s, np.zeros((count, 3)), twist, np.zeros((count, 3)), asked_s, time_s)
 
 
 def test_an_arm_stands_when_it_stays_slow_and_not_when_it_turns() -> None:
@@ -103,9 +103,9 @@ def test_the_change_of_velocity_is_taken_within_a_window_and_not_over_a_hole() -
 
 
 def test_it_is_known_when_the_last_chunk_came() -> None:
-    flight = flown(np.zeros(400))
-    assert flight.last_asked_s(0.4) is None
-    assert flight.last_asked_s(1.234) == pytest.approx(1.2)
+    found_s = flown(np.zeros(400)).asked_at_s(np.array([0.4, 0.5, 1.234]))
+    assert np.isnan(found_s[0])
+    assert found_s[1:] == pytest.approx([0.5, 1.2])
 
 
 def test_jerk_is_the_change_of_the_commanded_acceleration() -> None:

@@ -3,23 +3,55 @@
 Python imports this file at its start, where its folder is on PYTHONPATH. Between an arm and whoever
 watches it there is a network that may be down, and what is measured of a fault must not depend on
 it. So `state/pose` and `command/pose` are kept in files beside their writers, in the folder that
-FLIGHT_FOLDER names: one row of float64 a record, see `netns.flight_log`.
+FLIGHT_FOLDER names, with when each of the two last heard the other: one row of float64 a record,
+see `netns.flight_log`.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+import time
 from typing import Any
 
 RECORDED = {"sim": "state/pose", "command": "command/pose"}
 
 
-def _install(key_end: str, path: str) -> None:
+def _note_commands(heard_s: list[float]) -> None:
+    """Of the simulator: whenever its guard takes a command."""
+    from vla_zenoh.control.stream import CommandStream
+
+    take = CommandStream.take
+
+    def take_and_note(self: CommandStream[Any], command: Any) -> None:
+        heard_s[0] = time.monotonic()
+        take(self, command)
+
+    CommandStream.take = take_and_note
+
+
+def _note_states(heard_s: list[float]) -> None:
+    """Of the command node: whenever the arm's pose has come."""
+    from vla_zenoh.nodes.command_inputs import CommandInputs
+
+    take = CommandInputs.take
+
+    def take_and_note(self: CommandInputs, now_ns: int) -> Any:
+        inputs = take(self, now_ns)
+        if inputs.pose is not None:
+            heard_s[0] = time.monotonic()
+        return inputs
+
+    CommandInputs.take = take_and_note
+
+
+def _install(node: str, path: str) -> None:
     import numpy as np
 
     from vla_zenoh.nodes.node import Stream
 
+    key_end, heard_s = RECORDED[node], [float("nan")]
+    (_note_commands if node == "sim" else _note_states)(heard_s)
     put = Stream.put
     file = open(path, "ab", buffering=0)  # noqa: SIM115  # as long as the process lives
 
@@ -37,7 +69,9 @@ def _install(key_end: str, path: str) -> None:
                 np.nan if stamp_ns is None else (stamp_ns - self._clock.offset_ns) / 1e9
                 for stamp_ns in (header.stamp_wall_ns, asked_ns)
             )
-            file.write(np.concatenate([[at_s], *parts, [asked_s]]).tobytes())
+            # By its age: a clock that is set in between does not make it older.
+            silent_s = time.monotonic() - heard_s[0]
+            file.write(np.concatenate([[at_s], *parts, [asked_s, at_s - silent_s]]).tobytes())
         return header
 
     Stream.put = put_and_keep
@@ -46,4 +80,4 @@ def _install(key_end: str, path: str) -> None:
 _node = sys.orig_argv[3] if sys.orig_argv[1:3] == ["-m", "vla_zenoh"] else ""
 _folder = os.environ.get("FLIGHT_FOLDER")
 if _folder and _node in RECORDED:
-    _install(RECORDED[_node], os.path.join(_folder, f"{_node}.flight"))
+    _install(_node, os.path.join(_folder, f"{_node}.flight"))
