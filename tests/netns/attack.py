@@ -3,6 +3,10 @@
     attack.py CONFIG.json ROBOT WORKER     Zenoh's configuration, the robot's and a worker's name
 
 Prints whether a session was to be had, what was heard on which key, and whether anybody answered.
+
+First it does what moves an arm, if it is heard: a prompt that the model knows, an activation, and
+the tokens of whoever lives and holds. Then it stops the arm, takes the stop back and puts the
+simulation to its beginning. Last it speaks for others, and leaves its mark.
 """
 
 from __future__ import annotations
@@ -11,8 +15,11 @@ import json
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -24,7 +31,14 @@ from vla_zenoh.types import Header, PoseCommand
 
 LISTEN_S = 3.0
 MARK = "stranger"
-"""In everything the attacker says, so that others can tell it came through."""
+"""In what the attacker says, so that others can tell it came through."""
+MOTION, RATE = "HARD: go down within 0.1", "7"
+"""An arm of the lab does neither by itself, and can do both."""
+MOVE_S, MOVE_PERIOD_S = 3.0, 0.1
+TAKE_S = 0.5
+"""For each of the orders that follow each other."""
+
+Put = Callable[[str, Any], None]
 
 
 def main(config: str, robot: str, worker: str) -> None:
@@ -44,10 +58,10 @@ def main(config: str, robot: str, worker: str) -> None:
         front = (keys.camera_raw("front"), keys.camera_jpeg("front"))
         wishes = (keys.everything, *front, keys.state_pose, keys.command_pose, keys.prompt)
         listening = [session.declare_subscriber(key, handler) for key in wishes]
-        time.sleep(LISTEN_S / 2)
+        _seize(session, keys)
         for number in range(20):
             _speak(session, keys, worker, number)
-            time.sleep(LISTEN_S / 40)
+            time.sleep(LISTEN_S / 20)
         asked = (keys.prompt, keys.task, keys.clock("command"))
         answers = sum(
             reply.ok is not None for key in asked for reply in session.get(key, timeout=1.0)
@@ -60,6 +74,25 @@ def main(config: str, robot: str, worker: str) -> None:
             one.undeclare()
     said = {"opened": True, "links": links, "heard": heard, "answers": answers, "alive": alive}
     print(json.dumps(said))
+
+
+def _seize(session: zenoh.Session, keys: Keys) -> None:
+    put = partial(session.put, allowed_destination=zenoh.Locality.REMOTE)
+    tokens = []
+    for key in (keys.holding(MARK), keys.alive(MARK), keys.alive("replay")):
+        with suppress(zenoh.ZError):
+            tokens.append(session.liveliness().declare_token(key))
+    for _ in range(round(MOVE_S / MOVE_PERIOD_S)):
+        put(keys.rate, RATE)
+        put(keys.prompt, MOTION)
+        put(keys.active, f"true while {MARK}")
+        put(keys.active, "true")
+        time.sleep(MOVE_PERIOD_S)
+    for key in (keys.stop, keys.reset, keys.sim_reset):
+        put(key, "")
+        time.sleep(TAKE_S)
+    for token in tokens:
+        token.undeclare()
 
 
 def _speak(session: zenoh.Session, keys: Keys, worker: str, number: int) -> None:

@@ -1,7 +1,8 @@
 """Three hosts with certificates move the arm; whoever has none of these, or too little, does not.
 
 Real namespaces, a real router with mutual TLS and access control, a real session for each attempt;
-each result is looked at from the attacker's side and from the robot's.
+each result is looked at from the attacker's side and from the robot's. What the attacker does would
+move the arm, stop it and put its simulation back: done by an operator, at last, it does.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from netns.attack import MARK, MOTION, RATE
 from netns.lab import needs_namespaces
 from netns.site import HERE, Site, secured_site
 
@@ -28,8 +30,11 @@ PORT = 7447
 STEPS, STEP_M, TOLERANCE_M = 10, 0.01, 0.001
 STILL_M = 0.001
 """An arm that nobody moves stays within this."""
-WATCH_S = 7.0
-MARK = "stranger"
+MOVED_M = 0.05
+"""An arm that obeys the attacker goes down 0.1 m."""
+RATE_HZ = float(RATE)
+OTHER = "other"
+NODES = ["camera", "command", "router", "sim", "worker-scripted"]
 PLAIN = f"""\
 extends: panda_sim_two_hosts
 cameras:
@@ -132,24 +137,32 @@ def attack(site: Site, settings: dict[str, Any]) -> tuple[dict[str, Any], dict[s
     """What the attacker got, and what the robot's host saw of it."""
     file = site.folder / "attack.json"
     file.write_text(json.dumps(settings))
-    seen = site.folder / "watch.log"
-    watching = site.hosts["robot"].start(
-        *(sys.executable, str(HERE / "watch.py"), str(site.profile("robot"))),
-        *(str(WATCH_S), MARK),
-        output=seen,
+    watching = site.hosts["robot"].talk(
+        sys.executable, str(HERE / "watch.py"), str(site.profile("robot")), MARK
     )
-    got = site.hosts["strange"].ask(HERE / "attack.py", str(file), "panda", "other")
-    assert watching.wait(60.0) == 0, seen.read_text()
-    return got, json.loads(seen.read_text().strip().splitlines()[-1])
+    assert watching.stdin is not None
+    assert watching.stdout is not None
+    assert watching.stdout.readline().strip() == "watching", site.logs()
+    got = site.hosts["strange"].ask(HERE / "attack.py", str(file), "panda", OTHER)
+    watching.stdin.write("\n")
+    watching.stdin.flush()
+    seen = watching.stdout.readline()
+    assert watching.wait(60.0) == 0, site.logs()
+    return got, json.loads(seen)
 
 
 def nothing_came_of_it(seen: dict[str, Any]) -> None:
     assert seen["marked"] == {}
     assert seen["moved_m"] < STILL_M
-    assert not seen["active"]
-    assert seen["worker"] == "scripted"
-    assert MARK not in seen["prompt"]
-    assert seen["alive"] == ["camera", "command", "router", "sim", "worker-scripted"]
+    ((prompt, worker, rate_hz, active),) = seen["tasks"]  # one, from the beginning to the end
+    assert prompt != MOTION
+    assert MARK not in prompt
+    assert (worker, active) == ("scripted", False)
+    assert rate_hz != RATE_HZ
+    assert seen["transitions"] == []
+    assert seen["resets"] == 0
+    assert seen["held"] == []
+    assert seen["alive"] == NODES
 
 
 @pytest.mark.parametrize(
@@ -191,3 +204,27 @@ def test_a_stolen_worker_speaks_for_no_other_worker_and_moves_nothing(site: Site
     assert got["opened"]
     assert not any(key.startswith("command/") for key in got["heard"])
     nothing_came_of_it(seen)
+
+
+def operator(site: Site) -> dict[str, Any]:
+    return with_files(site, site.store, "desk", "operator")
+
+
+def test_the_same_attack_by_an_operator_does_all_that_strangers_did_not(site: Site) -> None:
+    """Else the tests above would pass whatever a stranger may do."""
+    try:
+        got, seen = attack(site, operator(site))
+    finally:
+        site.vla("desk", "use", "scripted", "--profile", str(site.profile("desk")))
+    assert got["opened"]
+    assert any(key.startswith("camera/") for key in got["heard"])
+    assert seen["moved_m"] > MOVED_M
+    assert [MOTION, "scripted", RATE_HZ, True] in seen["tasks"]
+    assert any(worker == MARK for _, worker, _, _ in seen["tasks"])
+    assert any(what.endswith("->stopped") for what in seen["transitions"])
+    assert any(what.startswith("stopped->") for what in seen["transitions"])
+    assert seen["resets"] == 1
+    assert seen["held"] == [MARK]
+    # What nodes say, and that they live, is not for people either.
+    assert not {"command/pose", f"delta/{OTHER}"} & seen["marked"].keys()
+    assert seen["alive"] == NODES
