@@ -29,6 +29,7 @@ ALL = (*ARM_JOINTS, *FINGERS)
 MS = 1_000_000
 POSITION_TOLERANCE_M = 1e-12
 PROFILE = load_profile("panda_ros2")
+STROKE_M = 0.08
 
 
 def joints(names: tuple[str, ...] = ALL, **changes: Any) -> Joints:
@@ -309,7 +310,7 @@ def wish(width_m: float) -> GripperCommand:
 
 
 def test_a_newer_wish_cancels_and_is_sent_when_the_goal_has_ended() -> None:
-    keeper = GoalKeeper(5.0)
+    keeper = GoalKeeper(5.0, STROKE_M)
     keeper.want(wish(0.0))
     assert keeper.step(0) is Step.SEND
     keeper.want(wish(0.02))
@@ -327,7 +328,7 @@ def test_a_newer_wish_cancels_and_is_sent_when_the_goal_has_ended() -> None:
 
 
 def test_a_goal_of_which_nothing_is_heard_is_given_up() -> None:
-    keeper = GoalKeeper(1.0)
+    keeper = GoalKeeper(1.0, STROKE_M)
     keeper.want(wish(0.0))
     keeper.step(0)
     keeper.want(wish(0.05))
@@ -337,9 +338,43 @@ def test_a_goal_of_which_nothing_is_heard_is_given_up() -> None:
     assert not keeper.ended(1), "what is heard of it later is not heard"
 
 
+def test_slow_fingers_have_the_time_they_need_and_who_is_silent_has_not() -> None:
+    keeper = GoalKeeper(1.0, STROKE_M)
+    keeper.want(GripperCommand(0.0, 0.01, 10.0))
+    keeper.step(0)
+    assert keeper.goal is not None
+    keeper.accepted(keeper.goal.number, 500 * MS)
+    keeper.step(9499 * MS)
+    assert keeper.goal is not None, "8 s for the way, and one"
+    keeper.step(9501 * MS)
+    assert keeper.goal is None
+    keeper.want(GripperCommand(0.0, 0.01, 10.0))
+    keeper.step(10_000 * MS)
+    assert keeper.goal is not None
+    keeper.accepted(keeper.goal.number, 10_000 * MS)
+    keeper.want(wish(0.08))
+    assert keeper.step(10_000 * MS) is Step.CANCEL
+    assert keeper.step(11_001 * MS) is Step.SEND, "a cancelled one ends at once"
+
+
+def test_a_wish_that_is_forgotten_is_not_sent_and_the_goal_in_flight_goes_on() -> None:
+    keeper = GoalKeeper(1.0, STROKE_M)
+    keeper.want(wish(0.0))
+    keeper.step(0)
+    keeper.want(wish(0.08))
+    assert keeper.forget() == wish(0.08)
+    assert keeper.forget() is None
+    goal = keeper.goal
+    assert goal is not None
+    assert goal.command == wish(0.0)
+    assert keeper.ended(goal.number)
+    assert keeper.step(1) is None
+    assert keeper.goal is None
+
+
 @given(st.lists(st.sampled_from(["want", "accept", "end", "step", "late end"]), max_size=60))
 def test_there_are_never_two_goals_and_the_last_wish_is_never_lost(steps: list[str]) -> None:
-    keeper = GoalKeeper(1e6)
+    keeper = GoalKeeper(1e6, STROKE_M)
     running: set[int] = set()
     sent: list[float] = []
     wishes: list[float] = []

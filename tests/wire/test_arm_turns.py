@@ -19,9 +19,17 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes import arm_hearing, slots
 from vla_zenoh.nodes.arm import ArmNode
 from vla_zenoh.nodes.clock import Tick
-from vla_zenoh.nodes.last_brake import FAILURES
+from vla_zenoh.nodes.last_brake import FAILURES, LEAST_S
 from vla_zenoh.profile import load_profile
-from vla_zenoh.types import Event, FloatArray, GripperState, Header, JointCommand, JointState
+from vla_zenoh.types import (
+    Event,
+    FloatArray,
+    GripperCommand,
+    GripperState,
+    Header,
+    JointCommand,
+    JointState,
+)
 
 TICK_S, TICK_NS = 0.004, 4_000_000
 SPEED_RAD_S, RAMP_S = 0.3, 0.1
@@ -43,6 +51,7 @@ from vla_zenoh.robot import Reading
 class Arm:
     def __init__(self):
         self.position_rad, self.said, self.moves, self.failing, self.tried = None, {}, [], 0, 0
+        self.widths_m = []
 
     def read(self):
         if "raise" in self.said:
@@ -56,7 +65,14 @@ class Arm:
             raise OSError("the cable is out")
         self.moves.append(command.position_rad)
         self.position_rad = command.position_rad
+
+    def grip(self, width_m, speed_m_s, force_n):
+        self.widths_m.append(width_m)
 """
+SLOW_S = 0.09
+"""Between two turns of a loop that is late: by less than timing.command_timeout_s."""
+GENTLE = "limits: {joint: {jerk_rad_s3: 0.5}}"
+"""From 0.3 rad/s the robot's own stop takes 1.1 s."""
 PROFILE = """
 extends: panda_sim
 robot: {driver: arm, command: joint}
@@ -78,6 +94,8 @@ class Turns:
     turn: int = 0
     script: dict[int, Callable[[], None]] = field(default_factory=dict)
     last: int = 2 * MOVING
+    period_s: float = TICK_S
+    state: str = "active"
     stop: threading.Event = field(default_factory=threading.Event)
 
     @property
@@ -85,7 +103,7 @@ class Turns:
         return self.node._file._robot
 
     def wait(self) -> Tick:
-        self.mono_ns += TICK_NS
+        self.mono_ns += round(self.period_s * 1e9)
         self.script.get(self.turn, lambda: None)()
         self.turn += 1
         if self.turn > self.last:
@@ -109,7 +127,17 @@ class Turns:
         header = Header(self.node.node.clock.wall_at(self.mono_ns), self.turn, "command#1")
         self.session.put(
             self.node.node.keys.command_joint,
-            records.encode(JointCommand(names, columns[0], columns[1], columns[2], "active")),
+            records.encode(JointCommand(names, columns[0], columns[1], columns[2], self.state)),
+            attachment=header_codec.encode(header),
+        )
+
+    def ask(self, width_m: float, age_s: float = 0.0) -> None:
+        """The one who leads the arm orders an opening, so long ago."""
+        stamp_ns = self.node.node.clock.wall_at(self.mono_ns) - round(age_s * 1e9)
+        header = Header(stamp_ns, self.turn, "command#1")
+        self.session.put(
+            self.node.node.keys.command_gripper,
+            records.encode(GripperCommand(width_m, 0.1, 10.0)),
             attachment=header_codec.encode(header),
         )
 
@@ -135,9 +163,11 @@ class Turns:
 
 
 @pytest.fixture
-def turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Turns]:
+def turns(
+    tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Turns]:
     (tmp_path / "my_arm.py").write_text(ARM)
-    (tmp_path / "lab.yaml").write_text(PROFILE)
+    (tmp_path / "lab.yaml").write_text(PROFILE + getattr(request, "param", ""))
     profile = load_profile(str(tmp_path / "lab.yaml"))
     with zenoh.open(zenoh.Config.from_json5(ALONE)) as session:
         node = ArmNode(profile, session)
@@ -177,6 +207,22 @@ def test_whatever_is_not_raised_the_motion_is_led_to_the_end(turns: Turns) -> No
     turns.run()
     braked(turns)
     assert np.abs(np.diff(turns.steps_rad)).max() < JERKED_RAD
+
+
+@pytest.mark.parametrize("turns", [GENTLE], indirect=True)
+def test_a_brake_that_takes_long_is_brought_to_its_end(turns: Turns) -> None:
+    turns.run()
+    braked(turns)
+    assert (turns.turn - turns.last) * TICK_S > LEAST_S
+    assert not turns.told("not_braked")
+
+
+def test_a_loop_that_is_too_slow_to_brake_ends_in_time_and_says_so(turns: Turns) -> None:
+    turns.script[turns.last] = lambda: setattr(turns, "period_s", SLOW_S)
+    turns.run()
+    assert (turns.turn - turns.last) * SLOW_S < 2 * LEAST_S
+    (event,) = turns.told("not_braked")
+    assert "the loop came too late" in event.why
 
 
 # -- what is raised ---------------------------------------------------------------------------
@@ -279,3 +325,16 @@ def test_a_fault_is_told_in_words_that_everybody_can_read(turns: Turns) -> None:
     turns.run()
     assert turns.node.state == "fault"
     assert "\x1b" not in turns.faults[-1][0]
+
+
+# -- the gripper ------------------------------------------------------------------------------
+def test_the_gripper_outlives_neither_a_stop_nor_the_age_of_its_orders(turns: Turns) -> None:
+    turns.script[MOVING] = lambda: turns.ask(0.05)
+    turns.script[MOVING + 1] = lambda: turns.ask(0.06, age_s=2.0)
+    turns.script[MOVING + 9] = lambda: setattr(turns, "state", "stopped")
+    turns.script[MOVING + 10] = lambda: turns.ask(0.07)
+    turns.script[turns.last] = lambda: turns.ask(0.08)  # this node is told to end
+    turns.run()
+    assert turns.arm.widths_m == [0.05]
+    assert turns.refused("stale") == 1
+    assert turns.refused("outlived") == 1

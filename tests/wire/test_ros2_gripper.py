@@ -13,6 +13,8 @@ from camera_rig import until
 from ros2_peer import Ros2Peer
 from ros2_rig import write_profile
 
+from vla_zenoh.control.gripper_guard import OLDEST_NS
+from vla_zenoh.interop.ros2.gripper_actions import SUCCEEDED
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.clock import Clock
@@ -42,11 +44,14 @@ class Rig:
         self.width_m: float | None = None
         self.over = threading.Event()
 
+    def turn(self, writer: str = "command#1", *, leads: bool = True) -> None:
+        self.gripper.turn(time.time_ns(), writer, leads=leads)
+
     def turn_until(self, what: str, name: str, count: int, writer: str = "command#1") -> None:
         """Turn until counter `name` stands at `count`."""
 
         def reached() -> bool:
-            self.gripper.turn(time.time_ns(), writer)
+            self.turn(writer)
             return self.node.counters[name] >= count
 
         until(what, reached)
@@ -83,7 +88,8 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
 
             def finish(_: Any) -> Any:
                 rig.over.wait()
-                return peer.message(f"{kind}_GetResult_Response")
+                result = peer.message(f"{kind}_Result", success=True)
+                return peer.message(f"{kind}_GetResult_Response", status=SUCCEEDED, result=result)
 
             peer.serve(f"{topic}/send_goal", f"{kind}_SendGoal", accept)
             peer.serve(f"{topic}/get_result", f"{kind}_GetResult", finish)
@@ -119,7 +125,7 @@ def test_a_wall_clock_that_is_set_does_not_give_up_a_goal(rig: Rig) -> None:
     rig.command.put(ORDER)
     rig.turn_until("the goal", "ros2.gripper_goals", 1)
     for now_ns in (time.time_ns() + HOUR_NS, time.time_ns() - HOUR_NS):
-        rig.gripper.turn(now_ns, "command#1")
+        rig.gripper.turn(now_ns, "command#1", leads=True)
         assert rig.gripper.busy
     assert rig.node.counters["ros2.gripper_timeouts"] == 0
 
@@ -143,3 +149,48 @@ def test_what_closes_the_fingers_from_where_they_are_is_a_grasp_and_nothing_else
         rig.turn_until("the goal", "ros2.gripper_goals", len(expected))
         until("the robot hears it", lambda: len(rig.actions) == len(expected))
         assert rig.actions == expected
+
+
+def test_a_wish_that_waits_for_the_gripper_is_not_sent_after_a_stop(rig: Rig) -> None:
+    rig.command.put(GripperCommand(0.0, 0.05, 10.0))
+    rig.turn_until("the goal, which hangs", "ros2.gripper_goals", 1)
+    rig.command.put(GripperCommand(0.08, 0.05, 10.0))
+    rig.turn_until("the wish waits", "ros2.gripper_cancelled", 1)
+    rig.turn(leads=False)  # the command node brakes
+    rig.turn(writer="", leads=False)
+    assert rig.node.counters["refused.outlived"] == 1
+    rig.over.set()
+
+    def ended() -> bool:
+        rig.turn(writer="", leads=False)
+        return not rig.gripper.busy
+
+    until("the goal ends", ended)
+    rig.turn(writer="", leads=False)
+    assert rig.node.counters["ros2.gripper_goals"] == 1
+    assert rig.gripper.wanted_m == 0.0
+
+
+def test_an_order_that_waited_while_this_side_stood_still_moves_nothing(rig: Rig) -> None:
+    rig.command.put(ORDER, stamp_wall_ns=time.time_ns() - 2 * OLDEST_NS)
+    rig.turn_until("it is refused", "refused.stale", 1)
+    assert not rig.gripper.busy
+
+
+@pytest.mark.parametrize("rig", [WITH_GRASP], indirect=True)
+def test_who_holds_something_is_told_by_the_fingers_and_not_by_the_grasp(rig: Rig) -> None:
+    rig.over.set()
+    rig.width_m = 0.08
+    rig.command.put(GripperCommand(0.0, 0.05, 10.0))
+    rig.turn_until("the goal", "ros2.gripper_goals", 1)
+    assert not rig.gripper.holding
+
+    def ended() -> bool:
+        rig.turn()
+        return not rig.gripper.busy
+
+    until("the grasp succeeds", ended)
+    assert rig.actions == ["Grasp"]
+    for at_m, holds in ((0.03, True), (0.0005, False), (None, False), (0.03, True)):
+        rig.width_m = at_m
+        assert rig.gripper.holding is holds

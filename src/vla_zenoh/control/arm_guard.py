@@ -65,7 +65,7 @@ class ArmGuard:
     ) -> None:
         self._poses, self._joints = poses, joints
         self._measure = measure
-        self._writer = ""
+        self._writer = self._state = ""
         self._unheeded_until_ns = 0
         self._now_ns = 0
         self.mode: Mode = mode
@@ -83,6 +83,11 @@ class ArmGuard:
     def writer(self) -> str:
         """Source of the stream that is being followed, empty where none is."""
         return self._writer if self.following else ""
+
+    @property
+    def leads(self) -> bool:
+        """Who is followed carries out what it is told; after a stop, for one, it only brakes."""
+        return self.following and self._state in LEADING
 
     @property
     def braking(self) -> bool:
@@ -136,6 +141,7 @@ class ArmGuard:
         reason = self._poses.offer(command, now_ns)
         if reason is None:
             self.mode, self._writer = "pose", command.header.source
+            self._state = command.record.state
         return reason
 
     def offer_joint(self, command: Stamped[JointCommand], now_ns: int) -> str | None:
@@ -159,6 +165,7 @@ class ArmGuard:
         reason = self._joints.offer(command, now_ns)
         if reason is None:
             self.mode, self._writer = "joint", command.header.source
+            self._state = command.record.state
         return reason
 
     def _note(self, reason: str | None, state: str, now_ns: int) -> None:

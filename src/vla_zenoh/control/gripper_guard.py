@@ -1,4 +1,4 @@
-"""The robot's side of gripper orders: whose are obeyed, each once, and never beyond the profile."""
+"""The robot's side of gripper orders: whose are obeyed, how old, each once, within the profile."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ from vla_zenoh.errors import CodecError
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.types import GripperCommand, Stamped
 
+OLDEST_NS = 1_000_000_000
+"""An order older than this is not carried out: who gave it may be gone, or have stopped the arm,
+while it waited on a link that hung or in a process that stood still."""
 MAX_SOURCES = 64
 """So many sources are remembered, the newest; each start of a command node is one."""
 
@@ -27,15 +30,20 @@ class GripperGuard:
         self._newest: dict[str, int] = {}
         self.bounded = 0
 
-    def take(self, order: Stamped[GripperCommand], writer: str) -> GripperCommand:
+    def take(
+        self, order: Stamped[GripperCommand], writer: str, now_ns: int, *, leads: bool
+    ) -> GripperCommand:
         """The order as it may be carried out.
 
         Args:
             order: what came.
             writer: source whose commands the arm follows, empty while it follows nobody's.
+            now_ns: wall clock, on which the order is stamped.
+            leads: that source carries out what it is told, see `ArmGuard.leads`.
 
         Raises:
-            CodecError: ``foreign`` (somebody else moves the arm) or ``replayed``.
+            CodecError: ``foreign`` (somebody else moves the arm), ``replayed``, ``stale``, or
+                ``outlived`` (who gave it was stopped meanwhile).
         """
         source, seq = order.header.source, order.header.seq
         if writer and source != writer:
@@ -47,6 +55,11 @@ class GripperGuard:
         self._newest[source] = seq
         if len(self._newest) > MAX_SOURCES:
             del self._newest[next(iter(self._newest))]
+        age_ns = now_ns - order.header.stamp_wall_ns
+        if age_ns > OLDEST_NS:
+            raise CodecError("stale", f"is {age_ns / 1e9:.1f} s old")
+        if writer and not leads:
+            raise CodecError("outlived", "came when who gave it had stopped")
         return self._within(order.record)
 
     def _within(self, asked: GripperCommand) -> GripperCommand:

@@ -180,6 +180,7 @@ class Lockstep:
             spec_sources={name: worker.source for name, worker in self.workers.items()},
             camera_ages_s=dict.fromkeys(self.profile.cameras, 0.0),
             camera_nodes=dict.fromkeys(self.profile.cameras, CAMERA),
+            beside=frozenset(self.alive),
         )
         inputs, self._inbox = self._inbox, Inputs([], [])
         out = self.commander.step(inputs, self.wall_ns(COMMAND))
@@ -301,7 +302,9 @@ class Lockstep:
 
     def _take_gripper_command(self, command: Stamped[GripperCommand]) -> None:
         try:
-            order = self._gripper_guard.take(command, self.guard.writer)
+            order = self._gripper_guard.take(
+                command, self.guard.writer, self.wall_ns(SIM), leads=self.guard.leads
+            )
         except CodecError as error:
             self.guard_refused[error.reason] += 1
             return

@@ -124,10 +124,10 @@ class ArmNode:
             if stop.is_set() and self._last_brake.over(tick.nominal_ns):
                 return
             self._read(tick.nominal_ns)
-            self._take_widths()
             away = "fault" if self._heard.fault else ""
             now_ns = self.node.clock.wall_at(tick.nominal_ns)
             self._lead.turn(now_ns, tick.nominal_ns, away=away, silent=self._heard.silent)
+            self._take_widths(now_ns)
             self._rate.tick()
             self._watch()
 
@@ -156,7 +156,9 @@ class ArmNode:
         self._file.move(command)
         self.node.counters["arm.commands_given"] += 1
 
-    def _take_widths(self) -> None:
+    def _take_widths(self, now_ns: int) -> None:
+        if self._lead.deaf:
+            return
         for arrival in self._orders.take_all():
             order = self.node.read(GripperCommand, arrival)
             if order is None:
@@ -166,7 +168,9 @@ class ArmNode:
                 self.node.refuse("no_gripper", why)
                 continue
             try:
-                command = self._gripper_guard.take(order, self._lead.writer)
+                command = self._gripper_guard.take(
+                    order, self._lead.writer, now_ns, leads=self._lead.leads
+                )
             except CodecError as error:
                 self.node.refuse(error.reason, f"command/gripper {error}")
                 continue

@@ -168,6 +168,11 @@ class Lead:
         self._deaf = True
 
     @property
+    def deaf(self) -> bool:
+        """It was deafened: what else belongs to the arm takes no more commands either."""
+        return self._deaf
+
+    @property
     def following(self) -> bool:
         """A command stream is being followed."""
         return self._guard is not None and self._guard.following
@@ -196,6 +201,11 @@ class Lead:
     def writer(self) -> str:
         """Source of the command stream that is followed, empty where none is."""
         return "" if self._guard is None else self._guard.writer
+
+    @property
+    def leads(self) -> bool:
+        """See `ArmGuard.leads`."""
+        return self._guard is not None and self._guard.leads
 
     @property
     def silences(self) -> int:

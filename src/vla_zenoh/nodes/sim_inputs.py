@@ -64,7 +64,7 @@ class SimInputs:
         for arrival in self._widths.take_all():
             width = self._node.read(GripperCommand, arrival)
             if width is not None:
-                self._take_width(width)
+                self._take_width(width, now_ns)
         for arrival in self._resets.take_all():
             seed = self._node.read_text(_seed_or_default, arrival)
             if seed is not None:
@@ -85,9 +85,13 @@ class SimInputs:
                 f"{mode}_{reason}", f"command/{mode} by {command.header.source[:60]!r}: {reason}"
             )
 
-    def _take_width(self, width: Stamped[GripperCommand]) -> None:
+    def _take_width(self, width: Stamped[GripperCommand], now_ns: int) -> None:
+        if self._lockstep:  # its clock is nobody else's: nothing has an age
+            now_ns = width.header.stamp_wall_ns
         try:
-            order = self._gripper_guard.take(width, self._guard.writer)
+            order = self._gripper_guard.take(
+                width, self._guard.writer, now_ns, leads=self._guard.leads
+            )
         except CodecError as error:
             self._node.refuse(error.reason, f"command/gripper {error}")
             return

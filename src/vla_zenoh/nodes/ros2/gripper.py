@@ -25,7 +25,7 @@ from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Gripper
 from vla_zenoh.types import Event, GripperCommand, Stamped
 
 GIVE_UP_S = 5.0
-"""A goal of which nothing is heard for so long is given up."""
+"""A goal is given up when nothing is heard of it for so long beyond what its fingers need."""
 ID_BYTES = 16
 
 
@@ -52,13 +52,14 @@ class Gripper:
         self._measured_m, self._sent_m = width, node.profile.robot.gripper.max_width_m
         self._orders = node.listen(node.keys.command_gripper, Inbox(16, SMALL_BYTES))
         self._guard = GripperGuard(node.profile.robot.gripper)
-        self._keeper = GoalKeeper(GIVE_UP_S)
+        self._keeper = GoalKeeper(GIVE_UP_S, node.profile.robot.gripper.max_width_m)
         self._news: deque[Callable[[], None]] = deque()
         self._goal_id = b""
         self._action = ""
         self._mono_ns = 0
+        self._led_by = ""
         self.wanted_m: float | None = None
-        self.holding = False
+        self._held = False
         self._callers: dict[str, dict[str, Caller]] = {}
         self._topic = None
         if profile is None:
@@ -75,20 +76,40 @@ class Gripper:
         """A goal is in flight."""
         return self._keeper.goal is not None
 
-    def turn(self, now_ns: int, writer: str) -> None:
+    @property
+    def holding(self) -> bool:
+        """Something is between the fingers.
+
+        A Franka's grasp succeeds where ``width - inner < d < width + outer`` holds for the distance
+        d of its fingers, and both tolerances are the whole stroke here, as nobody knows how thick
+        the object is: so it succeeds on nothing, and who holds something is told by d.
+
+        Source: documentation of franka_gripper, ``grasp``.
+        """
+        if self._action != GRASP or not self._held:
+            return self._held
+        at_m = self._measured_m()
+        dead_band_m = self._node.profile.robot.gripper.dead_band_m
+        return at_m is not None and at_m > self._sent_m + dead_band_m
+
+    def turn(self, now_ns: int, writer: str, *, leads: bool) -> None:
         """Take commands and answers, and do what is due.
 
         Args:
             now_ns: on the wall clock, for stamps.
             writer: source whose commands the arm follows, empty while it follows nobody's.
+            leads: that source carries out what it is told, see `ArmGuard.leads`.
         """
         self._mono_ns = time.monotonic_ns()
+        if self._led_by and not leads:
+            self._end_wish()
+        self._led_by = writer if leads else ""
         while self._news:
             self._news.popleft()()
         for arrival in self._orders.take_all():
             order = self._node.read(GripperCommand, arrival)
             if order is not None:
-                self._offer(order, now_ns, writer)
+                self._offer(order, now_ns, writer, leads=leads)
         step = self._keeper.step(self._mono_ns)
         self._node.counters["ros2.gripper_timeouts"] = self._keeper.timeouts
         goal = self._keeper.goal
@@ -97,9 +118,19 @@ class Gripper:
         elif step is Step.CANCEL and goal is not None:
             self._cancel()
 
-    def _offer(self, order: Stamped[GripperCommand], now_ns: int, writer: str) -> None:
+    def _end_wish(self) -> None:
+        """A stop, as any other end of a motion, ends what was asked for in it and not begun."""
+        wish = self._keeper.forget()
+        if wish is not None:
+            self.wanted_m = self._sent_m
+            why = f"to {wish.width_m:.3f} m waited when {self._led_by[:60]!r} stopped"
+            self._node.refuse("outlived", f"command/gripper {why}")
+
+    def _offer(
+        self, order: Stamped[GripperCommand], now_ns: int, writer: str, *, leads: bool
+    ) -> None:
         try:
-            command = self._guard.take(order, writer)
+            command = self._guard.take(order, writer, now_ns, leads=leads)
         except CodecError as error:
             self._node.refuse(error.reason, f"command/gripper {error}")
             return
@@ -128,7 +159,7 @@ class Gripper:
         self._sent_m = goal.command.width_m
         self._action = GRASP if use_grasp else self._profile.type
         self._goal_id = secrets.token_bytes(ID_BYTES)
-        self.holding = False
+        self._held = False
         request = gripper_actions.send_goal(
             self._messages,
             self._action,
@@ -138,7 +169,7 @@ class Gripper:
             max_width_m=self._node.profile.robot.gripper.max_width_m,
         )
         self._node.counters["ros2.gripper_goals"] += 1
-        self._call("send_goal", request, lambda answer: self._accepted(goal.number, answer))
+        self._call("send_goal", request, lambda answer: self._accepted(goal, answer))
 
     def _closes(self, width_m: float) -> bool:
         """Whether the fingers have to close for it; they are where they were sent last, at first
@@ -147,24 +178,34 @@ class Gripper:
         at_m = self._sent_m if measured_m is None else measured_m
         return width_m < at_m - self._node.profile.robot.gripper.dead_band_m
 
-    def _call(self, part: str, request: Any, done: Callable[[bytes | None], None]) -> None:
+    def _call(
+        self,
+        part: str,
+        request: Any,
+        done: Callable[[bytes | None], None],
+        wait_s: float | None = None,
+    ) -> None:
         # Answers come on Zenoh's thread; they are looked at in the next turn.
         self._callers[self._action][part].call(
-            self._messages.encode(request), lambda answer: self._news.append(lambda: done(answer))
+            self._messages.encode(request),
+            lambda answer: self._news.append(lambda: done(answer)),
+            wait_s,
         )
 
-    def _accepted(self, number: int, answer: bytes | None) -> None:
+    def _accepted(self, goal: Goal, answer: bytes | None) -> None:
         response = self._read(response_of(send_goal_of(self._action)), answer)
         if response is None or not response.accepted:
-            if self._keeper.ended(number):
+            if self._keeper.ended(goal.number):
                 self._complain("refused the goal" if response is not None else "does not answer")
             return
-        self._keeper.accepted(number, self._mono_ns)
+        self._keeper.accepted(goal.number, self._mono_ns)
         request = self._messages.new(
             request_of(get_result_of(self._action)),
             goal_id=gripper_actions.uuid(self._messages, self._goal_id),
         )
-        self._call("get_result", request, lambda answer: self._ended(number, answer))
+        # As long as the goal may take, and its end when it is cancelled then.
+        wait_s = self._keeper.travel_s(goal) + 2 * GIVE_UP_S
+        self._call("get_result", request, lambda answer: self._ended(goal.number, answer), wait_s)
 
     def _ended(self, number: int, answer: bytes | None) -> None:
         if not self._keeper.ended(number):
@@ -174,7 +215,7 @@ class Gripper:
             self._complain("does not say how the goal ended")
             return
         outcome = gripper_actions.outcome(self._action, response)
-        self.holding = outcome.holding
+        self._held = outcome.holding
         if not (outcome.reached or outcome.holding):
             self._complain(f"did not get there (status {response.status}) {outcome.said}")
 

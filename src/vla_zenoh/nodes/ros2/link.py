@@ -27,8 +27,6 @@ Done = Callable[[bytes | None], None]
 
 CALL_S = 5.0
 """Longest wait for a service to answer."""
-RESULT_S = 60.0
-"""Longest wait for an action to end."""
 
 _COMMANDS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
@@ -64,8 +62,14 @@ class Caller:
         self._session, self._key, self._gid, self._wait_s = session, key, gid, wait_s
         self._seq = itertools.count(1)
 
-    def call(self, request: bytes, done: Done) -> None:
-        """Ask; `done` is called once, on Zenoh's thread."""
+    def call(self, request: bytes, done: Done, wait_s: float | None = None) -> None:
+        """Ask; `done` is called once, on Zenoh's thread.
+
+        Args:
+            request: CDR bytes.
+            done: takes the answer, or None where none came in time.
+            wait_s: how long an answer is waited for; None: as long as the caller was made for.
+        """
         answers: list[bytes] = []
 
         def take(reply: zenoh.Reply) -> None:
@@ -82,7 +86,7 @@ class Caller:
             payload=request,
             encoding=_CDR,
             attachment=_attachment(self._gid, self._seq),
-            timeout=self._wait_s,
+            timeout=self._wait_s if wait_s is None else wait_s,
             target=zenoh.QueryTarget.BEST_MATCHING if self._gid is None else _ALL_COMPLETE,
         )
 
@@ -227,14 +231,11 @@ class Link:
         """Callers of an action's services: ``send_goal``, ``get_result``, ``cancel_goal``."""
         action = Endpoint(Role.ACTION_CLIENT, name, kind)
         parts = parts_of(action)
-        wait_s = {part: RESULT_S if part == "get_result" else CALL_S for part in parts}
         if self._rmw:  # there every part is announced, a bridge is told of the action
-            return {
-                part: self.call(end.name, end.type, wait_s[part]) for part, end in parts.items()
-            }
+            return {part: self.call(end.name, end.type, CALL_S) for part, end in parts.items()}
         self._declare(action)
         return {
-            part: Caller(self.session, self._wire.key(end), None, wait_s[part])
+            part: Caller(self.session, self._wire.key(end), None, CALL_S)
             for part, end in parts.items()
         }
 

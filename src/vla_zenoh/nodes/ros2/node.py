@@ -191,8 +191,9 @@ class Ros2Node:
             last = self._last_brake
             if stop.is_set() and (last is None or last.over(tick.nominal_ns)):
                 return
-            if self._gripper is not None and not stop.is_set():
-                self._gripper.turn(now_ns, "" if self._arm is None else self._arm.lead.writer)
+            if self._gripper is not None and self._arm is not None and not stop.is_set():
+                lead = self._arm.lead
+                self._gripper.turn(now_ns, lead.writer, leads=lead.leads)
             while self._news:
                 self._news.popleft()()
             self._rate.tick()
