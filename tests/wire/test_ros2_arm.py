@@ -3,172 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-import zenoh
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
-from ros2_peer import FINGERS, GOAL, Ros2Peer
-from ros2_rig import write_profile
+from ros2_turns import RAMP_S, SPEED_M_S, TICK_NS, TICK_S, Turns, ros2_turns
 
-from vla_zenoh.codec import header as header_codec
-from vla_zenoh.codec import records
 from vla_zenoh.control.arm_guard import UNHEEDED_NS
-from vla_zenoh.control.so3 import quat_from_rotation
-from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.nodes import slots
+from vla_zenoh.interop.arm_state import RESTARTED_NS
 from vla_zenoh.nodes.lead import STALLED_NS
-from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.ros2 import hearing
-from vla_zenoh.nodes.ros2.arm import Arm
-from vla_zenoh.nodes.ros2.link import Link
-from vla_zenoh.profile import load_profile
-from vla_zenoh.types import (
-    FloatArray,
-    GripperState,
-    Header,
-    JointCommand,
-    JointState,
-    PoseCommand,
-    PoseState,
-)
+from vla_zenoh.types import GripperState, JointCommand, JointState, PoseCommand, PoseState
 
-TICK_S, RAMP_S = 0.004, 0.1
-TICK_NS = 4_000_000
-SPEED_M_S = 0.2
 STEP_M = 2e-4
 SAG_RAD = 0.01
 SAME_M = 1e-6
 UNTURNED = np.array([0.0, 0.0, 0.0, 1.0])
-TOPIC = "/panda/panda_cartesian_impedance_controller/desired_pose"
-ALONE = """{
-  mode: "peer", scouting: {multicast: {enabled: false}}, listen: {endpoints: []}
-}"""
 JOINT_GOALS = """\
   joint_command: {topic: /goal, type: trajectory_msgs/msg/JointTrajectory}
 robot: {command: joint}
 """
-
-
-@dataclass
-class Turns:
-    """An arm, and what is heard of it: all within one process, at once."""
-
-    arm: Arm
-    node: Node
-    peer: Ros2Peer
-    session: zenoh.Session
-    goals: list[Any]
-    states: dict[type, list[Any]]
-    joints_rad: FloatArray = field(default_factory=lambda: HOME_RAD.copy())
-    mono_ns: int = 0
-    wall_ns: int = 10**18
-    seq: int = 0
-    moved_s: float = 0.0
-
-    def joint_states(self, velocity: float = 0.0) -> None:
-        fields: dict[str, Any] = {
-            "header": self.peer.header(self.wall_ns),
-            "name": [*ARM_JOINTS, *FINGERS],
-            "position": np.array([*self.joints_rad, 0.04, 0.04]),
-            "velocity": np.full(9, velocity),
-            "effort": np.zeros(9),
-        }
-        self.peer.put("/joint_states", self.peer.message("sensor_msgs/msg/JointState", **fields))
-
-    def turn(self, stall_s: float = 0.0, *, clock_s: float = 0.0) -> None:
-        self.mono_ns += TICK_NS
-        self.wall_ns += TICK_NS + round(clock_s * 1e9)
-        self.joint_states()
-        self.arm.turn(self.wall_ns, self.mono_ns, stall_s)
-
-    def sleep(self, duration_s: float) -> None:
-        for ns in ("mono_ns", "wall_ns"):
-            setattr(self, ns, getattr(self, ns) + round(duration_s * 1e9))
-
-    def put(self, record: Any, source: str = "command#1") -> None:
-        self.seq += 1
-        keys = self.node.keys
-        key = keys.command_joint if isinstance(record, JointCommand) else keys.command_pose
-        header = header_codec.encode(Header(self.wall_ns, self.seq, source))
-        self.session.put(key, records.encode(record), attachment=header)
-
-    def up(self, *, moves: bool = True) -> None:
-        """A command upwards from home, `moved_s` after it began at rest."""
-        self.moved_s += TICK_S * moves
-        ramp_s = min(self.moved_s, RAMP_S)
-        way_m = SPEED_M_S * (ramp_s * ramp_s / (2 * RAMP_S) + self.moved_s - ramp_s)
-        speed = SPEED_M_S * ramp_s / RAMP_S
-        home = panda().forward(HOME_RAD)
-        at_m, quat = home.position_m + (0.0, 0.0, way_m), quat_from_rotation(home.rotation)
-        change = SPEED_M_S / RAMP_S if self.moved_s < RAMP_S else 0.0
-        twist, acceleration = np.zeros(6), np.zeros(6)
-        twist[2], acceleration[2] = speed, change
-        self.put(PoseCommand(at_m, quat, twist, acceleration, at_m, quat, "active"))
-
-    def rise(self, duration_s: float = 0.4) -> None:
-        for _ in range(round(duration_s / TICK_S)):
-            self.up()
-            self.turn()
-        assert self.arm.detail()["following"]
-
-    @property
-    def heights_m(self) -> FloatArray:
-        return np.array([goal.pose.position.z for goal in self.goals])
-
-    def newest(self, kind: type) -> Any:
-        return self.states[kind][-1]
-
-    def refused(self, reason: str) -> int:
-        return self.node.counters[f"refused.{reason}"]
+BY_TF = "  tcp: tf\n"
 
 
 @pytest.fixture
 def turns(
     tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Turns]:
-    more = getattr(request, "param", "")
-    profile = load_profile(str(write_profile(tmp_path, more=more)))
-    assert profile.ros2 is not None
-    with zenoh.open(zenoh.Config.from_json5(ALONE)) as session:
-        node = Node("ros2", profile, session)
-        link = Link(session, profile.ros2, Messages("jazzy"), "vla_panda")
-        goals: list[Any] = []
-        peer = Ros2Peer(session)
-        peer.on(TOPIC, GOAL, goals.append)
-        peer.on("/goal", "trajectory_msgs/msg/JointTrajectory", goals.append)
-        arm = Arm(node, link, Messages("jazzy"), profile.ros2, lambda: (False, None, False))
-        states: dict[type, list[Any]] = {}
-        keys, subscribers = node.keys, []
-        for key, kind in (
-            (keys.state_joint, JointState),
-            (keys.state_pose, PoseState),
-            (keys.state_gripper, GripperState),
-        ):
-            heard = states.setdefault(kind, [])
-
-            def keep(sample: zenoh.Sample, kind: type = kind, heard: list[Any] = heard) -> None:
-                heard.append(records.decode(kind, sample.payload.to_bytes()))
-
-            handler = zenoh.handlers.Callback(keep, indirect=False)
-            subscribers.append(session.declare_subscriber(key, handler))
-        robot = Turns(arm, node, peer, session, goals, states, mono_ns=10**12)
-        clock = SimpleNamespace(monotonic_ns=lambda: robot.mono_ns)
-        for module in (slots, hearing):
-            monkeypatch.setattr(module, "time", clock)
-        robot.turn()
-        yield robot
-        peer.close()
-        link.close()
-        node.close()
-
-
-def steps_m(turns: Turns) -> FloatArray:
-    return np.diff(turns.heights_m)
+    with ros2_turns(tmp_path, monkeypatch, getattr(request, "param", "")) as turns:
+        yield turns
 
 
 # -- a loop that stands still -----------------------------------------------------------------
@@ -223,8 +86,8 @@ def test_a_late_turn_goes_on_from_what_was_sent_last(turns: Turns, stall_s: floa
     turns.turn(stall_s)
     turns.rise(0.6)
     assert turns.arm.lead.stalls == 0
-    assert steps_m(turns)[30:].min() > 0.5 * SPEED_M_S * TICK_S
-    assert np.abs(np.diff(steps_m(turns))).max() < STEP_M
+    assert turns.steps_m[30:].min() > 0.5 * SPEED_M_S * TICK_S
+    assert np.abs(np.diff(turns.steps_m)).max() < STEP_M
     home_m = panda().forward(HOME_RAD).position_m[2]
     asked_m = home_m + SPEED_M_S * (turns.moved_s + TICK_S - RAMP_S / 2)
     assert turns.heights_m[-1] == pytest.approx(asked_m, abs=STEP_M)
@@ -242,6 +105,37 @@ def test_a_wall_clock_that_is_set_silences_nobody(turns: Turns, step_s: float) -
     for _ in range(90):
         turns.turn()
     assert turns.arm.state == "braking", "and silence is noticed in time"
+
+
+def followed(turns: Turns, height_m: float) -> bool:
+    """The TCP is told to be where /tf says."""
+    since = len(turns.states[PoseState])
+    for _ in range(5):
+        turns.transform(height_m)
+        turns.turn()
+    told = turns.states[PoseState][since:]
+    return bool(told) and told[-1].position_m[2] == height_m
+
+
+@pytest.mark.parametrize("turns", [BY_TF], indirect=True)
+def test_a_robot_whose_clock_is_set_back_is_where_its_transforms_say(turns: Turns) -> None:
+    assert followed(turns, 0.25)
+    turns.wall_ns -= 3600 * 10**9
+    heard = len(turns.states[PoseState])
+    for _ in range(5):
+        turns.turn()
+    assert len(turns.states[PoseState]) == heard, "what is of another time is not told"
+    assert turns.refused("stale") > 0
+    assert "s ahead of the joints" in turns.told("stale")[0].why
+    assert followed(turns, 0.3)
+
+
+@pytest.mark.parametrize("turns", [BY_TF], indirect=True)
+def test_one_transform_from_the_future_does_not_stop_the_tcp(turns: Turns) -> None:
+    assert followed(turns, 0.25)
+    turns.transform(0.5, clock_s=2 * RESTARTED_NS / 1e9)
+    turns.turn()
+    assert followed(turns, 0.3)
 
 
 # -- what is taken ----------------------------------------------------------------------------

@@ -1,0 +1,187 @@
+"""The node ``ros2``, or its arm alone, turn by turn: in one process, at the time a test says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from panda_arm import ARM_JOINTS, HOME_RAD, panda
+from ros2_peer import FINGERS, GOAL, Ros2Peer
+from ros2_rig import write_profile
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
+from vla_zenoh.control.so3 import quat_from_rotation
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.nodes import slots
+from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.ros2 import hearing
+from vla_zenoh.nodes.ros2.arm import Arm
+from vla_zenoh.nodes.ros2.link import Link
+from vla_zenoh.nodes.ros2.node import Ros2Node
+from vla_zenoh.profile import load_profile
+from vla_zenoh.types import (
+    Event,
+    FloatArray,
+    GripperState,
+    Header,
+    JointCommand,
+    JointState,
+    PoseCommand,
+    PoseState,
+)
+
+TICK_S, RAMP_S = 0.004, 0.1
+TICK_NS = 4_000_000
+SPEED_M_S = 0.2
+TOPIC = "/panda/panda_cartesian_impedance_controller/desired_pose"
+ALONE = """{
+  mode: "peer", scouting: {multicast: {enabled: false}}, listen: {endpoints: []}
+}"""
+
+
+@dataclass
+class Turns:
+    """An arm, and what is heard of it: all within one process, at once."""
+
+    arm: Arm
+    node: Node
+    peer: Ros2Peer
+    session: zenoh.Session
+    goals: list[Any]
+    states: dict[type, list[Any]]
+    joints_rad: FloatArray = field(default_factory=lambda: HOME_RAD.copy())
+    mono_ns: int = 0
+    wall_ns: int = 10**18
+    seq: int = 0
+    moved_s: float = 0.0
+    whole: Ros2Node | None = None
+
+    def joint_states(self, velocity: float = 0.0) -> None:
+        fields: dict[str, Any] = {
+            "header": self.peer.header(self.wall_ns),
+            "name": [*ARM_JOINTS, *FINGERS],
+            "position": np.array([*self.joints_rad, 0.04, 0.04]),
+            "velocity": np.full(9, velocity),
+            "effort": np.zeros(9),
+        }
+        self.peer.put("/joint_states", self.peer.message("sensor_msgs/msg/JointState", **fields))
+
+    def turn(self, stall_s: float = 0.0, *, clock_s: float = 0.0) -> None:
+        self.mono_ns += TICK_NS
+        self.wall_ns += TICK_NS + round(clock_s * 1e9)
+        self.joint_states()
+        self.arm.turn(self.wall_ns, self.mono_ns, stall_s)
+
+    def sleep(self, duration_s: float) -> None:
+        for ns in ("mono_ns", "wall_ns"):
+            setattr(self, ns, getattr(self, ns) + round(duration_s * 1e9))
+
+    def put(self, record: Any, source: str = "command#1") -> None:
+        self.seq += 1
+        keys = self.node.keys
+        key = keys.command_joint if isinstance(record, JointCommand) else keys.command_pose
+        header = header_codec.encode(Header(self.wall_ns, self.seq, source))
+        self.session.put(key, records.encode(record), attachment=header)
+
+    def up(self, *, moves: bool = True) -> None:
+        """A command upwards from home, `moved_s` after it began at rest."""
+        self.moved_s += TICK_S * moves
+        ramp_s = min(self.moved_s, RAMP_S)
+        way_m = SPEED_M_S * (ramp_s * ramp_s / (2 * RAMP_S) + self.moved_s - ramp_s)
+        speed = SPEED_M_S * ramp_s / RAMP_S
+        home = panda().forward(HOME_RAD)
+        at_m, quat = home.position_m + (0.0, 0.0, way_m), quat_from_rotation(home.rotation)
+        change = SPEED_M_S / RAMP_S if self.moved_s < RAMP_S else 0.0
+        twist, acceleration = np.zeros(6), np.zeros(6)
+        twist[2], acceleration[2] = speed, change
+        self.put(PoseCommand(at_m, quat, twist, acceleration, at_m, quat, "active"))
+
+    def rise(self, duration_s: float = 0.4) -> None:
+        for _ in range(round(duration_s / TICK_S)):
+            self.up()
+            self.turn()
+        assert self.arm.detail()["following"]
+
+    def transform(self, height_m: float, *, clock_s: float = 0.0) -> None:
+        """On /tf: how high the TCP is above the base."""
+        shift = self.peer.message("geometry_msgs/msg/Vector3", z=height_m)
+        turn = self.peer.message("geometry_msgs/msg/Quaternion", w=1.0)
+        way = self.peer.message("geometry_msgs/msg/Transform", translation=shift, rotation=turn)
+        entry = self.peer.message(
+            "geometry_msgs/msg/TransformStamped",
+            header=self.peer.header(self.wall_ns + round(clock_s * 1e9), "panda_link0"),
+            child_frame_id="panda_hand_tcp",
+            transform=way,
+        )
+        self.peer.put("/tf", self.peer.message("tf2_msgs/msg/TFMessage", transforms=[entry]))
+
+    @property
+    def heights_m(self) -> FloatArray:
+        return np.array([goal.pose.position.z for goal in self.goals])
+
+    @property
+    def steps_m(self) -> FloatArray:
+        return np.diff(self.heights_m)
+
+    def told(self, what: str) -> list[Event]:
+        return [event for event in self.states[Event] if event.what == what]
+
+    def newest(self, kind: type) -> Any:
+        return self.states[kind][-1]
+
+    def refused(self, reason: str) -> int:
+        return self.node.counters[f"refused.{reason}"]
+
+
+@contextmanager
+def ros2_turns(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = "", *, whole: bool = False
+) -> Iterator[Turns]:
+    """`more` is YAML that goes on in the profile's section ros2; `whole`: with the node around."""
+    profile = load_profile(str(write_profile(folder, more=more)))
+    assert profile.ros2 is not None
+    with zenoh.open(zenoh.Config.from_json5(ALONE)) as session:
+        goals: list[Any] = []
+        peer = Ros2Peer(session)
+        peer.on(TOPIC, GOAL, goals.append)
+        peer.on("/goal", "trajectory_msgs/msg/JointTrajectory", goals.append)
+        ros2 = Ros2Node(profile, session) if whole else None
+        if ros2 is not None:
+            node, link, arm = ros2.node, ros2.link, ros2._arm
+            assert arm is not None
+        else:
+            node = Node("ros2", profile, session)
+            link = Link(session, profile.ros2, Messages("jazzy"), "vla_panda")
+            arm = Arm(node, link, Messages("jazzy"), profile.ros2, lambda: (False, None, False))
+        states: dict[type, list[Any]] = {}
+        keys, subscribers = node.keys, []
+        for key, kind in (
+            (keys.state_joint, JointState),
+            (keys.state_pose, PoseState),
+            (keys.state_gripper, GripperState),
+            (keys.event("ros2"), Event),
+        ):
+            heard = states.setdefault(kind, [])
+
+            def keep(sample: zenoh.Sample, kind: type = kind, heard: list[Any] = heard) -> None:
+                heard.append(records.decode(kind, sample.payload.to_bytes()))
+
+            handler = zenoh.handlers.Callback(keep, indirect=False)
+            subscribers.append(session.declare_subscriber(key, handler))
+        robot = Turns(arm, node, peer, session, goals, states, mono_ns=10**12, whole=ros2)
+        clock = SimpleNamespace(monotonic_ns=lambda: robot.mono_ns)
+        for module in (slots, hearing):
+            monkeypatch.setattr(module, "time", clock)
+        robot.turn()
+        yield robot
+        peer.close()
+        link.close()
+        node.close()
