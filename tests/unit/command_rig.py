@@ -70,6 +70,7 @@ class Rig:
             spec_sources={WORKER: SOURCE, OTHER: "worker-other-1"},
             camera_ages_s={"front": 0.0},
             camera_nodes={"front": "camera"},
+            beside=frozenset({"sim", "camera", f"worker-{WORKER}", f"worker-{OTHER}"}),
         )
         self.position_m, self.quat_xyzw = START_M.copy(), DOWN.copy()
         self.reference: PoseCommand | None = None

@@ -164,6 +164,7 @@ statuses = st.builds(
     maps(st.tuples(finite, finite)),
     maps(counts),
     details,
+    texts,
 )
 cameras = st.builds(
     CameraSpec,

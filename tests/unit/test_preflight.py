@@ -161,8 +161,10 @@ def test_when_all_is_well_there_is_no_reason() -> None:
         (r"the clock of node 'sim' is -0\.101 s off", clock("sim", Offset(-0.101, 0.3, 0.6))),
         (
             "the clock of node 'worker-scripted' on gpu is not known",
-            around(host="robot", hosts={"worker-scripted": "gpu"}),
+            around(hosts={"worker-scripted": "gpu"}, beside=frozenset({"sim", "camera"})),
         ),
+        # Whoever has not said yet where it is may be anywhere.
+        ("the clock of node 'sim' is not known", around(beside=frozenset())),
     ],
 )
 def test_each_thing_that_is_missing_is_a_reason(
@@ -176,6 +178,13 @@ def test_each_thing_that_is_missing_is_a_reason(
 def test_a_clock_that_is_reckoned_with_is_no_reason() -> None:
     ready = Ready()
     clock("camera", Offset(0.099, 0.3, 0.6))(ready)
+    assert ready.reasons() == []
+
+
+def test_a_clock_that_is_measured_need_not_be_our_own() -> None:
+    ready = Ready()
+    nodes = (*ready.around.beside, "camera")
+    around(beside=frozenset(), clocks=dict.fromkeys(nodes, Offset(0.0, 0.3, 0.6)))(ready)
     assert ready.reasons() == []
 
 

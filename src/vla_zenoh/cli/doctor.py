@@ -14,7 +14,6 @@ import zenoh
 from rich.table import Table
 
 from vla_zenoh.cli.options import (
-    HOST_VARIABLE,
     PROFILE_VARIABLE,
     AlsoOption,
     effective_profile,
@@ -24,6 +23,7 @@ from vla_zenoh.doctor import Finding, Needs, examine, needs_of
 from vla_zenoh.doctor.access import access
 from vla_zenoh.doctor.robot import robot
 from vla_zenoh.errors import SecurityError, SessionError
+from vla_zenoh.nodes.place import HOST_VARIABLE
 from vla_zenoh.nodes.rehearsal import Verdict, read_access, rehearse, try_identity
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile, SessionProfile

@@ -28,6 +28,8 @@ from vla_zenoh.types import NodeStatus
 HERE = "this computer"
 NOBODY = "-"
 POLL_S = 0.05
+SHOWN_OF_BOOT = 8
+"""Characters, which are drawn at random."""
 MAX_NUMBER = 40
 """Characters: anybody may say 1e308."""
 
@@ -121,10 +123,11 @@ def net(
 
 def _own(clocks: Clocks, statuses: Mapping[str, NodeStatus], links: tuple[str, ...]) -> list[Pair]:
     """Each host as seen from here."""
+    hosts = hosts_of(statuses)
     return [
         Pair(
             HERE,
-            statuses[node].host,
+            hosts[node],
             "net",
             node,
             round(found.round_trip_s * 1e3, 3),
@@ -135,6 +138,23 @@ def _own(clocks: Clocks, statuses: Mapping[str, NodeStatus], links: tuple[str, .
         for node, found in clocks.known().items()
         if node in statuses
     ]
+
+
+def hosts_of(statuses: Mapping[str, NodeStatus]) -> dict[str, str]:
+    """Node -> its host; where computers have the same name, with a piece of what tells them apart.
+
+    Whoever starts a node by hand need not say which host of the profile that is, and computers of a
+    laboratory are often copies of one, name included.
+    """
+    boots: dict[str, set[str]] = {}
+    for status in statuses.values():
+        boots.setdefault(status.host, set()).add(status.boot)
+    return {
+        name: status.host
+        if len(boots[status.host]) == 1
+        else f"{status.host} ({status.boot[:SHOWN_OF_BOOT] or 'unknown'})"
+        for name, status in statuses.items()
+    }
 
 
 def pairs_of(statuses: Mapping[str, NodeStatus], own: list[Pair]) -> list[Pair]:
@@ -150,20 +170,20 @@ def pairs_of(statuses: Mapping[str, NodeStatus], own: list[Pair]) -> list[Pair]:
 def _told(statuses: Mapping[str, NodeStatus]) -> list[Pair]:
     """What nodes say of nodes on other hosts."""
     out: list[Pair] = []
+    hosts = hosts_of(statuses)
     for name, status in statuses.items():
         for other, found in _map(status.detail.get("clocks")).items():
-            there = statuses.get(other)
             numbers = [
                 _number(_map(found).get(what))
                 for what in ("round_trip_ms", "offset_ms", "uncertainty_ms")
             ]
-            if there is not None and there.host != status.host and None not in numbers:
+            if hosts.get(other, hosts[name]) != hosts[name] and None not in numbers:
                 round_trip_ms, offset_ms, uncertainty_ms = (n or 0.0 for n in numbers)
                 links = _texts(_map(status.detail.get("net")).get("links"))
                 out.append(
                     Pair(
-                        status.host,
-                        there.host,
+                        hosts[name],
+                        hosts[other],
                         name,
                         other,
                         round_trip_ms,
@@ -177,6 +197,7 @@ def _told(statuses: Mapping[str, NodeStatus]) -> list[Pair]:
 
 def lines_of(statuses: Mapping[str, NodeStatus]) -> list[Line]:
     """What nodes say that they write, the most bytes first, and what was lost of who is silent."""
+    hosts = hosts_of(statuses)
     lost: dict[str, dict[str, int]] = {}
     for name, status in statuses.items():
         for key, count in _map(_map(status.detail.get("net")).get("lost")).items():
@@ -186,7 +207,7 @@ def lines_of(statuses: Mapping[str, NodeStatus]) -> list[Line]:
         for key, rates in _map(_map(status.detail.get("net")).get("sent")).items():
             if isinstance(rates, (list, tuple)) and len(rates) == 2:
                 rate_hz, bytes_s = (_number(rate) or 0.0 for rate in rates)
-                line = Line(key, name, status.host, rate_hz, bytes_s, lost.get(key, {}))
+                line = Line(key, name, hosts[name], rate_hz, bytes_s, lost.get(key, {}))
                 out.append(line)
     spoken = {line.key for line in out}
     out += [Line(key, NOBODY, NOBODY, 0.0, 0.0, lost[key]) for key in sorted(lost.keys() - spoken)]

@@ -6,11 +6,11 @@ from typing import Annotated, Any
 
 import typer
 
+from vla_zenoh.nodes.place import HOST_VARIABLE
 from vla_zenoh.profile import Profile, load_profile, override
 
 DEFAULT_PROFILE = "panda_sim"
 PROFILE_VARIABLE = "VLA_ZENOH_PROFILE"
-HOST_VARIABLE = "VLA_ZENOH_HOST"
 
 ProfileOption = Annotated[
     str,

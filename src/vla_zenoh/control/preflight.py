@@ -36,8 +36,8 @@ class Surroundings:
         worker_complaints: worker -> why it cannot infer, where it said so.
         camera_ages_s: camera -> age of its newest picture, as its node says.
         camera_nodes: camera -> the node that serves it.
-        host: the computer of the command node.
-        hosts: node -> its computer, as it says.
+        hosts: node -> where it runs, as it says.
+        beside: nodes that certainly run on the computer of the command node, and share its clock.
         clocks: node -> its clock minus that of the command node, where it was measured.
         holders: who is there to hold the arm active.
     """
@@ -49,8 +49,8 @@ class Surroundings:
     worker_complaints: Mapping[str, str] = field(default_factory=dict)
     camera_ages_s: Mapping[str, float] = field(default_factory=dict)
     camera_nodes: Mapping[str, str] = field(default_factory=dict)
-    host: str = ""
     hosts: Mapping[str, str] = field(default_factory=dict)
+    beside: frozenset[str] = frozenset()
     clocks: Mapping[str, Offset] = field(default_factory=dict)
     holders: frozenset[str] = frozenset()
 
@@ -231,7 +231,7 @@ def _cameras(profile: Profile, worker: str, around: Surroundings) -> list[str]:
 
 
 def _clocks(profile: Profile, worker: str, around: Surroundings) -> list[str]:
-    """Clocks that are off by more than can be reckoned with, or of other hosts and not known."""
+    """Clocks that are off by more than can be reckoned with, or not known and not our own."""
     spec = around.specs.get(worker)
     cameras = spec.observation.cameras if spec is not None else ()
     nodes = [around.robot_node, worker_node(worker)]
@@ -247,9 +247,9 @@ def _clocks(profile: Profile, worker: str, around: Surroundings) -> list[str]:
                 f"(+-{found.uncertainty_s:.4f} s), at most {bound_s:g} s is allowed "
                 "(timing.max_clock_offset_s); synchronise the clocks of both hosts (chrony or ptp)"
             )
-        elif found is None and around.hosts.get(node, around.host) != around.host:
+        elif found is None and node in around.alive - around.beside:
+            where = f" on {around.hosts[node]}" if node in around.hosts else ""
             reasons.append(
-                f"the clock of node {node!r} on {around.hosts[node]} is not known: it has not "
-                "answered yet"
+                f"the clock of node {node!r}{where} is not known: it has not answered yet"
             )
     return reasons

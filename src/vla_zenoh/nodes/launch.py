@@ -19,6 +19,7 @@ from vla_zenoh.errors import NodeError, ProfileError, SessionError
 from vla_zenoh.nodes.client import LEFT_OUT, Client
 from vla_zenoh.nodes.expiry import Expiry
 from vla_zenoh.nodes.hang import Said, hanging
+from vla_zenoh.nodes.place import HOST_VARIABLE, own_boot
 from vla_zenoh.nodes.session import open_session
 from vla_zenoh.nodes.supervisor import NodeCommand, Supervisor
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
@@ -175,6 +176,7 @@ class Host:
             log=log,
             tell=tell,
             folder=Path(self._folder.name),
+            variables={HOST_VARIABLE: self.host},
         )
         self._own_router = own_router
         self._expiry = Expiry(profile.session.security)
@@ -236,15 +238,20 @@ class Host:
         self.stop()
 
     def stop(self) -> None:
-        """Brake the arm, then end every node; within `STOP_BUDGET_S` in all."""
+        """Brake the arm, then end every node; within `STOP_BUDGET_S` in all.
+
+        An arm that needs no node of ours goes on: where a lab runs already, and all that was
+        started here was refused as there twice, it is none of our business.
+        """
         deadline_s = time.monotonic() + STOP_BUDGET_S
         # Where people may only look on, the arm brakes because the nodes of this host end.
         may = (
             self.profile.session.security is None
             or person(self.profile, self.host) is Role.OPERATOR
         )
-        if may and self.client is not None and "command" in self.client.alive:
-            self._brake(self.client)
+        client = self.client
+        if may and client is not None and "command" in client.alive and self._takes_part(client):
+            self._brake(client)
         if self.session is not None:
             self.session.close()
             self.session = self.client = None
@@ -253,6 +260,20 @@ class Host:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
+
+    def _takes_part(self, client: Client) -> bool:
+        """Whether a node that lives is one of ours, and not another one of its name."""
+        alive = client.alive
+        return any(
+            kind == "router"  # which starts where no other one answers, and may be silent: zenohd
+            or (
+                name in alive
+                and (status := client.status(name)) is not None
+                and status.boot == own_boot()
+                and self.supervisor.owns(name, status.pid)
+            )
+            for name, (kind, _) in self.supervisor.running().items()
+        )
 
     def _brake(self, client: Client) -> None:
         try:

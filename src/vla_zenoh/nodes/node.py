@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import secrets
-import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -22,6 +21,7 @@ from vla_zenoh.nodes.bounded import bytes_of, header_of
 from vla_zenoh.nodes.clock import Clock
 from vla_zenoh.nodes.news import News
 from vla_zenoh.nodes.offsets import Clocks
+from vla_zenoh.nodes.place import own_place
 from vla_zenoh.nodes.session import QOS, open_session
 from vla_zenoh.nodes.slots import Arrival, Inbox, Latest, Mailbox, Slot
 from vla_zenoh.nodes.speaker import Speaker
@@ -86,13 +86,17 @@ class Node:
         name: unique for this robot; a second node of the same name is refused.
         profile: the effective profile.
         session: an open session, closed by whoever opened it.
+        host: of the profile, on which this runs, where somebody said so.
 
     Raises:
         NodeError: a node of this name is alive already, or the router does not say.
     """
 
-    def __init__(self, name: str, profile: Profile, session: zenoh.Session) -> None:
+    def __init__(
+        self, name: str, profile: Profile, session: zenoh.Session, *, host: str | None = None
+    ) -> None:
         self.name, self.profile, self.session = name, profile, session
+        self.place = own_place(profile.session, host)
         self.keys = profile.keys
         self.clock = Clock()
         self.source = f"{name}#{secrets.token_hex(4)}"
@@ -185,7 +189,7 @@ class Node:
             NodeStatus(
                 self.name,
                 state,
-                socket.gethostname(),
+                self.place.host,
                 os.getpid(),
                 self.started_wall_ns,
                 ages_s or {},
@@ -193,6 +197,7 @@ class Node:
                 latency_ms or {},
                 dict(self.counters),
                 {**(detail or {}), "clocks": self._clocks_in_words(), "net": self._net()},
+                self.place.boot,
             )
         )
 

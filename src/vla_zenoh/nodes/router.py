@@ -53,7 +53,7 @@ def run_router(
     with open_session(
         profile.session, mode="router", connect=links, identity=name, access=access
     ) as session:
-        node = Node(name, profile, session)
+        node = Node(name, profile, session, host=host)
         detail: dict[str, Any] = {
             "listen": list(profile.session.listen),
             "security": security_of(profile),

@@ -79,7 +79,7 @@ class Seat:
         changed: threading.Condition,
     ) -> None:
         self.robot = profile.robot.name
-        node = self.node = Node(worker_node(name), profile, session)
+        node = self.node = Node(worker_node(name), profile, session, host=host)
         self.policy, self.name, self.spec = policy, name, policy.spec
         self.continuation = Continuation(policy)
         keys = node.keys

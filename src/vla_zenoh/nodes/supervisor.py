@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -67,6 +67,7 @@ class Supervisor:
         log: called with (node name, line) for every line a node writes.
         tell: called with (node name, sentence) for what the supervisor does.
         folder: where nodes may leave what one that is started again has to know.
+        variables: of the nodes' environment, beside ours.
     """
 
     def __init__(
@@ -76,8 +77,9 @@ class Supervisor:
         log: Callable[[str, str], None],
         tell: Callable[[str, str], None],
         folder: Path | None = None,
+        variables: Mapping[str, str] | None = None,
     ) -> None:
-        self._folder = folder
+        self._folder, self._variables = folder, dict(variables or {})
         self.children = [Child(command) for command in commands]
         self._log, self._tell = log, tell
         self.given_up: Child | None = None
@@ -156,6 +158,17 @@ class Supervisor:
             if child.command.name in pids
         }
 
+    def owns(self, name: str, pid: int) -> bool:
+        """Whether a process of this computer is that node as it was started here, and runs.
+
+        A model's own environment may stand between us and the process that speaks.
+        """
+        ours = self.pids().get(name)
+        try:
+            return ours is not None and os.getpgid(pid) == ours
+        except (ProcessLookupError, OverflowError):
+            return False
+
     def end(self, name: str, why: str) -> None:
         """End a node at once; `watch` starts it again."""
         for child in self.children:
@@ -164,7 +177,7 @@ class Supervisor:
                 _kill_group(child.process)
 
     def _spawn(self, child: Child) -> None:
-        environment = dict(os.environ)
+        environment = {**os.environ, **self._variables}
         environment[PARENT_VARIABLE] = str(os.getpid())
         environment["PYTHONUNBUFFERED"] = "1"
         # Zenoh colours its log also where it is read by us, and would look like a stranger's.

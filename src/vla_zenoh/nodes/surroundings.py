@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from typing import Any
@@ -12,6 +11,7 @@ from vla_zenoh.control.names import worker_node
 from vla_zenoh.control.preflight import Surroundings
 from vla_zenoh.errors import CodecError
 from vla_zenoh.nodes.node import Node
+from vla_zenoh.nodes.place import Place
 from vla_zenoh.nodes.slots import Arrival, Mailbox
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile.servers import camera_servers
@@ -38,7 +38,7 @@ class Neighbours:
         self._complaints: dict[str, str] = {}
         self._servers = camera_servers(node.profile)
         self._cameras: dict[str, tuple[float, int]] = {}
-        self._hosts: dict[str, str] = {}
+        self._places: dict[str, Place] = {}
         self._next_clocks_s = 0.0
         self._statuses = node.listen(node.keys.all_status, Mailbox(STATUSES_A_TICK))
         self._new_specs = node.listen(node.keys.all_specs, Mailbox(SPECS_A_TICK))
@@ -52,7 +52,7 @@ class Neighbours:
             self._changed = True
             if not alive:
                 self._voices.pop(name, None)
-                self._hosts.pop(name, None)
+                self._places.pop(name, None)
             if not alive and name.startswith("worker-"):
                 worker = name.removeprefix("worker-")
                 self._specs.pop(worker, None)
@@ -91,8 +91,12 @@ class Neighbours:
                     for camera, (age_s, heard_ns) in self._cameras.items()
                 },
                 {camera: self._servers[camera] for camera in self._cameras},
-                socket.gethostname(),
-                dict(self._hosts),
+                {name: place.host for name, place in self._places.items()},
+                frozenset(
+                    name
+                    for name, place in self._places.items()
+                    if place.shares_clock(self._node.place)
+                ),
                 self._node.clocks.known(),
                 frozenset(self._holders),
             )
@@ -173,7 +177,7 @@ class Neighbours:
             return key_names.last(key), None
 
     def _take_status(self, status: NodeStatus) -> None:
-        self._hosts[status.node] = status.host
+        self._places[status.node] = Place(status.host, status.boot)
         if status.node.startswith("worker-"):
             complaint = status.detail.get("complaint", "")
             worker = status.node.removeprefix("worker-")

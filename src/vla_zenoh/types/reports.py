@@ -29,7 +29,7 @@ class NodeStatus:
     Args:
         node: its name.
         state: one word.
-        host: where it runs.
+        host: where it runs: of the profile where it knows that, else the computer's own name.
         pid: process number.
         started_wall_ns: when it started; tells a restart.
         ages_s: age of the newest of every input.
@@ -38,6 +38,7 @@ class NodeStatus:
         counters: everything counted; refusals as ``refused.<reason>``.
         detail: whatever else a person wants to know: text, finite numbers, bools and None, in
             lists and maps that are not nested deep.
+        boot: start of the computer it runs on, which no other one has; empty where none is told.
     """
 
     node: str
@@ -50,9 +51,10 @@ class NodeStatus:
     latency_ms: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     counters: Mapping[str, int] = field(default_factory=dict)
     detail: Mapping[str, Any] = field(default_factory=dict)
+    boot: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("node", "state", "host"):
+        for name in ("node", "state", "host", "boot"):
             text(name, getattr(self, name), 256)
         set_field(self, "pid", integer("pid", self.pid))
         set_field(self, "started_wall_ns", integer("started_wall_ns", self.started_wall_ns))
