@@ -125,7 +125,7 @@ class Stage:
         self._measure_recovery(row, fault, recovered, since_s, stood_s)
         self._measure_goal(row, moving, finished)
         self._count(row, before, after)
-        self._tell(row, fault, finished, recovered, after["news"])
+        self._tell(row, finished, recovered, after["news"])
         judge(row, fault, finished, recovered)
         if missing := fault.missing(self):
             row.wrong.append(missing)
@@ -164,7 +164,6 @@ class Stage:
     def _tell(
         self,
         row: Row,
-        fault: Fault,
         finished: dict[str, Any],
         recovered: dict[str, Any],
         news: list[Any],
@@ -173,7 +172,7 @@ class Stage:
         if finished.get("done"):
             held = whats.count("active->holding")
             row.did = "went on to its goal" + (f", held {held} times on the way" if held else "")
-        elif row.stood_s is None and fault.seconds is not None and recovered.get("moves"):
+        elif row.stood_s is None and recovered.get("moves"):
             row.did = "went on"
         elif recovered.get("moves") and not row.activated:
             row.did = "stood, then went on by itself"
