@@ -28,7 +28,7 @@ class Groot(Adapter):
     Args:
         url: of the server, as tcp://HOST:PORT.
         version: n1.5 (flat names), n1.6 (nested ones; also N1.7).
-        preset: libero or bridge; see vla_zenoh/interop/presets.py.
+        preset: libero or bridge, see vla_zenoh/interop/presets.py; none: all is told.
         timeout_s: for connecting, and for each answer.
         api_token: where the server wants one.
         profile: of the robot, for its gripper.
@@ -41,7 +41,7 @@ class Groot(Adapter):
         self,
         url: str = f"tcp://127.0.0.1:{groot.PORT}",
         version: str = "n1.6",
-        preset: str = "libero",
+        preset: str = "",
         timeout_s: str = "2",
         api_token: str = "",
         profile: str = "panda_sim",

@@ -33,7 +33,7 @@ class OpenPi(Adapter):
 
     Args:
         url: of the server, as ws://HOST:PORT; wss:// likewise.
-        preset: libero, droid or own; see vla_zenoh/interop/presets.py.
+        preset: libero, droid or own, see vla_zenoh/interop/presets.py; none: all is told.
         timeout_s: for connecting, and for each answer.
         dialect: openpi, vllm (knows resets and sessions), auto: by the path of the URL.
         api_key: sent as ``Authorization: Api-Key``.
@@ -47,7 +47,7 @@ class OpenPi(Adapter):
     def __init__(
         self,
         url: str = f"ws://127.0.0.1:{openpi.PORT}",
-        preset: str = "libero",
+        preset: str = "",
         timeout_s: str = "2",
         dialect: str = "auto",
         api_key: str = "",

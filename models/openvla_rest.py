@@ -28,7 +28,7 @@ class OpenVlaRest(Adapter):
 
     Args:
         url: of the server, as http://HOST:PORT; https:// likewise; /act is added.
-        preset: bridge, libero or oft_libero; see vla_zenoh/interop/presets.py.
+        preset: bridge, libero or oft_libero, see vla_zenoh/interop/presets.py; none: all is told.
         unnorm_key: statistics the server unnormalises with, empty: its own choice.
         encoded: yes: JSON within JSON, for servers without json_numpy on the wire.
         timeout_s: for each question.
@@ -41,7 +41,7 @@ class OpenVlaRest(Adapter):
     def __init__(
         self,
         url: str = f"http://127.0.0.1:{openvla_rest.PORT}",
-        preset: str = "bridge",
+        preset: str = "",
         unnorm_key: str = "",
         encoded: str = "no",
         timeout_s: str = "2",

@@ -63,31 +63,35 @@ class Kind:
         return {"url": self.url.replace("PORT", str(port)), **self.options}
 
 
-_OPENPI = {**_PLAIN, **_SMALL, "map": _NO_WRIST["openpi"], "gripper_open": "high"}
-_GROOT = {**_PLAIN, **_SMALL, "map": _NO_WRIST["groot"]}
+_OPENPI = {
+    "preset": "libero",
+    **_PLAIN,
+    **_SMALL,
+    "map": _NO_WRIST["openpi"],
+    "gripper_open": "high",
+    "gripper_threshold": "0.5",
+}
+_GROOT = {"preset": "libero", **_PLAIN, **_SMALL, "map": _NO_WRIST["groot"]}
+_OPENVLA = {"preset": "bridge", **_SMALL, "horizon": "1"}
 KINDS: Mapping[str, Kind] = {
-    "openpi": Kind(
-        "openpi", "openpi_server.py", "ws://127.0.0.1:PORT", {**_OPENPI, "gripper_threshold": "0.5"}
-    ),
+    "openpi": Kind("openpi", "openpi_server.py", "ws://127.0.0.1:PORT", _OPENPI),
     "vllm": Kind(
         "openpi",
         "openpi_server.py",
         "ws://127.0.0.1:PORT/v1/realtime/robot/openpi",
-        {**_OPENPI, "gripper_threshold": "0.5"},
+        _OPENPI,
         "vllm",
     ),
     "groot": Kind("groot", "groot_server.py", "tcp://127.0.0.1:PORT", _GROOT),
     "groot_n15": Kind(
         "groot", "groot_server.py", "tcp://127.0.0.1:PORT", {**_GROOT, "version": "n1.5"}, "n1.5"
     ),
-    "openvla_rest": Kind(
-        "openvla_rest", "openvla_server.py", "http://127.0.0.1:PORT", {**_SMALL, "horizon": "1"}
-    ),
+    "openvla_rest": Kind("openvla_rest", "openvla_server.py", "http://127.0.0.1:PORT", _OPENVLA),
     "openvla_text": Kind(
         "openvla_rest",
         "openvla_server.py",
         "http://127.0.0.1:PORT/act",
-        {**_SMALL, "encoded": "yes"},
+        {**_OPENVLA, "encoded": "yes"},
         "text",
     ),
     "oft": Kind(

@@ -7,15 +7,24 @@ from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import WorkerError
+from vla_zenoh.interop.layout import Source
+from vla_zenoh.interop.options import read_map, read_size
 from vla_zenoh.model_options import read_json, whole_number
 from vla_zenoh.state_vector import read_state
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
 STATE, ACTION, PICTURE = "observation.state", "action", "observation.image"
+EMPTY = "observation.images.empty_camera_"
+"""Pictures of no camera, which LeRobot makes up itself."""
 MAX_STEPS = 1000
 WITHOUT_WORDS = frozenset({"act", "diffusion", "tdmpc", "vqbet"})
 """Policies that read no prompt."""
+GO_WITHOUT = frozenset({"pi0", "pi05", "smolvla", "xvla"})
+"""Policies that do without a picture that is not given."""
+OF_BASE = frozenset({"pi0", "pi05", "smolvla"})
+"""Fine-tuned, their config still has the pictures and the state of the published weights, whatever
+the data had; they bring pictures to their own size."""
 REMOTE_CODE = frozenset({"gaussian_actor", "groot", "pi0_fast"})
 """LeRobot runs code from a model hub for these."""
 
@@ -53,41 +62,75 @@ def features(folder: Path, config: Mapping[str, Any], name: str) -> dict[str, tu
 
 
 def pictures(
-    features: Mapping[str, tuple[int, ...]], told: str
+    features: Mapping[str, tuple[int, ...]], told: str, kind: str
 ) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Camera -> its feature and (C, H, W).
 
     Args:
         features: of the policy.
-        told: ``camera=feature,...`` where the camera is not called like the feature's last part.
+        told: ``feature=camera:NAME,...`` where the camera is not called like the feature's last
+            part; ``feature=`` leaves one out.
+        kind: of policy.
 
     Raises:
         WorkerError: names what does not fit.
+        SpecError: `told` cannot be read.
     """
-    wanted = {name: shape for name, shape in features.items() if name.startswith(PICTURE)}
-    pairs = [pair.partition("=")[::2] for pair in told.split(",") if pair]
-    named = {feature.strip(): camera.strip() for camera, feature in pairs}
+    wanted = {
+        name: shape
+        for name, shape in features.items()
+        if name.startswith(PICTURE) and not name.startswith(EMPTY)
+    }
+    named = read_map(told)
     strange = sorted(set(named) - set(wanted))
     if strange:
         raise WorkerError(
-            f"cameras names {strange[0]!r}, which the policy does not know; "
-            f"its pictures are: {', '.join(wanted) or 'none'} (cameras=CAMERA=FEATURE,...)"
+            f"map names {strange[0]!r}, which is no picture of the policy; "
+            f"its pictures are: {', '.join(wanted) or 'none'} (map=FEATURE=camera:NAME,...)"
         )
     out: dict[str, tuple[str, tuple[int, ...]]] = {}
     for feature, shape in wanted.items():
-        camera = named.get(feature, feature.rpartition(".")[2])
-        if camera in out:
-            raise WorkerError(f"two pictures of the policy are to come from camera {camera!r}")
+        source = named.get(feature, Source(camera=feature.rpartition(".")[2]))
+        if source is None:
+            if kind not in GO_WITHOUT:
+                raise WorkerError(f"map leaves out {feature}; a policy {kind!r} needs it")
+            continue
+        if not source.camera:
+            raise WorkerError(f"map: {feature} is a picture, so {feature}=camera:NAME")
+        if source.camera in out:
+            raise WorkerError(
+                f"two pictures of the policy are to come from camera {source.camera!r}"
+            )
         if len(shape) != 3 or shape[0] != 3:
             raise WorkerError(f"{feature} has shape {shape}; wanted three colours: (3, H, W)")
-        out[camera] = feature, shape
+        out[source.camera] = feature, shape
     return out
 
 
-def state_parts(features: Mapping[str, tuple[int, ...]], told: str, joints: int) -> tuple[str, ...]:
+def picture_size(told: str, shape: tuple[int, ...], kind: str) -> tuple[int, int] | None:
+    """Width and height a picture is given in; None: as the camera gives it.
+
+    Args:
+        told: WIDTHxHEIGHT, nothing, or ``auto``: that of the config, where that is the data's.
+        shape: (C, H, W) of the config.
+        kind: of policy.
+
+    Raises:
+        SpecError: `told` cannot be read.
+    """
+    if told != "auto":
+        return read_size(told)
+    return None if kind in OF_BASE else (shape[2], shape[1])
+
+
+def state_parts(
+    folder: Path, kind: str, features: Mapping[str, tuple[int, ...]], told: str, joints: int
+) -> tuple[str, ...]:
     """Parts that make ``observation.state``, in order, see `vla_zenoh.state_vector`.
 
     Args:
+        folder: of the policy.
+        kind: of policy.
         features: of the policy.
         told: the parts, joined by +.
         joints: how many the arm has.
@@ -102,7 +145,26 @@ def state_parts(features: Mapping[str, tuple[int, ...]], told: str, joints: int)
     shape = features.get(STATE, (0,))
     if len(shape) != 1:
         raise WorkerError(f"{STATE} has shape {shape}; wanted one row of numbers")
-    return read_state(told, shape[0], joints)
+    trained = _trained_state(folder) if kind in OF_BASE else None
+    return read_state(told, trained or shape[0], joints)
+
+
+def _trained_state(folder: Path) -> int | None:
+    """Numbers of the state in the statistics that it is scaled with; None: there are none."""
+    from safetensors import SafetensorError, safe_open
+
+    pipeline = folder / PIPELINES[0]
+    steps = read_json(pipeline).get("steps", []) if pipeline.is_file() else []
+    files = [folder / str(step["state_file"]) for step in steps if "state_file" in step]
+    for file in files:
+        try:
+            with safe_open(str(file), framework="np") as content:
+                for name in (f"{STATE}.{statistic}" for statistic in ("mean", "min", "q01")):
+                    if name in content.keys():  # noqa: SIM118  # it has no __contains__
+                        return content.get_slice(name).get_shape()[-1]
+        except (SafetensorError, OSError) as error:
+            raise WorkerError(f"{file} cannot be read: {str(error)[:200]}") from error
+    return None
 
 
 def one_by_one(config: Mapping[str, Any]) -> bool:
@@ -118,9 +180,9 @@ def horizon(config: Mapping[str, Any], told: str) -> int:
         SpecError: no whole number.
     """
     most = config.get("chunk_size", MAX_STEPS)
-    steps = whole_number("steps", told or str(config.get("n_action_steps", most)), least=1)
+    steps = whole_number("horizon", told or str(config.get("n_action_steps", most)), least=1)
     if steps > min(most, MAX_STEPS):
-        raise WorkerError(f"steps is {steps}; the policy's chunks have {most}")
+        raise WorkerError(f"horizon is {steps}; the policy's chunks have {most}")
     return steps
 
 

@@ -39,6 +39,8 @@ LATE_S = 0.6
 PATIENCE_S = 8.0
 BACK_OFF_S = 2.0
 UP_RAD = 0.03
+LIBERO = {"preset": "libero"}
+JOINTS = {"action": "joint_delta", "gripper": "none", "dt_s": "0.1"}
 ADAPTERS = ("openpi", "groot", "openvla_rest", "origami")
 
 
@@ -280,7 +282,7 @@ def test_an_answer_with_another_questions_number_is_refused() -> None:
         pytest.param("groot_n15", {"map": "state.x="}, "wants state x", marks=pytest.mark.slow),
         pytest.param(
             "origami",
-            {"action": "joint_delta"},
+            {"action": "joint_delta", "gripper": "none"},
             "action=joint_delta is set",
             marks=pytest.mark.slow,
         ),
@@ -305,14 +307,19 @@ def test_what_the_server_says_of_itself_is_held_against_the_options(
     ("name", "options", "named"),
     [
         ("openpi", {"url": "http://127.0.0.1:1"}, "ws://HOST:PORT"),
-        ("openpi", {"dialect": "latin"}, "auto, openpi, vllm"),
-        ("openpi", {"timeout_s": "0"}, "0.01 to 60"),
-        ("openpi", {"sise": "224x224"}, "no option 'sise'"),
-        ("groot", {"version": "n1"}, "n1.5, n1.6"),
-        ("groot", {"map": "image=camera:front"}, "must begin with 'video.'"),
-        ("groot", {"action": "joint_delta"}, "joints are not read"),
+        ("openpi", {}, "preset is '', allowed: libero, droid, own, none"),
+        ("groot", {}, "preset is '', allowed: libero, bridge, none"),
+        ("openvla_rest", {}, "preset is '', allowed: bridge, libero, oft_libero, none"),
+        ("openpi", {"preset": "none"}, "map is empty"),
+        ("openpi", {"preset": "none", "map": "a=prompt"}, r"--set action=\(delta or absolute"),
+        ("openpi", {**LIBERO, "dialect": "latin"}, "auto, openpi, vllm"),
+        ("openpi", {**LIBERO, "timeout_s": "0"}, "0.01 to 60"),
+        ("openpi", {**LIBERO, "sise": "224x224"}, "no option 'sise'"),
+        ("groot", {**LIBERO, "version": "n1"}, "n1.5, n1.6"),
+        ("groot", {**LIBERO, "map": "image=camera:front"}, "must begin with 'video.'"),
+        ("groot", {**LIBERO, **JOINTS}, "joints are not read"),
         ("openvla_rest", {"url": "ftp://x"}, "http://HOST:PORT"),
-        ("openvla_rest", {"encoded": "perhaps"}, "yes, no"),
+        ("openvla_rest", {**LIBERO, "encoded": "perhaps"}, "yes, no"),
         ("origami", {"session_id": ""}, "session_id is empty"),
     ],
 )
@@ -325,5 +332,7 @@ def test_an_option_that_cannot_be_is_refused_before_anything_runs(
 
 
 def test_a_servers_statistics_are_part_of_the_spec() -> None:
-    policy = make_policy(find_model("openvla_rest"), {"unnorm_key": "bridge_orig"})
+    policy = make_policy(
+        find_model("openvla_rest"), {"preset": "bridge", "unnorm_key": "bridge_orig"}
+    )
     assert policy.spec.action.normalisation == "bridge_orig"

@@ -7,12 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from vla_zenoh.errors import WorkerError
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.policy import Policy
 
+ATOL = 1e-12
 CONFIG: dict[str, Any] = {
     "type": "act",
     "n_obs_steps": 1,
@@ -25,30 +27,87 @@ CONFIG: dict[str, Any] = {
     },
     "output_features": {"action": {"type": "ACTION", "shape": [7]}},
 }
+WRIST = "observation.images.gripper_cam=camera:wrist"
 MEANING = {
-    "kind": "delta",
+    "action": "delta",
     "rotation": "rpy",
     "gripper": "open_fraction",
+    "gripper_open": "high",
     "dt_s": "0.05",
     "state": "joint+gripper_m",
-    "cameras": "wrist=observation.images.gripper_cam",
+    "map": WRIST,
 }
 
 
-def make(folder: Path, config: Mapping[str, Any] = CONFIG, **options: str) -> Policy:
+def make(folder: Path, config: Mapping[str, Any] = CONFIG, /, **options: str) -> Policy:
     (folder / "config.json").write_text(json.dumps(config))
     return make_policy(find_model("lerobot"), {"checkpoint": str(folder), **MEANING, **options})
 
 
 def test_the_spec_says_what_the_options_say(tmp_path: Path) -> None:
-    spec = make(tmp_path, frame="tcp", open_is_high="no", scale_m="0.001").spec
+    spec = make(tmp_path, frame="tcp", gripper_open="low").spec
     assert [camera.camera for camera in spec.observation.cameras] == ["front", "wrist"]
     assert {(c.width, c.height, c.resize) for c in spec.observation.cameras} == {(640, 480, "none")}
     assert spec.observation.state == ("joint", "gripper")
     assert not spec.observation.prompt
     assert (spec.action.horizon, spec.action.dt_s) == (50, 0.05)
     assert (spec.action.frame, spec.action.gripper_open_is_high) == ("tcp", False)
-    assert spec.action.position_scale_m == 0.001
+
+
+def test_numbers_are_read_in_the_units_and_bounds_that_are_told(tmp_path: Path) -> None:
+    """As LIBERO's: -1 to 1, of which one unit is 5 cm or half a radian, and 1 shuts the gripper."""
+    libero = {"rotation": "rotvec", "position_scale_m": "0.05", "rotation_scale_rad": "0.5"}
+    grip = {"gripper": "binary", "gripper_open": "low", "gripper_threshold": "0"}
+    policy = make(tmp_path, **libero, **grip, clip="1")
+    action = policy.spec.action
+    assert (action.gripper, action.gripper_open_is_high, action.gripper_threshold) == (
+        "binary",
+        False,
+        0.0,
+    )
+    steps = vars(policy)["_meaning"].steps(np.array([[1.0, -3.0, 0.5, 0.0, 0.2, 9.0, -1.0]]))
+    np.testing.assert_allclose(steps, [[0.05, -0.05, 0.025, 0, 0.1, 0.5, -1]], atol=ATOL)
+
+
+SMOLVLA: dict[str, Any] = {
+    "type": "smolvla",
+    "empty_cameras": 1,
+    "input_features": {
+        **{
+            f"observation.images.camera{n}": {"type": "VISUAL", "shape": [3, 256, 256]}
+            for n in (1, 2, 3)
+        },
+        "observation.images.empty_camera_0": {"type": "VISUAL", "shape": [3, 480, 640]},
+        "observation.state": {"type": "STATE", "shape": [6]},
+    },
+    "output_features": {"action": {"type": "ACTION", "shape": [7]}},
+}
+"""As after fine-tuning from the published weights: pictures and state of the config are theirs."""
+TWO = (
+    "observation.images.camera1=camera:front, observation.images.camera2=camera:wrist, "
+    "observation.images.camera3="
+)
+
+
+def test_a_fine_tuned_smolvla_is_given_what_its_data_had(tmp_path: Path) -> None:
+    numpy_file = pytest.importorskip("safetensors.numpy", reason="comes with LeRobot")
+    statistics = {"observation.state.mean": np.zeros(8), "observation.state.count": np.zeros(1)}
+    numpy_file.save_file(statistics, tmp_path / "scale.safetensors")
+    steps = [{"registry_name": "normalizer_processor", "state_file": "scale.safetensors"}]
+    (tmp_path / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}))
+    spec = make(tmp_path, SMOLVLA, map=TWO).spec
+    cameras = [(c.camera, c.width, c.resize) for c in spec.observation.cameras]
+    assert cameras == [("front", None, "none"), ("wrist", None, "none")]
+    assert spec.observation.state == ("joint", "gripper")
+    sized = make(tmp_path, SMOLVLA, map=TWO, size="256x256", resize="pad").spec.observation
+    assert {(c.width, c.height, c.resize) for c in sized.cameras} == {(256, 256, "pad")}
+    with pytest.raises(WorkerError, match="state has 8 numbers, 'joint' has 7"):
+        make(tmp_path, SMOLVLA, map=TWO, state="joint")
+
+
+def test_a_picture_that_lerobot_makes_up_is_asked_of_no_camera(tmp_path: Path) -> None:
+    spec = make(tmp_path, SMOLVLA, map="", state="x+y+z+rpy").spec
+    assert [c.camera for c in spec.observation.cameras] == ["camera1", "camera2", "camera3"]
 
 
 def test_a_policy_that_reads_words_asks_for_a_prompt(tmp_path: Path) -> None:
@@ -65,20 +124,25 @@ def test_a_policy_that_plans_by_itself_gives_one_step(
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"kind": ""}, r"kind is '', allowed: delta, absolute, joint_delta, joint_position"),
-        ({"rotation": "euler"}, r"rotation is 'euler', allowed: rpy, rotvec, quaternion"),
-        ({"gripper": ""}, r"gripper is '', allowed: .* open_fraction"),
+        ({"action": ""}, r"--set action=\(delta or absolute or joint_delta or joint_position\)"),
+        ({"kind": "delta"}, r"no option 'kind'; known: action, frame"),
+        ({"rotation": "euler"}, r"rotation is 'euler', allowed: rpy, rotvec, quat_xyzw, quat_wxyz"),
+        ({"gripper": ""}, r"--set gripper=\(none or .* open_fraction"),
+        ({"gripper_open": ""}, r"--set gripper_open=\(high or low"),
         ({"resize": "squash"}, r"resize is 'squash'"),
-        ({"dt_s": ""}, r"how long is a step"),
+        ({"size": "large"}, r"size is 'large', wanted WIDTHxHEIGHT"),
+        ({"dt_s": ""}, r"--set dt_s=\(seconds of a step, 1 / fps"),
         ({"dt_s": "fast"}, r"dt_s is 'fast'"),
         ({"state": ""}, r"state has 8 numbers, '' has 0"),
         ({"state": "joint"}, r"state has 8 numbers, 'joint' has 7"),
         ({"state": "joint+grip"}, r"called 'grip'; there are: joint \(one"),
-        ({"cameras": "wrist=observation.images.hand"}, r"which the policy does not know; its"),
-        ({"cameras": "front=observation.images.gripper_cam"}, r"two pictures .* 'front'"),
-        ({"steps": "101"}, r"steps is 101; the policy's chunks have 100"),
-        ({"steps": "many"}, r"steps is 'many'"),
-        ({"rotation": "quaternion"}, r"actions have shape \(7,\); .* are \(8,\)"),
+        ({"map": "observation.images.hand=camera:wrist"}, r"no picture of the policy; its"),
+        ({"map": "observation.images.gripper_cam=camera:front"}, r"two pictures .* 'front'"),
+        ({"map": f"{WRIST},observation.images.front="}, r"a policy 'act' needs it"),
+        ({"map": "observation.images.front=joint"}, r"front is a picture, so .*=camera:NAME"),
+        ({"horizon": "101"}, r"horizon is 101; the policy's chunks have 100"),
+        ({"horizon": "many"}, r"horizon is 'many'"),
+        ({"rotation": "quat_xyzw"}, r"actions have shape \(7,\); .* are \(8,\)"),
         ({"gripper": "none"}, r"actions have shape \(7,\); .* are \(6,\)"),
     ],
 )
@@ -89,12 +153,12 @@ def test_an_option_that_does_not_fit_is_named(
         make(tmp_path, **options)
 
 
-@pytest.mark.parametrize("kind", ["joint_position", "joint_delta"])
+@pytest.mark.parametrize("action", ["joint_position", "joint_delta"])
 def test_joint_actions_become_poses_by_the_joints_that_are_measured(
-    tmp_path: Path, kind: str
+    tmp_path: Path, action: str
 ) -> None:
     joints = {**CONFIG, "output_features": {"action": {"type": "ACTION", "shape": [8]}}}
-    spec = make(tmp_path, joints, kind=kind, rotation="").spec
+    spec = make(tmp_path, joints, action=action, rotation="").spec
     assert (spec.action.kind, spec.action.rotation) == ("absolute", "quaternion")
     assert spec.observation.state == ("joint", "gripper")
 
@@ -120,9 +184,9 @@ def test_an_arm_with_six_joints_has_a_state_of_six(tmp_path: Path) -> None:
 
 def test_joints_of_another_arm_are_refused_with_the_reason(tmp_path: Path) -> None:
     joints = {**CONFIG, "output_features": {"action": {"type": "ACTION", "shape": [14]}}}
-    with pytest.raises(WorkerError, match=r"7 joints with gripper 'open_fraction' are \(8,\)"):
-        make(tmp_path, joints, kind="joint_position")
-    with pytest.raises(WorkerError, match=r"position and rpy with gripper .* are \(7,\)"):
+    with pytest.raises(WorkerError, match=r"joints 7 \+ gripper 1 are \(8,\)"):
+        make(tmp_path, joints, action="joint_position")
+    with pytest.raises(WorkerError, match=r"position 3 \+ rpy 3 \+ gripper 1 are \(7,\)"):
         make(tmp_path, joints)
 
 

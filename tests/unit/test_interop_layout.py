@@ -10,7 +10,7 @@ import pytest
 
 from vla_zenoh.control.so3 import exp3, quat_from_rotation
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop import groot, openpi, origami
+from vla_zenoh.interop import groot, meaning, openpi, options, origami
 from vla_zenoh.interop.backoff import FIRST_S, LONGEST_S, Backoff
 from vla_zenoh.interop.joints import make_forward
 from vla_zenoh.interop.layout import Layout
@@ -21,6 +21,7 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState, JointState, PoseState
 
 WIDTH_M = 0.08
+ABSOLUTE = {"action": "absolute", "gripper": "binary", "gripper_open": "high", "dt_s": "0.1"}
 ATOL, ATOL_F32 = 1e-9, 1e-6
 ALL: dict[str, tuple[Presets, str]] = {
     f"{model}/{preset}": (presets, preset)
@@ -34,7 +35,7 @@ ALL: dict[str, tuple[Presets, str]] = {
 }
 
 
-def layout(presets: Presets = OPENPI, preset: str = "libero", **options: str) -> Layout:
+def layout(presets: Presets = OPENPI, /, preset: str = "libero", **options: str) -> Layout:
     return read_layout("x", presets, preset, options, max_width_m=WIDTH_M)
 
 
@@ -150,7 +151,7 @@ def test_origami_takes_the_columns_of_one_arm() -> None:
 
 
 def test_a_quaternion_may_begin_with_w() -> None:
-    of = layout(action="absolute", rotation="quat_wxyz", clip="", position_scale_m="1")
+    of = layout(**ABSOLUTE, rotation="quat_wxyz")
     answer = np.array([[0.4, 0, 0.3, 2**-0.5, 2**-0.5, 0, 0, 1]])
     steps = of.steps(answer, seen(of))
     np.testing.assert_allclose(steps, [[0.4, 0, 0.3, 2**-0.5, 0, 0, 2**-0.5, 1]], atol=ATOL)
@@ -208,7 +209,7 @@ def test_an_answer_of_another_form_is_refused_by_name(answer: Any, why: str) -> 
         ({"horizon": "1.5"}, "whole number"),
         ({"position_scale_m": "-1"}, "from 0 up"),
         ({"frame": "camera"}, "frame"),
-        ({"action": "absolute", "frame": "tcp"}, "base frame"),
+        ({**ABSOLUTE, "rotation": "rpy", "frame": "tcp"}, "base frame"),
         ({"columns": "7:0"}, "wanted 0:7"),
         ({"keys": "x,,y"}, "keys"),
     ],
@@ -220,8 +221,59 @@ def test_an_option_that_cannot_be_is_refused_and_says_what_can(
         layout(**options)
 
 
+MINE = {
+    "map": "image=camera:front, state=joint+gripper_open, prompt=prompt",
+    "action": "joint_position",
+    "gripper": "open_fraction",
+    "gripper_open": "high",
+    "dt_s": "0.05",
+    "horizon": "10",
+}
+"""A server of one's own: absolute joints, and a gripper from 0 to 1."""
+
+
+def test_a_server_of_ones_own_is_told_with_every_option_and_no_name_of_a_preset() -> None:
+    of = layout(preset="none", **MINE)
+    assert set(of.fields) == {"image", "state", "prompt"}
+    observation, forward = seen(of), make_forward(load_profile("panda_sim"))
+    assert observation.joint is not None
+    home_rad = observation.joint.position_rad
+    steps = of.steps({"actions": np.array([[*home_rad, 0.25]])}, observation, forward)
+    pose = forward(observation.joint, home_rad[None])[0]
+    np.testing.assert_allclose(steps, [[*pose, 0.25]], atol=ATOL)
+
+
+@pytest.mark.parametrize("name", ["action", "gripper", "gripper_open", "dt_s", "horizon"])
+def test_of_a_server_of_ones_own_no_meaning_is_guessed(name: str) -> None:
+    with pytest.raises(SpecError, match=rf"nobody says what the numbers mean: --set {name}=\("):
+        layout(preset="none", **{k: v for k, v in MINE.items() if k != name})
+    with pytest.raises(SpecError, match=r"--set rotation=\(rpy or rotvec"):
+        layout(preset="none", **{**MINE, "action": "delta"})
+
+
+def test_another_action_than_the_presets_keeps_nothing_of_what_it_says_of_numbers() -> None:
+    told = {"gripper": "none", "dt_s": "0.1"}
+    observed = seen(layout(preset="droid"))
+    assert observed.joint is not None
+    home_rad, forward = observed.joint.position_rad, make_forward(load_profile("panda_sim"))
+    wanted = forward(observed.joint, home_rad[None])
+    for preset in ("libero", "droid"):  # LIBERO's clip, DROID's 0.2 rad to the unit
+        of = layout(preset=preset, action="joint_position", **told)
+        steps = of.steps(home_rad[None].astype(float), observed, forward)
+        np.testing.assert_allclose(steps, wanted, atol=ATOL)
+    of = layout(action="absolute", rotation="rpy", **told)
+    steps = of.steps(np.array([[0.5, 0, 0.3, 0, 0, 2.0]]), seen(of))
+    np.testing.assert_allclose(steps, [[0.5, 0, 0.3, 0, 0, 2.0]], atol=ATOL)
+    with pytest.raises(SpecError, match="joint_position is not that of preset droid, so nobody"):
+        layout(preset="droid", action="joint_position")
+
+
+def test_the_action_that_the_preset_has_anyway_changes_nothing() -> None:
+    assert layout(action="delta") == layout()
+
+
 def test_an_unknown_preset_is_refused_with_those_there_are() -> None:
-    with pytest.raises(SpecError, match="no preset 'bridge'; known: libero, droid, own"):
+    with pytest.raises(SpecError, match="preset is 'bridge', allowed: libero, droid, own, none"):
         layout(preset="bridge")
 
 
@@ -238,9 +290,8 @@ def test_columns() -> None:
 
 
 def test_the_spec_of_every_option_has_its_default_documented() -> None:
-    import vla_zenoh.interop.options as module
-
-    assert all(name in (module.__doc__ or "") for name in DEFAULTS)
+    told = f"{options.__doc__}{meaning.__doc__}"
+    assert all(name in told for name in DEFAULTS)
 
 
 # -- what servers say of themselves ---------------------------------------------------------------

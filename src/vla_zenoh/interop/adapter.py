@@ -73,7 +73,7 @@ class Adapter(ABC):
             max_width_m=self._profile.robot.gripper.max_width_m,
             normalisation=normalisation,
         )
-        if self.layout.needs_joints and not self.joints:
+        if self.layout.meaning.needs_joints and not self.joints:
             raise SpecError("action: joints are not read by this adapter; use delta or absolute")
         self.spec: ModelSpec = self.layout.spec
         self._forward: Forward | None = None
@@ -112,7 +112,7 @@ class Adapter(ABC):
     # -- what a worker asks -------------------------------------------------------------------
     def load(self) -> None:
         """Kinematics, where they are needed; the server is asked with the first observation."""
-        if self.layout.needs_joints:
+        if self.layout.meaning.needs_joints:
             self._forward = make_forward(self._profile)
 
     def reset(self) -> None:

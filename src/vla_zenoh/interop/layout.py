@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import PeerError
-from vla_zenoh.interop.joints import Forward, poses_of
+from vla_zenoh.errors import PeerError, SpecError
+from vla_zenoh.interop.joints import Forward
+from vla_zenoh.interop.meaning import Meaning
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
 from vla_zenoh.state_vector import state_vector
 from vla_zenoh.types import shown
-
-Action = Literal["delta", "absolute", "joint_delta", "joint_position"]
-TheirRotation = Literal["rpy", "rotvec", "quat_xyzw", "quat_wxyz"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +43,7 @@ class Layout:
         spec: what our side is told.
         keys: names in the answer.
         columns: of the answer, None: all.
-        action: what the arm's numbers are.
-        rotation: in which form the answer has it.
-        clip: bound of the arm's raw numbers.
-        scales: (position, rotation, joint) one unit in m, rad, rad.
+        meaning: of its numbers.
         max_width_m: of our gripper.
     """
 
@@ -56,26 +51,15 @@ class Layout:
     spec: ModelSpec
     keys: tuple[str, ...]
     columns: tuple[int, ...] | None
-    action: Action
-    rotation: TheirRotation
-    clip: float
-    scales: tuple[float, float, float]
+    meaning: Meaning
     max_width_m: float
-
-    @property
-    def needs_joints(self) -> bool:
-        """Its answers are joints, so forward kinematics are needed."""
-        return self.action in ("joint_delta", "joint_position")
 
     @property
     def width(self) -> int | None:
         """Columns of an answer, None where only the arm knows how many joints it has."""
         if self.columns is not None:
             return len(self.columns)
-        if self.needs_joints:
-            return None
-        turns = 4 if self.rotation.startswith("quat") else 3
-        return 3 + turns + (self.spec.action.gripper != "none")
+        return None if self.meaning.needs_joints else sum(self.meaning.parts(0).values())
 
     # -- out ----------------------------------------------------------------------------------
     def request(self, observation: Observation) -> dict[str, Any]:
@@ -148,51 +132,11 @@ class Layout:
             PeerError: see `gather`; also another number of columns.
         """
         rows = self.gather(answer)
-        grips = int(self.spec.action.gripper != "none")
-        arm, gripper = rows[:, : rows.shape[1] - grips], rows[:, rows.shape[1] - grips :]
-        if self.clip:
-            arm = arm.clip(-self.clip, self.clip)
-        arm = (
-            self._by_joints(arm, observation, forward)
-            if self.needs_joints
-            else self._by_pose(arm, rows.shape[1])
-        )
-        return np.concatenate([arm, gripper], axis=1)
-
-    def _by_pose(self, arm: NDArray[np.float64], columns: int) -> NDArray[np.float64]:
-        turns = 4 if self.rotation.startswith("quat") else 3
-        if arm.shape[1] != 3 + turns:
-            grip = "" if self.spec.action.gripper == "none" else " + gripper 1"
-            raise PeerError(
-                "peer_reply",
-                f"the answer has {columns} columns, wanted {self.spec.action.dimension}: "
-                f"position 3 + {self.rotation} {turns}{grip}; choose them with columns=",
-            )
-        position, rotation = arm[:, :3] * self.scales[0], arm[:, 3:]
-        if turns == 3:
-            rotation = rotation * self.scales[1]
-        else:
-            norm = np.linalg.norm(rotation, axis=1, keepdims=True)
-            if (abs(norm - 1.0) > 0.1).any():
-                raise PeerError("peer_reply", f"a quaternion of norm {norm.min():.3g}; wanted 1")
-            rotation = np.roll(rotation / norm, 0 if self.rotation == "quat_xyzw" else -1, axis=1)
-        return np.concatenate([position, rotation], axis=1)
-
-    def _by_joints(
-        self, arm: NDArray[np.float64], observation: Observation, forward: Forward | None
-    ) -> NDArray[np.float64]:
-        measured = observation.joint
-        assert measured is not None
-        assert forward is not None
-        if arm.shape[1] != len(measured.names):
-            raise PeerError(
-                "peer_reply",
-                f"the answer has {arm.shape[1]} joints, the arm has {len(measured.names)}; "
-                "choose them with columns=",
-            )
-        return poses_of(
-            arm * self.scales[2], measured, forward, deltas=self.action == "joint_delta"
-        )
+        try:
+            return self.meaning.steps(rows, observation.joint, forward)
+        except SpecError as error:
+            hint = "; choose them with columns=" if error.reason == "shape" else ""
+            raise PeerError("peer_reply", f"{error}{hint}") from error
 
 
 def _matrix(name: str, value: Any, named: bool) -> NDArray[np.float64]:

@@ -104,8 +104,8 @@ def mismatches(metadata: Mapping[str, Any], layout: Layout) -> list[str]:
         elif layout.columns is None and wanted is not None and dim != wanted:
             out.append(f"it gives {dim} columns, {wanted} are wanted (columns=)")
     space = metadata.get("action_space")
-    if isinstance(space, str) and space.startswith("joint") is not layout.needs_joints:
-        out.append(f"its action_space is {space}, action={layout.action} is set")
+    if isinstance(space, str) and space.startswith("joint") is not layout.meaning.needs_joints:
+        out.append(f"its action_space is {space}, action={layout.meaning.action} is set")
     size = metadata.get("image_resolution")
     if isinstance(size, list) and len(size) == 2:
         for camera in layout.spec.observation.cameras:

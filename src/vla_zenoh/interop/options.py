@@ -1,7 +1,7 @@
 """The options that make a `Layout`.
 
 Everything is given as text options (``--set name=value``), and a preset is no more than such
-options for a known robot, each of which can be overridden::
+options for a known robot, each of which can be overridden; the preset ``none`` has none::
 
     map        observation/image=camera:front, observation/state=position+rotvec+fingers_m,
                prompt=prompt; also NAME=blank:HxW (black), NAME= (leave it out of the preset)
@@ -10,43 +10,21 @@ options for a known robot, each of which can be overridden::
     colour     rgb, bgr
     keys       names in the answer, stood side by side (groot: x,y,z,...)
     columns    which of its columns, as 0:7 or 0,1,2,6
-    action     delta, absolute (of the TCP); joint_delta, joint_position (become absolute poses
-               by the arm's forward kinematics)
-    frame      base, tcp
-    rotation   rpy, rotvec, quat_xyzw, quat_wxyz
-    clip       numbers of the arm are clipped to [-clip, clip] first; empty: not
-    position_scale_m, rotation_scale_rad, joint_scale_rad   one unit of the answer
-    gripper    none, delta_m, absolute_m, open_fraction, binary
-    gripper_open       high, low: which end of binary and open_fraction is open
-    gripper_threshold  of binary
-    dt_s       duration of a step
-    horizon    steps taken from an answer, at most
+
+and what the numbers of an answer mean, see `vla_zenoh.interop.meaning`.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
-from typing import Literal, cast, get_args
-
-from pydantic import ValidationError
+from typing import Literal, cast
 
 from vla_zenoh.errors import SpecError
-from vla_zenoh.faults import in_words
-from vla_zenoh.interop.layout import Action, Layout, Source, TheirRotation
-from vla_zenoh.model_options import number, one_of, whole_number
-from vla_zenoh.policy import (
-    ActionSpec,
-    CameraSpec,
-    Frame,
-    GripperMeaning,
-    ModelSpec,
-    ObservationSpec,
-    Resize,
-    Rotation,
-    StatePart,
-)
+from vla_zenoh.interop.layout import Layout, Source
+from vla_zenoh.interop.meaning import MEANING, as_spec_error, read_meaning
+from vla_zenoh.model_options import number
+from vla_zenoh.policy import CameraSpec, ModelSpec, ObservationSpec, Resize, StatePart
 from vla_zenoh.state_vector import parts_of, read_parts
 
 DEFAULTS: Mapping[str, str] = {
@@ -56,23 +34,13 @@ DEFAULTS: Mapping[str, str] = {
     "colour": "rgb",
     "keys": "actions",
     "columns": "",
-    "action": "delta",
-    "frame": "base",
-    "rotation": "rpy",
-    "clip": "",
-    "position_scale_m": "1",
-    "rotation_scale_rad": "1",
-    "joint_scale_rad": "1",
-    "gripper": "binary",
-    "gripper_open": "high",
-    "gripper_threshold": "0.5",
-    "dt_s": "0.1",
-    "horizon": "1",
+    **MEANING,
 }
+NONE = "none"
+"""The preset that says nothing."""
 _SIZE = re.compile(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})")
 _SLICE = re.compile(r"([0-9]{1,4}):([0-9]{1,4})")
 MAX_KEYS = 256
-OPEN = ("high", "low")
 
 
 def read_layout(
@@ -97,8 +65,12 @@ def read_layout(
     Raises:
         SpecError: an option is not known or cannot be read; names what is allowed.
     """
+    presets = {**presets, NONE: {}}
     if preset not in presets:
-        raise SpecError(f"no preset {preset!r}; known: {', '.join(presets)}")
+        raise SpecError(
+            f"preset is {preset!r}, allowed: {', '.join(presets)} (--set preset=...); "
+            f"{NONE}: of a server of your own, every option is told"
+        )
     unknown = [option for option in options if option not in DEFAULTS]
     if unknown:
         raise SpecError(f"no option {', '.join(map(repr, unknown))}; known: {', '.join(DEFAULTS)}")
@@ -107,46 +79,17 @@ def read_layout(
     fields = {theirs: source for theirs, source in entries.items() if source is not None}
     if not fields:
         raise SpecError("map is empty: say which of the server's names is filled with what")
-    action = one_of("action", chosen["action"], get_args(Action))
-    rotation = one_of("rotation", chosen["rotation"], get_args(TheirRotation))
-    joints = action.startswith("joint")
-    try:
-        spec = ModelSpec(
-            name=name,
-            observation=_observation(fields, chosen, joints),
-            action=ActionSpec(
-                horizon=whole_number("horizon", chosen["horizon"]),
-                dt_s=number("dt_s", chosen["dt_s"]),
-                kind="delta" if action == "delta" else "absolute",
-                frame=cast(Frame, "base" if joints else chosen["frame"]),
-                rotation=_our_rotation(rotation, joints),
-                gripper=cast(GripperMeaning, chosen["gripper"]),
-                gripper_open_is_high=one_of("gripper_open", chosen["gripper_open"], OPEN) == "high",
-                gripper_threshold=number(
-                    "gripper_threshold", chosen["gripper_threshold"], least=-math.inf
-                ),
-                normalisation=normalisation,
-            ),
-        )
-    except ValidationError as error:
-        faults = "; ".join(
-            f"{'.'.join(map(str, fault['loc'])) or 'options'}: {in_words(fault)}"
-            for fault in error.errors(include_url=False)
-        )
-        raise SpecError(f"the options give no valid spec: {faults}") from error
+    told = {name: value for name, value in options.items() if name in MEANING}
+    whose = f"preset {preset}"
+    meaning = read_meaning(told, presets[preset], whose, normalisation=normalisation)
+    with as_spec_error():
+        observation = _observation(fields, chosen, meaning.needs_joints)
     return Layout(
         fields=fields,
-        spec=spec,
+        spec=ModelSpec(name=name, observation=observation, action=meaning.spec),
         keys=_keys(chosen["keys"]),
         columns=read_columns(chosen["columns"]),
-        action=cast(Action, action),
-        rotation=cast(TheirRotation, rotation),
-        clip=number("clip", chosen["clip"] or "0"),
-        scales=(
-            number("position_scale_m", chosen["position_scale_m"]),
-            number("rotation_scale_rad", chosen["rotation_scale_rad"]),
-            number("joint_scale_rad", chosen["joint_scale_rad"]),
-        ),
+        meaning=meaning,
         max_width_m=max_width_m,
     )
 
@@ -154,9 +97,7 @@ def read_layout(
 def _observation(
     fields: Mapping[str, Source], chosen: Mapping[str, str], joints: bool
 ) -> ObservationSpec:
-    size = _SIZE.fullmatch(chosen["size"])
-    if chosen["size"] and size is None:
-        raise SpecError(f"size is {chosen['size']!r}, wanted WIDTHxHEIGHT, or nothing")
+    size = read_size(chosen["size"])
     parts = {part for source in fields.values() for part in parts_of(source.parts)}
     parts |= {"joint"} if joints else set()
     order: tuple[StatePart, ...] = ("joint", "pose", "gripper")
@@ -165,8 +106,8 @@ def _observation(
         cameras=tuple(
             CameraSpec(
                 camera=camera,
-                width=int(size[1]) if size else None,
-                height=int(size[2]) if size else None,
+                width=size[0] if size else None,
+                height=size[1] if size else None,
                 resize=cast(Resize, chosen["resize"] if size else "none"),
                 colour=cast(Literal["rgb", "bgr"], chosen["colour"]),
             )
@@ -175,10 +116,6 @@ def _observation(
         state=tuple(part for part in order if part in parts),
         prompt=any(source.prompt for source in fields.values()),
     )
-
-
-def _our_rotation(theirs: str, joints: bool) -> Rotation:
-    return "quaternion" if joints or theirs.startswith("quat") else cast(Rotation, theirs)
 
 
 def read_timeout(text: str) -> float:
@@ -198,6 +135,18 @@ def _keys(text: str) -> tuple[str, ...]:
     if not all(keys) or len(set(keys)) != len(keys) or len(keys) > MAX_KEYS:
         raise SpecError(f"keys is {text!r}, wanted different names with a comma between them")
     return keys
+
+
+def read_size(text: str) -> tuple[int, int] | None:
+    """Width and height of the option `size`; None: as the camera gives it.
+
+    Raises:
+        SpecError: it is neither 224x224 nor empty.
+    """
+    size = _SIZE.fullmatch(text)
+    if text and size is None:
+        raise SpecError(f"size is {text!r}, wanted WIDTHxHEIGHT, or nothing")
+    return (int(size[1]), int(size[2])) if size else None
 
 
 def read_columns(text: str) -> tuple[int, ...] | None:

@@ -81,10 +81,10 @@ def mismatches(metadata: Any, layout: Layout) -> list[str]:
             out.append(f"it gives {dim} columns, column {max(layout.columns)} is wanted")
         elif layout.columns is None and layout.width not in (None, dim):
             out.append(f"it gives {dim} columns, {layout.width} are wanted (columns=)")
-    if kind == "absolute_joint_position" and layout.action != "joint_position":
-        out.append(f"its actions are joint positions, action={layout.action} is set")
+    if kind == "absolute_joint_position" and layout.meaning.action != "joint_position":
+        out.append(f"its actions are joint positions, action={layout.meaning.action} is set")
     if kind == "absolute_joint_position" and units not in (None, "radians"):
         out.append(f"its joints are in {shown(units)}, wanted radians")
-    if isinstance(kind, str) and kind != "absolute_joint_position" and layout.needs_joints:
-        out.append(f"its actions are {kind}, action={layout.action} is set")
+    if isinstance(kind, str) and kind != "absolute_joint_position" and layout.meaning.needs_joints:
+        out.append(f"its actions are {kind}, action={layout.meaning.action} is set")
     return out

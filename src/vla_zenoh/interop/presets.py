@@ -1,7 +1,9 @@
 """Options for the robots and data sets that published policies were trained on.
 
 What is not converted: where the model's world has its origin (LIBERO's is not the robot's base),
-how its tool frame is turned against ours, and how its pictures were framed.
+how its tool frame is turned against ours, how its pictures were framed, and that the controllers of
+LIBERO and DROID put a step on where the arm is measured, of which it then covers a part: here a
+step is put on the goal, and all of it is carried out.
 
 Sources: openpi's examples for DROID and LIBERO, DROID's own joint velocity control (one unit is 0.2
 rad a step), robosuite's OSC_POSE controller (one unit is 0.05 m or 0.5 rad a step), GR00T's LIBERO
@@ -15,7 +17,7 @@ from collections.abc import Mapping
 Presets = Mapping[str, Mapping[str, str]]
 
 _STATE8 = "position+rotvec+fingers_m"
-_OSC = {
+OSC = {
     "action": "delta",
     "rotation": "rotvec",
     "clip": "1",
@@ -23,8 +25,10 @@ _OSC = {
     "rotation_scale_rad": "0.5",
     "dt_s": "0.05",
 }
-"""LIBERO's controller. Its environment takes -1 for an open gripper; data for OpenVLA and GR00T was
-converted to 1 for open."""
+"""LIBERO's controller."""
+_OPENS_AT_1 = {"gripper": "binary", "gripper_open": "high"}
+"""As data for OpenVLA and GR00T was converted to; LIBERO's environment takes -1 for open."""
+_BRIDGE = {"action": "delta", "rotation": "rpy", "dt_s": "0.2", **_OPENS_AT_1}
 _OWN = {
     "size": "",
     "resize": "none",
@@ -39,7 +43,8 @@ OPENPI: Presets = {
     "libero": {
         "map": "observation/image=camera:front, observation/wrist_image=camera:wrist, "
         f"observation/state={_STATE8}, prompt=prompt",
-        **_OSC,
+        **OSC,
+        "gripper": "binary",
         "gripper_open": "low",
         "gripper_threshold": "0",
         "horizon": "10",
@@ -51,6 +56,7 @@ OPENPI: Presets = {
         "action": "joint_delta",
         "joint_scale_rad": "0.2",
         "clip": "1",
+        "gripper": "binary",
         "gripper_open": "low",
         "dt_s": "0.0666667",
         "horizon": "8",
@@ -69,7 +75,8 @@ GROOT: Presets = {
         "annotation.human.action.task_description=prompt",
         "size": "256x256",
         "keys": "x,y,z,roll,pitch,yaw,gripper",
-        **_OSC,
+        **OSC,
+        **_OPENS_AT_1,
         "horizon": "16",
     },
     "bridge": {
@@ -78,8 +85,7 @@ GROOT: Presets = {
         "annotation.human.action.task_description=prompt",
         "size": "256x256",
         "keys": "x,y,z,roll,pitch,yaw,gripper",
-        "action": "delta",
-        "dt_s": "0.2",
+        **_BRIDGE,
         "horizon": "8",
     },
 }
@@ -87,15 +93,20 @@ GROOT: Presets = {
 OPENVLA_REST: Presets = {
     "bridge": {
         "map": "image=camera:front, instruction=prompt",
-        "action": "delta",
-        "dt_s": "0.2",
+        **_BRIDGE,
         "horizon": "1",
     },
-    "libero": {"map": "image=camera:front, instruction=prompt", **_OSC, "horizon": "1"},
+    "libero": {
+        "map": "image=camera:front, instruction=prompt",
+        **OSC,
+        **_OPENS_AT_1,
+        "horizon": "1",
+    },
     "oft_libero": {
         "map": "full_image=camera:front, wrist_image=camera:wrist, "
         f"state={_STATE8}, instruction=prompt",
-        **_OSC,
+        **OSC,
+        **_OPENS_AT_1,
         "horizon": "8",
     },
 }

@@ -33,9 +33,10 @@ pytestmark = pytest.mark.models
 ATOL = 1e-6
 """Metres and radians, of float32."""
 MEANING = {
-    "kind": "delta",
+    "action": "delta",
     "rotation": "rpy",
     "gripper": "open_fraction",
+    "gripper_open": "high",
     "dt_s": "0.1",
     "state": "position+rotvec+gripper_m",
 }
@@ -116,7 +117,7 @@ def test_a_chunk_is_what_lerobots_own_queue_gives(whole: Path, seed: int) -> Non
 
 
 def test_the_whole_chunk_can_be_had(whole: Path) -> None:
-    policy = loaded(whole, steps=str(tiny_act.CHUNK))
+    policy = loaded(whole, horizon=str(tiny_act.CHUNK))
     seen = looking(policy, 0)
     steps = np.asarray(policy.infer(seen).steps)
     assert policy.spec.action.horizon == tiny_act.CHUNK
@@ -138,7 +139,7 @@ def test_joints_become_the_poses_they_lead_to(tmp_path: Path) -> None:
     home_rad = profile.robot.home_rad
     mean = torch.tensor([*home_rad, 0.5])
     tiny_act.write(tmp_path / "act", {"mean": mean, "std": torch.full((8,), 0.05)})
-    policy = loaded(tmp_path / "act", kind="joint_position", rotation="")
+    policy = loaded(tmp_path / "act", action="joint_position", rotation="")
     none = np.zeros(7)
     joint = JointState(profile.robot.arm_joints, np.array(home_rad), none, none)
     seen = replace(looking(policy, 0), joint=joint)
