@@ -166,5 +166,19 @@ def test_what_is_questionable_is_advice_and_no_failure() -> None:
     )
 
 
+@pytest.mark.parametrize(("acceleration", "said"), [(0.25, False), (0.2, True)])
+@pytest.mark.parametrize("driver", ["sim", "ros2"])
+def test_a_brake_that_up_would_cut_short_is_told(
+    own_folder: Path, driver: str, acceleration: float, said: bool
+) -> None:
+    (own_folder / "lab.yaml").write_text(
+        f"extends: panda_{driver}\nlimits: {{translation: {{acceleration_m_s2: {acceleration}}}}}\n"
+    )
+    result = RUNNER.invoke(profile_app, ["check", "lab"])
+    assert result.exit_code == 0
+    told = "advice limits: a brake from full speed may take 2.6 s" in result.stderr
+    assert told == (said and driver == "ros2"), result.stderr
+
+
 def test_check_wants_a_name() -> None:
     assert RUNNER.invoke(profile_app, ["check"]).exit_code == 2

@@ -25,6 +25,10 @@ profile_app = typer.Typer(
     no_args_is_help=True,
 )
 
+LONG_BRAKE_S = 2.5
+"""`up` ends a robot's node 2.8 s after Ctrl-C; a part of that goes by until this node hears of it.
+See `STOP_ORDER` in `vla_zenoh.nodes.supervisor`."""
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for a script.")]
 
 
@@ -84,7 +88,7 @@ def check(
     for name in names:
         try:
             profile = load_profile(name)
-            hints = [*advice(profile), *_arm(profile, name, host)]
+            hints = [*advice(profile), *_arm(profile, name, host), *_brake(profile)]
         except ProfileError as error:
             wrong = True
             for line in str(error).splitlines():
@@ -123,6 +127,24 @@ def _arm(profile: Profile, name: str, host: str | None) -> list[str]:
         what = f"{profile.robot.description!r} cannot be read: {error}"
         raise ProfileError(f"{profile_file(name)}: robot.description: {what}") from error
     return []
+
+
+def _brake(profile: Profile) -> list[str]:
+    """Where `up` would end the robot's node while that still brakes."""
+    if profile.robot.driver == "sim":
+        return []
+    try:
+        from vla_zenoh.control.longest_brake import longest_brake_s
+    except ImportError:
+        return []  # the arm was not looked at either, which is told
+    brake_s = longest_brake_s(profile)
+    if brake_s <= LONG_BRAKE_S:
+        return []
+    return [
+        f"limits: a brake from full speed may take {brake_s:.1f} s, and `vla-zenoh up` ends the "
+        "robot's node within 3 s of Ctrl-C, braked or not: less velocity, or more acceleration and "
+        "jerk"
+    ]
 
 
 def _runs_command(profile: Profile, name: str, host: str | None) -> bool:
