@@ -16,6 +16,7 @@ from vla_zenoh.cli.options import (
     effective_profile,
 )
 from vla_zenoh.cli.output import console
+from vla_zenoh.cli.plain_door import refuse_beyond_here
 from vla_zenoh.interop.offer import make_offer
 from vla_zenoh.interop.openpi import PORT
 from vla_zenoh.loader import make_policy
@@ -46,7 +47,9 @@ def openpi(
     names: Annotated[
         str, typer.Option("--map", help="Other names, as observation/image=camera:front,...")
     ] = "",
-    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; with --api-key, also one of a network.")
+    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = PORT,
     api_key: Annotated[
         str, typer.Option(envvar="VLA_ZENOH_API_KEY", help="What clients have to bring.")
@@ -57,6 +60,15 @@ def openpi(
 ) -> None:
     """Answer openpi's clients with a model of ours; whoever asks drives the robot."""
     loaded = effective_profile(profile)
+    if not api_key:
+        refuse_beyond_here(
+            loaded,
+            "--host",
+            host,
+            "drive with this model, and no key is asked",
+            "give --api-key KEY (VLA_ZENOH_API_KEY), which is not encrypted, or leave it out, and "
+            f"type on the other computer `ssh -L {port}:127.0.0.1:{port} THIS_COMPUTER`",
+        )
     robot, chosen = loaded.robot, chosen_worker(loaded, worker, options or [])
     run_in_own_environment(chosen.model, python, extra="serve")
     from vla_zenoh.nodes.openpi_server import OpenPiServer

@@ -19,6 +19,7 @@ from vla_zenoh.cli.options import (
     ProfileOption,
 )
 from vla_zenoh.cli.output import errors, fail
+from vla_zenoh.cli.plain_door import refuse_beyond_here
 from vla_zenoh.errors import MissingExtraError, ProfileError, RecordingError
 from vla_zenoh.nodes.process import run_node, stop_on_signals
 from vla_zenoh.nodes.viewer import Viewer, open_server, open_window
@@ -50,7 +51,11 @@ def view(
         float | None, typer.Option("--seconds", "-s", help="Listen for so long.", min=0.1)
     ] = None,
     bind: Annotated[
-        str, typer.Option("--bind", help="With --serve: where to listen; 0.0.0.0 is everywhere.")
+        str,
+        typer.Option(
+            "--bind",
+            help="With --serve: where to listen; elsewhere than here in an insecure profile alone.",
+        ),
     ] = "127.0.0.1",
     port: Annotated[
         int,
@@ -84,6 +89,8 @@ def _live(
     from vla_zenoh.view.show import Show
 
     done: list[Show] = []
+    if serve:
+        _refuse_strangers(profile, bind, port)
 
     def run(session: Any, stop: threading.Event) -> None:
         with _sink(profile.robot.name, serve, save, bind, port) as (stream, viewer):
@@ -118,6 +125,8 @@ def _recorded(
     stop = stop_on_signals()
     file = open_recording(path)
     profile = _profile_of(file, profile_name)
+    if serve:
+        _refuse_strangers(profile, bind, port)
     with _sink(path.stem, serve, save, bind, port) as (stream, viewer):
         show = Show(profile, stream, keys=file.keys)
         for entry in file.entries(lambda key: not key.endswith("/raw")):
@@ -131,6 +140,19 @@ def _recorded(
             stop.wait(POLL_S)
     if not show.shown and not stop.is_set():
         fail(f"{path} holds nothing that can be shown")
+
+
+def _refuse_strangers(profile: Profile, bind: str, port: int) -> None:
+    ways = " ".join(f"-L {each}:127.0.0.1:{each}" for each in (port, port + 1))
+    refuse_beyond_here(
+        profile,
+        "--bind",
+        bind,
+        "look through the cameras and send this view what it likes, as Rerun has neither password "
+        "nor encryption",
+        f"leave it out, and type on the other computer `ssh {ways} THIS_COMPUTER`: the page is "
+        "there as it is here; or take --save FILE.rrd there",
+    )
 
 
 def _profile_of(file: RunFile, name: str) -> Profile:

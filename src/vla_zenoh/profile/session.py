@@ -60,7 +60,12 @@ def is_loopback(endpoint: str) -> bool:
     """Whether only this computer can be meant: a file, ``localhost``, or an address of loopback."""
     if endpoint.startswith(FILE_PROTOCOLS):
         return True
-    host = host_of(endpoint).partition("%")[0]
+    return is_loopback_address(host_of(endpoint))
+
+
+def is_loopback_address(address: str) -> bool:
+    """Likewise for an address without protocol and port."""
+    host = address.partition("%")[0]
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:  # a name, which leads wherever its resolver says
