@@ -168,9 +168,10 @@ class Ros2Node:
         try:
             self._drive(pace, stop)
         except Exception as error:
-            last = self._last_brake
-            braked = last is None or last.wind_down(pace, self._brake_on)
-            how = f"{'braked' if braked else 'not braked'}, and ends"
+            how = "ends"
+            if self._last_brake is not None:
+                braked = self._last_brake.wind_down(pace, self._brake_on)
+                how = "braked, and ends" if braked else "not braked, and ends"
             why = f"{one_line(repr(error), MAX_WORDS)}: {how}"
             self.node.tell(Event("error", "fault", "broken", why))
             raise
