@@ -15,37 +15,29 @@
 # ///
 """OpenVLA (Kim et al., CoRL 2024) from a directory of weights, as published or fine-tuned.
 
-One picture and the prompt in, one step out: metres and radians by which the TCP shall go, in the
-axes of the robot's base, and how far the gripper shall be open. A directory fine-tuned by
-OpenVLA-OFT may want more pictures and the robot's state, and gives a chunk. No code of the
-checkpoint runs.
+One picture and the prompt in, one step out: by how much the TCP shall go and how far the gripper
+shall be open, in the units of the data. A directory fine-tuned by OpenVLA-OFT may want more
+pictures and the robot's state, and gives a chunk. No code of the checkpoint runs.
 
     vla-zenoh worker openvla --set checkpoint=DIR --set unnorm_key=bridge_orig
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 from vla_zenoh_model_openvla.checkpoint import TOKENIZER, Checkpoint, read_checkpoint
 from vla_zenoh_model_openvla.chunk_files import chunk_steps, find_chunk_files
+from vla_zenoh_model_openvla.meaning import data_meaning
 from vla_zenoh_model_openvla.picture import trained_form
 from vla_zenoh_model_openvla.statistics import AXES, Range, choose, read_range
 from vla_zenoh_model_openvla.tokens import PROMPTS, ActionBins, prompt_text, prompt_tokens
 
 from vla_zenoh.errors import SpecError, WorkerError
-from vla_zenoh.model_options import checkpoint_folder, number, one_of
-from vla_zenoh.policy import (
-    ActionSpec,
-    ActionSteps,
-    CameraSpec,
-    ModelSpec,
-    Observation,
-    ObservationSpec,
-)
+from vla_zenoh.model_options import checkpoint_folder, one_of
+from vla_zenoh.policy import ActionSteps, CameraSpec, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import load_profile
 from vla_zenoh.state_vector import parts_of, read_state, state_vector
 
@@ -54,15 +46,6 @@ Dtype = Literal["auto", "bfloat16", "float16", "float32"]
 Quantise = Literal["none", "int8", "nf4"]
 Choice = Literal["auto", "yes", "no"]
 
-STEP_S: Mapping[str, float] = {
-    "bridge_orig": 1 / 5,
-    "fractal20220817_data": 1 / 3,
-    "libero_10_no_noops": 1 / 20,
-    "libero_goal_no_noops": 1 / 20,
-    "libero_object_no_noops": 1 / 20,
-    "libero_spatial_no_noops": 1 / 20,
-}
-"""How long a step lasts in data sets that say so: a delta at another rate is another speed."""
 AUGMENTED = "image_aug"
 """What the published fine-tuning writes into the name of a run whose pictures were cropped."""
 
@@ -75,8 +58,7 @@ class OpenVLA:
         unnorm_key: data set whose statistics turn numbers into metres; may be left out where there
             is only one.
         adapter: directory of a LoRA adapter that was not merged.
-        camera: the picture that the model is given; OFT: several, separated by commas.
-        dt_s: duration of a step; known for some data sets, and asked for otherwise.
+        cameras: the picture that the model is given; OFT: several, separated by commas.
         center_crop: give it the middle 90 % of the picture. ``auto``: where the directory's name
             says that it was trained with ``image_aug``.
         template: prompt it was trained with, ``7b`` or ``v01``; ``auto``: by its Llama.
@@ -85,7 +67,9 @@ class OpenVLA:
         quantise: ``int8`` or ``nf4``: Llama's layers in less memory.
         chunk: OFT: steps of a chunk; known for LIBERO and Bridge.
         state: OFT: what the numbers of the robot's state are, see `vla_zenoh.state_vector`.
-        profile: of the robot; OFT: its gripper, for parts of the state that are fractions of it.
+        profile: of the robot; OFT: its gripper and arm, for the state.
+        meaning: of the numbers in the units of the data, see vla_zenoh/interop/meaning.py; known
+            for some data sets. `horizon` is, unless told otherwise, the whole chunk.
     """
 
     def __init__(
@@ -93,8 +77,7 @@ class OpenVLA:
         checkpoint: str = "",
         unnorm_key: str = "",
         adapter: str = "",
-        camera: str = "front",
-        dt_s: str = "auto",
+        cameras: str = "front",
         center_crop: str = "auto",
         template: str = "auto",
         device: str = "auto",
@@ -103,6 +86,7 @@ class OpenVLA:
         chunk: str = "auto",
         state: str = "",
         profile: str = "panda_sim",
+        **meaning: str,
     ) -> None:
         folder = checkpoint_folder(checkpoint)
         one_of("dtype", dtype, get_args(Dtype))
@@ -119,15 +103,16 @@ class OpenVLA:
         trained = AUGMENTED in str(self._adapter or found.folder.resolve())
         self._crop = trained if center_crop == "auto" else center_crop == "yes"
         self._device, self._dtype, self._quantise = device, dtype, quantise
-        self._cameras = tuple(name.strip() for name in camera.split(","))
+        self._cameras = tuple(name.strip() for name in cameras.split(","))
         self._files = find_chunk_files(self._adapter or found.folder)
-        steps = 1 if self._files is None else chunk_steps(chunk, self._key)
+        self._chunk = 1 if self._files is None else chunk_steps(chunk, self._key)
+        self._meaning = data_meaning(meaning, self._key, self._range, self._chunk)
         self._state_range: Range | None = None
         self._state: tuple[str, ...] = ()
         robot = load_profile(profile).robot
         self._max_width_m = robot.gripper.max_width_m
         if self._files is None and (len(self._cameras) > 1 or state):
-            raise WorkerError("plain OpenVLA sees one camera and no state; camera= names one")
+            raise WorkerError("plain OpenVLA sees one camera and no state; cameras= names one")
         if self._files is not None and self._files.state is not None:
             trained_on = read_range(found.statistics, self._key, "proprio", size=None)
             self._state_range = trained_on
@@ -140,16 +125,7 @@ class OpenVLA:
                 state=parts_of(self._state),
                 prompt=True,
             ),
-            action=ActionSpec(
-                horizon=steps,
-                dt_s=_step_s(dt_s, self._key),
-                kind="delta",
-                frame="base",
-                rotation="rpy",
-                gripper="open_fraction",
-                gripper_open_is_high=True,
-                normalisation=self._key,
-            ),
+            action=self._meaning.spec,
         )
         self.network: Any = None
         self._tokenizer: Any = None
@@ -189,7 +165,7 @@ class OpenVLA:
         if self._files is not None:
             from vla_zenoh_model_openvla.chunk_head import load_chunk_head
 
-            self._head = load_chunk_head(self._files, network, self.spec.action.horizon)
+            self._head = load_chunk_head(self._files, network, self._chunk)
         self._must_see()
 
     def _must_see(self) -> None:
@@ -222,7 +198,7 @@ class OpenVLA:
             found = [config.bos_token_id, *found]
         ids = prompt_tokens(found)
         patches = self.network.vision_backbone.patches * len(self._cameras)
-        places = AXES * self.spec.action.horizon + 2
+        places = AXES * self._chunk + 2
         if len(ids) + patches + places > config.max_position_embeddings:
             raise SpecError(f"a prompt of {len(ids)} tokens is more than the model reads")
         return ids
@@ -257,23 +233,13 @@ class OpenVLA:
             answer = [self.bins.decode(answer)]
         normalised = np.asarray(answer, np.float64)
         raw["normalised"] = normalised.tolist()
-        steps = self._range.expand(normalised)
-        steps[:, -1] = np.clip(steps[:, -1], 0.0, 1.0)
-        return ActionSteps(steps, raw=raw, pictures=seen)
+        rows = self._range.expand(normalised)[: self.spec.action.horizon]
+        if self.spec.action.gripper == "open_fraction":
+            rows[:, -1] = np.clip(rows[:, -1], 0.0, 1.0)
+        return ActionSteps(self._meaning.steps(rows), raw=raw, pictures=seen)
 
     def _answer(self, ids: list[int], pictures: list[Any], state: list[float] | None) -> Any:
         """Tokens of a step; OFT: (steps, 7) numbers."""
         if self._head is None:
             return self.network.act(ids, pictures[0], AXES)
         return self._head.act(self.network, ids, pictures, state).cpu().numpy()
-
-
-def _step_s(given: str, key: str) -> float:
-    if given != "auto":
-        return number("dt_s", given)
-    if key not in STEP_S:
-        raise WorkerError(
-            f"how long does a step of {key!r} last? Say so with --set dt_s=SECONDS "
-            "(a delta that is carried out at another rate is another speed)"
-        )
-    return STEP_S[key]

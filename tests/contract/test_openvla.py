@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import SpecError, WorkerError
 from vla_zenoh.loader import find_model, import_model, make_policy
-from vla_zenoh.policy import Policy
+from vla_zenoh.policy import Policy, example_observation
 
 MODEL = import_model(find_model("openvla"))
 from vla_zenoh_model_openvla import picture, tokens  # noqa: E402
@@ -197,7 +197,95 @@ def test_the_spec_says_what_the_numbers_mean(tmp_path: Path) -> None:
     assert (action.gripper, action.gripper_open_is_high) == ("open_fraction", True)
     assert action.normalisation == "bridge_orig"
     assert action.dt_s == pytest.approx(0.2)
-    assert action.position_scale_m == 1.0
+    np.testing.assert_array_equal(
+        steps_of(make(tmp_path / "a", unnorm_key="bridge_orig"), [[0.01] * 7]), [[0.01] * 7]
+    )
+
+
+LIBERO: dict[str, list[Any]] = {
+    "mask": [True] * 6 + [False],
+    "q01": [-0.9375] * 3 + [-0.2] * 3 + [0.0],
+    "q99": [0.9375] * 3 + [0.3] * 3 + [1.0],
+}
+"""In the units of its controller, of which one is 5 cm or half a radian."""
+
+
+def steps_of(policy: Policy, rows: Any) -> Any:
+    return vars(policy)["_meaning"].steps(np.array(rows))
+
+
+@pytest.mark.parametrize("key", ["libero_spatial_no_noops", "libero_90"])
+def test_liberos_numbers_are_those_of_its_controller(tmp_path: Path, key: str) -> None:
+    policy = make(write(tmp_path / "a", statistics={key: {"action": LIBERO}}))
+    action = policy.spec.action
+    assert (action.kind, action.frame, action.rotation) == ("delta", "base", "rotvec")
+    assert (action.gripper, action.gripper_open_is_high, action.dt_s) == (
+        "open_fraction",
+        True,
+        0.05,
+    )
+    rows = vars(policy)["_range"].expand([[1.0, -1.0, 0.0, 1.0, -1.0, 0.0, 0.7]])
+    wanted = [[0.05 * 0.9375, -0.05 * 0.9375, 0, 0.15, -0.1, 0.025, 0.7]]
+    np.testing.assert_allclose(steps_of(policy, rows), wanted, atol=ATOL)
+    np.testing.assert_allclose(steps_of(policy, [[9.0] * 6 + [1]])[0], [0.05] * 3 + [0.5] * 3 + [1])
+
+
+def test_the_native_worker_and_the_server_of_the_same_weights_ask_for_the_same(
+    tmp_path: Path,
+) -> None:
+    native = make(write(tmp_path / "a", statistics={"libero_goal_no_noops": {"action": LIBERO}}))
+    served: Any = make_policy(find_model("openvla_rest"), {"preset": "libero"})
+    rows = np.array([[0.5, -0.25, 0.125, 0.1, -0.2, 0.3, 1.0]])
+    theirs = served.layout.steps(rows, example_observation(served.spec))
+    np.testing.assert_allclose(steps_of(native, rows), theirs, atol=ATOL)
+    assert native.spec.action.rotation == served.spec.action.rotation
+    assert native.spec.action.dt_s == served.spec.action.dt_s
+
+
+def test_data_of_ones_own_may_mean_something_else(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", statistics={"mine": {"action": BRIDGE}})
+    told = {"position_scale_m": "0.001", "frame": "tcp", "rotation": "rotvec", "dt_s": "0.1"}
+    policy = make(folder, **told, gripper_open="low")
+    action = policy.spec.action
+    assert (action.frame, action.rotation) == ("tcp", "rotvec")
+    assert not action.gripper_open_is_high
+    np.testing.assert_allclose(
+        steps_of(policy, [[2.0, 0, 0, 0, 0, 0.1, 1]]), [[0.002, 0, 0, 0, 0, 0.1, 1]], atol=ATOL
+    )
+    absolute = {"action": "absolute", "rotation": "rpy", "gripper": "absolute_m", "dt_s": "0.1"}
+    assert make(folder, **absolute).spec.action.gripper == "absolute_m"
+
+
+def test_statistics_that_are_no_metres_are_refused_until_somebody_says_what_they_are(
+    tmp_path: Path,
+) -> None:
+    folder = write(tmp_path / "a", statistics={"my_kitchen": {"action": LIBERO}})
+    with pytest.raises(
+        WorkerError, match=r"steps of 0\.938, which are no metres.*position_scale_m"
+    ):
+        make(folder, dt_s="0.05")
+    units = {"position_scale_m": "0.05", "rotation_scale_rad": "0.5", "rotation": "rotvec"}
+    policy = make(folder, **units, dt_s="0.05")
+    np.testing.assert_allclose(steps_of(policy, [[1.0] * 7]), [[0.05] * 3 + [0.5] * 3 + [1]])
+
+
+@pytest.mark.parametrize(
+    ("told", "match"),
+    [
+        ({"action": "joint_position", "gripper": "none"}, "joints are not read by this worker"),
+        ({"rotation": "quat_xyzw"}, r"7 numbers, position 3 \+ quat_xyzw 4 \+ gripper 1 are 8"),
+        ({"gripper": "none"}, r"7 numbers, position 3 \+ rpy 3 are 6"),
+        ({"horizon": "2"}, "horizon is 2; the model's chunks have 1"),
+        ({"action": "absolute"}, r"not that of data set 'mine', so nobody says .*--set rotation="),
+        ({"scale_m": "1"}, r"no option 'scale_m'; known: action, frame"),
+    ],
+)
+def test_a_meaning_that_cannot_be_is_named(
+    tmp_path: Path, told: dict[str, str], match: str
+) -> None:
+    folder = write(tmp_path / "a", statistics={"mine": {"action": BRIDGE}})
+    with pytest.raises(WorkerError, match=match):
+        make(folder, **{"dt_s": "0.1", **told})
 
 
 @pytest.mark.parametrize("key", ["", "brigde_orig"])
@@ -214,7 +302,7 @@ def test_statistics_beside_the_weights_replace_those_of_the_base_model(tmp_path:
 
 
 def test_the_duration_of_a_step_is_asked_for_where_it_is_not_known(tmp_path: Path) -> None:
-    with pytest.raises(WorkerError, match=r"how long does a step of 'other' last"):
+    with pytest.raises(WorkerError, match=r"--set dt_s=\(seconds of a step"):
         make(write(tmp_path / "a"), unnorm_key="other")
 
 

@@ -142,7 +142,7 @@ def folder(whole: Path, tmp_path: Path) -> Path:
 
 
 def make(folder: Path, **options: str) -> Any:
-    given = {"camera": "front,wrist", "state": STATE_TEXT, "device": "cpu", **options}
+    given = {"cameras": "front,wrist", "state": STATE_TEXT, "device": "cpu", **options}
     return make_policy(find_model("openvla"), {"checkpoint": str(folder), **given})
 
 
@@ -162,6 +162,7 @@ def test_the_spec_is_that_of_the_data(whole: Path) -> None:
     assert (spec.action.horizon, spec.action.dt_s) == (STEPS, 0.05)
     assert [camera.camera for camera in spec.observation.cameras] == ["front", "wrist"]
     assert spec.observation.state == ("pose", "gripper")
+    assert make(whole, horizon="3").spec.action.horizon == 3
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -173,8 +174,19 @@ def test_a_chunk_is_what_the_computation_by_hand_gives(whole: Path, oft: Oft, se
     wanted = oft.numbers(pictures, raw["prompt_tokens"], raw["state"])
     np.testing.assert_allclose(np.array(raw["normalised"]), wanted, atol=ATOL)
     steps = check_steps(policy.spec.action, answer.steps)
+    low, high = np.array(BRIDGE["q01"])[:6], np.array(BRIDGE["q99"])[:6]
+    units = np.clip(low + (wanted[:, :6] + 1) / 2 * (high - low), -1, 1)
+    np.testing.assert_allclose(steps[:, :6], units * ([0.05] * 3 + [0.5] * 3), atol=ATOL)
     assert steps.shape == (STEPS, 7)
     assert (np.abs(raw["state"]) <= 1).all()
+
+
+def test_fewer_steps_than_a_chunk_has_are_its_first(whole: Path) -> None:
+    first, all_steps = (
+        np.asarray(policy.infer(looking(policy, 1, 2)).steps)
+        for policy in (loaded(whole, horizon="3"), loaded(whole))
+    )
+    np.testing.assert_array_equal(first, all_steps[:3])
 
 
 def test_each_picture_and_the_state_matter(whole: Path) -> None:
@@ -196,6 +208,7 @@ def test_each_picture_and_the_state_matter(whole: Path) -> None:
         ({"state": "position"}, "state has 8 numbers, 'position' has 3"),
         ({"state": ""}, "state has 8 numbers"),
         ({"chunk": "eight"}, "chunk is 'eight'"),
+        ({"horizon": "9"}, "horizon is 9; the model's chunks have 8"),
     ],
 )
 def test_options_that_do_not_fit_are_named(

@@ -1,0 +1,64 @@
+"""What the numbers of a data set mean once they are unnormalised: as it is known, or as told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from vla_zenoh_model_openvla.statistics import AXES, Range
+
+from vla_zenoh.errors import WorkerError
+from vla_zenoh.interop.meaning import Meaning, read_meaning
+from vla_zenoh.interop.presets import OSC
+
+USUAL: Mapping[str, str] = {
+    "action": "delta",
+    "rotation": "rpy",
+    "gripper": "open_fraction",
+    "gripper_open": "high",
+}
+"""What OpenVLA's own data sets were converted to: metres and radians."""
+DATA: Mapping[str, Mapping[str, str]] = {
+    "bridge_orig": {"dt_s": "0.2"},
+    "fractal20220817_data": {"dt_s": "0.333333"},
+    "libero": OSC,
+}
+"""What is known of data sets, by how their names begin. LIBERO's statistics are in the units of its
+controller. Of others `dt_s` is asked for: a delta at another rate is another speed."""
+LONGEST_STEP_M = 0.5
+"""No arm goes further in a step of its data: numbers that do are no metres."""
+
+
+def data_meaning(told: Mapping[str, str], key: str, trained: Range, chunk: int) -> Meaning:
+    """What the numbers of the data set `key` mean, as told and as it is known.
+
+    Args:
+        told: by a person, see `vla_zenoh.interop.meaning`.
+        key: of the data set.
+        trained: range of its actions.
+        chunk: steps in an answer of the model.
+
+    Raises:
+        SpecError: an option cannot be, or is missing.
+        WorkerError: what is told is not `AXES` numbers, or more steps than a chunk has, or nobody
+            says what statistics are that cannot be metres.
+    """
+    data = next((known for begin, known in DATA.items() if key.startswith(begin)), {})
+    known = {**USUAL, **data, "horizon": str(chunk)}
+    found = read_meaning(told, known, f"data set {key!r}", normalisation=key)
+    if found.needs_joints:
+        raise WorkerError("action: joints are not read by this worker; use delta or absolute")
+    parts = found.parts(0)
+    if sum(parts.values()) != AXES:
+        wanted = " + ".join(f"{name} {count}" for name, count in parts.items())
+        raise WorkerError(f"an action has {AXES} numbers, {wanted} are {sum(parts.values())}")
+    if found.spec.horizon > chunk:
+        raise WorkerError(f"horizon is {found.spec.horizon}; the model's chunks have {chunk}")
+    longest = float(np.abs([trained.low[:3], trained.high[:3]]).max())
+    if found.action == "delta" and longest * found.scales[0] > LONGEST_STEP_M:
+        raise WorkerError(
+            f"data set {key!r} has steps of {longest:.3g}, which are no metres. Say what one unit "
+            "is with --set position_scale_m= and --set rotation_scale_rad= (robosuite's and "
+            "LIBERO's controller: 0.05, 0.5 and rotation=rotvec)"
+        )
+    return found
