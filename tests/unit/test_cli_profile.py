@@ -103,6 +103,10 @@ def test_wrong_ones_are_told_line_by_line_on_stderr(own_folder: Path) -> None:
         ("tcp_frame: panda_hand_tpc", "has no link 'panda_hand_tpc'; did you mean"),
         ("finger_joints: [panda_finger]", "has no joint 'panda_finger'; did you mean"),
         ("base_frame: panda_hand", "base_frame 'panda_hand' of panda.urdf moves"),
+        (
+            "gripper: {joint_open_rad: 0.0, joint_shut_rad: 0.8}",
+            "slides: write gripper: {joint_open_m: ..., joint_shut_m: ...}",
+        ),
     ],
 )
 def test_what_the_description_of_the_robot_does_not_have_is_a_fault(

@@ -182,6 +182,38 @@ def told(path: str) -> list[str]:
             "robot.gripper.dead_band_m: must be less than max_width_m (0.01): nothing would move",
         ),
         (
+            "robot: {gripper: {joint_open_rad: 0}}",
+            "lab.yaml:2: robot.gripper.joint_open_rad: needs joint_shut_rad beside it",
+        ),
+        (
+            "robot: {gripper: {joint_open_rad: 0, joint_shut_rad: 45}}",
+            "robot.gripper.joint_shut_rad: is 45: more than a turn; give radians",
+        ),
+        (
+            "robot: {gripper: {joint_open_m: 0.0, joint_shut_m: 0.0}}",
+            "robot.gripper.joint_shut_m: is that of joint_open_m: nothing would move",
+        ),
+        (
+            "robot: {gripper: {joint_open_rad: 0, joint_shut_rad: 1, joint_open_m: 0.1,"
+            " joint_shut_m: 0}}",
+            "robot.gripper.joint_open_m: is for a joint that slides, joint_open_rad for one",
+        ),
+        (
+            "ros2: {pose_command: {topic: /t, type: geometry_msgs/msg/PoseStamped}, "
+            "gripper: {topic: /g, type: control_msgs/action/GripperCommand}}",
+            "ros2.gripper.position: is missing: does the driver take the m between the fingers",
+        ),
+        (
+            "ros2: {pose_command: {topic: /t, type: geometry_msgs/msg/PoseStamped}, "
+            "gripper: {topic: /g, type: std_msgs/msg/Float64, position: joint}}",
+            "ros2.gripper.position: is joint, which needs joint_open_rad and joint_shut_rad",
+        ),
+        (
+            "ros2: {pose_command: {topic: /t, type: geometry_msgs/msg/PoseStamped}, "
+            "gripper: {topic: /g, type: franka_msgs/action/Move, position: finger}}",
+            "ros2.gripper.position: is not for franka_msgs/action/Move, which takes the width",
+        ),
+        (
             "robot: {driver: ros}",
             "wants 'sim', 'ros2' or 'arm'; did you mean 'ros2'? (given: 'ros')",
         ),

@@ -16,11 +16,14 @@ from vla_zenoh.interop.ros2.gripper_actions import (
     MOVE,
     Outcome,
     outcome,
+    position,
     send_goal,
 )
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.samples import Picture, Stamp
 from vla_zenoh.interop.ros2.topics import pose
+from vla_zenoh.profile import GripperProfile
+from vla_zenoh.profile.ros2 import Ros2Gripper
 from vla_zenoh.types import GripperCommand, JointCommand, NodeStatus, PoseCommand
 
 M = Messages(
@@ -192,6 +195,7 @@ POSE = PoseCommand(
 )
 JOINTS = JointCommand(NAMES, np.arange(7) / 7, np.arange(7) / 70, np.zeros(7), "active")
 WIDTH = GripperCommand(0.04, 0.1, 20.0)
+ROBOTIQ = {"joint_open_rad": 0.0, "joint_shut_rad": 0.7929}
 
 
 def written(kind: str, key: str, record: Any) -> Any:
@@ -250,16 +254,16 @@ def test_joints_are_written_as_plain_numbers() -> None:
     assert message.data.tolist() == JOINTS.position_rad.tolist()
 
 
-def test_widths_are_written_as_plain_numbers() -> None:
-    assert written("std_msgs/msg/Float64", "command_gripper", WIDTH).data == 0.04
-    array = written("std_msgs/msg/Float64MultiArray", "command_gripper", WIDTH)
+def test_openings_are_written_as_plain_numbers() -> None:
+    assert written("std_msgs/msg/Float64", "command_gripper", 0.04).data == 0.04
+    array = written("std_msgs/msg/Float64MultiArray", "command_gripper", 0.04)
     assert array.data.tolist() == [0.04]
 
 
 # -- gripper actions ------------------------------------------------------------------------------
-def goal(action: str, per_finger: bool = False) -> Any:
+def goal(action: str, position: float = 0.0) -> Any:
     identity = bytes(range(16))
-    request = send_goal(M, action, identity, WIDTH, per_finger=per_finger, max_width_m=0.08)
+    request = send_goal(M, action, identity, WIDTH, position=position, max_width_m=0.08)
     request = M.decode(request.__msgtype__, M.encode(request))
     assert bytes(request.goal_id.uuid) == identity
     return request.goal
@@ -270,8 +274,30 @@ def test_a_goal_says_width_speed_and_force() -> None:
     grasp = goal(GRASP)
     assert (grasp.width, grasp.speed, grasp.force) == (0.04, 0.1, 20.0)
     assert (grasp.epsilon.inner, grasp.epsilon.outer) == (0.08, 0.08)
-    command = goal(GRIPPER_COMMAND, per_finger=True).command
-    assert (command.position, command.max_effort) == (0.02, 20.0)
+    command = goal(GRIPPER_COMMAND, position=-0.3).command
+    assert (command.position, command.max_effort) == (-0.3, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("means", "ends", "at_m", "expected"),
+    [
+        ("width", {}, 0.04, 0.04),
+        ("finger", {}, 0.04, 0.02),
+        (None, ROBOTIQ, 0.085, 0.0),
+        (None, ROBOTIQ, 0.0, 0.7929),
+        ("joint", ROBOTIQ, 0.0425, 0.39645),
+        ("width", ROBOTIQ, 0.0425, 0.0425),
+        ("finger", ROBOTIQ, 0.0425, 0.02125),
+        (None, {"joint_open_m": -0.02, "joint_shut_m": 0.02}, 0.085, -0.02),
+        (None, {"joint_open_m": -0.02, "joint_shut_m": 0.02}, 0.0, 0.02),
+    ],
+)
+def test_an_opening_is_sent_as_the_driver_takes_it(
+    means: Any, ends: dict[str, float], at_m: float, expected: float
+) -> None:
+    ros2 = Ros2Gripper(topic="/gripper", type=GRIPPER_COMMAND, position=means)
+    gripper = GripperProfile(max_width_m=0.085, **ends)
+    assert position(ros2, gripper, at_m) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

@@ -394,7 +394,7 @@ def test_a_robots_clock_that_differs_is_measured_and_told(tmp_path: Path) -> Non
 TF = """\
   tcp: tf
   wrench: {topic: /wrench}
-  gripper: {topic: /width, type: std_msgs/msg/Float64, per_finger: true}
+  gripper: {topic: /width, type: std_msgs/msg/Float64, position: finger}
   pose_command: {topic: /target, type: geometry_msgs/msg/PoseStamped, frame: base}
 """
 

@@ -22,6 +22,7 @@ def make_kinematics(profile: Profile) -> Kinematics:
         robot.arm_joints,
         robot.finger_joints,
         base_frame=robot.base_frame,
+        finger_ends=robot.gripper.joint_ends,
     )
 
 

@@ -19,7 +19,12 @@ from numpy.typing import ArrayLike
 
 from vla_zenoh.control.so3 import Pose
 from vla_zenoh.errors import ProfileError, RecordError
+from vla_zenoh.profile import JointEnds
 from vla_zenoh.types import FloatArray, JointState
+
+BEYOND_LIMITS = 0.1
+"""Of its range a finger joint may be told to end so far outside of it: drivers and descriptions of
+one gripper differ in the last digits."""
 
 
 class Kinematics:
@@ -29,11 +34,13 @@ class Kinematics:
         urdf: robot description.
         tcp_frame: the link whose pose is meant.
         arm_joints: in any order.
-        finger_joints: locked at their upper limit, where the hand is widest.
+        finger_joints: locked where the hand is widest.
         base_frame: poses are given in this link, which must not move; None: the URDF's root.
+        finger_ends: where that is; None: at their upper limit, which needs joints that slide.
 
     Raises:
-        ProfileError: a joint or link is not in the URDF, cannot be used, or lacks its limits.
+        ProfileError: a joint or link is not in the URDF, cannot be used, or lacks its limits; or
+            the ends of a finger joint are not such as it can have.
     """
 
     def __init__(
@@ -44,10 +51,13 @@ class Kinematics:
         finger_joints: Sequence[str] = (),
         *,
         base_frame: str | None = None,
+        finger_ends: JointEnds | None = None,
     ) -> None:
         self.urdf = urdf
         self.full_model: Any = pin.buildModelFromUrdf(str(urdf))
-        self.locked_position = _locked(self.full_model, urdf, arm_joints, finger_joints)
+        self.locked_position = _locked(
+            self.full_model, urdf, arm_joints, finger_joints, finger_ends
+        )
         self.locked_joints: list[int] = [
             index for index in range(1, self.full_model.njoints)
             if self.full_model.names[index] not in arm_joints
@@ -154,7 +164,11 @@ def _near(name: str, known: Sequence[str]) -> str:
 
 
 def _locked(
-    model: Any, urdf: Path, arm_joints: Sequence[str], finger_joints: Sequence[str]
+    model: Any,
+    urdf: Path,
+    arm_joints: Sequence[str],
+    finger_joints: Sequence[str],
+    finger_ends: JointEnds | None,
 ) -> FloatArray:
     """Configuration of the whole robot at which all but the arm is locked."""
     known = list(model.names)[1:]
@@ -173,13 +187,36 @@ def _locked(
     position = pin.neutral(model)
     for name in finger_joints:
         joint = model.joints[model.getJointId(name)]
-        upper = float(model.upperPositionLimit[joint.idx_q])
-        if joint.nq != 1 or not math.isfinite(upper):
-            raise ProfileError(
-                f"finger joint {name!r} of {urdf.name} has no upper limit to open to"
-            )
-        position[joint.idx_q] = upper
+        position[joint.idx_q] = _wide_open(model, joint, f"{name!r} of {urdf.name}", finger_ends)
     return position
+
+
+def _wide_open(model: Any, joint: Any, called: str, ends: JointEnds | None) -> float:
+    """Position of a finger joint at which the hand is widest, m or rad."""
+    lower = float(model.lowerPositionLimit[joint.idx_q])
+    upper = float(model.upperPositionLimit[joint.idx_q])
+    if joint.nq != 1 or not (math.isfinite(lower) and math.isfinite(upper)):
+        raise ProfileError(f"finger joint {called} has no limits to open and to shut at")
+    unit = "m" if joint.shortname().startswith("JointModelP") else "rad"
+    if ends is None and unit == "m":
+        return upper
+    way = f"it goes from {lower:g} to {upper:g} {unit}"
+    wanted = f"gripper: {{joint_open_{unit}: ..., joint_shut_{unit}: ...}}"
+    if ends is None:
+        raise ProfileError(
+            f"finger joint {called} turns, and its angle is no width: say at which angle the "
+            f"gripper is open by max_width_m and at which it is shut, as {wanted}; {way}"
+        )
+    if ends.unit != unit:
+        does = "slides" if unit == "m" else "turns"
+        raise ProfileError(f"finger joint {called} {does}: write {wanted}; {way}")
+    margin = BEYOND_LIMITS * (upper - lower)
+    for what, value in (("open", ends.open), ("shut", ends.shut)):
+        if not lower - margin <= value <= upper + margin:
+            raise ProfileError(
+                f"finger joint {called} cannot be at gripper.joint_{what}_{unit} ({value:g}): {way}"
+            )
+    return ends.open
 
 
 def _frame(model: Any, urdf: Path, name: str) -> int:

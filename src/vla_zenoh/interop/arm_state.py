@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vla_zenoh.control.fingers import Fingers
 from vla_zenoh.control.kinematics import Kinematics
 from vla_zenoh.control.so3 import Pose, quat_from_rotation
 from vla_zenoh.errors import CodecError, RecordError
@@ -20,8 +21,8 @@ MOVING_M_S = 0.002
 BEYOND = 10.0
 """A joint may be told to be, and to move, this many times as far as its description allows: zero
 points are set in many ways, garbage is further off."""
-WIDEST_M = 10.0
-"""Fingers told to be further open, or to move so far within a second, are garbage."""
+FURTHEST = 10.0
+"""Finger joints told to be further, m or rad, or to move so far within a second, are garbage."""
 RESTARTED_NS = 1_000_000_000
 """A stamp this much older than the last one is a robot that was started anew, or a clock that was
 set; a smaller step back is a message that was overtaken."""
@@ -57,7 +58,8 @@ class ArmState:
 
     def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
         robot = profile.robot
-        self._arm, self._fingers = robot.arm_joints, robot.finger_joints
+        self._arm, self._finger_names = robot.arm_joints, robot.finger_joints
+        self._fingers = Fingers(robot.gripper, len(robot.finger_joints))
         self._max_width_m = robot.gripper.max_width_m
         self._kinematics = kinematics
         at = [kinematics.arm_joints.index(name) for name in robot.arm_joints]
@@ -139,19 +141,18 @@ class ArmState:
         return np.zeros(len(at))
 
     def _take_fingers(self, joints: Joints, places: dict[str, int], stamp_ns: int) -> None:
-        at = [places[name] for name in self._fingers if name in places]
+        at = [places[name] for name in self._finger_names if name in places]
         if not at:
             return
-        share = len(self._fingers) / len(at)
         positions = _finite("position", joints.position[at])
-        if float(np.abs(positions).max()) > WIDEST_M:
-            raise CodecError("invalid", f"a finger more than {WIDEST_M:g} m open")
+        if float(np.abs(positions).max()) > FURTHEST:
+            raise CodecError("invalid", f"a finger joint beyond {FURTHEST:g} m or rad")
         self._finger_newness.check(stamp_ns)
-        width_m = float(positions.sum()) * share
+        width_m = self._fingers.width_m(positions)
         elapsed_s = (stamp_ns - self.width_stamp_ns) / 1e9
         velocity = None if joints.velocity is None else joints.velocity[at]
-        if velocity is not None and bool((np.abs(velocity) <= WIDEST_M).all()):
-            self._finger_speed_m_s = abs(float(velocity.sum())) * share
+        if velocity is not None and bool((np.abs(velocity) <= FURTHEST).all()):
+            self._finger_speed_m_s = self._fingers.speed_m_s(velocity)
         elif self.width_m is not None and 0 < elapsed_s < 1:
             self._finger_speed_m_s = abs(width_m - self.width_m) / elapsed_s
         self.width_m, self.width_stamp_ns = width_m, stamp_ns
@@ -178,7 +179,7 @@ class ArmState:
             wanted_m: width asked for last; where no finger joints are described, it is believed.
             held: the gripper said that it holds something.
         """
-        if not self._fingers:
+        if not self._finger_names:
             width_m = self._max_width_m if wanted_m is None else wanted_m
             return GripperState(width_m, busy, held)
         if self.width_m is None:

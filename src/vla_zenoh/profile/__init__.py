@@ -12,7 +12,7 @@ from vla_zenoh.profile.load import (
     read_profile,
     to_yaml,
 )
-from vla_zenoh.profile.robot import GripperProfile, RobotProfile
+from vla_zenoh.profile.robot import GripperProfile, JointEnds, RobotProfile
 from vla_zenoh.profile.schema import CameraProfile, Composition, HostProfile, Profile, Timing
 from vla_zenoh.profile.session import SessionProfile
 
@@ -23,6 +23,7 @@ __all__ = [
     "Composition",
     "GripperProfile",
     "HostProfile",
+    "JointEnds",
     "JointLimits",
     "Limits",
     "Profile",

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from vla_zenoh.faults import nearest
-from vla_zenoh.profile.ros2 import JOINT_COMMANDS
+from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Gripper
 from vla_zenoh.profile.section import Place
 from vla_zenoh.profile.session import TRUSTED_PROTOCOLS, endpoint_faults, is_loopback
 
@@ -108,6 +108,24 @@ def _ros2(profile: Profile) -> Iterator[Fault]:
     gripper = ros2.gripper
     if gripper is not None and gripper.grasp and gripper.type != "franka_msgs/action/Move":
         yield ("ros2", "gripper", "grasp"), "goes with type franka_msgs/action/Move only"
+    if gripper is not None:
+        yield from _gripper_position(gripper, robot.gripper.joint_ends is not None)
+
+
+def _gripper_position(gripper: Ros2Gripper, has_ends: bool) -> Iterator[Fault]:
+    """A number that the gripper takes for another one opens it where it should close."""
+    place = ("ros2", "gripper", "position")
+    ends = "joint_open_rad and joint_shut_rad (_m where it slides) in robot.gripper"
+    if gripper.says_width and gripper.position is not None:
+        yield place, f"is not for {gripper.type}, which takes the width"
+    elif gripper.position == "joint" and not has_ends:
+        yield place, f"is joint, which needs {ends}"
+    elif not (gripper.says_width or gripper.position or has_ends):
+        yield (
+            place,
+            f"is missing: does the driver take the m between the fingers (width), those of one "
+            f"finger (finger), or what its joint goes by (joint, with {ends})?",
+        )
 
 
 def _way_to_ros2(profile: Profile) -> Iterator[Fault]:

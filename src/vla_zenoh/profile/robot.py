@@ -3,21 +3,78 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
 from vla_zenoh.profile.section import Name, Section, Word, Words, refuse
 
 
+class JointEnds(NamedTuple):
+    """Where a finger joint is when the gripper is open, and when it is shut; ``rad`` or ``m``."""
+
+    open: float
+    shut: float
+    unit: Literal["rad", "m"]
+
+
 class GripperProfile(Section):
-    """The gripper. A command is sent when the width differs by more than the dead band."""
+    """The gripper.
+
+    Args:
+        max_width_m: widest opening between the fingers.
+        speed_m_s: of a command.
+        force_n: likewise.
+        dead_band_m: a command is sent when the width differs by more.
+        command_timeout_s: a gripper that has not said for so long that it stands is taken as
+            standing.
+        joint_open_rad: angle of a finger joint that turns when the gripper is open by max_width_m.
+        joint_shut_rad: its angle when the fingers meet. In between both go in a straight line.
+        joint_open_m: likewise of one that slides, where finger joints are not such as add up to
+            the width.
+        joint_shut_m: likewise.
+    """
 
     max_width_m: float = Field(default=0.08, gt=0, le=1)
     speed_m_s: float = Field(default=0.1, ge=1e-4, le=1)
     force_n: float = Field(default=25.0, ge=0, le=500)
     dead_band_m: float = Field(default=0.001, gt=0, le=0.05)
     command_timeout_s: float = Field(default=2.0, gt=0, le=30)
+    joint_open_rad: float | None = None
+    joint_shut_rad: float | None = None
+    joint_open_m: float | None = Field(default=None, ge=-1, le=1)
+    joint_shut_m: float | None = Field(default=None, ge=-1, le=1)
+
+    @property
+    def joint_ends(self) -> JointEnds | None:
+        """What the profile says of the finger joint, None where fingers add up to the width."""
+        if self.joint_open_rad is not None and self.joint_shut_rad is not None:
+            return JointEnds(self.joint_open_rad, self.joint_shut_rad, "rad")
+        if self.joint_open_m is not None and self.joint_shut_m is not None:
+            return JointEnds(self.joint_open_m, self.joint_shut_m, "m")
+        return None
+
+    @model_validator(mode="after")
+    def _ends_fit(self) -> GripperProfile:
+        turning = (("joint_open_rad", self.joint_open_rad), ("joint_shut_rad", self.joint_shut_rad))
+        sliding = (("joint_open_m", self.joint_open_m), ("joint_shut_m", self.joint_shut_m))
+        faults = [
+            ((name,), f"is {angle:g}: more than a turn; give radians")
+            for name, angle in turning
+            if angle is not None and abs(angle) > 2 * math.pi
+        ]
+        for pair in (turning, sliding):
+            (_, at_open), (_, at_shut) = pair
+            if (at_open is None) != (at_shut is None):
+                missing, given = pair if at_open is None else pair[::-1]
+                faults.append(((given[0],), f"needs {missing[0]} beside it"))
+            elif at_open is not None and at_open == at_shut:
+                faults.append(((pair[1][0],), f"is that of {pair[0][0]}: nothing would move"))
+        if all(any(value is not None for _, value in pair) for pair in (turning, sliding)):
+            why = "is for a joint that slides, joint_open_rad for one that turns: give one of them"
+            faults.append((("joint_open_m",), why))
+        refuse(faults)
+        return self
 
 
 class RobotProfile(Section):
@@ -32,7 +89,8 @@ class RobotProfile(Section):
         base_frame: link all poses are given in.
         tcp_frame: link whose pose is meant.
         arm_joints: in the order in which every list of joint values in the profile is.
-        finger_joints: of the gripper.
+        finger_joints: of the gripper, whose joint states tell its width. Those that slide add up to
+            it; of those that turn `gripper` has to say where they are open and shut.
         home_rad: where a reset puts the simulated arm, and the posture a redundant arm keeps.
         gripper: its own section.
     """

@@ -84,13 +84,16 @@ class Ros2Wrench(Section):
 
 
 class Ros2Gripper(Section):
-    """What the gripper is commanded by: an action, or a topic of widths.
+    """What the gripper is commanded by: an action, or a topic of numbers.
 
     Args:
         topic: name of the action or topic.
         type: one of `GRIPPER_ACTIONS`, or a topic of plain numbers.
         grasp: action of franka_msgs/action/Grasp that closes, where ``topic`` only moves.
-        per_finger: positions are those of one finger, half of the width.
+        position: what the number means that is sent, where the type does not say it: ``width``, the
+            m between the fingers; ``finger``, the m of one of them, half of that; ``joint``, the m
+            or rad of the finger joint, by the ``joint_open`` and ``joint_shut`` of robot.gripper.
+            None: ``joint`` where robot.gripper has those; else it has to be said.
     """
 
     topic: Topic
@@ -102,7 +105,12 @@ class Ros2Gripper(Section):
         "std_msgs/msg/Float64MultiArray",
     ]
     grasp: Topic | None = None
-    per_finger: bool = False
+    position: Literal["width", "finger", "joint"] | None = None
+
+    @property
+    def says_width(self) -> bool:
+        """The type itself means the width."""
+        return self.type.startswith("franka_msgs/")
 
 
 class Ros2Profile(Section):

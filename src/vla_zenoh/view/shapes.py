@@ -19,6 +19,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vla_zenoh.control.arm import make_kinematics
+from vla_zenoh.control.fingers import Fingers
 from vla_zenoh.control.so3 import Pose
 from vla_zenoh.errors import ResourceError, VlaZenohError
 from vla_zenoh.profile import Profile
@@ -67,7 +68,8 @@ class RobotShapes:
         self._joints = {
             name: self._index(name) for name in (*robot.arm_joints, *robot.finger_joints)
         }
-        self._fingers = robot.finger_joints
+        self._finger_names = robot.finger_joints
+        self._fingers = Fingers(robot.gripper, len(robot.finger_joints))
         self.meshes = link_meshes(self.kinematics.urdf)
         self._frames = {mesh.link: self._model.getFrameId(mesh.link) for mesh in self.meshes}
 
@@ -81,8 +83,8 @@ class RobotShapes:
                 self._q[self._joints[name]] = value
 
     def open(self, width_m: float) -> None:
-        """Open the fingers to a width, each by its share."""
-        self.move({name: width_m / len(self._fingers) for name in self._fingers})
+        """Open the fingers to a width, all alike."""
+        self.move(dict.fromkeys(self._finger_names, self._fingers.position(width_m)))
 
     def placements(self) -> Iterator[tuple[str, Pose]]:
         """Every link with a mesh, and its pose in the base frame."""

@@ -6,8 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vla_zenoh.control.fingers import Fingers
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.names import request_of, send_goal_of
+from vla_zenoh.profile import GripperProfile
+from vla_zenoh.profile.ros2 import Ros2Gripper
 from vla_zenoh.types import GripperCommand
 
 MOVE, GRASP = "franka_msgs/action/Move", "franka_msgs/action/Grasp"
@@ -24,13 +27,20 @@ class Outcome(NamedTuple):
     said: str
 
 
+def position(ros2: Ros2Gripper, gripper: GripperProfile, width_m: float) -> float:
+    """The number that the gripper's driver takes for an opening: m, or rad of its joint."""
+    if ros2.position == "joint" or (ros2.position is None and gripper.joint_ends is not None):
+        return Fingers(gripper, 0).position(width_m)
+    return width_m / 2 if ros2.position == "finger" else width_m
+
+
 def send_goal(
     messages: Messages,
     action: str,
     goal_id: bytes,
     command: GripperCommand,
     *,
-    per_finger: bool,
+    position: float,
     max_width_m: float,
 ) -> Any:
     """The request that begins a goal.
@@ -40,23 +50,22 @@ def send_goal(
         action: one of the three.
         goal_id: 16 bytes.
         command: opening, speed and force.
-        per_finger: the robot's positions are those of one finger.
+        position: the opening as `GRIPPER_COMMAND` takes it, see `position`; the others take widths.
         max_width_m: a grasp succeeds at whatever width up to this.
     """
-    width_m = command.width_m / 2 if per_finger else command.width_m
     if action == MOVE:
-        goal = {"width": width_m, "speed": command.speed_m_s}
+        goal = {"width": command.width_m, "speed": command.speed_m_s}
     elif action == GRASP:
         epsilon = messages.new("franka_msgs/msg/GraspEpsilon", inner=max_width_m, outer=max_width_m)
         goal = {
-            "width": width_m,
+            "width": command.width_m,
             "epsilon": epsilon,
             "speed": command.speed_m_s,
             "force": command.force_n,
         }
     else:
         order = messages.new(
-            "control_msgs/msg/GripperCommand", position=width_m, max_effort=command.force_n
+            "control_msgs/msg/GripperCommand", position=position, max_effort=command.force_n
         )
         goal = {"command": order}
     return messages.new(

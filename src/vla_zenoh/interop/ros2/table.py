@@ -19,7 +19,7 @@ from vla_zenoh.interop.ros2.topics import (
     transforms,
     wrench,
 )
-from vla_zenoh.types import FloatArray, GripperCommand, JointCommand, PoseCommand
+from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
 
 Write = Callable[[Messages, str, Any, Stamp], Any]
 
@@ -48,8 +48,8 @@ class Writing(NamedTuple):
     Args:
         type: ROS type.
         key: which of our keys it carries on.
-        record: what comes on that key.
-        write: makes a message of the record.
+        record: what it is made of: what comes on that key, or of a gripper the number it takes.
+        write: makes a message of that.
     """
 
     type: str
@@ -73,8 +73,8 @@ READINGS = (
 
 
 GRIPPER_WRITINGS = (
-    Writing(float_array.TYPE, "command_gripper", GripperCommand, float_array.write_width),
-    Writing(plain.NUMBER, "command_gripper", GripperCommand, plain.write_width),
+    Writing(float_array.TYPE, "command_gripper", float, float_array.write_position),
+    Writing(plain.NUMBER, "command_gripper", float, plain.write_position),
 )
 
 

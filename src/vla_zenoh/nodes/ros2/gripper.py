@@ -1,4 +1,4 @@
-"""The gripper of a ROS 2 robot: by an action, one goal at a time, or by a topic of widths."""
+"""The gripper of a ROS 2 robot: by an action, one goal at a time, or by a topic of numbers."""
 
 from __future__ import annotations
 
@@ -145,12 +145,15 @@ class Gripper:
         if self._topic is None:
             self._keeper.want(command)
             return
-        share = 0.5 if self._profile.per_finger else 1.0
-        order = GripperCommand(command.width_m * share, command.speed_m_s, command.force_n)
-        message = _WIDTHS[self._profile.type](
-            self._messages, self._profile.type, order, Stamp(now_ns, "")
+        message = _NUMBERS[self._profile.type](
+            self._messages, self._profile.type, self._position(command), Stamp(now_ns, "")
         )
         self._topic.put(self._messages.encode(message))
+
+    def _position(self, command: GripperCommand) -> float:
+        assert self._profile is not None
+        gripper = self._node.profile.robot.gripper
+        return gripper_actions.position(self._profile, gripper, command.width_m)
 
     # -- the action ---------------------------------------------------------------------------
     def _send(self, goal: Goal) -> None:
@@ -165,7 +168,7 @@ class Gripper:
             self._action,
             self._goal_id,
             goal.command,
-            per_finger=self._profile.per_finger,
+            position=self._position(goal.command),
             max_width_m=self._node.profile.robot.gripper.max_width_m,
         )
         self._node.counters["ros2.gripper_goals"] += 1
@@ -240,4 +243,4 @@ class Gripper:
         self._node.tell(Event("warning", "fault", "gripper", why[:1000]))
 
 
-_WIDTHS: dict[str, table.Write] = {row.type: row.write for row in table.GRIPPER_WRITINGS}
+_NUMBERS: dict[str, table.Write] = {row.type: row.write for row in table.GRIPPER_WRITINGS}

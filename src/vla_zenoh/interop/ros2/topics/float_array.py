@@ -8,7 +8,7 @@ import numpy as np
 
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.samples import Stamp
-from vla_zenoh.types import GripperCommand, JointCommand
+from vla_zenoh.types import JointCommand
 
 TYPE = "std_msgs/msg/Float64MultiArray"
 
@@ -18,6 +18,6 @@ def write_joints(messages: Messages, kind: str, command: JointCommand, stamp: St
     return messages.new(kind, data=np.array(command.position_rad))
 
 
-def write_width(messages: Messages, kind: str, command: GripperCommand, stamp: Stamp) -> Any:
-    """The opening of a gripper (m), alone."""
-    return messages.new(kind, data=np.array([command.width_m]))
+def write_position(messages: Messages, kind: str, position: float, stamp: Stamp) -> Any:
+    """The opening of a gripper, as its driver takes it, alone."""
+    return messages.new(kind, data=np.array([position]))

@@ -6,7 +6,6 @@ from typing import Any
 
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.samples import Stamp
-from vla_zenoh.types import GripperCommand
 
 TEXT, TRUTH, NUMBER = "std_msgs/msg/String", "std_msgs/msg/Bool", "std_msgs/msg/Float64"
 
@@ -16,6 +15,6 @@ def read(message: Any) -> Any:
     return message.data
 
 
-def write_width(messages: Messages, kind: str, command: GripperCommand, stamp: Stamp) -> Any:
-    """The opening of a gripper, in m."""
-    return messages.new(kind, data=command.width_m)
+def write_position(messages: Messages, kind: str, position: float, stamp: Stamp) -> Any:
+    """The opening of a gripper, as its driver takes it."""
+    return messages.new(kind, data=position)
