@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from vla_zenoh.cli.profile import profile_app
 from vla_zenoh.control.arm import make_kinematics, make_shadow
+from vla_zenoh.interop.ros2.gripper_actions import position
 from vla_zenoh.loader import make_robot
 from vla_zenoh.profile import load_profile
 from vla_zenoh.resources import robot_urdf
@@ -25,11 +26,23 @@ MESHES = "package://ur_description/"
 """How drivers of ROS name the folder of a robot's shapes."""
 
 
+KNUCKLE = """
+  <link name="robotiq_85_left_knuckle_link"/>
+  <joint name="robotiq_85_left_knuckle_joint" type="revolute">
+    <parent link="tool0"/><child link="robotiq_85_left_knuckle_link"/><axis xyz="0 1 0"/>
+    <limit lower="0" upper="0.8" effort="50" velocity="0.5"/>
+  </joint>
+</robot>"""
+"""The joint of a 2F-85, as its driver describes it."""
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """With all files of the text."""
     found = re.findall(r"```\w+\n# (\w+\.\w+)\n(.*?)```", TEXT, re.DOTALL)
-    assert [name for name, _ in found] == ["ur5.yaml", "my_arm.py", "mine.yaml"]
+    assert [name for name, _ in found] == [
+        "ur5.yaml", "ur5e_2f85.yaml", "my_arm.py", "mine.yaml"
+    ]  # fmt: skip
     for name, text in found:
         (tmp_path / name).write_text(text, "utf-8")
     return tmp_path
@@ -77,6 +90,29 @@ def test_a_description_of_the_robots_own_driver_needs_its_meshes_beside_it(folde
     (folder / "ur_description").symlink_to(package)
     result = CliRunner().invoke(profile_app, words)
     assert (result.exit_code, result.stderr) == (0, "")
+
+
+def test_a_gripper_that_turns_is_refused_until_its_two_angles_are_said(folder: Path) -> None:
+    shipped = robot_urdf(load_profile(str(folder / "ur5.yaml")).robot.description)
+    (folder / "ur_description").symlink_to(shipped.parents[1])
+    text = re.sub(r"package://[^\"]*?/ur_description/", MESHES, shipped.read_text())
+    (folder / "ur5e_2f85.urdf").write_text(text.replace("</robot>", KNUCKLE))
+    (folder / "ur5e.yaml").write_text("extends: ur5\nrobot: {name: ur5e}\n")
+    file = folder / "ur5e_2f85.yaml"
+    result = CliRunner().invoke(profile_app, ["check", str(file)])
+    assert (result.exit_code, result.stderr) == (0, "")
+    profile = load_profile(str(file))
+    assert profile.ros2 is not None
+    assert profile.ros2.gripper is not None
+    sent = [position(profile.ros2.gripper, profile.robot.gripper, at_m) for at_m in (0.085, 0.0)]
+    assert sent == pytest.approx([0.0, 0.7929])
+
+    said = "".join(line for line in file.read_text().splitlines(True) if "_rad:" not in line)
+    file.write_text(said.replace("GripperCommand}", "GripperCommand, position: width}"))
+    result = CliRunner().invoke(profile_app, ["check", str(file)])
+    assert result.exit_code == 1
+    assert "finger joint 'robotiq_85_left_knuckle_joint' of ur5e_2f85.urdf turns" in result.stderr
+    assert "gripper: {joint_open_rad: ..., joint_shut_rad: ...}" in result.stderr
 
 
 def test_its_own_arm_is_right_and_goes_where_it_is_told_to(folder: Path) -> None:
