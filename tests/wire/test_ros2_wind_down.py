@@ -108,7 +108,7 @@ def test_what_breaks_in_the_loop_brakes_the_arm_and_is_told(
 def test_a_target_that_cannot_be_sent_is_followed_by_those_that_can(
     loop: Loop, breaks: Callable[..., None]
 ) -> None:
-    loop.script[MOVING] = lambda: breaks(1 + FAILURES - 1)
+    loop.script[MOVING] = lambda: breaks(2)
     assert ends_broken(loop).endswith(": braked, and ends")
     braked(loop.turns)
 
