@@ -23,6 +23,8 @@ SPOKEN = (
     "action_msgs/srv/CancelGoal_Response",
     "control_msgs/action/GripperCommand_GetResult_Response",
     "control_msgs/action/GripperCommand_SendGoal_Request",
+    "control_msgs/action/ParallelGripperCommand_GetResult_Response",
+    "control_msgs/action/ParallelGripperCommand_SendGoal_Request",
     "diagnostic_msgs/msg/DiagnosticArray",
     "franka_msgs/action/Grasp_SendGoal_Request",
     "franka_msgs/action/Move_GetResult_Request",

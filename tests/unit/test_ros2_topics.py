@@ -14,6 +14,7 @@ from vla_zenoh.interop.ros2.gripper_actions import (
     GRASP,
     GRIPPER_COMMAND,
     MOVE,
+    PARALLEL_COMMAND,
     Outcome,
     outcome,
     position,
@@ -276,6 +277,9 @@ def test_a_goal_says_width_speed_and_force() -> None:
     assert (grasp.epsilon.inner, grasp.epsilon.outer) == (0.08, 0.08)
     command = goal(GRIPPER_COMMAND, position=-0.3).command
     assert (command.position, command.max_effort) == (-0.3, 20.0)
+    command = goal(PARALLEL_COMMAND, position=-0.3).command
+    assert (command.position.tolist(), command.effort.tolist()) == ([-0.3], [20.0])
+    assert not command.velocity.size
 
 
 @pytest.mark.parametrize(
@@ -310,6 +314,8 @@ def test_an_opening_is_sent_as_the_driver_takes_it(
         (GRASP, 5, {"success": True}, Outcome(False, False, "")),
         (GRIPPER_COMMAND, 4, {"reached_goal": True}, Outcome(True, False, "")),
         (GRIPPER_COMMAND, 4, {"stalled": True}, Outcome(False, True, "")),
+        (PARALLEL_COMMAND, 4, {"reached_goal": True}, Outcome(True, False, "")),
+        (PARALLEL_COMMAND, 6, {"stalled": True}, Outcome(False, True, "")),
     ],
 )
 def test_a_result_tells_what_became_of_the_goal(

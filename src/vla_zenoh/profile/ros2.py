@@ -36,6 +36,7 @@ GRIPPER_ACTIONS = (
     "franka_msgs/action/Move",
     "franka_msgs/action/Grasp",
     "control_msgs/action/GripperCommand",
+    "control_msgs/action/ParallelGripperCommand",
 )
 
 
@@ -101,6 +102,7 @@ class Ros2Gripper(Section):
         "franka_msgs/action/Move",
         "franka_msgs/action/Grasp",
         "control_msgs/action/GripperCommand",
+        "control_msgs/action/ParallelGripperCommand",
         "std_msgs/msg/Float64",
         "std_msgs/msg/Float64MultiArray",
     ]

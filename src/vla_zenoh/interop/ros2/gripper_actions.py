@@ -15,6 +15,7 @@ from vla_zenoh.types import GripperCommand
 
 MOVE, GRASP = "franka_msgs/action/Move", "franka_msgs/action/Grasp"
 GRIPPER_COMMAND = "control_msgs/action/GripperCommand"
+PARALLEL_COMMAND = "control_msgs/action/ParallelGripperCommand"
 SUCCEEDED = 4
 """action_msgs/GoalStatus.STATUS_SUCCEEDED."""
 
@@ -47,10 +48,10 @@ def send_goal(
 
     Args:
         messages: of the robot's distribution.
-        action: one of the three.
+        action: one of the four.
         goal_id: 16 bytes.
         command: opening, speed and force.
-        position: the opening as `GRIPPER_COMMAND` takes it, see `position`; the others take widths.
+        position: the opening as the driver takes it, see `position`; `MOVE`, `GRASP` take widths.
         max_width_m: a grasp succeeds at whatever width up to this.
     """
     if action == MOVE:
@@ -63,6 +64,14 @@ def send_goal(
             "speed": command.speed_m_s,
             "force": command.force_n,
         }
+    elif action == PARALLEL_COMMAND:
+        # It has one joint, which needs no name; its speed, in the joint's unit, is the driver's.
+        order = messages.new(
+            "sensor_msgs/msg/JointState",
+            position=np.array([position]),
+            effort=np.array([command.force_n]),
+        )
+        goal = {"command": order}
     else:
         order = messages.new(
             "control_msgs/msg/GripperCommand", position=position, max_effort=command.force_n
@@ -92,7 +101,7 @@ def outcome(action: str, response: Any) -> Outcome:
     """What the answer of get_result means."""
     result = response.result
     reached = response.status == SUCCEEDED
-    if action == GRIPPER_COMMAND:
+    if action in (GRIPPER_COMMAND, PARALLEL_COMMAND):
         return Outcome(reached and bool(result.reached_goal), bool(result.stalled), "")
     success = reached and bool(result.success)
     return Outcome(success, success and action == GRASP, str(result.error)[:300])
