@@ -2,7 +2,7 @@
 
 For model environments: numpy alone. Parts are joined by ``+``, as in ``position+rotvec+gripper_m``:
 
-    joint                           positions of the arm's joints, rad: as many as it has
+    joint, joint_deg                positions of the arm's joints, rad or degrees: as many as it has
     position, x y z                 TCP in the base frame, m
     rpy, roll pitch yaw             its rotation: extrinsic x, y, z, rad
     rotvec, rx ry rz                likewise axis times angle, rad
@@ -33,6 +33,7 @@ COORDINATES: Mapping[str, tuple[str, ...]] = {
 """Parts whose numbers have names of their own."""
 PARTS: Mapping[str, tuple[StatePart | None, int | None]] = {
     "joint": ("joint", None),
+    "joint_deg": ("joint", None),
     **{whole: ("pose", 3) for whole in COORDINATES},
     **{name: ("pose", 1) for names in COORDINATES.values() for name in names},
     "quat_xyzw": ("pose", 4),
@@ -126,8 +127,8 @@ def state_vector(
     out: list[float] = []
     for name in names:
         whole, index = _WHOLE.get(name, (name, None))
-        if joint is not None and name == "joint":
-            numbers = joint.position_rad.tolist()
+        if joint is not None and name in JOINTS:
+            numbers = JOINTS[name](joint.position_rad).tolist()
         elif pose is not None and whole == "position":
             numbers = pose.position_m.tolist()
         elif pose is not None and whole in ROTATIONS:
@@ -176,6 +177,10 @@ def _open(width_m: float, max_width_m: float) -> float:
     return min(max(width_m / max_width_m, 0.0), 1.0)
 
 
+JOINTS: Mapping[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    "joint": np.asarray,
+    "joint_deg": np.rad2deg,
+}
 ROTATIONS: Mapping[str, Callable[[Numbers], list[float]]] = {
     "rpy": rpy,
     "rotvec": rotvec,
@@ -217,8 +222,8 @@ def state_of(
     at = 0
     for name, size in zip(names, sizes, strict=True):
         values, at = numbers[at : at + size], at + size
-        if name == "joint":
-            out["joint"] = values
+        if name in JOINTS:
+            out["joint"] = values if name == "joint" else np.deg2rad(values)
         elif name == "position":
             out["position_m"] = values
         elif name in _ROTATIONS_BACK:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -21,6 +22,7 @@ from vla_zenoh.dataset.statistics import Colours, of_numbers
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.recording.run import load_run
 from vla_zenoh.state_vector import read_parts
+from vla_zenoh.types import JointState
 
 FPS, USED = 10, 2
 """Steps of a chunk until the next one takes over."""
@@ -170,6 +172,24 @@ def test_figures_of_pictures_are_those_of_their_pixels() -> None:
         np.testing.assert_allclose(np.reshape(found[name], 3), wanted[name], rtol=1e-9)
     for name in ("q01", "q10", "q50", "q90", "q99"):
         np.testing.assert_allclose(np.reshape(found[name], 3), wanted[name], atol=1.5 / 255)
+
+
+def test_the_state_of_an_arm_has_as_many_joints_as_it_was_recorded_with(
+    run_file: Path, tmp_path: Path
+) -> None:
+    run = load_run(run_file)
+    six, none = tuple(f"j{n}" for n in range(6)), np.zeros(6)
+    joint = JointState(six, np.arange(6) / 10, none, none)
+    run = replace(run, joints=[heard._replace(record=joint) for heard in run.poses])
+    export(tmp_path / "six", episodes_of(run), [], read_parts("joint+joint_deg+gripper_m"))
+    info = json.loads((tmp_path / "six" / "meta" / "info.json").read_text())
+    state = info["features"]["observation.state"]
+    assert state["shape"] == [13]
+    assert state["names"][5:7] == ["joint6", "joint1_deg"]
+    rows = pq.read_table(next((tmp_path / "six" / "data").rglob("*.parquet")))
+    first = rows.column("observation.state")[0].as_py()
+    np.testing.assert_allclose(first[:6], np.arange(6) / 10, atol=STATE_ATOL)
+    np.testing.assert_allclose(first[6:12], np.rad2deg(np.arange(6) / 10), rtol=STATE_ATOL)
 
 
 def test_what_cannot_become_a_dataset_is_named(run_file: Path, tmp_path: Path) -> None:

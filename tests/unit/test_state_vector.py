@@ -82,12 +82,14 @@ def test_every_part_has_as_many_numbers_as_it_says() -> None:
 
 
 @pytest.mark.parametrize("joints", [UR, PANDA])
-def test_joints_are_as_many_as_the_arm_has(joints: int) -> None:
-    names = state_vector.read_state("joint+gripper_open", joints + 1, joints)
+@pytest.mark.parametrize(("part", "unit"), [("joint", 1.0), ("joint_deg", 180 / np.pi)])
+def test_joints_are_as_many_as_the_arm_has(joints: int, part: str, unit: float) -> None:
+    names = state_vector.read_state(f"{part}+gripper_open", joints + 1, joints)
     zeros = np.zeros(joints)
     arm = JointState(tuple(f"j{n}" for n in range(joints)), np.arange(joints) / 10, zeros, zeros)
     numbers = state_vector.state_vector(names, replace(seen(), joint=arm), MAX_WIDTH_M)
-    np.testing.assert_allclose(numbers, [*(np.arange(joints) / 10), 0.25], atol=ATOL)
+    wanted = unit * np.arange(joints) / 10
+    np.testing.assert_allclose(numbers, [*wanted, 0.25], rtol=ATOL)
     back = state_vector.state_of(names, numbers.astype(float), joints, MAX_WIDTH_M)
     np.testing.assert_allclose(back["joint"], arm.position_rad, atol=ATOL)
     with pytest.raises(SpecError, match=rf"has 9 numbers, 'joint' has {joints}; .*\({joints}\)"):

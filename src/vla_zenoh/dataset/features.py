@@ -20,7 +20,6 @@ from vla_zenoh.types import Task
 DEFAULT_STATE = "position+rpy+gripper_m"
 STATE, ACTION, PICTURE = "observation.state", "action", "observation.images."
 NAMES = {
-    "joint": [f"joint{index}" for index in range(1, 8)],
     "position": ["x", "y", "z"],
     "rpy": ["roll", "pitch", "yaw"],
     "rotvec": ["rx", "ry", "rz"],
@@ -33,9 +32,23 @@ NEAR_NS = 100_000_000
 """A state belongs to a frame when it lies no further from it than this."""
 
 
-def state_names(parts: Sequence[str]) -> list[str]:
-    """A name for each number."""
-    return [name for part in parts for name in NAMES.get(part, [part])]
+def state_names(parts: Sequence[str], joints: int) -> list[str]:
+    """A name for each number.
+
+    Args:
+        parts: of the state.
+        joints: how many the arm has.
+    """
+    of_arm = {
+        "joint": [f"joint{index}" for index in range(1, joints + 1)],
+        "joint_deg": [f"joint{index}_deg" for index in range(1, joints + 1)],
+    }
+    return [name for part in parts for name in {**NAMES, **of_arm}.get(part, [part])]
+
+
+def joints_of(episode: Episode) -> int:
+    """How many joints the arm was recorded with; 0: none were."""
+    return len(episode.run.joints[0].record.names) if episode.run.joints else 0
 
 
 def action_names(spec: ActionSpec) -> list[str]:

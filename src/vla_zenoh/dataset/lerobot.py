@@ -25,6 +25,7 @@ from vla_zenoh.dataset.features import (
     PICTURE,
     STATE,
     action_names,
+    joints_of,
     state_names,
     states_of,
 )
@@ -117,6 +118,7 @@ class _Dataset:
         self._spec = episodes[0].spec
         self._fps = fps_of(self._spec.action)
         self._states = [states_of(episode, parts) for episode in self._episodes]
+        self._state_names = state_names(parts, joints_of(episodes[0]))
         self._tasks = list(
             dict.fromkeys(frame.prompt for episode in self._episodes for frame in episode.frames)
         )
@@ -168,7 +170,7 @@ class _Dataset:
     def _write_data(self) -> list[dict[str, NDArray[Any]]]:
         """Rows of each episode, as they were written."""
         pa = self._pa
-        numbers = {STATE: len(state_names(self._parts)), ACTION: self._spec.action.dimension}
+        numbers = {STATE: len(self._state_names), ACTION: self._spec.action.dimension}
         schema = pa.schema(
             [(name, pa.list_(pa.float32(), size)) for name, size in numbers.items()]
             + [("timestamp", pa.float32())]
@@ -329,7 +331,7 @@ class _Dataset:
                 },
             }
         for name, names in (
-            (STATE, state_names(self._parts)),
+            (STATE, self._state_names),
             (ACTION, action_names(self._spec.action)),
         ):
             out[name] = {"dtype": "float32", "shape": [len(names)], "names": names}
