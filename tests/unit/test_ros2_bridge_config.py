@@ -119,7 +119,7 @@ def test_a_robot_by_joints_whose_gripper_takes_widths_has_no_action(tmp_path: Pa
 robot: {command: joint}
 ros2:
   joint_command: {topic: /joints, type: trajectory_msgs/msg/JointTrajectory}
-  gripper: {topic: /width, type: std_msgs/msg/Float64}
+  gripper: {topic: /width, type: std_msgs/msg/Float64, position: width}
 """,
     )
     found = allowed(profile)

@@ -22,7 +22,7 @@ EVERYTHING = """\
   gripper: {grasp: /panda_gripper/grasp}
 """
 NO_PEOPLE = """\
-  gripper: {topic: /width, type: std_msgs/msg/Float64}
+  gripper: {topic: /width, type: std_msgs/msg/Float64, position: width}
   services: null
 """
 

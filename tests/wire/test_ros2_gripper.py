@@ -30,6 +30,14 @@ WITH_GRASP = "  gripper: {grasp: /panda_gripper/grasp}\n"
 FORGOTTEN_S = 0.35
 """Longer than timing.command_timeout_s."""
 MOVE, GRASP = "/panda_gripper/move/_action", "/panda_gripper/grasp/_action"
+KNUCKLE = "/robotiq_gripper_controller/gripper_cmd"
+SHUT_RAD = 0.7929
+ROBOTIQ = f"""\
+  gripper: {{topic: {KNUCKLE}, type: control_msgs/action/GripperCommand}}
+robot: {{gripper: {{joint_open_rad: 0.0, joint_shut_rad: {SHUT_RAD}}}}}
+"""
+ENDS = {"GripperCommand": {"stalled": True}}
+"""How the robot's actions end."""
 ORDER = GripperCommand(0.02, 0.05, 10.0)
 
 
@@ -78,8 +86,8 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
         peer = Ros2Peer(theirs, "ros2dds")
         rig = Rig(node, gripper, *streams)
 
-        def serve(topic: str, action: str) -> None:
-            kind = f"franka_msgs/action/{action}"
+        def serve(topic: str, action: str, package: str = "franka_msgs") -> None:
+            kind = f"{package}/action/{action}"
 
             def accept(asked: Any) -> Any:
                 rig.goals.append(asked.goal)
@@ -88,7 +96,7 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
 
             def finish(_: Any) -> Any:
                 rig.over.wait()
-                result = peer.message(f"{kind}_Result", success=True)
+                result = peer.message(f"{kind}_Result", **ENDS.get(action, {"success": True}))
                 return peer.message(f"{kind}_GetResult_Response", status=SUCCEEDED, result=result)
 
             peer.serve(f"{topic}/send_goal", f"{kind}_SendGoal", accept)
@@ -96,6 +104,7 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
 
         serve(MOVE, "Move")
         serve(GRASP, "Grasp")
+        serve(f"{KNUCKLE}/_action", "GripperCommand", "control_msgs")
         until("the gripper listens", lambda: all(stream.wanted for stream in streams))
         yield rig
         rig.over.set()
@@ -194,3 +203,23 @@ def test_who_holds_something_is_told_by_the_fingers_and_not_by_the_grasp(rig: Ri
     for at_m, holds in ((0.03, True), (0.0005, False), (None, False), (0.03, True)):
         rig.width_m = at_m
         assert rig.gripper.holding is holds
+
+
+@pytest.mark.parametrize("rig", [ROBOTIQ], indirect=True)
+def test_a_gripper_that_turns_is_sent_the_angle_of_its_opening(rig: Rig) -> None:
+    rig.over.set()
+    rig.width_m = 0.08
+    for number, (width_m, angle_rad) in enumerate(
+        ((0.08, 0.0), (0.02, 0.75 * SHUT_RAD), (0.0, SHUT_RAD)), 1
+    ):
+        rig.command.put(GripperCommand(width_m, 0.05, 10.0))
+        rig.turn_until("the goal", "ros2.gripper_goals", number)
+        until("the robot hears it", lambda count=number: len(rig.goals) == count)
+        assert rig.goals[-1].command.position == pytest.approx(angle_rad)
+
+        def ended() -> bool:
+            rig.turn()
+            return not rig.gripper.busy
+
+        until("it ends", ended)
+    assert rig.gripper.holding, "it stalled"
