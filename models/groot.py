@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy", "pyzmq>=26"]
+# dependencies = ["numpy", "pyzmq>=26", "pin>=4", "example-robot-data>=6"]
 # ///
 """Asks a GR00T policy server (N1.5, N1.6 and later) over ZeroMQ.
 
@@ -31,10 +31,11 @@ class Groot(Adapter):
         preset: libero or bridge, see vla_zenoh/interop/presets.py; none: all is told.
         timeout_s: for connecting, and for each answer.
         api_token: where the server wants one.
-        profile: of the robot, for its gripper.
+        profile: of the robot: its gripper and, where answers are joints, its arm.
         layout: see vla_zenoh/interop/options.py. Pictures are video.NAME, states state.NAME.
     """
 
+    joints = True
     lost = (zmq.ZMQError,)
 
     def __init__(

@@ -317,7 +317,7 @@ def test_what_the_server_says_of_itself_is_held_against_the_options(
         ("openpi", {**LIBERO, "sise": "224x224"}, "no option 'sise'"),
         ("groot", {**LIBERO, "version": "n1"}, "n1.5, n1.6"),
         ("groot", {**LIBERO, "map": "image=camera:front"}, "must begin with 'video.'"),
-        ("groot", {**LIBERO, **JOINTS}, "joints are not read"),
+        ("openvla_rest", {**LIBERO, **JOINTS}, "joints are not read"),
         ("openvla_rest", {"url": "ftp://x"}, "http://HOST:PORT"),
         ("openvla_rest", {**LIBERO, "encoded": "perhaps"}, "yes, no"),
         ("origami", {"session_id": ""}, "session_id is empty"),

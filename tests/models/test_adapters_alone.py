@@ -34,7 +34,7 @@ except PeerError as error:
 OPTIONS = {
     # adapter: (options, where its server is not, whether it needs the arm's kinematics)
     "openpi": ({"preset": "droid"}, "ws://127.0.0.1:PORT", True),
-    "groot": ({"preset": "libero"}, "tcp://127.0.0.1:PORT", False),
+    "groot": ({"preset": "libero"}, "tcp://127.0.0.1:PORT", True),
     "openvla_rest": ({"preset": "oft_libero"}, "http://127.0.0.1:PORT", False),
     "origami": ({"dt_s": "0.1"}, "tcp/127.0.0.1:PORT", True),
 }

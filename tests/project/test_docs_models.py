@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import itertools
 import json
 import re
+import shlex
 import socketserver
 import subprocess
 import sys
@@ -16,9 +18,12 @@ from typing import Any
 
 import pytest
 from camera_rig import until
+from typer.main import get_command
 
+from vla_zenoh.cli.main import app
 from vla_zenoh.errors import PeerError
-from vla_zenoh.interop.options import DEFAULTS
+from vla_zenoh.interop.meaning import MEANING, read_meaning
+from vla_zenoh.interop.options import DEFAULTS, read_map
 from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, ORIGAMI
 from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.lockstep import Lockstep
@@ -32,6 +37,7 @@ from vla_zenoh.policy import (
 )
 from vla_zenoh.profile import load_profile
 from vla_zenoh.profile.fit import workers_of
+from vla_zenoh.state_vector import COORDINATES, PARTS, read_parts
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "models.md").read_text("utf-8")
@@ -110,8 +116,11 @@ def test_every_preset_and_option_is_told() -> None:
     for presets in (OPENPI, GROOT, OPENVLA_REST, ORIGAMI):
         for preset in presets:
             assert f"`{preset}`" in TEXT, preset
-    for option in DEFAULTS:
+    for option in (*DEFAULTS, "none"):
         assert f"`{option}`" in TEXT, option
+    coordinates = {name for names in COORDINATES.values() for name in names}
+    for part in set(PARTS) - coordinates - {"zero"}:
+        assert f"`{part}`" in TEXT, part
 
 
 def test_its_profiles_are_right_and_each_host_knows_what_it_runs(tmp_path: Path) -> None:
@@ -130,17 +139,15 @@ def test_its_profiles_are_right_and_each_host_knows_what_it_runs(tmp_path: Path)
     assert workers_of(left, left.hosts["gpu"]) == ("mine", "scripted")
 
 
-@pytest.mark.parametrize("model", ["openpi", "groot", "openvla_rest", "origami", "lerobot/model"])
-def test_every_argument_of_an_adapter_is_told(model: str) -> None:
-    tree = ast.parse((ROOT / "models" / f"{model}.py").read_text("utf-8"))
-    makers = [
-        part
-        for part in ast.walk(tree)
-        if isinstance(part, ast.FunctionDef) and part.name == "__init__"
-    ]
-    told = [argument.arg for maker in makers for argument in maker.args.args[1:]]
+@pytest.mark.parametrize(
+    "model", ["openpi", "groot", "openvla_rest", "origami", "lerobot", "openvla"]
+)
+def test_every_argument_of_a_model_is_told(model: str) -> None:
+    told = parameters(model)
     assert told
-    assert [name for name in told if f"`{name}`" not in TEXT and f" {name}=" not in TEXT] == []
+    assert [
+        name for name in sorted(told) if f"`{name}`" not in TEXT and f" {name}=" not in TEXT
+    ] == []
 
 
 def test_all_that_a_model_is_given_and_may_ask_for_is_told() -> None:
@@ -188,3 +195,90 @@ def answers(asked: Callable[[str], Any]) -> bool:
         return len(asked("up")) == 2
     except PeerError:
         return False
+
+
+# -- command lines --------------------------------------------------------------------------------
+OTHERS = ("lerobot", "openvla")
+"""Models whose constructor reads a directory of weights."""
+
+
+def command_lines() -> list[list[str]]:
+    """Words of every command of the page, without brackets and comments."""
+    text = re.sub(r"\\?\n {8,}", " ", TEXT)
+    lines = re.findall(r"^ {4}(?:\w+=\S+ )*(vla-zenoh .*)$", text, re.MULTILINE)
+    words = [shlex.split(line.replace("[", "").replace("]", ""), comments=True) for line in lines]
+    return [part for line in words for part in split(line)]
+
+
+def split(words: list[str]) -> list[list[str]]:
+    """Commands that stand in one line with ; between them."""
+    out: list[list[str]] = [[]]
+    for word in words:
+        out[-1].append(word.removesuffix(";"))
+        if word.endswith(";"):
+            out.append([])
+    return out
+
+
+def settings(words: list[str]) -> dict[str, str]:
+    told = [after for word, after in itertools.pairwise(words) if word == "--set"]
+    return dict(setting.split("=", 1) for setting in told)
+
+
+def parameters(model: str) -> set[str]:
+    """Options that the constructor of a shipped model names itself."""
+    tree = ast.parse(find_model(model).path.read_text("utf-8"))
+    (maker,) = [
+        part
+        for part in ast.walk(tree)
+        if isinstance(part, ast.FunctionDef) and part.name == "__init__"
+    ]
+    return {argument.arg for argument in maker.args.args[1:]}
+
+
+def test_its_commands_have_the_options_that_they_are_given() -> None:
+    seen = 0
+    for words in command_lines():
+        command: Any = get_command(app)
+        context = command.make_context("vla-zenoh", [], resilient_parsing=True)
+        rest = words[1:]
+        while hasattr(command, "get_command"):
+            found = command.get_command(context, rest[0])
+            assert found is not None, words
+            command, rest = found, rest[1:]
+        known = {name for parameter in command.params for name in parameter.opts}
+        given = {word.partition("=")[0] for word in rest if re.match(r"--?[a-z]", word)}
+        assert given <= known, (words, given - known)
+        seen += 1
+    assert seen > 30
+
+
+def told_to(*models: str) -> list[tuple[str, dict[str, str]]]:
+    lines = [words for words in command_lines() if words[1] in ("worker", "check", "serve")]
+    return [(line[2], settings(line)) for line in lines if line[2] in models]
+
+
+def test_its_servers_can_be_asked_with_the_options_that_stand_there() -> None:
+    lines = told_to("openpi", "groot", "openvla_rest", "origami")
+    lines = [(model, told) for model, told in lines if "url" in told]
+    assert {model for model, told in lines if told.get("preset") == "none"} == {
+        "openpi",
+        "groot",
+        "openvla_rest",
+    }
+    for model, told in lines:
+        policy = make_policy(find_model(model), told)
+        assert policy.spec.observation.prompt
+
+
+def test_its_checkpoints_are_told_what_they_need_to_be_told() -> None:
+    lines = told_to(*OTHERS)
+    assert len([model for model, _ in lines if model == "lerobot"]) >= 4
+    assert len([model for model, _ in lines if model == "openvla"]) >= 6
+    for model, told in lines:
+        meaning = {name: value for name, value in told.items() if name in MEANING}
+        assert set(told) - set(meaning) <= parameters(model), (model, told)
+        if model == "lerobot":
+            assert read_meaning({"horizon": "1", **meaning})
+            assert read_parts(told["state"])
+            read_map(told.get("map", ""))
