@@ -11,11 +11,13 @@ from camera_rig import free_endpoint, until
 
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
+from vla_zenoh.codec.image import MAX_JPEG_BYTES
 from vla_zenoh.nodes.attendance import MAX_OTHERS
 from vla_zenoh.nodes.client import MAX_WHY, Client
 from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.seen import SeenListener
+from vla_zenoh.nodes.seen import MAX_SAMPLES, SeenListener
 from vla_zenoh.nodes.session import open_session
+from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import Event, Header, NodeStatus, Seen
 
@@ -101,4 +103,25 @@ def test_nobody_shows_what_another_worker_saw_nor_names_a_folder_elsewhere(
 
         until("some are shown", shown)
         assert set(seen) == {"scripted"}
+        listener.close()
+
+
+def test_what_is_no_picture_does_not_wait_for_who_looks(profile: Profile) -> None:
+    who = header_codec.encode(Header(1, 2, "stranger#1"))
+    key = profile.keys.seen("scripted", "front")
+    with open_session(profile.session) as here, open_session(profile.session) as there:
+        listener = SeenListener(here, profile.keys)
+
+        def deleted() -> bool:
+            there.delete(key)
+            return listener.left_out["deleted"] > 0
+
+        until("a deletion is counted", deleted)  # though nobody takes anything
+        there.put(key, bytes(MAX_JPEG_BYTES + 1), attachment=who, congestion_control=SURELY)
+        until("so is what is too large", lambda: listener.left_out["oversize"] == 1)
+        for number in range(MAX_SAMPLES + 1):
+            there.put(f"{key}{number}", b"jpeg", attachment=who, congestion_control=SURELY)
+        until("the oldest made room", lambda: listener.left_out["late"] == 1)
+        assert listener.take() == []
+        assert listener.left_out["cameras"] == MAX_SAMPLES - MAX_CAMERAS
         listener.close()

@@ -17,7 +17,7 @@ from vla_zenoh.nodes import offsets
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.offsets import MAX_HEARD, MAX_PEERS
 from vla_zenoh.nodes.session import open_session
-from vla_zenoh.nodes.surroundings import Neighbours
+from vla_zenoh.nodes.surroundings import MAX_WORKERS, Neighbours
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import Header, NodeStatus
 
@@ -98,6 +98,35 @@ def test_a_camera_is_believed_by_the_node_that_serves_it_and_by_no_other(scene: 
     scene.says(scene.thief, -1e9)
     assert scene.look().camera_nodes == {"front": "camera"}
     assert scene.around.camera_ages_s["front"] >= 3.0
+
+
+def test_a_worker_among_many_who_complain_says_when_it_is_well_again(scene: Scene) -> None:
+    others = [
+        Node(f"worker-{nth}", scene.thief.profile, scene.camera.session)
+        for nth in range(MAX_WORKERS)
+    ]
+    workers = [scene.thief, *others]
+    until("all live", lambda: {node.name for node in workers} <= scene.look().alive)
+
+    def complain(node: Node, complaint: str) -> None:
+        node.report("running", detail={"complaint": complaint}, now=True)
+
+    for node in workers[:-1]:  # one after the other: more at once find no room in a mailbox
+        name = node.name.removeprefix("worker-")
+        complain(node, "no sun")
+        until(name, lambda name=name: scene.look().worker_complaints.get(name) == "no sun")
+    complain(workers[-1], "no sun")
+    until("it is counted", lambda: scene.look() and scene.refused("more_workers") == 1)
+
+    complain(scene.thief, "no moon")
+    until("its new word", lambda: scene.look().worker_complaints["scripted"] == "no moon")
+    complain(scene.thief, "")
+    until("it is well", lambda: "scripted" not in scene.look().worker_complaints)
+    complain(workers[-1], "no sun")
+    until("there is room", lambda: str(MAX_WORKERS - 1) in scene.look().worker_complaints)
+    assert len(scene.around.worker_complaints) == MAX_WORKERS
+    for node in others:
+        node.close()
 
 
 def test_no_picture_is_younger_than_now(scene: Scene) -> None:

@@ -14,7 +14,10 @@ import pytest
 from chain import MOVING_M_S, READY_PATIENCE_S, Chain, command_line
 
 from vla_zenoh.codec.image import decode_jpeg
+from vla_zenoh.nodes.launch import EXPENDABLE, Host
+from vla_zenoh.nodes.place import own_boot
 from vla_zenoh.nodes.seen import SeenListener, Sight
+from vla_zenoh.profile import override
 
 COMMAND_TOLERANCE, ARM_TOLERANCE = 1.1, 2.7
 """As in tests/fault/test_dead_nodes.py."""
@@ -128,6 +131,28 @@ def test_a_worker_of_a_name_that_is_taken_refuses_to_start(chain: Chain) -> None
         out, _ = process.communicate(timeout=30)
     assert process.returncode == 1
     assert "a node 'worker-scripted' of robot 'panda' is alive already" in out
+
+
+def test_a_second_up_of_a_host_is_refused_and_leaves_the_arm_to_the_running_one(
+    chain: Chain,
+) -> None:
+    chain.activate_when_ready()
+    told: list[tuple[str, str]] = []
+    twin = override(chain.profile, {"hosts": {chain.host.host: {"nodes": ["worker"]}}})
+    with Host(twin, None, log=lambda *_: None, tell=lambda *said: told.append(said)) as second:
+
+        def ended() -> bool:
+            second.watch(spare=EXPENDABLE)
+            return any("ended with code 1" in sentence for _, sentence in told)
+
+        chain.until("its worker ends", ended, READY_PATIENCE_S)
+    count = chain.detail("accepted_chunks")
+    chain.until("it goes on", lambda: chain.detail("accepted_chunks") > count + 2)
+    assert chain.state() == "active"
+    assert not chain.events("active->inactive")
+    heard = chain.client.snapshot().values()
+    places = {(said.host, said.boot) for said, _, alive in heard if alive}
+    assert places == {(chain.host.host, own_boot())}
 
 
 def test_a_worker_that_is_not_there_is_refused_in_motion_and_the_arm_goes_on(
