@@ -36,7 +36,7 @@ sys.path[:0] = [str(TESTS), str(TESTS / "fault")]
 import numpy as np  # noqa: E402
 import zenoh  # noqa: E402
 from chain import Chain, running_chain  # noqa: E402
-from ledger import Ledger, segments  # noqa: E402
+from ledger import Growth, Ledger, segments  # noqa: E402
 from refusals import EXPLAINS, STALL_S, Refusals, Witness, unexplained  # noqa: E402
 from report import Found, line, show  # noqa: E402
 from rich.console import Console  # noqa: E402
@@ -66,6 +66,10 @@ WEIGHTS = {
     "junk": 3,
 }
 KILLED = {"worker-scripted": 3, "worker-twin": 3, "camera": 3, "sim": 2, "command": 2, "router": 1}
+DEADLY = ("kill", "freeze")
+CALM_SHARE, CALM_WARM_S = 0.2, 30.0
+"""So much of the time, the last, is calm; what the last death has left comes to rest before it is
+looked whether anything grows."""
 QUIET_S = (1.0, 5.0)
 FREEZE_S = (0.05, 3.0)
 LIFE_S = 65.0
@@ -101,6 +105,8 @@ class Soak:
         self._random = random.Random(seed)
         random.seed(seed)  # the junk's
         self._whom = ""
+        self._weights: dict[str, int] = dict(WEIGHTS)
+        self._calm_s = 0.0
         self._do: dict[str, Callable[[], str | None]] = {
             "prompt": self._prompt,
             "worker": self._worker,
@@ -122,6 +128,10 @@ class Soak:
         try:
             self._begin()
             end_s = time.monotonic() + 60 * minutes
+            calm_s = 60 * minutes * CALM_SHARE
+            while time.monotonic() < end_s - calm_s:
+                self._one()
+            self._begin_calm()
             while time.monotonic() < end_s:
                 self._one()
             self._end()
@@ -145,6 +155,12 @@ class Soak:
         self._note("start")
         chain.recorder.forget()
 
+    def _begin_calm(self) -> None:
+        """From here on nothing dies: who still grows, grows for ever."""
+        self._weights = {name: weight for name, weight in WEIGHTS.items() if name not in DEADLY}
+        self._say("calm: nothing is killed or frozen any more")
+        self._calm_s = time.monotonic() + CALM_WARM_S
+
     def _end(self) -> None:
         found, chain = self.found, self.chain
         chain.client.set_worker(WORKERS[0])
@@ -158,14 +174,11 @@ class Soak:
         for growth in self._ledger.growth():
             # The program that measures keeps samples: it is shown and not judged.
             found.leaks += growth.leaks if growth.node != MEASURER else []
-        found.held["lives"] = [
-            {
-                "node": g.node,
-                "life_s": round(g.life_s),
-                "heap_mib": [g.first.heap_mib, g.last.heap_mib],
-            }
-            for g in self._ledger.growth()
-        ]
+        calm = self._ledger.growth_since(self._calm_s)
+        for growth in calm:
+            found.leaks += growth.leaks if growth.node != MEASURER else []
+        found.held["calm"] = [_life(growth) for growth in calm]
+        found.held["lives"] = [_life(growth) for growth in self._ledger.growth()]
         before, after = found.held["start"]["segments"], found.held["end"]["segments"]
         if after.orphans > before.orphans + MORE_SEGMENTS:
             found.leaks.append(
@@ -187,7 +200,7 @@ class Soak:
 
     # -- one thing after the other ------------------------------------------------------------
     def _one(self) -> None:
-        action = self._random.choices(list(WEIGHTS), list(WEIGHTS.values()))[0]
+        action = self._random.choices(list(self._weights), list(self._weights.values()))[0]
         began_s, self._whom = time.monotonic(), ""
         said = self._do[action]()
         if said is None:
@@ -356,6 +369,14 @@ class Soak:
             )
             time.sleep(0.001)
         return f"{JUNK} pieces of junk"
+
+
+def _life(growth: Growth) -> dict[str, Any]:
+    return {
+        "node": growth.node,
+        "life_s": round(growth.life_s),
+        "heap_mib": [growth.first.heap_mib, growth.last.heap_mib],
+    }
 
 
 def main() -> int:

@@ -9,7 +9,7 @@ import time
 from collections import Counter
 
 import pytest
-from ledger import GROWTH_HANDLES, GROWTH_MIB, Growth, Held, Ledger, look, segments
+from ledger import CALM_MIB, GROWTH_HANDLES, GROWTH_MIB, Growth, Held, Ledger, look, segments
 from refusals import EXPLAINS, FROM, NEVER, STALL_S, Refusals, Witness, unexplained
 from report import Found, line
 
@@ -88,6 +88,13 @@ def test_growth_beyond_its_bound_is_a_leak() -> None:
     assert Growth("sim", 1, 60.0, first, little).leaks == []
     (words,) = Growth("sim", 1, 60.0, first, much).leaks
     assert "heap_mib" in words
+
+
+def test_in_the_calm_less_is_allowed() -> None:
+    first = Held(20.0, 100.0, 90.0, 80.0, 30, 20)
+    more = first._replace(heap_mib=80.0 + CALM_MIB + 1)
+    assert Growth("sim", 1, 60.0, first, more).leaks == []
+    assert Growth("sim", 1, 60.0, first, more, CALM_MIB).leaks != []
 
 
 def test_what_this_process_holds_is_seen() -> None:
