@@ -75,6 +75,7 @@ class Row:
         off_mm: beside the goal in the end, where it reached one.
         lost: records that were written and never arrived, by reader and key.
         refused: by node and reason.
+        news: what the command node and the simulator said of it: node, transition, why.
         wrong: what of our promises it broke.
     """
 
@@ -94,6 +95,7 @@ class Row:
     off_mm: float | None = None
     lost: dict[str, int] = field(default_factory=dict)
     refused: dict[str, int] = field(default_factory=dict)
+    news: list[list[str]] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:

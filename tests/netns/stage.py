@@ -111,6 +111,7 @@ class Stage:
         self.ask("rest")
         time.sleep(1.2)  # status comes twice a second
         after = self.ask("count")
+        row.news = after["news"]
         measure_motion(
             row,
             fault,
@@ -125,7 +126,7 @@ class Stage:
         self._measure_recovery(row, fault, recovered, since_s, stood_s)
         self._measure_goal(row, moving, finished)
         self._count(row, before, after)
-        self._tell(row, finished, recovered, after["news"])
+        self._tell(row, finished, recovered)
         judge(row, fault, finished, recovered)
         if missing := fault.missing(self):
             row.wrong.append(missing)
@@ -166,9 +167,8 @@ class Stage:
         row: Row,
         finished: dict[str, Any],
         recovered: dict[str, Any],
-        news: list[Any],
     ) -> None:
-        whats = [what for node, what, _ in news if node == "command"]
+        whats = [what for node, what, _ in row.news if node == "command"]
         if finished.get("done"):
             held = whats.count("active->holding")
             row.did = "went on to its goal" + (f", held {held} times on the way" if held else "")
@@ -177,7 +177,7 @@ class Stage:
         elif recovered.get("moves") and not row.activated:
             row.did = "stood, then went on by itself"
         elif recovered.get("moves"):
-            ended = (why for _, what, why in news if what.endswith("->inactive"))
+            ended = (why for _, what, why in row.news if what.endswith("->inactive"))
             why = next((why for why in ended if why != "deactivated"), "")  # that was we
             row.did = "stood until it was activated" + (f" ({why})" if why else "")
         else:
