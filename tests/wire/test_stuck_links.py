@@ -113,6 +113,7 @@ def state_delays_ms(*, separate: bool) -> list[float]:
         stop.set()
         for thread in threads:
             thread.join()
+        stuck.undeclare()  # it would hold up the end of its session, too
         quick.undeclare()
         for node in (reader, robot, camera):
             node.close()
