@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 SMALL_MTU = 1280
 """What IPv6 asks of every link, and many a tunnel has."""
-FRONT = '{source: "sim:front", width: 160, height: 120, rate_hz: 20}'
+FRONT = "sim:front"
+PICTURE = f"file:{Path(__file__).resolve().parents[2] / 'docs/images/front.png'}"
+"""A camera that stamps its pictures by its own clock; those of the simulator have the scene's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,22 +33,23 @@ class Layout:
     mtu: int = 0
 
 
-def _profile(extends: str, more: str = "") -> str:
-    return f"extends: {extends}\ncameras:\n  front: {FRONT}\n  wrist: null\n{more}"
+def _profile(extends: str, more: str = "", front: str = FRONT) -> str:
+    camera = f'{{source: "{front}", width: 160, height: 120, rate_hz: 20}}'
+    return f"extends: {extends}\ncameras:\n  front: {camera}\n  wrist: null\n{more}"
 
 
-EYES = (
-    _profile(
-        "panda_sim_lab",
+def _eyes(front: str = FRONT, clocks: tuple[str, ...] = ()) -> Layout:
+    """The cameras have a computer of their own."""
+    hosts = (
         "hosts:\n"
         "  robot: {nodes: [router, sim, command]}\n"
         "  eyes: {nodes: [camera], connect: [tcp/127.0.0.1:7447]}\n"
-        "  gpu: {nodes: [worker], connect: [tcp/127.0.0.1:7447]}\n",
-    ),
-    ("robot", "eyes", "gpu"),
-    ("robot",),
-)
-"""The cameras have a computer of their own."""
+        "  gpu: {nodes: [worker], connect: [tcp/127.0.0.1:7447]}\n"
+    )
+    plain = _profile("panda_sim_lab", hosts, front)
+    return Layout(plain, ("robot", "eyes", "gpu"), ("robot",), clocks=clocks)
+
+
 LAYOUTS = {
     # The robot's computer, one for models, and a desk.
     "lab": Layout(_profile("panda_sim_lab"), ("robot", "gpu", "desk"), ("robot",), ("gpu",)),
@@ -53,8 +57,8 @@ LAYOUTS = {
     "narrow": Layout(
         _profile("panda_sim_lab"), ("robot", "gpu"), ("robot",), ("gpu",), mtu=SMALL_MTU
     ),
-    "eyes": Layout(*EYES),
-    "eyes-clock": Layout(*EYES, clocks=("eyes",)),
+    "eyes": _eyes(),
+    "eyes-clock": _eyes(PICTURE, clocks=("eyes",)),
     # Robot and cameras each on the network, the router on neither.
     "apart": Layout(
         _profile(
