@@ -21,7 +21,7 @@ ASKED_EARLY: Reasons = {"command": frozenset({"activate_refused"})}
 """The arm is asked for again while preflight still finds something missing: that is we."""
 OVERDUE: Reasons = {
     "command": frozenset({"stale", "expired", "future", "clock_step", "worker_refused"}),
-    "sim": frozenset({"pose_braking", "pose_jump", "pose_too_fast", "clock_step"}),
+    "sim": frozenset({"pose_late", "pose_braking", "pose_jump", "pose_too_fast", "clock_step"}),
     "camera": frozenset({"clock_step"}),
     "worker": frozenset({"clock_step"}),
 }

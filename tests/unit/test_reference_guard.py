@@ -23,6 +23,7 @@ LIMITS = GuardLimits(0.1, BRAKE)
 START = Pose(np.array([0.43, 0.0, 0.3]), exp3(np.array([3.0, 0.1, 0.0])))
 SOURCE = "command-1"
 RAMP_S = 0.16
+LATE_ATOL_MS = 20.0
 PATH_ATOL_M = 5e-5  # what clocks may drift apart while a command is held up
 FOLLOWED_M, FOLLOWED_RAD = 1e-4, 1e-3
 STEP_M, STEP_M_S = (
@@ -115,6 +116,35 @@ def test_a_command_that_was_held_up_on_its_way_does_not_pull_it_back(held_up_ms:
         assert x == pytest.approx(line.x(t * MS), abs=PATH_ATOL_M)
         assert x > before
         before = x
+
+
+def test_a_stream_that_comes_later_and_later_ends_as_one_that_fell_silent() -> None:
+    """Half of what is written gets through a link in time, all of it in order, with no pause."""
+    side, line, slow_ms = guard(), Line(0.1), 300
+    said: dict[str | None, int] = {}
+    for t in range(1500):
+        late_ms = max(t - slow_ms, 0) // 2
+        if t % (8 if late_ms else 4) == 0:
+            written_ns = (t - late_ms) * MS
+            said.setdefault(side.offer(line.at(written_ns, arrives_ns=t * MS), now(t * MS)), t)
+        side.tick(now(t * MS))
+    assert said["late"] == pytest.approx(slow_ms + 2 * LIMITS.timeout_s * 1e3, abs=LATE_ATOL_MS)
+    # What is taken then has been refused for as long as a stream may be silent.
+    assert said["braking"] - said["late"] == pytest.approx(LIMITS.timeout_s * 1e3, abs=LATE_ATOL_MS)
+    assert side.silences == 1
+    assert not side.braking
+    assert norm3(side.motion.twist[:3]) == 0.0
+
+
+@pytest.mark.parametrize("step_ns", [-2 * 10**9, 2 * 10**9])
+def test_a_writer_whose_clock_is_set_is_followed_on(step_ns: int) -> None:
+    side, line = guard(), Line(0.3)
+    for t in range(600):
+        if t % 4 == 0:
+            line.ahead_ns = step_ns if t >= 300 else 0
+            assert side.offer(line.at(t * MS), now(t * MS)) is None
+        x = float(side.tick(now(t * MS)).pose.position_m[0])
+        assert x == pytest.approx(line.x(t * MS), abs=1e-6)
 
 
 def test_one_stamp_from_the_future_does_not_spoil_the_clock() -> None:

@@ -119,10 +119,10 @@ class JointGuard:
         """Take a command, or say in one word why not.
 
         Returns:
-            None, or ``foreign``, ``replayed``, ``braking``, ``names`` (not exactly the arm's
-            joints), ``jump``, ``too_fast``, ``out_of_range``.
+            None, or ``foreign``, ``replayed``, ``late``, ``braking``, ``names`` (not exactly the
+            arm's joints), ``jump``, ``too_fast``, ``out_of_range``.
         """
-        objection = self._stream.objection(command.header)
+        objection = self._stream.objection(command.header, command.received_ns)
         if objection is not None:
             return objection
         if self.braking:

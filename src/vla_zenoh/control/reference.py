@@ -108,10 +108,10 @@ class ReferenceGuard:
         """Take a command, or say in one word why not.
 
         Returns:
-            None, or ``foreign``, ``replayed``, ``braking``, ``jump``, ``too_fast``.
+            None, or ``foreign``, ``replayed``, ``late``, ``braking``, ``jump``, ``too_fast``.
         """
         record = command.record
-        objection = self._stream.objection(command.header)
+        objection = self._stream.objection(command.header, command.received_ns)
         if objection is not None:
             return objection
         if self.braking:

@@ -33,13 +33,28 @@ class CommandStream(Generic[Command]):
         self._ticked_ns = 0
         self._anew = False
 
-    def objection(self, header: Header) -> str | None:
-        """Why a command with this header is not taken: ``foreign``, ``replayed``, or nothing."""
+    def objection(self, header: Header, received_ns: int) -> str | None:
+        """Why a command is not taken: ``foreign``, ``replayed``, ``late``, or nothing.
+
+        Late is what was longer on its way than the stream may be silent: who followed a link that
+        gets slower and slower would go on long after its writer has braked.
+        """
         if self.newest is not None and header.source != self._source:
             return "foreign"
         if header.source == self._source and header.seq <= self._last_seq:
             return "replayed"
+        if self.newest is not None and self._late(header, received_ns):
+            went_back = header.stamp_wall_ns < self.newest.header.stamp_wall_ns
+            return None if went_back else "late"  # stamps of a stream go back when a clock was set
         return None
+
+    def _shortest_ns(self, received_ns: int) -> int:
+        passed_ns = 0 if self.newest is None else received_ns - self.newest.received_ns
+        return self._delay_ns + int(CLOCK_DRIFT * passed_ns)
+
+    def _late(self, header: Header, received_ns: int) -> bool:
+        late_ns = received_ns - header.stamp_wall_ns - self._shortest_ns(received_ns)
+        return late_ns >= self._timeout_s * 1e9
 
     def take(self, command: Stamped[Command]) -> None:
         """Follow `command`: it is put on our clock by its stamp, because arrival times jitter.
@@ -49,12 +64,9 @@ class CommandStream(Generic[Command]):
         """
         stamp_ns = command.header.stamp_wall_ns
         delay_ns = command.received_ns - stamp_ns
-        if self.newest is not None:
-            passed_ns = command.received_ns - self.newest.received_ns
-            shortest_ns = self._delay_ns + int(CLOCK_DRIFT * passed_ns)
-            # Later than a stream may be silent: not a hold-up, one of the clocks was set.
-            if delay_ns - shortest_ns < self._timeout_s * 1e9:
-                delay_ns = min(delay_ns, shortest_ns)
+        # Later than a stream may be silent: not a hold-up, one of the clocks was set.
+        if self.newest is not None and not self._late(command.header, command.received_ns):
+            delay_ns = min(delay_ns, self._shortest_ns(command.received_ns))
         self._delay_ns = delay_ns
         self._base_ns = stamp_ns + delay_ns
         self._anew = True
