@@ -113,7 +113,12 @@ def _measure_silence(row: Row, profile: Profile, measured: Flight, commanded: Fl
         longest = flight.longest_s(flight.heard_s)
         if longest is not None:
             row.unheard_s[node], since_s = longest
-            row.unheard_bound_s[node] = patience_s + _brake_s(profile, commanded, since_s)
+            brakes_s = [_brake_s(profile, commanded, since_s)]
+            if node == "sim":  # what it does may have been commanded long before
+                here = measured.between(since_s - AROUND_S, since_s + AROUND_S)
+                speeds = here.twist[:: len(here.twist) // 10 + 1, :3]
+                brakes_s += [brake_s(profile, speed, np.zeros(3)) for speed in speeds]
+            row.unheard_bound_s[node] = patience_s + max(brakes_s)
 
 
 def _brake_s(profile: Profile, commanded: Flight, at_s: float) -> float:
