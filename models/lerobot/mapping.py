@@ -151,11 +151,13 @@ def state_parts(
 
 def _trained_state(folder: Path) -> int | None:
     """Numbers of the state in the statistics that it is scaled with; None: there are none."""
-    from safetensors import SafetensorError, safe_open
-
     pipeline = folder / PIPELINES[0]
     steps = read_json(pipeline).get("steps", []) if pipeline.is_file() else []
     files = [folder / str(step["state_file"]) for step in steps if "state_file" in step]
+    if not files:
+        return None
+    from safetensors import SafetensorError, safe_open  # comes with LeRobot
+
     for file in files:
         try:
             with safe_open(str(file), framework="np") as content:
