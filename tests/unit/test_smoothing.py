@@ -21,6 +21,7 @@ STILL = 1e-6  # m/s and rad/s
 AT_TARGET_M, AT_TARGET_RAD = 1e-8, 1e-7
 # Errors of the trapezium rule over one tick of a motion whose jerk is bounded.
 STEP_ATOL_M, STEP_ATOL_RAD = 2e-7, 1e-6
+BACKWARDS_M_S = 1e-9
 SPEED_ATOL = np.array([2e-4] * 3 + [1e-3] * 3)
 SLOWEST, REACH_M = 0.1, 0.15
 
@@ -116,6 +117,23 @@ def test_a_brake_ends_where_it_was_foretold_and_stays_there(
     assert motion.at_rest
     assert norm3(motion.motion.pose.position_m - foretold.position_m) < AT_TARGET_M
     assert angle_between(motion.motion.pose.rotation, foretold.rotation) < AT_TARGET_RAD
+
+
+@pytest.mark.parametrize("jerk", [0.02, 0.1, 1.0])
+def test_a_brake_that_has_little_jerk_gets_no_faster_first(jerk: float) -> None:
+    motion = smoother()
+    motion.target(Pose(START.position_m + [0.15, 0.0, 0.0], exp3([-0.5, 0.0, -0.3])))
+    for _ in range(34):
+        motion.tick()
+    assert motion.motion.acceleration[0] > 0
+    motion.brake(Shares(jerk=jerk))
+    foretold = motion.resting_pose()
+    while not motion.at_rest:
+        before = motion.motion
+        check_tick(before, motion.tick())
+        assert motion.motion.twist[0] >= -BACKWARDS_M_S
+        again = motion.resting_pose()
+        assert norm3(again.position_m - foretold.position_m) < AT_TARGET_M
 
 
 def test_a_brake_stops_within_the_jerk_limit_and_never_turns_back() -> None:

@@ -117,7 +117,7 @@ class Smoother:
         self._input.target_position = self._input.current_position
         self._input.target_velocity = zeros
         self._input.target_acceleration = zeros
-        self.braking = False
+        self.braking = self._under_way = False
         self.motion = Motion(
             Pose(np.array(pose.position_m, dtype=np.float64), self._anchor),
             np.zeros(6),
@@ -154,15 +154,31 @@ class Smoother:
 
         Args:
             shares: of the limits, where not all can be had; all axes then stop together, for what
-                bounds them is bound to the direction. Not looked at while it brakes already.
+                bounds them is bound to the direction. More of the jerk is taken where the arm would
+                get too fast otherwise. Not looked at while it brakes already.
         """
         if self.braking:
             return
         self._anchor_here()
+        self._under_way = False
+        shares = shares and shares._replace(jerk=max(shares.jerk, self._least_jerk()))
         self._take(shares or FULL)
         self.braking = True
         self._input.control_interface = ControlInterface.Velocity
         self._input.synchronization = Synchronization.Phase if shares else Synchronization.No
+
+    def _least_jerk(self) -> float:
+        """Part of the jerk limits that an acceleration needs to end in time.
+
+        Before its axis is faster than its limit where it speeds up, before that turns round where
+        it slows down. A brake with less of it would go on speeding up for a while.
+        """
+        velocity = np.array(self._input.current_velocity)
+        acceleration = np.array(self._input.current_acceleration)
+        speed = np.abs(velocity)
+        room = np.where(velocity * acceleration < 0, speed, self.box[0] - speed)
+        needed = acceleration**2 / (2 * np.maximum(room, REST_VELOCITY)) / self.box[2]
+        return min(float(needed.max()), 1.0)
 
     def resting_pose(self) -> Pose:
         """Brake, and foretell where that ends."""
@@ -171,7 +187,10 @@ class Smoother:
         self.brake()
         path = Trajectory(AXES)
         try:
-            Ruckig(AXES).calculate(self._input, path)
+            if self._under_way:
+                path = self._output.trajectory  # planned anew from here, axes may stop otherwise
+            else:
+                Ruckig(AXES).calculate(self._input, path)
             position, _, _ = path.at_time(path.duration)
         except (RuckigError, ValueError):
             return self.motion.pose
@@ -217,6 +236,7 @@ class Smoother:
                 self.reset(self.motion.pose)
                 return self.motion
         self._output.pass_to_input(self._input)
+        self._under_way = self.braking
         position = np.array(self._output.new_position)
         velocity = np.array(self._output.new_velocity)
         acceleration = np.array(self._output.new_acceleration)
