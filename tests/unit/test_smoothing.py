@@ -42,8 +42,9 @@ def ordered(motion: Smoother, order: tuple[np.ndarray, np.ndarray] | Shares | No
         motion.brake(order)
         return
     here = motion.motion.pose
-    speed = SLOWEST + (1 - SLOWEST) * abs(order[0][0]) / REACH_M
-    motion.target(Pose(START.position_m + order[0], exp3(order[1]) @ here.rotation), Shares(speed))
+    parts = SLOWEST + (1 - SLOWEST) * np.abs(order[0]) / REACH_M
+    goal = Pose(START.position_m + order[0], exp3(order[1]) @ here.rotation)
+    motion.target(goal, Shares(*parts.tolist()))
 
 
 def check_tick(before: Motion, now: Motion) -> None:
@@ -117,6 +118,20 @@ def test_a_brake_ends_where_it_was_foretold_and_stays_there(
     assert motion.at_rest
     assert norm3(motion.motion.pose.position_m - foretold.position_m) < AT_TARGET_M
     assert angle_between(motion.motion.pose.rotation, foretold.rotation) < AT_TARGET_RAD
+
+
+@pytest.mark.parametrize("jerk", [0.02, 0.1, 1.0])
+def test_a_way_that_goes_on_with_little_jerk_gets_no_faster_than_it_may(jerk: float) -> None:
+    motion = smoother()
+    goal = Pose(START.position_m + [0.4, 0.0, 0.0], START.rotation)
+    motion.target(goal)
+    for _ in range(34):
+        motion.tick()
+    motion.target(goal, Shares(jerk=jerk))
+    while not motion.at_rest:
+        before = motion.motion
+        check_tick(before, motion.tick())
+    assert norm3(motion.motion.pose.position_m - goal.position_m) < AT_TARGET_M
 
 
 @pytest.mark.parametrize("jerk", [0.02, 0.1, 1.0])

@@ -137,10 +137,11 @@ class Smoother:
 
         Args:
             pose: where to.
-            shares: of the limits; who is faster slows down within them.
+            shares: of the limits; who is faster slows down within them. More of the jerk is taken
+                where the arm would get too fast first, or turn round.
         """
         self._anchor_here()
-        self._take(shares)
+        self._take(shares._replace(jerk=max(shares.jerk, self._least_jerk())))
         self.braking = False
         self._input.control_interface = ControlInterface.Position
         self._input.synchronization = Synchronization.Phase
@@ -171,7 +172,7 @@ class Smoother:
         """Part of the jerk limits that an acceleration needs to end in time.
 
         Before its axis is faster than its limit where it speeds up, before that turns round where
-        it slows down. A brake with less of it would go on speeding up for a while.
+        it slows down. With less of it the arm would go on speeding up for a while, to any speed.
         """
         velocity = np.array(self._input.current_velocity)
         acceleration = np.array(self._input.current_acceleration)
