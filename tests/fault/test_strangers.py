@@ -19,7 +19,7 @@ from vla_zenoh.keys import SCHEMA, Keys
 from vla_zenoh.security.roles import key_members
 from vla_zenoh.types import Event, GripperCommand, GripperState, Header, JointCommand, Task
 
-SHORT_S, LONG_S = 5.0, 30.0
+SHORT_S, LONG_S = 8.0, 30.0
 PAUSE_S = 0.001
 """Between two puts: a thousand a second, were they for nothing."""
 HUGE = bytes(2_000_000)

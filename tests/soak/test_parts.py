@@ -9,7 +9,17 @@ import time
 from collections import Counter
 
 import pytest
-from ledger import CALM_MIB, GROWTH_HANDLES, GROWTH_MIB, Growth, Held, Ledger, look, segments
+from ledger import (
+    CALM_MIB,
+    GROWTH_HANDLES,
+    GROWTH_MIB,
+    ROUTER_MIB,
+    Growth,
+    Held,
+    Ledger,
+    look,
+    segments,
+)
 from refusals import EXPLAINS, FROM, NEVER, STALL_S, Refusals, Witness, unexplained
 from report import Found, line
 
@@ -94,7 +104,16 @@ def test_in_the_calm_less_is_allowed() -> None:
     first = Held(20.0, 100.0, 90.0, 80.0, 30, 20)
     more = first._replace(heap_mib=80.0 + CALM_MIB + 1)
     assert Growth("sim", 1, 60.0, first, more).leaks == []
-    assert Growth("sim", 1, 60.0, first, more, CALM_MIB).leaks != []
+    assert Growth("sim", 1, 60.0, first, more, True).leaks != []
+    assert Growth("router", 1, 60.0, first, more, True).leaks != []
+
+
+def test_only_a_router_may_take_what_it_takes_once() -> None:
+    first = Held(20.0, 100.0, 90.0, 80.0, 30, 20)
+    more = first._replace(heap_mib=80.0 + ROUTER_MIB)
+    assert Growth("router", 1, 60.0, first, more).leaks == []
+    assert Growth("router", 1, 60.0, first, more._replace(heap_mib=more.heap_mib + 1)).leaks != []
+    assert Growth("sim", 1, 60.0, first, more).leaks != []
 
 
 def test_what_this_process_holds_is_seen() -> None:
