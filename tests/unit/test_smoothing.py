@@ -257,3 +257,96 @@ def test_reset_forgets_all_motion() -> None:
     assert motion.at_rest
     np.testing.assert_allclose(now.pose.position_m, there.position_m, atol=1e-15)
     np.testing.assert_allclose(now.pose.rotation, there.rotation, atol=1e-12)
+
+
+# An axis that stands at its goal, and the range that a motion keeps.
+AT_GOAL = np.array([1e-5] * 3 + [1e-5] * 3)  # m, rad
+noises = st.floats(-1.0, 1.0).flatmap(
+    lambda sign: st.sampled_from([1e-16, 1e-14, 1e-12, 1e-10]).map(lambda size: sign * size)
+)
+
+
+class Ends:
+    """A rotation-free view of a motion: translation, and turns about one base axis."""
+
+    def __init__(self, motion: Smoother) -> None:
+        self.motion = motion
+
+    def away(self) -> np.ndarray:
+        pose = self.motion.motion.pose
+        return np.concatenate(
+            [pose.position_m - START.position_m, log3(pose.rotation @ START.rotation.T)]
+        )
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(
+        st.tuples(st.integers(3, 90), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), noises),
+        min_size=3,
+        max_size=8,
+    )
+)
+def test_an_axis_at_its_goal_stays_there_whatever_the_others_do(
+    retargets: list[tuple[int, float, float, float]],
+) -> None:
+    motion = smoother()
+    turn = exp3(np.array([0.0, 0.0, 1.0]))
+    for ticks, x_m, yaw_rad, noise in retargets:
+        # Rounding in whoever computes the goals: z, roll and pitch are to stand.
+        position_m = START.position_m + [x_m, 0.0, noise]
+        rotation = exp3(np.array([noise, -noise, yaw_rad])) @ START.rotation
+        motion.target(Pose(position_m, turn.T @ turn @ rotation))
+        for _ in range(ticks):
+            motion.tick()
+            away = Ends(motion).away()
+            assert (np.abs(away[[1, 2, 3, 4]]) < AT_GOAL[[1, 2, 3, 4]]).all()
+
+
+def brake_range(motion: Smoother) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest positions (3,) m of the shortest stop from here."""
+    stopping = Smoother(motion.motion.pose, DT_S, LIMITS)
+    stopping.brake_from(motion.motion)
+    path = [stopping.motion.pose.position_m]
+    while not stopping.at_rest:
+        path.append(stopping.tick().pose.position_m)
+    return np.min(path, axis=0), np.max(path, axis=0)
+
+
+@settings(max_examples=120)
+@given(st.lists(st.tuples(st.integers(1, 70), offsets), min_size=2, max_size=6))
+def test_a_retargeted_motion_stays_between_its_start_its_target_and_where_it_can_stop(
+    retargets: list[tuple[int, np.ndarray]],
+) -> None:
+    motion = smoother()
+    for ticks, offset in retargets:
+        target = START.position_m + REACH_M * offset
+        start, (least, most) = motion.motion.pose.position_m, brake_range(motion)
+        least = np.minimum(np.minimum(least, start), target) - AT_GOAL[:3]
+        most = np.maximum(np.maximum(most, start), target) + AT_GOAL[:3]
+        motion.target(Pose(target, START.rotation))
+        for _ in range(ticks):
+            position_m = motion.tick().pose.position_m
+            assert (position_m >= least).all()
+            assert (position_m <= most).all()
+
+
+@settings(max_examples=60)
+@given(
+    offsets,
+    offsets,
+    st.lists(st.tuples(st.integers(1, 60), st.floats(0.05, 1.0), shares), min_size=2, max_size=8),
+)
+def test_a_motion_along_a_line_stays_on_it_whatever_the_limits_become(
+    along: np.ndarray, turn: np.ndarray, orders: list[tuple[int, float, Shares]]
+) -> None:
+    motion, way = smoother(), np.concatenate([REACH_M * along, 0.6 * turn])
+    length = float(np.linalg.norm(way))
+    for ticks, part, parts in orders:
+        goal = Pose(START.position_m + part * way[:3], exp3(part * way[3:]) @ START.rotation)
+        motion.target(goal, parts)
+        for _ in range(ticks):
+            motion.tick()
+            away = Ends(motion).away()
+            beside = away - (away @ way) / max(length, 1e-9) ** 2 * way
+            assert np.abs(beside).max() < AT_GOAL[0]

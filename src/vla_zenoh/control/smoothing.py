@@ -5,19 +5,31 @@ Translation is planned in the base frame. Rotation is planned as the rotation ve
 starts at zero, stays small, never wraps at pi, and velocity and acceleration carry over exactly
 (at r = 0, r' is the body velocity and r'' the body acceleration).
 
+A motion that already goes along the straight way to its target, or stands, is planned as one
+degree of freedom along that way: it stays on the line whatever the limits become. The same holds
+for its translation or its rotation alone. What is left has a degree of freedom for each axis; all
+of them are synchronised in time.
+
+Ruckig solves for profiles of a given duration by root finding with a precision of 1e-8. An axis
+that stands at its target but carries rounding noise (a velocity of 1e-16) while another axis takes
+long can be given a profile that leaves at full jerk and comes back. So what Ruckig cannot tell from
+zero is set to zero before it plans, and a plan in which an axis leaves the range between its start,
+its target and where it could stop is replaced by one in which each axis goes as fast as it can.
+
 Ruckig: Berscheid and Kroeger, "Jerk-limited real-time trajectory generation with arbitrary target
 states", RSS 2021.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from ruckig import (
     ControlInterface,
     InputParameter,
-    OutputParameter,
+    Result,
     Ruckig,
     RuckigError,
     Synchronization,
@@ -29,10 +41,17 @@ from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
 AXES = 6
+ALL, TRANSLATION, ROTATION = slice(0, 6), slice(0, 3), slice(3, 6)
 REST_VELOCITY = 1e-6
 """m/s and rad/s: slower counts as standing."""
 REST_OFFSET = 1e-6
 """m and rad: nearer to the target counts as there. Ruckig may end some 1e-9 beside it."""
+
+QUIET = (1e-8, 1e-8, 1e-6)
+"""m or rad, per s, per s^2: smaller is noise, and taken for zero. The first two are the precision
+of Ruckig's solver; such an acceleration changes a velocity by less than that within a tick."""
+ASTRAY = 1e-6
+"""m and rad: a plan may leave the range between start, target and stop by this much: rounding."""
 
 ROTATION_BOX = 0.55
 """Share of a rotation limit given to each axis, so that the norm over three axes (sqrt 3 of it) and
@@ -80,6 +99,38 @@ class Motion(NamedTuple):
     acceleration: FloatArray
 
 
+class _State(NamedTuple):
+    """(6,) position, velocity and acceleration of all axes, in the chart of the anchor."""
+
+    position: FloatArray
+    velocity: FloatArray
+    acceleration: FloatArray
+
+
+class _Plan:
+    """A planned motion: a path in k coordinates along the columns of a basis.
+
+    Args:
+        start: (6,) where it begins.
+        basis: (6, k).
+        path: of the k coordinates, which begin at zero.
+    """
+
+    def __init__(self, start: FloatArray, basis: FloatArray, path: Trajectory) -> None:
+        self._start, self._basis, self._path = start, basis, path
+        self.duration_s: float = path.duration
+        self.end = start + basis @ path.at_time(path.duration)[0]
+        """(6,) where it ends."""
+
+    def at(self, time_s: float) -> _State:
+        """State at `time_s` after its beginning."""
+        if time_s >= self.duration_s:
+            return _State(self.end, np.zeros(AXES), np.zeros(AXES))
+        position, velocity, acceleration = self._path.at_time(time_s)
+        basis = self._basis
+        return _State(self._start + basis @ position, basis @ velocity, basis @ acceleration)
+
+
 class Smoother:
     """Follows targets within velocity, acceleration and jerk limits, or brakes.
 
@@ -91,9 +142,7 @@ class Smoother:
 
     def __init__(self, pose: Pose, dt_s: float, limits: MotionLimits) -> None:
         self._dt_s = dt_s
-        self._otg = Ruckig(AXES, dt_s)
-        self._input = InputParameter(AXES)
-        self._output = OutputParameter(AXES)
+        self._ruckigs: dict[int, Ruckig] = {}
         self.box = np.array([self._box(limits, order) for order in range(3)])
         """(3, 6) limits of velocity, acceleration and jerk of every axis at full shares."""
         self.failures = 0
@@ -106,114 +155,198 @@ class Smoother:
     def reset(self, pose: Pose) -> None:
         """Stand still at `pose`, forgetting all motion. Only for an arm that is not streamed to."""
         self._anchor = orthonormal(pose.rotation)
-        zeros = [0.0] * AXES
-        self._otg.reset()
-        self._take(FULL)
-        self._input.control_interface = ControlInterface.Position
-        self._input.synchronization = Synchronization.Phase
-        self._input.current_position = [*pose.position_m.tolist(), 0.0, 0.0, 0.0]
-        self._input.current_velocity = zeros
-        self._input.current_acceleration = zeros
-        self._input.target_position = self._input.current_position
-        self._input.target_velocity = zeros
-        self._input.target_acceleration = zeros
-        self.braking = self._under_way = False
+        zeros = np.zeros(AXES)
+        self._state = _State(np.array([*pose.position_m, 0.0, 0.0, 0.0]), zeros, zeros)
+        self._target = self._state.position
+        self._plan: _Plan | None = None
+        self._elapsed_s = 0.0
+        self.braking = False
         self.motion = Motion(
             Pose(np.array(pose.position_m, dtype=np.float64), self._anchor),
             np.zeros(6),
             np.zeros(6),
         )
 
-    def _take(self, shares: Shares) -> None:
-        velocity, acceleration, jerk = (
-            [share * limit for limit in row] for share, row in zip(shares, self.box, strict=True)
-        )
-        self._input.max_velocity = velocity
-        self._input.max_acceleration = acceleration
-        self._input.max_jerk = jerk
-
     def target(self, pose: Pose, shares: Shares = FULL) -> None:
         """Head for `pose` from the present state, without a step in velocity or acceleration.
 
         Args:
             pose: where to.
-            shares: of the limits; who is faster slows down within them. More of the jerk is taken
+            shares: of the limits; a faster motion slows down within them. More of the jerk is used
                 where the arm would get too fast first, or turn round.
         """
         self._anchor_here()
-        self._take(shares._replace(jerk=max(shares.jerk, self._least_jerk())))
         self.braking = False
-        self._input.control_interface = ControlInterface.Position
-        self._input.synchronization = Synchronization.Phase
-        self._input.target_position = [
-            *pose.position_m.tolist(),
-            *log3(self._anchor.T @ pose.rotation).tolist(),
-        ]
+        self._target = np.array([*pose.position_m, *log3(self._anchor.T @ pose.rotation)])
+        limits = self.box * np.array(shares._replace(jerk=self._enough_jerk(shares)))[:, None]
+        way = self._target - self._state.position
+        way[np.abs(way) < QUIET[0]] = 0.0
+        self._begin(self._towards(way, limits))
 
     def brake(self, shares: Shares | None = None) -> None:
         """Come to rest as fast as the limits allow, each axis by itself.
 
         Args:
             shares: of the limits, where not all can be had; all axes then stop together, for what
-                bounds them is bound to the direction. More of the jerk is taken where the arm would
+                bounds them is bound to the direction. More of the jerk is used where the arm would
                 get too fast otherwise. Not looked at while it brakes already.
         """
         if self.braking:
             return
         self._anchor_here()
-        self._under_way = False
-        shares = shares and shares._replace(jerk=max(shares.jerk, self._least_jerk()))
-        self._take(shares or FULL)
+        limits = self.box
+        if shares is not None:
+            limits = limits * np.array(shares._replace(jerk=self._enough_jerk(shares)))[:, None]
         self.braking = True
-        self._input.control_interface = ControlInterface.Velocity
-        self._input.synchronization = Synchronization.Phase if shares else Synchronization.No
+        self._begin(self._stop(limits, together=shares is not None))
 
-    def _least_jerk(self) -> float:
-        """Part of the jerk limits that an acceleration needs to end in time.
+    # -- planning -----------------------------------------------------------------------------
+    def _begin(self, plan: _Plan | None) -> None:
+        """Go on with `plan`; where there is none brake, and where that cannot be planned stand."""
+        self._elapsed_s = 0.0
+        if plan is None:
+            self.failures += 1
+            self.braking = True
+            plan = self._stop(self.box, together=False)
+        if plan is None:
+            self.reset(self.motion.pose)
+            return
+        self._plan = plan
+
+    def _towards(self, way: FloatArray, limits: FloatArray) -> _Plan | None:
+        """The plan of a motion by `way` (6,): together where no coordinate goes astray."""
+        if not np.isfinite(way).all():
+            return None
+        basis = self._basis(way)
+        ask = self._ask(basis, limits)
+        ask.target_position = (basis.T @ way).tolist()
+        for synchronization in (Synchronization.Time, Synchronization.No):
+            ask.synchronization = synchronization
+            path = self._calculated(ask)
+            if path is not None and (
+                synchronization is Synchronization.No
+                or len(basis.T) == 1
+                or not self._goes_astray(path, ask)
+            ):
+                return _Plan(self._state.position, basis, path)
+        return None
+
+    def _basis(self, way: FloatArray) -> FloatArray:
+        """(6, k) the fewest directions that a motion by `way` needs.
+
+        One, where it goes along its way already; else one for translation or rotation, whichever
+        does so, and the axes for the other.
+        """
+        for groups in ((ALL,), (TRANSLATION, ROTATION)):
+            columns = [self._directions(way, axes) for axes in groups]
+            if len(groups) > 1 or len(columns[0].T) <= 1:
+                break
+        basis = np.concatenate(columns, axis=1)
+        return basis if basis.size else np.eye(AXES)[:, :1]
+
+    def _directions(self, way: FloatArray, axes: slice) -> FloatArray:
+        """(6, k) the same for these axes alone: none, one or all of them."""
+        _, velocity, acceleration = self._state
+        part = np.zeros(AXES)
+        part[axes] = way[axes]
+        length = math.sqrt(float(part @ part))
+        direction = part / length if length else part
+        for value, quiet in ((velocity, QUIET[1]), (acceleration, QUIET[2])):
+            beside = value - float(direction @ value) * direction
+            if (np.abs(beside[axes]) > quiet).any():
+                return np.eye(AXES)[:, axes]
+        return direction[:, None] if length else np.zeros((AXES, 0))
+
+    def _goes_astray(self, path: Trajectory, ask: InputParameter) -> bool:
+        """Whether a coordinate leaves the range between its start, target and where it can stop."""
+        target = np.array(ask.target_position)
+        least, most = np.minimum(target, 0.0) - ASTRAY, np.maximum(target, 0.0) + ASTRAY
+        low, high = _extrema(path)
+        if (low >= least).all() and (high <= most).all():
+            return False
+        ask.control_interface = ControlInterface.Velocity
+        ask.synchronization = Synchronization.No
+        stop = self._calculated(ask)
+        ask.control_interface = ControlInterface.Position
+        if stop is None:
+            return True
+        stop_low, stop_high = _extrema(stop)
+        return bool(
+            (low < np.minimum(least, stop_low - ASTRAY)).any()
+            or (high > np.maximum(most, stop_high + ASTRAY)).any()
+        )
+
+    def _stop(self, limits: FloatArray, *, together: bool) -> _Plan | None:
+        basis = np.eye(AXES)
+        ask = self._ask(basis, limits)
+        ask.control_interface = ControlInterface.Velocity
+        for synchronization in [Synchronization.Phase] * together + [Synchronization.No]:
+            ask.synchronization = synchronization
+            path = self._calculated(ask)
+            if path is not None:
+                return _Plan(self._state.position, basis, path)
+        return None
+
+    def _ask(self, basis: FloatArray, limits: FloatArray) -> InputParameter:
+        """What Ruckig is asked, along the columns of `basis` (6, k), each within all limits."""
+        _, velocity, acceleration = self._state
+        with np.errstate(divide="ignore"):
+            along = (limits[:, :, None] / np.abs(basis)).min(axis=1)
+        ask = InputParameter(len(basis.T))
+        ask.current_position = [0.0] * len(basis.T)
+        ask.current_velocity = (velocity @ basis).tolist()
+        ask.current_acceleration = (acceleration @ basis).tolist()
+        ask.max_velocity, ask.max_acceleration, ask.max_jerk = along.tolist()
+        return ask
+
+    def _calculated(self, ask: InputParameter) -> Trajectory | None:
+        """The trajectory of `ask`, None where Ruckig finds none."""
+        size = ask.degrees_of_freedom
+        path = Trajectory(size)
+        ruckig = self._ruckigs.setdefault(size, Ruckig(size))
+        try:
+            done = ruckig.calculate(ask, path) in (Result.Working, Result.Finished)
+        except (RuckigError, ValueError):
+            return None
+        return path if done else None
+
+    def _enough_jerk(self, shares: Shares) -> float:
+        """At least that part of the jerk limits that an acceleration needs to end in time.
 
         Before its axis is faster than its limit where it speeds up, before that turns round where
         it slows down. With less of it the arm would go on speeding up for a while, to any speed.
         """
-        velocity = np.array(self._input.current_velocity)
-        acceleration = np.array(self._input.current_acceleration)
+        _, velocity, acceleration = self._state
         speed = np.abs(velocity)
         room = np.where(velocity * acceleration < 0, speed, self.box[0] - speed)
         needed = acceleration**2 / (2 * np.maximum(room, REST_VELOCITY)) / self.box[2]
-        return min(float(needed.max()), 1.0)
+        return max(shares.jerk, min(float(needed.max()), 1.0))
 
     def resting_pose(self) -> Pose:
         """Brake, and foretell where that ends."""
         if self.at_rest:
             return self.motion.pose
         self.brake()
-        path = Trajectory(AXES)
-        try:
-            if self._under_way:
-                path = self._output.trajectory  # planned anew from here, axes may stop otherwise
-            else:
-                Ruckig(AXES).calculate(self._input, path)
-            position, _, _ = path.at_time(path.duration)
-        except (RuckigError, ValueError):
+        if self._plan is None:
             return self.motion.pose
-        return Pose(
-            np.array(position[:3]), orthonormal(self._anchor @ exp3(np.array(position[3:])))
-        )
+        end = self._plan.end
+        return Pose(end[:3], orthonormal(self._anchor @ exp3(end[3:])))
 
     def brake_from(self, motion: Motion) -> None:
         """Take over a motion that somebody else made, and brake."""
         self.reset(motion.pose)
         body = motion.pose.rotation.T
-        self._input.current_velocity = [
-            *motion.twist[:3].tolist(),
-            *(body @ motion.twist[3:]).tolist(),
-        ]
-        self._input.current_acceleration = [
-            *motion.acceleration[:3].tolist(),
-            *(body @ motion.acceleration[3:]).tolist(),
-        ]
+        (velocity, spin), (change, spin_change) = (
+            (values[:3], body @ values[3:]) for values in (motion.twist, motion.acceleration)
+        )
+        self._state = self._state._replace(
+            velocity=np.concatenate([velocity, spin]),
+            acceleration=np.concatenate([change, spin_change]),
+        )
         self.motion = motion
         self.brake()
 
+    # -- moving -------------------------------------------------------------------------------
     def tick(self, pace: float = 1.0) -> Motion:
         """Advance by one tick.
 
@@ -221,52 +354,43 @@ class Smoother:
             pace: part of the tick by which the motion goes on: who follows it may be slow. Twist
                 and acceleration are those of the motion at its own pace.
         """
-        self._otg.delta_time = pace * self._dt_s
-        try:
-            self._otg.update(self._input, self._output)
-        except (RuckigError, ValueError):
-            # A failed calculation leaves the old trajectory half overwritten: forget it, and stop.
-            self.failures += 1
-            self._otg.reset()
-            self.braking = False
-            self.brake()
-            try:
-                self._otg.update(self._input, self._output)
-            except (RuckigError, ValueError):
-                self._otg.reset()
-                self.reset(self.motion.pose)
-                return self.motion
-        self._output.pass_to_input(self._input)
-        self._under_way = self.braking
-        position = np.array(self._output.new_position)
-        velocity = np.array(self._output.new_velocity)
-        acceleration = np.array(self._output.new_acceleration)
-        spin, spin_change = body_rates(position[3:], velocity[3:], acceleration[3:])
+        if self._plan is None:
+            return self.motion
+        self._elapsed_s += pace * self._dt_s
+        position, velocity, acceleration = self._state = self._plan.at(self._elapsed_s)
+        if self._elapsed_s >= self._plan.duration_s:
+            self._plan = None
         rotation = self._anchor @ exp3(position[3:])
-        velocity[3:] = rotation @ spin
-        acceleration[3:] = rotation @ spin_change
-        self.motion = Motion(Pose(position[:3], rotation), velocity, acceleration)
+        spin, spin_change = body_rates(position[3:], velocity[3:], acceleration[3:])
+        twist, change = velocity.copy(), acceleration.copy()
+        twist[3:], change[3:] = rotation @ spin, rotation @ spin_change
+        self.motion = Motion(Pose(position[:3].copy(), rotation), twist, change)
         return self.motion
 
     @property
     def at_rest(self) -> bool:
         """Standing, and not about to start."""
+        if self._plan is None:
+            return True
         if float(np.abs(self.motion.twist).max()) > REST_VELOCITY:
             return False
         if self.braking:
             return float(np.abs(self.motion.acceleration).max()) < 1e-3
-        ahead = np.array(self._input.target_position) - np.array(self._input.current_position)
-        return float(np.abs(ahead).max()) < REST_OFFSET
+        return float(np.abs(self._target - self._state.position).max()) < REST_OFFSET
 
     def _anchor_here(self) -> None:
-        rotvec = np.array(self._input.current_position[3:])
-        rate = np.array(self._input.current_velocity[3:])
-        change = np.array(self._input.current_acceleration[3:])
-        spin, spin_change = body_rates(rotvec, rate, change)
-        self._anchor = orthonormal(self._anchor @ exp3(rotvec))
-        self._input.current_position = [*self._input.current_position[:3], 0.0, 0.0, 0.0]
-        self._input.current_velocity = [*self._input.current_velocity[:3], *spin.tolist()]
-        self._input.current_acceleration = [
-            *self._input.current_acceleration[:3],
-            *spin_change.tolist(),
-        ]
+        """Move the anchor to the present rotation, and take noise for zero."""
+        position, velocity, acceleration = self._state
+        spin, spin_change = body_rates(position[3:], velocity[3:], acceleration[3:])
+        self._anchor = orthonormal(self._anchor @ exp3(position[3:]))
+        velocity = np.concatenate([velocity[:3], spin])
+        acceleration = np.concatenate([acceleration[:3], spin_change])
+        velocity[np.abs(velocity) < QUIET[1]] = 0.0
+        acceleration[np.abs(acceleration) < QUIET[2]] = 0.0
+        self._state = _State(np.concatenate([position[:3], np.zeros(3)]), velocity, acceleration)
+
+
+def _extrema(path: Trajectory) -> tuple[FloatArray, FloatArray]:
+    """(k,) least and greatest positions."""
+    low, high = np.array([(one.min, one.max) for one in path.position_extrema]).T
+    return low, high
