@@ -95,10 +95,12 @@ class Aggregator:
 
     def _weight(self, older: Plan, plan: Plan, now_ns: int) -> float:
         """Share of `plan` against `older`: 0 when it arrives, 1 at the end of its window."""
-        window_ns = min(self._blend_ns, older.end_ns - plan.arrival_ns)
-        if now_ns - plan.arrival_ns >= window_ns:
+        had_ns = plan.lasted_ns(now_ns) - plan.lasted_ns(plan.arrival_ns)
+        left_ns = len(older.goals) * older.dt_ns - older.lasted_ns(plan.arrival_ns)
+        window_ns = min(self._blend_ns, left_ns)
+        if had_ns >= window_ns:
             return 1.0
-        s = max(now_ns - plan.arrival_ns, 0) / window_ns
+        s = max(had_ns, 0) / window_ns
         return s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
 
 

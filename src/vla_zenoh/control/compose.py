@@ -20,6 +20,10 @@ In overlapping plans the goal that is followed may be a blend of several, see
 A chunk that is replaced half-way counts for the time it had, and for its first step at least: the
 speed a model asks for is the speed it gets however often it is asked, and a single step is a step.
 Steps are counted in the same way: a plan begins with as many as its ``W_0`` stands for.
+
+All of this is in plan time, which is the wall time while the speed override is 100 %. At a share
+``s`` of it plan time passes ``s`` times as fast: each step takes ``dt / s``, and the goals are the
+same ones.
 """
 
 from __future__ import annotations
@@ -36,6 +40,45 @@ from vla_zenoh.types import Cause, FloatArray
 
 HISTORY_NS = 15_000_000_000
 """Observations are refused long before they are this old."""
+OVERRIDES_NS = 600_000_000_000
+"""A slow plan lasts long: how long changes of the override are remembered."""
+FOREVER_NS = 1 << 62
+
+
+class PlanClock:
+    """Plan time as a function of wall time (both ns): it passes at the speed override's share."""
+
+    def __init__(self) -> None:
+        self._marks: list[tuple[int, int, float]] = [(0, 0, 1.0)]
+
+    @property
+    def override(self) -> float:
+        """Plan seconds per second of the wall clock, 0 to 1."""
+        return self._marks[-1][2]
+
+    def set(self, override: float, now_ns: int) -> None:
+        """From `now_ns` on plan time passes at this share."""
+        self._marks.append((now_ns, self.at(now_ns), override))
+        while len(self._marks) > 1 and self._marks[1][0] < now_ns - OVERRIDES_NS:
+            del self._marks[0]
+
+    def at(self, wall_ns: int) -> int:
+        """Plan time at a wall time of the last seconds, or to come at the present share."""
+        marks = (mark for mark in reversed(self._marks) if mark[0] <= wall_ns)
+        since_ns, plan_ns, override = next(marks, self._marks[0])
+        passed_ns = wall_ns - since_ns
+        return plan_ns + (passed_ns if override == 1.0 else round(override * passed_ns))
+
+    def wall_at(self, plan_ns: int) -> int:
+        """Wall time when plan time will be `plan_ns`; far away while plan time stands still."""
+        since_ns, base_ns, override = self._marks[-1]
+        if override <= 0.0:
+            return FOREVER_NS
+        return since_ns + round((plan_ns - base_ns) / override)
+
+
+WALL_CLOCK = PlanClock()
+"""Plan time of whoever has no speed override."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +114,7 @@ class Plan:
         most: steps of the episode that there are at all, as far as the policy has said.
         done: the policy says that these steps are the last.
         arrival_ns: when the chunk arrived.
+        clock: plan time. `dt_ns` is in plan time, the other times are of the wall.
     """
 
     effective_ns: int
@@ -84,14 +128,19 @@ class Plan:
     most: float = math.inf
     done: bool = False
     arrival_ns: int = 0
+    clock: PlanClock = WALL_CLOCK
+
+    def lasted_ns(self, t_ns: int) -> int:
+        """Plan time from the observation to `t_ns`."""
+        return self.clock.at(t_ns) - self.clock.at(self.start_ns)
 
     def index_at(self, t_ns: int) -> int:
         """Index of the step in force at `t_ns`."""
-        return min(max((t_ns - self.start_ns) // self.dt_ns, 0), len(self.goals) - 1)
+        return min(max(self.lasted_ns(t_ns) // self.dt_ns, 0), len(self.goals) - 1)
 
     def asked_until(self, t_ns: int) -> Goal:
         """What its steps have asked for until `t_ns`, its first step at least."""
-        done, part_ns = divmod(t_ns - self.start_ns, self.dt_ns)
+        done, part_ns = divmod(self.lasted_ns(t_ns), self.dt_ns)
         if done < 1:
             return self.goals[0]
         if done >= len(self.goals) or part_ns == 0:
@@ -104,7 +153,7 @@ class Plan:
 
     def steps_asked_until(self, t_ns: int) -> float:
         """Steps of the episode that have been asked for until `t_ns`, parts of one included."""
-        had = (t_ns - self.start_ns) / self.dt_ns
+        had = self.lasted_ns(t_ns) / self.dt_ns
         return min(self.begun + min(max(had, 1.0), len(self.goals)), self.most)
 
     def steps_in_force(self, t_ns: int) -> float:
@@ -113,8 +162,9 @@ class Plan:
 
     @property
     def end_ns(self) -> int:
-        """End of the last step's window."""
-        return self.start_ns + len(self.goals) * self.dt_ns
+        """End of the last step's window, at the present override."""
+        end_ns = self.clock.at(self.start_ns) + len(self.goals) * self.dt_ns
+        return self.clock.wall_at(end_ns)
 
     def shift(self, index: int, way_m: FloatArray, turn: FloatArray, limits: Limits) -> None:
         """Move the goals from `index` on; what leaves the workspace stays at its border."""
@@ -138,6 +188,7 @@ class GoalTimeline:
     """All plans of the last seconds."""
 
     def __init__(self, goal: Goal, now_ns: int) -> None:
+        self.clock = PlanClock()
         self._plans: list[Plan] = []
         self.hold(goal, now_ns)
 
@@ -159,7 +210,7 @@ class GoalTimeline:
         """Put `plan` in force, not before what is there already and not after now."""
         earliest = self._plans[-1].effective_ns if self._plans else plan.effective_ns
         plan.effective_ns = max(earliest, min(plan.effective_ns, now_ns))
-        plan.arrival_ns = now_ns
+        plan.arrival_ns, plan.clock = now_ns, self.clock
         self._plans.append(plan)
         while len(self._plans) > 1 and self._plans[1].effective_ns < now_ns - HISTORY_NS:
             del self._plans[0]

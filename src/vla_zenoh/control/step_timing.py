@@ -1,0 +1,163 @@
+"""How fast to go to a goal, so that an arm neither stops nor rushes between the steps of a policy.
+
+A step has a duration. An arm that goes to each goal as fast as it can waits there for the next one:
+stop and go, at every step of a policy that answers one step at a time. Here the arm is given the
+time that the step has. With plan time t, a plan that arrived at ``a`` with ``u`` of its H steps
+gone, and the next chunk expected at ``x``::
+
+    D_k = a + (k - u) dt f     f = max(1, (x - a) / ((H - u) dt))    step k is due
+    A_k = D_k + m              m = spare + stop(v) / 2               and arrived at
+    v   = |W_k - p| / (A_k - t)
+
+Steps last dt, or longer where the chunk would be over before the next one is expected. ``stop(v)``
+is how long a stop from v takes: braking for W_k, where the arm would stand, begins at D_k + spare
+and not before, and by then the next goal is there. So the speed is constant while goals come in
+time and evenly, and the arm is ``v m`` behind them. Where no goal follows it comes to rest at the
+last one. ``x`` is a phase-locked clock of the arrivals (an alpha-beta filter), ``spare`` twice
+their mean deviation from it: what an inference takes varies.
+
+Only the speed is bounded by this. Which goal is in force when, and where the arm ends, are those of
+`vla_zenoh.control.compose`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vla_zenoh.control.compose import Plan
+from vla_zenoh.types import FloatArray
+
+PHASE, PERIOD, DEVIATION = 0.3, 0.1, 0.2
+"""Gains of the clock of arrivals: its phase, its period, and the mean deviation from it."""
+SPARE = 2.0
+"""Mean deviations for which the arm has a way to go when a chunk is late."""
+LOST = 2.0
+"""A chunk that comes this many periods after the last one begins a new sequence."""
+STEADY = 0.1
+"""A speed that differs from what is wanted by this part of it is kept."""
+SLOWEST = 1e-3
+"""Least share of the velocity limits."""
+SOON_NS = 1_000_000
+
+
+class Arrivals:
+    """When the next chunk is to be expected, in plan time."""
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Nothing has arrived yet."""
+        self._last_ns: float | None = None
+        self._period_ns = 0.0
+        self._deviation_ns = 0.0
+
+    def arrived(self, now_ns: int, asked_period_ns: float) -> None:
+        """A chunk arrived, of a worker that is asked for one in every `asked_period_ns`."""
+        expected_ns = None if self._last_ns is None else self._last_ns + self._period_ns
+        if expected_ns is None or now_ns - expected_ns > (LOST - 1) * self._period_ns:
+            self._last_ns, self._period_ns = now_ns, asked_period_ns
+            return
+        late_ns = now_ns - expected_ns
+        self._last_ns = expected_ns + PHASE * late_ns
+        self._period_ns = max(self._period_ns + PERIOD * late_ns, 0.5 * asked_period_ns)
+        self._deviation_ns += DEVIATION * (abs(late_ns) - self._deviation_ns)
+
+    @property
+    def next_ns(self) -> float:
+        """When the next chunk is expected; the beginning of time before the first one."""
+        return -math.inf if self._last_ns is None else self._last_ns + self._period_ns
+
+    @property
+    def spare_ns(self) -> float:
+        """How much later than that it may well be."""
+        return SPARE * self._deviation_ns
+
+
+class StepTiming:
+    """The speed to each goal.
+
+    Args:
+        box: (3, 6) velocity, acceleration and jerk limits of every axis.
+    """
+
+    def __init__(self, box: FloatArray) -> None:
+        self._box = box
+        self._arrivals = Arrivals()
+        self.restart()
+
+    def restart(self) -> None:
+        """The arm stands, nothing was asked of it yet."""
+        self._arrivals.restart()
+        self._plan: Plan | None = None
+        self._begun_ns = 0
+        self._gone = self._stretch = 0.0
+
+    def share(
+        self,
+        plan: Plan,
+        index: int,
+        now_ns: int,
+        asked_period_s: float,
+        way: FloatArray,
+        velocity: FloatArray,
+    ) -> float:
+        """Share of the velocity limits for the way to a goal.
+
+        Args:
+            plan: the newest.
+            index: of its goal in force.
+            now_ns: wall time.
+            asked_period_s: between two chunks, in plan time.
+            way: (6,) from the commanded pose to the goal, m and rad.
+            velocity: (6,) at present, m/s and rad/s, in the same axes.
+        """
+        if plan.cause is None:
+            return 1.0
+        plan_ns = plan.clock.at(now_ns)
+        if plan is not self._plan:
+            self._take(plan, plan_ns, asked_period_s)
+        due_ns = self._begun_ns + (index + 1 - self._gone) * plan.dt_ns * self._stretch
+        # Of a chunk with steps left the next goal comes by the clock, not with the next chunk.
+        last = index + 1 == len(plan.goals)
+        time_s = max(due_ns - plan_ns + last * self._arrivals.spare_ns, SOON_NS) / 1e9
+        override = plan.clock.override
+        return self._paced(way, velocity, time_s / max(override, 1e-9), override)
+
+    def _take(self, plan: Plan, plan_ns: int, asked_period_s: float) -> None:
+        self._plan, self._begun_ns = plan, plan_ns
+        self._arrivals.arrived(plan_ns, asked_period_s * 1e9)
+        steps = len(plan.goals)
+        gone = (plan_ns - plan.clock.at(plan.start_ns)) / plan.dt_ns
+        self._gone = min(max(gone, 0.0), steps - 1.0)
+        lasts_ns = (steps - self._gone) * plan.dt_ns
+        self._stretch = max(1.0, (self._arrivals.next_ns - plan_ns) / lasts_ns)
+
+    def _paced(
+        self, way: FloatArray, velocity: FloatArray, time_s: float, override: float
+    ) -> float:
+        """Share of the velocity limits that takes `time_s` and half a stop for a way (6,)."""
+        limits = self._box[0]
+        length = float(np.max(np.abs(way) / limits))  # s at full speed
+        if length <= 0.0:
+            return 1.0
+        now = float(np.max(np.abs(velocity) / limits))
+        # In units of the velocity limits along the way, as the limits of the other orders are.
+        leading = int(np.argmax(np.abs(way) / limits))
+        most, jerk = self._box[1:, leading] / limits[leading]
+        most, jerk = most * override**2, jerk * override**3
+        share = length / time_s
+        for _ in range(3):
+            share = length / (time_s + 0.5 * _stop_s(min(share, 1.0), most, jerk))
+        if abs(now - share) < STEADY * share:
+            share = now
+        return min(max(share, SLOWEST), 1.0)
+
+
+def _stop_s(speed: float, most: float, jerk: float) -> float:
+    """How long a stop takes from constant `speed`, within an acceleration and a jerk."""
+    if speed * jerk < most * most:
+        return 2.0 * math.sqrt(speed / jerk)
+    return speed / most + most / jerk
