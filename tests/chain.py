@@ -285,6 +285,7 @@ class Chain:
         client.put(client.keys.active, "false")
         client.put(client.keys.worker, "scripted")
         client.put(client.keys.prompt, "hold")
+        client.put(client.keys.speed, "100")
         client.set_rate(self.profile.task.rate_hz, END_PATIENCE_S)
 
         def settled() -> bool:

@@ -123,6 +123,16 @@ class Keys:
         return self._at("rate")
 
     @property
+    def speed(self) -> str:
+        """How fast the arm is driven, 0 to 100 percent of what is planned: ``30`` or ``30 %``."""
+        return self._at("speed")
+
+    @property
+    def slower(self) -> str:
+        """Likewise, but it only ever lowers `speed`: for whoever may stop the arm."""
+        return self._at("slower")
+
+    @property
     def stop(self) -> str:
         """Anything: latched emergency stop."""
         return self._at("stop")

@@ -333,6 +333,7 @@ def _targets() -> Iterator[Target]:
         ("text", b"put the red brick in the box"),
         ("activation", b"true while anna"),
         ("rate", b"1e1"),
+        ("percent", b"30 %"),
         ("name", b"scripted"),
         ("seed", b"17"),
     ):

@@ -18,6 +18,7 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     "text": settings.decode_text,
     "bool": settings.decode_bool,
     "rate": settings.decode_rate,
+    "percent": settings.decode_percent,
     "name": settings.decode_name,
     "seed": settings.decode_seed,
 }
@@ -108,6 +109,26 @@ def test_what_is_no_plain_number_is_no_rate(word: str) -> None:
 def test_a_rate_stays_within_bounds(word: str) -> None:
     with pytest.raises(CodecError, match=r"outside \[0\.05, 100\]"):
         settings.decode_rate(word.encode())
+
+
+@pytest.mark.parametrize(
+    ("word", "percent"),
+    [("30", 30.0), ("30 %", 30.0), ("30%\n", 30.0), ("0", 0.0), (" 100 ", 100.0), ("12.5", 12.5)],
+)
+def test_a_speed_is_a_number_of_percent(word: str, percent: float) -> None:
+    assert settings.decode_percent(word.encode()) == percent
+
+
+@pytest.mark.parametrize("word", ["", "%", "slow", "30 % %", "% 30", "nan", "0x5", "5,0", "true"])
+def test_what_is_no_percentage_is_no_speed(word: str) -> None:
+    with pytest.raises(CodecError, match="is no percentage: give a number from 0 to 100"):
+        settings.decode_percent(word.encode())
+
+
+@pytest.mark.parametrize("word", ["-1", "100.1 %", "1e999", "1e3"])
+def test_a_speed_is_never_more_than_planned_nor_less_than_none(word: str) -> None:
+    with pytest.raises(CodecError, match=r"outside \[0, 100\]"):
+        settings.decode_percent(word.encode())
 
 
 @given(st.text(st.sampled_from("abzAZ09_.-/*$ é"), max_size=8))

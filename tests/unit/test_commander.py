@@ -20,9 +20,10 @@ from command_rig import (
     quat_of,
 )
 
-from vla_zenoh.control.commander import Inputs, Setting
+from vla_zenoh.control.commander import Commander, Inputs, Setting
 from vla_zenoh.control.mover import LINGER_NS
 from vla_zenoh.control.so3 import norm3
+from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState, PoseState
 
 UP = [0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.0]
@@ -667,6 +668,42 @@ def test_a_new_rate_in_motion_changes_nothing_but_the_task() -> None:
     rig.assert_smooth()
 
 
+def test_the_speed_is_part_of_the_task_and_no_new_episode() -> None:
+    rig = moving_rig()
+    episode = rig.commander.task.episode
+    assert rig.commander.task.speed_percent == 100.0
+    assert rig.put("speed", 30.0).task_changed
+    assert rig.commander.task.speed_percent == 30.0
+    assert rig.put("speed", 80.0).task_changed
+    assert (rig.commander.task.speed_percent, rig.commander.task.episode) == (80.0, episode)
+    assert rig.state == "active"
+
+
+def test_slower_only_ever_lowers_the_speed() -> None:
+    rig = Rig()
+    rig.put("slower", 40.0)
+    assert rig.commander.task.speed_percent == 40.0
+    out = rig.put("slower", 40.5)
+    assert rig.commander.task.speed_percent == 40.0
+    assert rig.refused == {"slower_refused": 1}
+    assert [event.why for event in out.events] == [
+        "40.5 % is more than the 40 % in force; put it on speed to go faster"
+    ]
+    rig.put("slower", 40.0)
+    rig.put("slower", 0.0)
+    assert rig.commander.task.speed_percent == 0.0
+    rig.put("speed", 100.0)
+    assert rig.commander.task.speed_percent == 100.0
+    assert rig.refused == {"slower_refused": 1}
+
+
+def test_the_speed_at_the_beginning_is_that_of_the_profile() -> None:
+    profile = load_profile("panda_sim")
+    slow = profile.task.model_copy(update={"speed_percent": 25.0})
+    commander = Commander(profile.model_copy(update={"task": slow}))
+    assert commander.task.speed_percent == 25.0
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -674,6 +711,8 @@ def test_a_new_rate_in_motion_changes_nothing_but_the_task() -> None:
         ("rate", -1.0),
         ("rate", True),
         ("rate", "fast"),
+        *((name, value) for name in ("speed", "slower") for value in (math.nan, -1.0, True, "30")),
+        ("speed", 100.5),
         ("prompt", "x" * 5000),
         ("prompt", 3.0),
         ("prompt", "\ud800"),

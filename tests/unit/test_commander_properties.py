@@ -44,6 +44,7 @@ put = st.one_of(
     st.tuples(st.just("active"), st.booleans() | st.sampled_from([None, "true", 1.0])),
     st.tuples(st.sampled_from(["stop", "reset", "lose", "nonsense"]), st.none()),
     st.tuples(st.just("rate"), st.floats() | st.none()),
+    st.tuples(st.sampled_from(["speed", "slower"]), st.floats(0, 100) | st.floats() | st.none()),
     st.tuples(st.just("prompt"), st.text(max_size=20)),
     st.tuples(st.just("worker"), st.sampled_from([WORKER, OTHER, "ghost", ""])),
 )
@@ -192,7 +193,18 @@ def test_a_thousand_steps_of_no_time_are_no_harm() -> None:
 def test_inputs_of_everything_at_once_in_one_tick() -> None:
     rig = Rig()
     rig.activate()
-    names = ["active", "prompt", "worker", "rate", "lose", "reset", "stop", "other"]
+    names = [
+        "active",
+        "prompt",
+        "worker",
+        "rate",
+        "speed",
+        "slower",
+        "lose",
+        "reset",
+        "stop",
+        "other",
+    ]
     values: list[Any] = [True, False, None, "", "x", 0.0, float("nan"), float("inf")]
     inputs = Inputs(
         [Setting(name, value) for name in names for value in values],

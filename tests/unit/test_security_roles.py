@@ -146,7 +146,8 @@ def test_only_the_command_node_writes_commands_and_only_the_robot_writes_states(
 
 
 def test_only_an_operator_says_what_is_to_be_done(lab: Profile) -> None:
-    orders = {"prompt", "active", "worker", "rate", "stop", "reset", "sim/reset"}
+    orders = {"prompt", "active", "worker", "rate", "speed", "slower", "stop", "reset"}
+    orders.add("sim/reset")
     for identity in identities(lab):
         written = may(lab, identity.common_name, Act.PUT)
         assert written & orders == (orders if identity.role is Role.OPERATOR else set())

@@ -151,6 +151,7 @@ def test_the_worker_that_an_operator_is_says_its_own_deltas_and_nothing_else(lab
     keys = lab.chain.profile.keys
     others = (
         *(keys.prompt, keys.active, keys.worker, keys.rate, keys.stop, keys.reset, keys.task),
+        *(keys.speed, keys.slower),
         *(keys.delta("scripted"), keys.spec("scripted"), keys.command_pose, keys.command_gripper),
         *(keys.state_pose, keys.camera_jpeg("front"), keys.status("command"), keys.sim_reset),
     )

@@ -87,6 +87,23 @@ def test_who_comes_late_learns_the_task(chain: Chain) -> None:
     assert (task.prompt, task.rate_hz, task.active) == ("HARD: yaw left x2", 7.0, False)
 
 
+def test_the_speed_reaches_the_task_and_status_and_slower_never_raises_it(chain: Chain) -> None:
+    foreign_program(chain, speed="60 %")
+    chain.until("60 %", lambda: chain.detail("speed_percent") == 60.0)
+    assert chain.client.task is not None
+    assert (chain.client.task.speed_percent, value_of(chain, "speed")) == (60.0, "60")
+    assert chain.client.slow_down(30.0).speed_percent == 30.0
+    with pytest.raises(SessionError, match=r"50 % is more than the 30 % in force"):
+        chain.client.slow_down(50.0)
+    assert value_of(chain, "speed") == "30"
+    assert chain.client.set_speed(50.0).speed_percent == 50.0
+    began = chain.refused().get("command.invalid", 0)
+    for text in ("fast", "101", "-1"):
+        chain.client.put(chain.client.keys.speed, text)
+    chain.until("told", lambda: chain.refused().get("command.invalid", 0) == began + 3)
+    assert value_of(chain, "speed") == "50"
+
+
 def test_what_is_refused_changes_nothing_and_is_said(chain: Chain) -> None:
     before = chain.client.task
     began = chain.refused()

@@ -30,7 +30,7 @@ from vla_zenoh.printable import one_line
 from vla_zenoh.types import NodeStatus
 
 MAX_NUMBER = 40
-SETTINGS = ("prompt", "active", "worker", "rate")
+SETTINGS = ("prompt", "active", "worker", "rate", "speed")
 
 
 @dataclass(slots=True)

@@ -45,6 +45,7 @@ PARTS = (
     Part(DRIVE, "deactivate", "switches:deactivate"),
     Part(DRIVE, "use", "switches:use"),
     Part(DRIVE, "rate", "switches:rate"),
+    Part(DRIVE, "speed", "switches:speed"),
     Part(DRIVE, "stop", "switches:stop"),
     Part(DRIVE, "reset", "switches:reset"),
     Part(DRIVE, "trial", "trial:trial"),

@@ -220,9 +220,12 @@ def _word(name: str, found: NodeStatus) -> str:
     if name == "command":
         rate_hz = detail.get("rate_hz")
         rate = f"{rate_hz:g}" if isinstance(rate_hz, (int, float)) else "?"
+        speed = detail.get("speed_percent")
+        slowed = isinstance(speed, (int, float)) and speed < 100
         doing = (
             f"prompt {detail.get('prompt', '')!r}, worker {detail.get('worker', '')}, {rate} Hz, "
             f"{detail.get('accepted_chunks', 0)} chunks carried out"
+            f"{f', speed {speed:g} %' if slowed else ''}"
         )
         return f"{one_line(detail.get('why', ''), MAX_WORDS)}\n{one_line(doing, MAX_WORDS)}"
     word = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")

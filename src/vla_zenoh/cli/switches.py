@@ -1,4 +1,4 @@
-"""vla-zenoh activate, deactivate, use, rate, stop, reset: one put each."""
+"""vla-zenoh activate, deactivate, use, rate, speed, stop, reset: one put each."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ from vla_zenoh.cli.options import (
     RobotOption,
 )
 from vla_zenoh.cli.output import complain, console, errors, fail, styled
+from vla_zenoh.codec.settings import decode_percent
+from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import Keys
 from vla_zenoh.nodes.alive import robots_alive
 from vla_zenoh.nodes.client import Client
 from vla_zenoh.nodes.process import stop_on_signals
 from vla_zenoh.profile import as_robot
+from vla_zenoh.types import Task
 
 STOP_PATIENCE_S = 3.0
 LOOK_S, POLL_S = 1.0, 0.05
@@ -95,6 +98,40 @@ def rate(
     with aim.driver("rate", f"{rate_hz:g}") as client:
         task = client.set_rate(rate_hz)
         console().print(f"rate: {task.rate_hz:g} Hz, {aim.named(client)}", soft_wrap=True)
+
+
+def speed(
+    percent: Annotated[
+        str | None,
+        typer.Argument(help="0 to 100; 0: it stands, still active. Without it: what it is now."),
+    ] = None,
+    profile: ProfileOption = DEFAULT_PROFILE,
+    connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
+) -> None:
+    """Drive slower than planned, on the same path. Who may stop the arm may lower it."""
+    aim = Aim(profile, connect, host, robot)
+    wanted = None if percent is None else decode_percent(percent.encode())
+    # To lower it is like a stop: as whoever may, of those whose certificates lie here.
+    with aim.client(stop=wanted is not None) as client:
+        task = client.wait_for(lambda: client.task, STOP_PATIENCE_S)
+        if task is None:
+            _complain(aim, client, "speed", "say how fast it is driven")
+        lower = wanted is not None and wanted <= task.speed_percent
+        if lower and (why := aim.powerless(client.profile, "speed", f"{wanted:g}")):
+            raise SecurityError(why)
+        if wanted is None or lower:
+            _tell_speed(aim, client, task if wanted is None else client.slow_down(wanted))
+            return
+    with aim.driver("speed", f"{wanted:g}") as client:
+        _tell_speed(aim, client, client.set_speed(wanted))
+
+
+def _tell_speed(aim: Aim, client: Client, task: Task) -> None:
+    console().print(
+        f"speed: {task.speed_percent:g} % of what is planned, {aim.named(client)}", soft_wrap=True
+    )
 
 
 def stop(

@@ -91,6 +91,24 @@ def decode_rate(payload: bytes) -> float:
     return rate_hz
 
 
+def decode_percent(payload: bytes) -> float:
+    """A share of the speed, 0 to 100 percent: a plain number, ``%`` may stand behind it.
+
+    Raises:
+        CodecError: not such a number, or outside.
+    """
+    word = decode_text(payload)
+    number = word.removesuffix("%").rstrip()
+    if not _NUMBER.fullmatch(number):
+        raise CodecError(
+            "invalid", f"{word[:40]!r} is no percentage: give a number from 0 to 100, such as '30'"
+        )
+    percent = float(number)
+    if not 0.0 <= percent <= 100.0:
+        raise CodecError("invalid", f"speed {word[:40]!r} percent is outside [0, 100]")
+    return abs(percent)  # of "-0"
+
+
 def decode_name(payload: bytes) -> str:
     """A worker's name: one word that can stand in a key.
 

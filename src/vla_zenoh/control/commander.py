@@ -62,7 +62,8 @@ class Commander:
         self.dry_run = dry_run
         self.state = State.INACTIVE
         self.why = "not activated yet"
-        self.task = Task(0, False, profile.task.prompt, profile.task.worker, profile.task.rate_hz)
+        asked = profile.task
+        self.task = Task(0, False, asked.prompt, asked.worker, asked.rate_hz, asked.speed_percent)
         self.pose: Stamped[PoseState] | None = None
         self.joint: Stamped[JointState] | None = None
         self.gripper_state: Stamped[GripperState] | None = None
@@ -184,6 +185,11 @@ class Commander:
                 self._change_worker(value, now_ns)
         elif name == "rate" and isinstance(value, (int, float)):
             self.task = replace(self.task, rate_hz=value)
+        elif name in ("speed", "slower") and isinstance(value, (int, float)):
+            if name == "slower" and value > self.task.speed_percent:
+                now = f"the {self.task.speed_percent:g} % in force"
+                raise RecordError(f"{value:g} % is more than {now}; put it on speed to go faster")
+            self.task = replace(self.task, speed_percent=value)
         elif name == "active" and (value is True or isinstance(value, str)):
             self._activate(now_ns, "" if value is True else value)
         elif name == "active" and value is False:

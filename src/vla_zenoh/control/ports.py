@@ -26,7 +26,8 @@ from vla_zenoh.types import (
 
 
 class Setting(NamedTuple):
-    """Somebody put a setting. `name`: prompt, active, worker, rate, stop, reset or lose.
+    """Somebody put a setting. `name`: prompt, active, worker, rate, speed, slower, stop,
+    reset or lose.
 
     Of ``active`` a text is the name of whoever holds the arm active.
     """

@@ -178,6 +178,20 @@ class Client:
             timeout_s,
         )
 
+    def set_speed(self, percent: float, timeout_s: float = 2.0) -> Task:
+        """Likewise for the share of the planned speed that is driven, 0 to 100 percent."""
+        return self._set_speed(self.keys.speed, percent, "speed", timeout_s)
+
+    def slow_down(self, percent: float, timeout_s: float = 2.0) -> Task:
+        """Likewise, for whoever may stop the arm: refused where it would go faster."""
+        return self._set_speed(self.keys.slower, percent, "slower", timeout_s)
+
+    def _set_speed(self, key: str, percent: float, what: str, timeout_s: float) -> Task:
+        def taken(task: Task) -> bool:
+            return math.isclose(task.speed_percent, percent, rel_tol=1e-5, abs_tol=1e-9)
+
+        return self._set(key, f"{percent:g}", taken, what, timeout_s)
+
     def set_worker(self, worker: str, timeout_s: float = 2.0) -> Task:
         """Likewise for the worker."""
         return self._set(

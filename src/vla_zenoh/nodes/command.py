@@ -72,6 +72,7 @@ class CommandNode:
             (keys.prompt, lambda: task.task.prompt),
             (keys.worker, lambda: task.task.worker),
             (keys.rate, lambda: f"{task.task.rate_hz:g}"),
+            (keys.speed, lambda: f"{task.task.speed_percent:g}"),
             (keys.active, lambda: "true" if task.task.active else "false"),
         ):
             self.node.answer(key, self._text_reply(key, value))

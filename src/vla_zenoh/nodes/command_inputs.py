@@ -48,6 +48,8 @@ class CommandInputs:
             ("prompt", node.listen(keys.prompt, Mailbox(16, WORDS)), settings.decode_text),
             ("worker", node.listen(keys.worker, Mailbox(16, WORDS)), settings.decode_name),
             ("rate", node.listen(keys.rate, Mailbox(16, WORDS)), settings.decode_rate),
+            ("speed", node.listen(keys.speed, Mailbox(16, WORDS)), settings.decode_percent),
+            ("slower", node.listen(keys.slower, Mailbox(16, WORDS)), settings.decode_percent),
             ("active", node.listen(keys.active, Mailbox(16, WORDS)), settings.decode_activation),
         ]
         self._speakers = {

@@ -86,6 +86,7 @@ class CommandStatus:
                 "prompt": task.prompt,
                 "worker": task.worker,
                 "rate_hz": task.rate_hz,
+                "speed_percent": task.speed_percent,
                 "episode": task.episode,
                 "accepted_chunks": mind.progress.chunks,
                 "accepted_steps": mind.progress.steps,

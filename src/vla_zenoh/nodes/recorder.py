@@ -149,7 +149,7 @@ class Recorder:
         """Settings are put once and kept by the command node: those in force stand at the top."""
         keys = self.node.keys
         wanted = [zenoh.KeyExpr(expression) for expression in self._expressions]
-        for key in (keys.prompt, keys.worker, keys.rate, keys.active):
+        for key in (keys.prompt, keys.worker, keys.rate, keys.speed, keys.active):
             if not any(expression.includes(zenoh.KeyExpr(key)) for expression in wanted):
                 continue
             for reply in self.node.session.get(key, timeout=ANSWER_S):

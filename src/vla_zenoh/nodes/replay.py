@@ -40,6 +40,8 @@ GROUPS = (
     "active",
     "worker",
     "rate",
+    "speed",
+    "slower",
     "stop",
     "reset",
     "status",

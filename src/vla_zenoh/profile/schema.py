@@ -190,11 +190,19 @@ class SimProfile(Section):
 
 
 class TaskProfile(Section):
-    """What the settings are until somebody puts others."""
+    """What the settings are until somebody puts others.
+
+    Args:
+        prompt: what the model is asked to do.
+        rate_hz: chunks per second asked of the workers.
+        worker: whose chunks are obeyed.
+        speed_percent: of the speed that is planned, so much is driven.
+    """
 
     prompt: Text = "hold"
     rate_hz: float = Field(default=5.0, ge=0.05, le=100)
     worker: Name = "scripted"
+    speed_percent: float = Field(default=100.0, ge=0, le=100)
 
 
 class PicturesProfile(Section):

@@ -98,6 +98,9 @@ TABLE = (
     Row("holding", announce=frozenset({OPERATOR}), watch=frozenset({COMMAND})),
     _setting("worker"),
     _setting("rate"),
+    _setting("speed"),
+    # Who may stop the arm may slow it down, whoever may activate it.
+    _stream("slower", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
     _stream("stop", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
     _stream("reset", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
     Row(

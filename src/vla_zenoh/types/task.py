@@ -18,6 +18,7 @@ class Task:
         prompt: plain text.
         worker: name of the worker whose chunks are obeyed.
         rate_hz: chunks per second asked of the workers.
+        speed_percent: of the speed that is planned, so much is driven; 0: the arm stands, active.
     """
 
     episode: int
@@ -25,6 +26,7 @@ class Task:
     prompt: str
     worker: str
     rate_hz: float
+    speed_percent: float = 100.0
 
     def __post_init__(self) -> None:
         set_field(self, "episode", integer("episode", self.episode))
@@ -32,3 +34,4 @@ class Task:
         text("prompt", self.prompt)
         text("worker", self.worker, 128)
         set_field(self, "rate_hz", number("rate_hz", self.rate_hz, 0.01, 1000.0))
+        set_field(self, "speed_percent", number("speed_percent", self.speed_percent, 0.0, 100.0))

@@ -82,7 +82,8 @@ class Words:
             f"**{plain(state) or 'unknown'}**{f', {plain(why)}' if why else ''}",
             "",
             f"{plain(task.worker)} at {task.rate_hz:g} Hz, episode {task.episode}, "
-            f"{'active' if task.active else 'not active'}",
+            f"{'active' if task.active else 'not active'}"
+            f"{f', speed {task.speed_percent:g} %' if task.speed_percent < 100 else ''}",
         ]
 
     def _of_bounds(self, stamp_ns: int) -> list[str]:
