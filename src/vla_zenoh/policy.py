@@ -127,6 +127,8 @@ class ActionSpec(_Spec):
         gripper_open_is_high: polarity of ``open_fraction`` and ``binary``: True: a large value
             means open (OpenVLA), False: it means closed.
         gripper_threshold: where ``binary`` switches.
+        pace: ``steady``: a step lasts `dt_s`, and the arm neither stops nor rushes between steps
+            that come in time; ``soonest``: it goes to each goal as fast as its limits allow.
         normalisation: the key of the statistics the model's output was scaled with, for people.
     """
 
@@ -141,6 +143,7 @@ class ActionSpec(_Spec):
     # Adding zero makes -0.0 zero: they mean the same, and must have the same hash.
     gripper_threshold: Annotated[float, AfterValidator(lambda value: value + 0.0)] = 0.5
     normalisation: Text | None = None
+    pace: Literal["steady", "soonest"] = "steady"
 
     @property
     def dimension(self) -> int:

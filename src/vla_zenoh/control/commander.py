@@ -98,7 +98,9 @@ class Commander:
         for chunk in inputs.chunks:
             self._take_chunk(chunk, now_ns)
         self._look_around(now_ns)
-        if not self._mover.advance(self.state, now_ns, ticks, self._out):
+        if not self._mover.advance(
+            self.state, self.task, self._watch.deadline_ns, now_ns, ticks, self._out
+        ):
             self._change(Trigger.FAULT, "no trajectory could be computed; braked")
         if self.state is State.ACTIVE and self._mover.timeline is not None:
             self.progress.look(self._mover.timeline, self.task.episode, now_ns)

@@ -115,6 +115,7 @@ class Plan:
         done: the policy says that these steps are the last.
         arrival_ns: when the chunk arrived.
         clock: plan time. `dt_ns` is in plan time, the other times are of the wall.
+        soonest: the arm goes to each goal as fast as it can, and waits there for the next one.
     """
 
     effective_ns: int
@@ -129,6 +130,7 @@ class Plan:
     done: bool = False
     arrival_ns: int = 0
     clock: PlanClock = WALL_CLOCK
+    soonest: bool = False
 
     def lasted_ns(self, t_ns: int) -> int:
         """Plan time from the observation to `t_ns`."""
@@ -172,7 +174,7 @@ class Plan:
         self.bounded = min(self.bounded, max(index, 1))
         for later in range(index, len(self.goals)):
             goal = self.goals[later]
-            inside, _ = into_workspace(limits, goal.pose.position_m + way_m)
+            inside, _ = into_workspace(limits, goal.pose.position_m + way_m, goal.pose.position_m)
             turned = orthonormal(goal.pose.rotation @ turn)
             self.goals[later] = Goal(Pose(inside, turned), goal.width_m)
 

@@ -33,6 +33,7 @@ class Composer:
         self._open_loop_s = profile.timing.max_open_loop_s
         self._max_width_m = profile.robot.gripper.max_width_m
         self._reach = reach
+        self._pace = profile.composition.pace
 
     def compose(
         self, chunk: Stamped[ActionChunk], action: ActionSpec, timeline: GoalTimeline, out: Outputs
@@ -92,6 +93,7 @@ class Composer:
             len(goals) if self._reach is None or self._refusing else min(len(goals), BOUND_AHEAD),
             record.episode,
             done=done,
+            soonest=(action.pace if self._pace == "spec" else self._pace) == "soonest",
         )
         if standing_on.episode == record.episode:
             plan.begun = standing_on.steps_asked_until(record.observation_stamp_ns)

@@ -45,7 +45,7 @@ def bound_step(limits: Limits, before: Pose, asked: Pose) -> tuple[Pose, list[Li
     hits += hit
     rotvec, hit = _bound_norm("step_rad", rotvec, limits.step_rad)
     hits += hit
-    inside, overshoot_m = into_workspace(limits, before.position_m + translation)
+    inside, overshoot_m = into_workspace(limits, before.position_m + translation, before.position_m)
     if overshoot_m > 0:
         hits.append(LimitHit("workspace", overshoot_m, 0.0))
     if not hits:
@@ -62,11 +62,24 @@ def _bound_norm(name: str, vector: FloatArray, limit: float) -> tuple[FloatArray
     return vector * (limit / norm), [LimitHit(name, norm, limit, norm > REFUSE_FACTOR * limit)]
 
 
-def into_workspace(limits: Limits, position_m: FloatArray) -> tuple[FloatArray, float]:
-    """The nearest position inside the workspace box, and how far that is (m)."""
+def into_workspace(
+    limits: Limits, position_m: FloatArray, before_m: FloatArray | None = None
+) -> tuple[FloatArray, float]:
+    """The nearest position inside the workspace box, and how far that is (m).
+
+    Args:
+        limits: the box.
+        position_m: (3,) in the base frame.
+        before_m: (3,) where the step to it begins. From outside the box it may come back or stay,
+            and goes no further out.
+    """
     box = limits.workspace
     x, y, z = position_m.tolist()
     (x_low, x_high), (y_low, y_high), (z_low, z_high) = box.x_m, box.y_m, box.z_m
+    if before_m is not None:
+        x0, y0, z0 = before_m.tolist()
+        x_low, y_low, z_low = min(x_low, x0), min(y_low, y0), min(z_low, z0)
+        x_high, y_high, z_high = max(x_high, x0), max(y_high, y0), max(z_high, z0)
     if x_low <= x <= x_high and y_low <= y <= y_high and z_low <= z <= z_high:
         return position_m, 0.0
     inside = np.array(

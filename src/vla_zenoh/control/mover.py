@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from vla_zenoh.control.aggregate import Aggregator
 from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
 from vla_zenoh.control.composer import Composer
@@ -13,9 +15,10 @@ from vla_zenoh.control.limits import leash
 from vla_zenoh.control.ports import Outputs
 from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.slowdown import Slowdown
-from vla_zenoh.control.smoothing import Motion, Shares, Smoother, motion_limits
-from vla_zenoh.control.so3 import Pose, held_pose, pose_of, quat_from_rotation
+from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother, motion_limits
+from vla_zenoh.control.so3 import Pose, held_pose, log3, pose_of, quat_from_rotation
 from vla_zenoh.control.states import OBEYING, State
+from vla_zenoh.control.step_timing import StepTiming
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
@@ -26,12 +29,17 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
     Stamped,
+    Task,
 )
 
 LINGER_NS = 500_000_000
 """The stream goes on for this long after the arm stands, so that its last pose is not lost."""
 SAME_WIDTH_M = 0.005
 """A gripper this near to the width last sent has reached it."""
+LEAST_OVERRIDE = 0.01
+"""A speed override below this is none: the arm stands."""
+ROUNDING_M = 1e-4
+"""A command is put back into the workspace where it is outside by less."""
 
 
 class Mover:
@@ -62,9 +70,11 @@ class Mover:
         self.goal: Goal | None = None
         self.streaming = False
         self.speed = 1.0
-        """Share of the speed limits that the arm has to its goal."""
+        """Share of the speed limits that the arm has to its goal, the override aside."""
+        self._override, self._slowing = 1.0, False
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
+        self._timing: StepTiming | None = None
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
 
@@ -111,6 +121,7 @@ class Mover:
         standing = not self.streaming or self.at_rest
         if self._smoother is None:
             self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits))
+            self._timing = StepTiming(self._smoother.box)
         elif standing:
             # Also at rest: a robot that braked by itself stands elsewhere than we command.
             self._smoother.reset(start)
@@ -121,11 +132,20 @@ class Mover:
         # A blocked arm's controller is led back to where the arm is. Otherwise a brake under way
         # goes on to its end, and the goal is where it ends.
         goal = Goal(actual if blocked else self._smoother.resting_pose(), width_m)
+        assert self._timing is not None
+        self._timing.restart()
+        self._box_m = self._box_around(start)
         if self.timeline is None:
             self.timeline = GoalTimeline(goal, now_ns)
         else:
             self.timeline.restart(goal, now_ns)
         self.goal = None if blocked else goal
+
+    def _box_around(self, pose: Pose) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corner (3,) m of the workspace, and of where the arm begins outside."""
+        box = self._limits.workspace
+        low, high = np.array([box.x_m, box.y_m, box.z_m]).T
+        return np.minimum(low, pose.position_m), np.maximum(high, pose.position_m)
 
     def _held_joints(self, joint: JointState) -> FloatArray:
         """Joints the robot's controller holds, or where they are."""
@@ -146,8 +166,18 @@ class Mover:
         return min(max(gripper.width_m, 0.0), self._max_width_m)
 
     # -- one tick -----------------------------------------------------------------------------
-    def advance(self, state: State, now_ns: int, ticks: int, out: Outputs) -> bool:
+    def advance(
+        self, state: State, task: Task, overdue_ns: int, now_ns: int, ticks: int, out: Outputs
+    ) -> bool:
         """Move on by `ticks` periods: after the goal in force where active, else braking.
+
+        Args:
+            state: of the command node.
+            task: its rate and speed override.
+            overdue_ns: when the watchdog brakes unless a chunk comes.
+            now_ns: time of this tick.
+            ticks: see `Commander.step`.
+            out: what happened.
 
         Returns:
             whether a trajectory could be computed; where not, the arm brakes.
@@ -155,8 +185,9 @@ class Mover:
         if self._smoother is None or self.timeline is None:
             return True
         self._cause = None
+        self._take_override(task.speed_percent / 100.0, self.timeline, now_ns)
         if state is State.ACTIVE:
-            self._cause = self._follow(self._smoother, self.timeline, now_ns, out)
+            self._cause = self._follow(self._smoother, self.timeline, task, overdue_ns, now_ns, out)
         else:
             self._brake(self._smoother, self.timeline, now_ns)
         went_on, self.streaming = self.streaming, self._must_stream(state, now_ns)
@@ -184,30 +215,86 @@ class Mover:
         if state is State.ACTIVE:
             out.gripper = self.gripper.step(now_ns, gripper)
 
+    def _take_override(self, override: float, timeline: GoalTimeline, now_ns: int) -> None:
+        """Let plan time pass at the speed override, and plan the way to the goal anew."""
+        override = override if override >= LEAST_OVERRIDE else 0.0
+        if override != self._override or override != timeline.clock.override:
+            self._override = override
+            timeline.clock.set(override, now_ns)
+            self.goal = None
+
     def _follow(
-        self, smoother: Smoother, timeline: GoalTimeline, now_ns: int, out: Outputs
+        self,
+        smoother: Smoother,
+        timeline: GoalTimeline,
+        task: Task,
+        overdue_ns: int,
+        now_ns: int,
+        out: Outputs,
     ) -> Cause | None:
         plans = self._aggregator.plans(timeline, now_ns)
         for plan in plans:
             self._composer.bound_until(plan, plan.index_at(now_ns), out)
         goal = self._aggregator.goal(plans, now_ns)
-        if goal is not self.goal:
-            pose, hits = leash(self._limits, goal.pose, smoother.motion.pose)
+        if self._override == 0.0:
+            self._stand(smoother)
+            return timeline.plan.cause
+        slowed = self._slowing and _within(smoother, self._override)
+        pose, hits = leash(self._limits, goal.pose, smoother.motion.pose)
+        if goal is not self.goal or hits or slowed:
             if hits:
-                goal = self._shorten(plans, goal, pose, now_ns)
-                out.tell("warning", "limit", hits[0].name, "leash", hits[0].value, hits[0].limit)
+                cut = self._shorten(plans, goal, pose, now_ns)
+                if goal is not self.goal:
+                    out.tell(
+                        "warning", "limit", hits[0].name, "leash", hits[0].value, hits[0].limit
+                    )
+                goal = cut
             self._slow_down(goal.slowdown, out)
-            smoother.target(goal.pose, self._shares(smoother, goal.pose))
+            shares = self._shares(smoother, goal.pose, timeline.plan, task, overdue_ns, now_ns)
+            smoother.target(goal.pose, shares)
             self.goal = goal
             self.gripper.want(goal.width_m)
         return timeline.plan.cause
 
-    def _shares(self, smoother: Smoother, goal: Pose) -> Shares:
-        """Parts of its limits that the arm has on the way to a goal."""
+    def _stand(self, smoother: Smoother) -> None:
+        """Stop on the way, to go on from there when the override allows it again."""
         if self._joints is None:
-            return Shares(velocity=self.speed)
+            smoother.brake(FULL)
+        else:
+            self._joints.brake(smoother)
+        self.goal = None
+
+    def _shares(
+        self,
+        smoother: Smoother,
+        goal: Pose,
+        plan: Plan,
+        task: Task,
+        overdue_ns: int,
+        now_ns: int,
+    ) -> Shares:
+        """Parts of its limits that the arm has on the way to a goal."""
+        override, speed = self._override, self.speed * self._override
+        if not plan.soonest:
+            assert self._timing is not None
+            here, twist, _ = smoother.motion
+            body = here.rotation.T
+            way = np.concatenate([goal.position_m - here.position_m, log3(body @ goal.rotation)])
+            velocity = np.concatenate([twist[:3], body @ twist[3:]])
+            index, left_s = plan.index_at(now_ns), (overdue_ns - now_ns) / 1e9
+            share = self._timing.share(
+                plan, index, now_ns, 1.0 / task.rate_hz, left_s, way, velocity
+            )
+            speed = min(speed, share)
+        # The same motion in more time: its acceleration shrinks with the square of the override,
+        # its jerk with the cube. Until a faster arm has slowed down it brakes as hard as it may.
+        self._slowing = not _within(smoother, override)
+        most = FULL if self._slowing else Shares(1.0, override**2, override**3)
+        shares = Shares(speed, most.acceleration, most.jerk)
+        if self._joints is None:
+            return shares
         joints = self._joints.shares(smoother.motion, goal, smoother.box)
-        return joints._replace(velocity=min(joints.velocity, self.speed))
+        return Shares(*map(min, joints, shares))
 
     def _slow_down(self, slower: Slowdown | None, out: Outputs) -> None:
         """Take over the speed of a goal; tell each reason once in every activation."""
@@ -252,8 +339,11 @@ class Mover:
 
     def _pose_command(self, motion: Motion, state: State) -> PoseCommand:
         goal = self.goal.pose if self.goal else motion.pose
+        inside_m = np.clip(motion.pose.position_m, *self._box_m)
+        if float(np.abs(inside_m - motion.pose.position_m).max()) > ROUNDING_M:
+            inside_m = motion.pose.position_m  # to put it back would be a jump
         return PoseCommand(
-            motion.pose.position_m,
+            inside_m,
             quat_from_rotation(motion.pose.rotation),
             motion.twist,
             motion.acceleration,
@@ -262,3 +352,12 @@ class Mover:
             state.value,
             self._cause,
         )
+
+
+def _within(smoother: Smoother, override: float) -> bool:
+    """Whether the arm moves as slowly as it would at this override."""
+    motion, box = smoother.motion, smoother.box * (1 + 1e-6)
+    return bool(
+        (np.abs(motion.twist) <= override * box[0]).all()
+        and (np.abs(motion.acceleration) <= override**2 * box[1]).all()
+    )

@@ -13,8 +13,8 @@ Steps last dt, or longer where the chunk would be over before the next one is ex
 is how long a stop from v takes: braking for W_k, where the arm would stand, begins at D_k + spare
 and not before, and by then the next goal is there. So the speed is constant while goals come in
 time and evenly, and the arm is ``v m`` behind them. Where no goal follows it comes to rest at the
-last one. ``x`` is a phase-locked clock of the arrivals (an alpha-beta filter), ``spare`` twice
-their mean deviation from it: what an inference takes varies.
+last one, before the watchdog would brake it. ``x`` is a phase-locked clock of the arrivals (an
+alpha-beta filter), ``spare`` twice their mean deviation from it: what an inference takes varies.
 
 Only the speed is bounded by this. Which goal is in force when, and where the arm ends, are those of
 `vla_zenoh.control.compose`.
@@ -33,13 +33,12 @@ PHASE, PERIOD, DEVIATION = 0.3, 0.1, 0.2
 """Gains of the clock of arrivals: its phase, its period, and the mean deviation from it."""
 SPARE = 2.0
 """Mean deviations for which the arm has a way to go when a chunk is late."""
-LOST = 2.0
-"""A chunk that comes this many periods after the last one begins a new sequence."""
 STEADY = 0.1
 """A speed that differs from what is wanted by this part of it is kept."""
 SLOWEST = 1e-3
 """Least share of the velocity limits."""
 SOON_NS = 1_000_000
+MARGIN_NS = 10_000_000
 
 
 class Arrivals:
@@ -51,18 +50,21 @@ class Arrivals:
     def restart(self) -> None:
         """Nothing has arrived yet."""
         self._last_ns: float | None = None
-        self._period_ns = 0.0
-        self._deviation_ns = 0.0
+        self._period_ns = self._deviation_ns = 0.0
+        self._intervals = 0
 
     def arrived(self, now_ns: int, asked_period_ns: float) -> None:
         """A chunk arrived, of a worker that is asked for one in every `asked_period_ns`."""
-        expected_ns = None if self._last_ns is None else self._last_ns + self._period_ns
-        if expected_ns is None or now_ns - expected_ns > (LOST - 1) * self._period_ns:
+        if self._last_ns is None:
             self._last_ns, self._period_ns = now_ns, asked_period_ns
             return
-        late_ns = now_ns - expected_ns
-        self._last_ns = expected_ns + PHASE * late_ns
-        self._period_ns = max(self._period_ns + PERIOD * late_ns, 0.5 * asked_period_ns)
+        self._intervals += 1
+        expected_ns = self._last_ns + self._period_ns
+        late_ns, half_ns = now_ns - expected_ns, 0.5 * self._period_ns
+        # The first intervals say most: a slow model is not asked as often as it was meant to be.
+        phase, period = max(PHASE, 1 / self._intervals), max(PERIOD, 1 / self._intervals)
+        self._last_ns = min(max(expected_ns + phase * late_ns, now_ns - half_ns), now_ns + half_ns)
+        self._period_ns = max(self._period_ns + period * late_ns, 0.5 * asked_period_ns)
         self._deviation_ns += DEVIATION * (abs(late_ns) - self._deviation_ns)
 
     @property
@@ -93,7 +95,7 @@ class StepTiming:
         self._arrivals.restart()
         self._plan: Plan | None = None
         self._begun_ns = 0
-        self._gone = self._stretch = 0.0
+        self._gone = self._stretch = self._spare_ns = 0.0
 
     def share(
         self,
@@ -101,6 +103,7 @@ class StepTiming:
         index: int,
         now_ns: int,
         asked_period_s: float,
+        left_s: float,
         way: FloatArray,
         velocity: FloatArray,
     ) -> float:
@@ -111,6 +114,7 @@ class StepTiming:
             index: of its goal in force.
             now_ns: wall time.
             asked_period_s: between two chunks, in plan time.
+            left_s: until the watchdog brakes, if no chunk comes.
             way: (6,) from the commanded pose to the goal, m and rad.
             velocity: (6,) at present, m/s and rad/s, in the same axes.
         """
@@ -120,23 +124,33 @@ class StepTiming:
         if plan is not self._plan:
             self._take(plan, plan_ns, asked_period_s)
         due_ns = self._begun_ns + (index + 1 - self._gone) * plan.dt_ns * self._stretch
-        # Of a chunk with steps left the next goal comes by the clock, not with the next chunk.
-        last = index + 1 == len(plan.goals)
-        time_s = max(due_ns - plan_ns + last * self._arrivals.spare_ns, SOON_NS) / 1e9
+        time_s = max(due_ns - plan_ns + self._spare_ns, SOON_NS) / 1e9
         override = plan.clock.override
-        return self._paced(way, velocity, time_s / max(override, 1e-9), override)
+        return self._paced(way, velocity, time_s / override, left_s, override)
 
     def _take(self, plan: Plan, plan_ns: int, asked_period_s: float) -> None:
-        self._plan, self._begun_ns = plan, plan_ns
         self._arrivals.arrived(plan_ns, asked_period_s * 1e9)
-        steps = len(plan.goals)
-        gone = (plan_ns - plan.clock.at(plan.start_ns)) / plan.dt_ns
-        self._gone = min(max(gone, 0.0), steps - 1.0)
+        steps, before = len(plan.goals), self._plan
+        self._gone = 0.0
+        if before is not None:
+            now_ns = plan.clock.wall_at(plan_ns)
+            asked = before.steps_asked_until(now_ns) - before.steps_asked_until(plan.start_ns)
+            self._gone = min(max(asked * before.dt_ns / plan.dt_ns, 0.0), steps - 1.0)
         lasts_ns = (steps - self._gone) * plan.dt_ns
-        self._stretch = max(1.0, (self._arrivals.next_ns - plan_ns) / lasts_ns)
+        wait_ns = max(self._arrivals.next_ns - plan_ns, 0.0)
+        self._stretch = max(1.0, wait_ns / lasts_ns)
+        self._spare_ns = MARGIN_NS + max(
+            0.0, wait_ns + self._arrivals.spare_ns - lasts_ns * self._stretch
+        )
+        self._plan, self._begun_ns = plan, plan_ns
 
     def _paced(
-        self, way: FloatArray, velocity: FloatArray, time_s: float, override: float
+        self,
+        way: FloatArray,
+        velocity: FloatArray,
+        time_s: float,
+        left_s: float,
+        override: float,
     ) -> float:
         """Share of the velocity limits that takes `time_s` and half a stop for a way (6,)."""
         limits = self._box[0]
@@ -150,8 +164,9 @@ class StepTiming:
         most, jerk = most * override**2, jerk * override**3
         share = length / time_s
         for _ in range(3):
-            share = length / (time_s + 0.5 * _stop_s(min(share, 1.0), most, jerk))
-        if abs(now - share) < STEADY * share:
+            stop_s = _stop_s(min(share, 1.0), most, jerk)
+            share = length / max(min(time_s + 0.5 * stop_s, left_s - 0.6 * stop_s), 1e-3)
+        if (1 - STEADY) * share < now < share:
             share = now
         return min(max(share, SLOWEST), 1.0)
 

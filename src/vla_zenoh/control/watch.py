@@ -26,25 +26,26 @@ class Watch:
         self._limits, self._timing = profile.limits, profile.timing
         self.tracking_m = self.tracking_rad = 0.0
         self._excused = (0.0, 0.0)
-        self._deadline_ns = 0
+        self.deadline_ns = 0
+        """When the next chunk is overdue."""
 
     # -- chunks -------------------------------------------------------------------------------
     def expect_first(self, now_ns: int, rate_hz: float) -> None:
         """An episode begins at `now_ns`; its first chunk takes longer than the others."""
-        self._deadline_ns = now_ns + self._patience_ns(rate_hz, FIRST_CHUNK_PATIENCE_S)
+        self.deadline_ns = now_ns + self._patience_ns(rate_hz, FIRST_CHUNK_PATIENCE_S)
 
     def expect_next(self, end_ns: int, rate_hz: float, now_ns: int) -> None:
         """The newest chunk runs out at `end_ns`, or where it would be followed too long."""
         last_ns = now_ns + int(self._timing.max_open_loop_s * 1e9)
-        self._deadline_ns = min(end_ns, last_ns) + self._patience_ns(rate_hz)
+        self.deadline_ns = min(end_ns, last_ns) + self._patience_ns(rate_hz)
 
     def starved(self, now_ns: int) -> bool:
         """The next chunk is overdue."""
-        return now_ns > self._deadline_ns
+        return now_ns > self.deadline_ns
 
     def forsaken(self, now_ns: int) -> bool:
         """It is overdue for so long that nobody may still expect the arm to go on by itself."""
-        return now_ns > self._deadline_ns + int(self._timing.max_hold_s * 1e9)
+        return now_ns > self.deadline_ns + int(self._timing.max_hold_s * 1e9)
 
     def _patience_ns(self, rate_hz: float, extra_s: float = 0.0) -> int:
         """How long to wait for the next chunk: one period at the asked rate, and the watchdog."""

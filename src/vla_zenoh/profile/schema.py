@@ -128,12 +128,15 @@ class Composition(Section):
         blend_s: the window of ``blend``.
         ensemble_decay: m of ``ensemble``: chunk i, 0 the oldest, has the weight exp(-m i).
         ensemble_plans: the newest so many chunks have a say at most.
+        pace: ``spec``: as the model's spec says; ``steady`` or ``soonest``: whatever it says, see
+            `vla_zenoh.policy.ActionSpec`.
     """
 
     mode: Literal["replace", "blend", "ensemble"] = "replace"
     blend_s: float = Field(default=0.2, gt=0, le=2)
     ensemble_decay: float = Field(default=0.01, ge=0, le=10)
     ensemble_plans: int = Field(default=16, ge=2, le=64)
+    pace: Literal["spec", "steady", "soonest"] = "spec"
 
 
 class CameraProfile(Section):
