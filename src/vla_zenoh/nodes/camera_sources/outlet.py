@@ -74,6 +74,8 @@ class Outlet:
         if (state, why) == (self.state, self.why):
             return
         was, self.state, self.why = self.state, state, why
+        if state == ENDED:
+            self.bad = None
         level = "info" if state in (OK, ENDED) else "warning"
         if state != was:
             self._tell(Event(level, "transition", f"{self.name}:{was}->{state}", why[:1000]))
