@@ -54,7 +54,7 @@ POSES = "/bench/desired_pose"
 
 PROFILE = """\
 extends: panda_ros2
-cameras: {{front: {{rate_hz: 200}}, wrist: null}}
+cameras: {{front: {{rate_hz: 200, check: {{same_s: 0}}}}, wrist: null}}
 ros2:
   domain: {domain}
   cameras: {{wrist: null}}

@@ -28,7 +28,8 @@ WIDTH, HEIGHT, CAMERA_HZ, STATE_HZ = 160, 120, 20, 200
 PROFILE = """\
 extends: panda_ros2
 cameras:
-  front: {{width: {width}, height: {height}, rate_hz: {camera_hz}}}
+  # Drawn, without noise: a still scene gives the very same picture.
+  front: {{width: {width}, height: {height}, rate_hz: {camera_hz}, check: {{same_s: 0}}}}
   wrist: null
 task: {{prompt: hold, rate_hz: 5, worker: scripted}}
 session:

@@ -206,6 +206,22 @@ def test_a_robot_that_is_switched_off_and_on_moves_again_only_when_it_is_told() 
     check_motion(loop, own_brake=True)
 
 
+def test_a_camera_that_lies_ends_the_motion_and_has_to_be_good_again_to_activate() -> None:
+    loop = moving()
+    since = mark(loop)
+    loop.camera_faults["front"] = "shows the same picture since 1.0 s"
+    loop.run(0.5)
+    assert loop.commander.why == "camera 'front' shows the same picture since 1.0 s"
+    assert stop_time_s(loop, since) < BRAKE_STOP_S
+    assert way_m(loop, since) < BRAKE_WAY_M
+    loop.put("active", True)
+    loop.run(0.1)
+    assert loop.commander.state.value == "inactive"
+    loop.camera_faults.clear()
+    goes_on(loop)
+    check_motion(loop)
+
+
 def test_without_commands_the_robot_brakes_by_itself_and_nothing_jumps_afterwards() -> None:
     loop = moving()
     since = mark(loop)

@@ -465,6 +465,27 @@ def test_a_node_that_is_gone_ends_the_activation_and_coming_back_does_not_renew_
     rig.activate()
 
 
+def test_a_camera_that_lies_ends_the_activation_by_name() -> None:
+    rig = moving_rig()
+    frozen = {"front": "shows the same picture since 1.2 s"}
+    rig.around = replace(rig.around, camera_faults=frozen)
+    rig.tick()
+    assert rig.state == "inactive"
+    assert rig.commander.why == "camera 'front' shows the same picture since 1.2 s"
+    rig.around = replace(rig.around, camera_faults={})
+    rig.run(1.0)
+    assert rig.state == "inactive"
+    rig.assert_smooth()
+    rig.activate()
+
+
+def test_a_camera_that_the_model_does_not_use_may_lie() -> None:
+    rig = moving_rig()
+    rig.around = replace(rig.around, camera_faults={"wrist": "is black"})
+    rig.tick()
+    assert rig.state == "active"
+
+
 def test_a_node_that_is_not_needed_may_go() -> None:
     rig = moving_rig()
     rig.around = replace(rig.around, alive=rig.around.alive - {f"worker-{OTHER}"})

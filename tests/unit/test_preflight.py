@@ -157,6 +157,10 @@ def test_when_all_is_well_there_is_no_reason() -> None:
         ("no living node serves camera 'front'", around(camera_nodes={})),
         ("camera 'front' has sent no picture for 1.5 s", around(camera_ages_s={"front": 1.5})),
         ("camera 'front' has sent no picture for inf s", around(camera_ages_s={})),
+        (
+            r"camera 'front' shows the same picture since 1\.2 s",
+            around(camera_faults={"front": "shows the same picture since 1.2 s"}),
+        ),
         (r"the clock of node 'camera' is \+0\.150 s off", clock("camera", Offset(0.15, 0.1, 0.2))),
         (r"the clock of node 'sim' is -0\.101 s off", clock("sim", Offset(-0.101, 0.3, 0.6))),
         (

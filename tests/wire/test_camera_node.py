@@ -26,6 +26,8 @@ JPEG_TOLERANCE = 6  # of 255, within a patch of one colour
 STOP_S = 0.5
 FRESH_S = 0.3
 SLOW_READER_S = 0.1
+STILL_SCENE_S = 6
+"""Longer than any source with noise may show the very same picture."""
 RATE_TOLERANCE = 0.1
 COLOURS = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "skin": (224, 172, 105)}
 
@@ -295,6 +297,20 @@ def test_a_simulated_camera_is_fresh_while_scenes_come_and_lost_when_they_stop()
         assert rig.happened("front:ok->lost")
         stage.show(SceneState("table", stage.qpos), time.time_ns())
         rig.wait_for("front", "ok")
+
+
+def test_a_scene_that_stands_still_is_no_frozen_camera() -> None:
+    with camera_rig(SMALL) as rig:
+        stage = Stage(rig)
+        heard = [rig.listen(rig.profile.keys.camera_raw(camera)) for camera in SMALL]
+        until("a renderer", lambda: rig.statuses[-1].detail["renderer"] == "raycast")
+        give_up = time.monotonic() + STILL_SCENE_S
+        while time.monotonic() < give_up:
+            stage.show(SceneState("table", stage.qpos), time.time_ns())
+            time.sleep(1 / 30)
+        assert all(len(frames) > STILL_SCENE_S for frames, _ in heard)
+        assert not any("bad" in rig.camera(camera) for camera in SMALL)
+        assert rig.statuses[-1].state == "running"
 
 
 def test_what_is_no_scene_of_ours_is_refused_and_counted_and_the_node_lives_on() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,41 @@ def image(rig: Ros2Rig, stamp_ns: int, encoding: str = "bgr8", value: int = 7) -
         step=3 * WIDTH,
         data=pixels.ravel(),
     )
+
+
+def test_a_camera_that_shows_one_picture_again_and_again_is_said_to_be_bad(rig: Ros2Rig) -> None:
+    dice = np.random.default_rng(2)
+    pool = [dice.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8).ravel() for _ in range(5)]
+    turn = count()
+
+    def bad(check: str) -> bool:
+        found = rig.detail("cameras")["front"].get("bad")
+        return found is not None and found["check"] == check
+
+    def send(stamp_ns: int, pixels: np.ndarray[Any, Any], done: bool) -> bool:
+        message = image(rig, stamp_ns)
+        message.data = pixels
+        rig.peer.put(CAMERA, message)
+        time.sleep(0.02)
+        return done
+
+    def newest() -> np.ndarray[Any, Any]:
+        return pool[next(turn) % len(pool)]
+
+    def good() -> bool:
+        done = (
+            rig.detail("cameras")["front"]["state"] == "ok"
+            and "bad" not in rig.detail("cameras")["front"]
+        )
+        return send(time.time_ns(), newest(), done)
+
+    rig.wait("a true camera", good)
+    # A driver that stamps an old buffer anew, and one whose clock stands; nobody listens.
+    rig.wait("frozen", lambda: send(time.time_ns(), pool[0], bad("same_s")))
+    rig.wait("true again", good)
+    stuck_ns = time.time_ns()
+    rig.wait("its stamps", lambda: send(stuck_ns, newest(), bad("stamp_s")))
+    rig.wait("true again", good)
 
 
 def test_pictures_come_with_their_stamp_and_depth_is_refused(rig: Ros2Rig) -> None:

@@ -100,6 +100,27 @@ def test_a_camera_is_believed_by_the_node_that_serves_it_and_by_no_other(scene: 
     assert scene.around.camera_ages_s["front"] >= 3.0
 
 
+def test_what_is_wrong_with_a_camera_is_its_own_nodes_word_until_it_is_good(scene: Scene) -> None:
+    def says(node: Node, bad: Any) -> None:
+        fields = {"age_s": 0.0, **({} if bad is None else {"bad": bad})}
+        node.report("running", detail={"cameras": {"front": fields}}, now=True)
+
+    says(scene.camera, {"why": "is black", "check": "clipped_share", "value": 1.0, "limit": 0.98})
+    until("its word", lambda: scene.look().camera_faults == {"front": "is black"})
+    count = scene.refused("foreign_camera")
+    says(scene.thief, None)
+    until("it is refused", lambda: scene.look() and scene.refused("foreign_camera") > count)
+    assert scene.around.camera_faults == {"front": "is black"}
+    says(scene.camera, None)
+    until("it is good", lambda: scene.look().camera_faults == {})
+    for nonsense in (True, "black", {}, {"why": 3.0}):
+        says(scene.camera, nonsense)
+        says(scene.camera, {"why": "x" * 5000})
+        until("cut short", lambda: scene.look().camera_faults.get("front") == "x" * 300)
+        says(scene.camera, nonsense)
+        until("good", lambda: not scene.look().camera_faults)
+
+
 def test_a_worker_among_many_who_complain_says_when_it_is_well_again(scene: Scene) -> None:
     others = [
         Node(f"worker-{nth}", scene.thief.profile, scene.camera.session)

@@ -228,10 +228,22 @@ def _word(name: str, found: NodeStatus) -> str:
             f"{f', speed {speed:g} %' if slowed else ''}"
         )
         return f"{one_line(detail.get('why', ''), MAX_WORDS)}\n{one_line(doing, MAX_WORDS)}"
+    if bad := _bad_cameras(detail.get("cameras")):
+        return _lines([one_line(each, MAX_WORDS) for each in bad])
     word = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
     if not word and "obeyed" in detail:
         return "obeyed" if detail["obeyed"] else "in the shadow"
     return one_line(word or _days_left(detail.get("certificates")), MAX_WORDS)
+
+
+def _bad_cameras(said: object) -> list[str]:
+    """What is wrong with each camera of a node."""
+    out: list[str] = []
+    for name, fields in said.items() if isinstance(said, Mapping) else ():
+        bad = fields.get("bad") if isinstance(fields, Mapping) else None
+        if isinstance(bad, Mapping):
+            out.append(f"camera {name!r} {bad.get('why', '')}")
+    return out
 
 
 def _event(node: str, header: Header, event: Event) -> Text:

@@ -40,6 +40,8 @@ class Surroundings:
         beside: nodes that certainly run on the computer of the command node, and share its clock.
         clocks: node -> its clock minus that of the command node, where it was measured.
         holders: who is there to hold the arm active.
+        camera_faults: camera -> why it must not be believed, as its node says: how a sentence that
+            begins with ``camera NAME`` goes on.
     """
 
     alive: frozenset[str] = frozenset()
@@ -53,6 +55,7 @@ class Surroundings:
     beside: frozenset[str] = frozenset()
     clocks: Mapping[str, Offset] = field(default_factory=dict)
     holders: frozenset[str] = frozenset()
+    camera_faults: Mapping[str, str] = field(default_factory=dict)
 
 
 def reasons_not_to_activate(
@@ -227,6 +230,8 @@ def _cameras(profile: Profile, worker: str, around: Surroundings) -> list[str]:
             reasons.append(f"no living node serves camera {camera!r}")
         elif age_s > CAMERA_PATIENCE_S:
             reasons.append(f"camera {camera!r} has sent no picture for {age_s:.1f} s")
+        elif camera in around.camera_faults:
+            reasons.append(f"camera {camera!r} {around.camera_faults[camera]}")
     return reasons
 
 

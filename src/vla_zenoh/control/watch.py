@@ -108,13 +108,14 @@ class Watch:
             if late_s > patience_s:
                 return f"robot state comes late: {what} by {late_s:.3f} s, at most {patience_s:g} s"
         needed = [around.robot_node, worker_node(worker)]
-        needed += [
-            around.camera_nodes.get(camera.camera, "camera")
-            for camera in lease.spec.observation.cameras
-        ]
+        cameras = [camera.camera for camera in lease.spec.observation.cameras]
+        needed += [around.camera_nodes.get(camera, "camera") for camera in cameras]
         for node in needed:
             if node not in around.alive:
                 return f"node {node!r} is gone"
+        for camera in cameras:
+            if camera in around.camera_faults:
+                return f"camera {camera!r} {around.camera_faults[camera]}"
         if around.spec_sources.get(worker) != lease.source:
             return f"worker {worker!r} was started anew"
         return ""

@@ -96,6 +96,7 @@ class Lockstep:
             for index, (name, each) in enumerate(policies.items())
         }
         self.alive = {SIM, CAMERA, COMMAND, *(w.source for w in self.workers.values())}
+        self.camera_faults: dict[str, str] = {}
         self._clock_ns: Counter[str] = Counter()
         self._picture = picture or _gray
         self._arrivals: list[tuple[int, int, Callable[[], None]]] = []
@@ -181,6 +182,7 @@ class Lockstep:
             camera_ages_s=dict.fromkeys(self.profile.cameras, 0.0),
             camera_nodes=dict.fromkeys(self.profile.cameras, CAMERA),
             beside=frozenset(self.alive),
+            camera_faults=dict(self.camera_faults),
         )
         inputs, self._inbox = self._inbox, Inputs([], [])
         out = self.commander.step(inputs, self.wall_ns(COMMAND))

@@ -65,7 +65,7 @@ class CameraNode:
             )
             for camera, settings in chosen.items()
         }
-        self._told: tuple[str, ...] = ()
+        self._told: tuple[tuple[str, ...], tuple[bool, ...]] = ((), ())
         self._sim: SimCameras | None = None
         self._threads = [
             self._thread(camera, Grabber(make_source(settings), self._outlets[camera]).run)
@@ -144,13 +144,14 @@ class CameraNode:
     # -- status -------------------------------------------------------------------------------
     def _watch(self) -> None:
         states = tuple(outlet.state for outlet in self._outlets.values())
-        state = _summary(states)
+        bad = tuple(outlet.bad is not None for outlet in self._outlets.values())
+        state = "degraded" if any(bad) else _summary(states)
         with self._voice:
-            changed = states != self._told
+            changed = (states, bad) != self._told
             if not changed and not self.node.report_due(state):
                 return
             self.node.follow_clock()
-            self._told = states
+            self._told = (states, bad)
             figures = {name: outlet.figures() for name, outlet in self._outlets.items()}
             for outlet in self._outlets.values():
                 for what, count in outlet.counters().items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Mapping
 from typing import Any
 
 from vla_zenoh import keys as key_names
@@ -18,6 +19,7 @@ from vla_zenoh.profile.servers import camera_servers
 from vla_zenoh.types import NodeStatus
 
 MAX_WORKERS, MAX_HOLDERS = 32, 32
+MAX_WHY = 300
 CLOCKS_PERIOD_S = 0.25
 STATUSES_A_TICK, SPECS_A_TICK = 8, 4
 """What is more was not sent by any node of ours: each says something twice a second."""
@@ -38,6 +40,7 @@ class Neighbours:
         self._complaints: dict[str, str] = {}
         self._servers = camera_servers(node.profile)
         self._cameras: dict[str, tuple[float, int]] = {}
+        self._camera_faults: dict[str, str] = {}
         self._places: dict[str, Place] = {}
         self._next_clocks_s = 0.0
         self._statuses = node.listen(node.keys.all_status, Mailbox(STATUSES_A_TICK))
@@ -99,6 +102,7 @@ class Neighbours:
                 ),
                 self._node.clocks.known(),
                 frozenset(self._holders),
+                dict(self._camera_faults),
             )
 
     def _follow_clocks(self) -> None:
@@ -140,7 +144,7 @@ class Neighbours:
         cameras = status.detail.get("cameras")
         for camera, fields in cameras.items() if isinstance(cameras, dict) else ():
             if camera in self._servers and isinstance(fields, dict):
-                self._take_camera(name, camera, fields.get("age_s"), now_ns)
+                self._take_camera(name, camera, fields, now_ns)
 
     def _hear_spec(self, arrival: Arrival) -> None:
         """Likewise for the spec of a worker."""
@@ -187,12 +191,12 @@ class Neighbours:
             if not complaint:  # who has none takes no room
                 known.pop(worker, None)
             elif worker in known or len(known) < MAX_WORKERS:
-                known[worker] = complaint[:300]
+                known[worker] = complaint[:MAX_WHY]
             else:
                 self._node.counters["refused.more_workers"] += 1
 
-    def _take_camera(self, node: str, camera: str, age_s: Any, now_ns: int) -> None:
-        """The age of a camera's newest picture, as the node says that serves it by the profile."""
+    def _take_camera(self, node: str, camera: str, fields: Mapping[Any, Any], now_ns: int) -> None:
+        """How a camera is, as the node says that serves it by the profile."""
         server = self._servers[camera]
         if node != server:
             self._node.refuse(
@@ -202,6 +206,12 @@ class Neighbours:
                 node,
             )
             return
+        age_s, bad = fields.get("age_s"), fields.get("bad")
+        why = bad.get("why") if isinstance(bad, Mapping) else None
+        if isinstance(why, str):
+            self._camera_faults[camera], self._changed = why[:MAX_WHY], True
+        elif self._camera_faults.pop(camera, None) is not None:
+            self._changed = True
         if isinstance(age_s, (int, float)) and not isinstance(age_s, bool):
             self._cameras[camera] = (max(float(age_s), 0.0), now_ns)
             self._changed = True

@@ -139,6 +139,31 @@ class Composition(Section):
     pace: Literal["spec", "steady", "soonest"] = "spec"
 
 
+class CameraCheck(Section):
+    """When a camera's own pictures say that it must not be believed; `vla_zenoh.picture_check`.
+
+    A limit of 0, of a share 1, switches that check off.
+
+    Args:
+        same_s: the very same picture for so long: it is frozen, as a sensor has noise. null: by its
+            source: 1 of ``v4l2:``, 2 of ``ros2:``, 5 of ``rtsp:``, whose compression may repeat a
+            still scene; 0 of ``sim:``, ``file:`` and virtual devices, which have no noise.
+        stamp_s: the driver's time stamp does not go forward for so long.
+        clipped_share: share of the picture that may be black, or white.
+        contrast_levels: between its brightest and darkest parts, of 255: fewer is a covered lens.
+        uniform_share: share of the picture that may be one even area. Off by default: a table top
+            and a hand before the lens look alike.
+        after_s: black, white, without contrast or even for so long.
+    """
+
+    same_s: float | None = Field(default=None, ge=0, le=3600)
+    stamp_s: float = Field(default=0.5, ge=0, le=60)
+    clipped_share: float = Field(default=0.98, gt=0, le=1)
+    contrast_levels: float = Field(default=5.0, ge=0, le=100)
+    uniform_share: float = Field(default=1.0, gt=0, le=1)
+    after_s: float = Field(default=0.5, ge=0, le=60)
+
+
 class CameraProfile(Section):
     """A camera.
 
@@ -155,6 +180,7 @@ class CameraProfile(Section):
         fit_for_workers: a worker on another host gets them in the very size of its spec, made
             where the camera is. Of the sources all but ``ros2:`` can.
         loop: a file starts again at its end.
+        check: when its pictures say that it must not be believed.
     """
 
     source: Annotated[Word, AfterValidator(_source)]
@@ -166,6 +192,7 @@ class CameraProfile(Section):
     jpeg_width: int | None = Field(default=None, ge=16, le=8192)
     fit_for_workers: bool = False
     loop: bool = True
+    check: CameraCheck = CameraCheck()
 
 
 class SimProfile(Section):

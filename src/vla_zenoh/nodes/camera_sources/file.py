@@ -121,6 +121,8 @@ class FileSource:
         loop: start again at the end.
     """
 
+    same_s, stamp_ns = 0.0, None  # a picture may be shown for as long as one likes
+
     def __init__(self, path: str, rate_hz: float, loop: bool) -> None:
         self._path = Path(path).expanduser()
         self._rate_hz, self._loop = rate_hz, loop

@@ -7,7 +7,7 @@ import time
 
 from vla_zenoh.errors import NodeError, VlaZenohError
 from vla_zenoh.nodes.camera_sources.outlet import ENDED, OK, Outlet
-from vla_zenoh.nodes.camera_sources.source import STALL_S, Source
+from vla_zenoh.nodes.camera_sources.source import LOOK_S, STALL_S, Source
 
 BACKOFF_S, MAX_BACKOFF_S = 0.2, 2.0
 BROKEN_IN_A_ROW = 5
@@ -30,7 +30,7 @@ class Grabber:
         while not stop.is_set():
             try:
                 self._source.open()
-                self._outlet.backend = self._source.backend
+                self._outlet.opened(self._source.backend, self._source.same_s)
                 self._grab_all(stop)
             except Exception as error:  # no camera may end the others, whatever its library does
                 if stop.is_set():
@@ -48,7 +48,7 @@ class Grabber:
 
     def _grab_all(self, stop: threading.Event) -> None:
         source, outlet = self._source, self._outlet
-        opened = last_good = time.monotonic()
+        opened = last_good = looked = time.monotonic()
         proved, broken = False, 0
         while (mono_ns := source.grab(stop)) is not None and not stop.is_set():
             now = time.monotonic()
@@ -57,7 +57,8 @@ class Grabber:
             # By the time now, not of capture: a backlog must not come out in a burst.
             if not outlet.in_time(time.monotonic_ns()):
                 continue
-            if proved and not outlet.wanted:
+            wanted = outlet.wanted or not proved
+            if not wanted and now - looked < LOOK_S:
                 last_good = now
                 continue
             picture = source.retrieve()
@@ -67,7 +68,10 @@ class Grabber:
                 if broken >= BROKEN_IN_A_ROW and now - last_good > STALL_S:
                     raise NodeError(f"the last {broken} pictures could not be decoded")
                 continue
-            outlet.put(picture, mono_ns)
+            looked = now
+            outlet.look(picture, mono_ns, source.stamp_ns)
+            if wanted:
+                outlet.put(picture, mono_ns)
             outlet.seen(mono_ns)
             last_good, proved, broken = now, True, 0
             outlet.change(OK)

@@ -20,6 +20,7 @@ from vla_zenoh.nodes.camera_sources.picture import fit, to_rgb
 from vla_zenoh.nodes.camera_sources.source import Pixels
 from vla_zenoh.nodes.meter import Percentiles, RateMeter
 from vla_zenoh.nodes.node import Node
+from vla_zenoh.picture_check import Finding, PictureCheck
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Event, Image
 
@@ -36,6 +37,7 @@ class Outlet:
         shown: its source as people may read it, without passwords.
         node: the node on whose behalf it writes.
         tell: writes an event; may be called from any thread.
+        same_s: so long its source may give the very same picture; 0: for ever.
     """
 
     def __init__(
@@ -45,10 +47,13 @@ class Outlet:
         shown: str,
         node: Node,
         tell: Callable[[Event], None],
+        same_s: float = 0.0,
     ) -> None:
         self.name, self.profile = name, profile
         self.backend = ""
         self.state, self.why = WAITING, "it is being opened"
+        self.bad: Finding | None = None
+        self._check = PictureCheck(name, profile.check, same_s)
         self.counts: Counter[str] = Counter()
         self.pace = Pace(profile.rate_hz)
         self._shown, self._clock, self._tell = shown[:_SOURCE_LIMIT], node.clock, tell
@@ -69,6 +74,8 @@ class Outlet:
         if (state, why) == (self.state, self.why):
             return
         was, self.state, self.why = self.state, state, why
+        if state == ENDED:
+            self.bad = None
         level = "info" if state in (OK, ENDED) else "warning"
         if state != was:
             self._tell(Event(level, "transition", f"{self.name}:{was}->{state}", why[:1000]))
@@ -109,6 +116,23 @@ class Outlet:
         with self._lock:
             self._rate.tick()
         return True
+
+    # -- what is wrong with it ----------------------------------------------------------------
+    def opened(self, backend: str, same_s: float) -> None:
+        """Its source is open, anew: its pictures have nothing to do with those before."""
+        self.backend = backend
+        self._check = PictureCheck(self.name, self.profile.check, same_s)
+
+    def look(self, picture: Pixels, mono_ns: int, stamp_ns: int | None = None) -> None:
+        """Judge the camera by a picture of this time, and by the time its driver says."""
+        before, self.bad = self.bad, self._check.look(picture, mono_ns, stamp_ns)
+        if self.bad is None:
+            if before is not None:
+                self._tell(Event("info", "notice", f"{self.name}:good", "its pictures are good"))
+        elif before is None or before.what != self.bad.what:
+            self.counts["bad"] += 1
+            _, what, why, value, limit = self.bad
+            self._tell(Event("warning", "fault", f"{self.name}:{what}", why, value, limit))
 
     # -- pictures -----------------------------------------------------------------------------
     @property
@@ -174,7 +198,7 @@ class Outlet:
 
     # -- what is reported ---------------------------------------------------------------------
     def detail(self) -> dict[str, Any]:
-        """For status: state, source, back end, and the age of the newest picture."""
+        """For status: state, source, back end, age of the newest picture, what is wrong with it."""
         newest = self._newest_mono_ns
         told: dict[str, Any] = {
             "state": self.state,
@@ -182,6 +206,8 @@ class Outlet:
             "backend": self.backend,
             "age_s": None if newest is None else (time.monotonic_ns() - newest) / 1e9,
         }
+        if (bad := self.bad) is not None:
+            told["bad"] = {name: getattr(bad, name) for name in ("why", "check", "value", "limit")}
         return told | ({"why": self.why} if self.why else {})
 
     def figures(self) -> tuple[float, tuple[float, float] | None]:

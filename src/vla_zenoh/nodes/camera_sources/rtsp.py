@@ -18,6 +18,8 @@ OPEN_S = 10.0
 """To log in and wait for a picture to begin with: cameras send one in several seconds."""
 INSTANT_S = 0.015
 MAX_BACKLOG = 500
+SAME_S = 5.0
+"""Compression may repeat a still scene until its next whole picture, which is seldom later."""
 _OPTIONS = (
     *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(OPEN_S * 1000)),
     *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(STALL_S * 1000)),
@@ -37,6 +39,8 @@ class RtspSource:
     Args:
         url: ``rtsp://[user:password@]host[:port]/path``.
     """
+
+    same_s, stamp_ns = SAME_S, None
 
     def __init__(self, url: str) -> None:
         self._url = url

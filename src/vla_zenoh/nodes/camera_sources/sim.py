@@ -160,6 +160,7 @@ class SimCameras:
             proof_due = mono_ns - self._drawn_ns[outlet.name] > IDLE_PERIOD_S * 1e9
             if in_time if outlet.wanted else proof_due:
                 rgb = self._draw(renderer, camera, outlet)
+                outlet.look(rgb, mono_ns)
                 outlet.put_rgb(rgb, mono_ns, stamp_ns)
                 self._drawn_ns[outlet.name] = mono_ns
                 outlet.change(OK)

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 Pixels = NDArray[Any]
 """What OpenCV gives: (H, W) or (H, W, 1, 3 or 4), blue first, uint8 or uint16."""
 
+LOOK_S = 0.5
+"""A picture is looked at this often even when nobody wants it: a broken camera is to be seen."""
 STALL_S = 2.0
 """A source that gives no picture for this long is closed and opened again."""
 
@@ -20,6 +22,16 @@ class Source(Protocol):
     @property
     def backend(self) -> str:
         """What reads it, known once it is open."""
+        ...
+
+    @property
+    def same_s(self) -> float:
+        """So long it may give the very same picture and work; 0: for ever. Known likewise."""
+        ...
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """What the driver said of the time of the grabbed picture; None where it says nothing."""
         ...
 
     def open(self) -> None:

@@ -18,6 +18,10 @@ DEV = Path("/dev")
 MAX_UNCOMPRESSED_PX = 640 * 480
 """USB 2 carries this many pixels 30 times a second uncompressed, and no more."""
 SANE_AGE_S = 1.0
+SAME_S = 1.0
+"""No two pictures of a sensor are alike, in every bit of thousands of pixels."""
+SYS = Path("/sys/class/video4linux")
+VIRTUAL = "/sys/devices/virtual/"
 
 
 class V4l2Source:
@@ -32,6 +36,8 @@ class V4l2Source:
         self._path = DEV / f"video{device}" if device.isdecimal() else Path(device)
         self._profile = profile
         self._capture = Capture()
+        self.same_s = SAME_S
+        self.stamp_ns: int | None = None
 
     @property
     def backend(self) -> str:
@@ -41,6 +47,7 @@ class V4l2Source:
         why = why_not(self._path)
         if why:
             raise NodeError(why)
+        self.same_s = 0.0 if is_virtual(self._path) else SAME_S
         width, height = self._profile.width, self._profile.height
         options = [
             *(cv2.CAP_PROP_FRAME_WIDTH, width),
@@ -62,7 +69,9 @@ class V4l2Source:
     def grab(self, stop: threading.Event) -> int | None:
         if not self._capture.grab():
             raise NodeError(f"{self._path} gave no picture for {STALL_S:g} s, or was pulled out")
-        return captured_ns(self._capture.get(cv2.CAP_PROP_POS_MSEC), time.monotonic_ns())
+        position_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+        self.stamp_ns = round(position_ms * 1e6) if position_ms > 0 else None
+        return captured_ns(position_ms, time.monotonic_ns())
 
     def retrieve(self) -> Pixels | None:
         return self._capture.retrieve()
@@ -80,6 +89,16 @@ def captured_ns(position_ms: float, now_ns: int) -> int:
     """
     stamp_ns = round(position_ms * 1e6)
     return stamp_ns if 0 <= now_ns - stamp_ns < SANE_AGE_S * 1e9 else now_ns
+
+
+def is_virtual(path: Path, sys: Path = SYS) -> bool:
+    """Whether `path` is a program's device, as of v4l2loopback: it may show a scene without noise.
+
+    Args:
+        path: of the device, may be a link.
+        sys: where the kernel tells what video devices are.
+    """
+    return (sys / path.resolve().name).resolve().is_relative_to(VIRTUAL)
 
 
 def why_not(path: Path) -> str:

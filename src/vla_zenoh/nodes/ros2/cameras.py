@@ -14,7 +14,7 @@ from vla_zenoh.interop.ros2.qos import SENSOR
 from vla_zenoh.interop.ros2.samples import Picture
 from vla_zenoh.nodes.camera_sources.outlet import OK, Outlet
 from vla_zenoh.nodes.camera_sources.picture import fit
-from vla_zenoh.nodes.camera_sources.source import STALL_S
+from vla_zenoh.nodes.camera_sources.source import LOOK_S, STALL_S
 from vla_zenoh.nodes.node import Node
 from vla_zenoh.nodes.ros2.link import Link
 from vla_zenoh.nodes.slots import Arrival, Latest
@@ -22,8 +22,8 @@ from vla_zenoh.profile.ros2 import Ros2Camera
 from vla_zenoh.types import Event
 
 WAIT_S = 0.1
-LOOK_S = 0.5
-"""A picture is decoded this often even when nobody wants it: a broken camera is to be seen."""
+SAME_S = 2.0
+"""A sensor has noise; drivers that skip a picture now and then are borne with."""
 
 Tell = Callable[[Event], None]
 Refuse = Callable[[str, str, str], None]
@@ -53,7 +53,7 @@ class Camera:
         refuse: Refuse,
     ) -> None:
         self._topic, self._node, self._messages, self._refuse = topic, node, messages, refuse
-        self.outlet = Outlet(name, node.profile.cameras[name], topic.topic, node, tell)
+        self.outlet = Outlet(name, node.profile.cameras[name], topic.topic, node, tell, SAME_S)
         self.outlet.backend = topic.type
         self._newness = Newness()
         self._looked_s = -LOOK_S
@@ -82,6 +82,9 @@ class Camera:
         self._looked_s = now_s
         try:
             picture = self._read(arrival)
+            outlet.look(picture.rgb, arrival.mono_ns, picture.stamp_ns or None)
+            if picture.stamp_ns:
+                self._newness.check(picture.stamp_ns)
         except CodecError as error:
             self._refuse(error.reason, f"{self._topic.topic}: {error}", outlet.name)
             if error.reason in ("encoding", "frame"):  # they will all be like that
@@ -103,6 +106,4 @@ class Camera:
             raise CodecError(
                 "frame", f"in frame {picture.frame[:60]!r}, wanted {self._topic.frame!r}"
             )
-        if picture.stamp_ns:
-            self._newness.check(picture.stamp_ns)
         return picture

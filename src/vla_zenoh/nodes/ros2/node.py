@@ -121,6 +121,7 @@ class Ros2Node:
         for slot in self.link.slots:
             node.watch(slot)
         self._rate = RateMeter()
+        self._bad: tuple[bool, ...] = ()
         self._realtime = False
         self._clock_s = 0.0
 
@@ -207,8 +208,10 @@ class Ros2Node:
             self.node.follow_clock()
             self._watch_bridges()
         state = "running" if self._arm is None else self._arm.state
-        if not self.node.report_due(state):
+        bad = tuple(camera.outlet.bad is not None for camera in self._cameras)
+        if bad == self._bad and not self.node.report_due(state):
             return
+        now, self._bad = bad != self._bad, bad
         figures = {camera.outlet.name: camera.outlet.figures() for camera in self._cameras}
         for camera in self._cameras:
             for what, count in camera.outlet.counters().items():
@@ -229,6 +232,7 @@ class Ros2Node:
             ages_s={} if age_s is None else {"joint_states": age_s},
             rates_hz=rates_hz | {name: rate_hz for name, (rate_hz, _) in figures.items()},
             latency_ms={name: late for name, (_, late) in figures.items() if late is not None},
+            now=now,
         )
 
     @property
