@@ -38,7 +38,7 @@ def moving_rig(**kwargs: object) -> Rig:
     rig = Rig(**kwargs)  # pyright: ignore[reportArgumentType]
     rig.activate()
     for _ in range(6):
-        rig.send([[0.04, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
+        rig.send([[0.03, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
         rig.run(0.096)
     assert norm3(rig.commands[-1].twist[:3]) > 0.2
     return rig

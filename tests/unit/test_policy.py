@@ -34,7 +34,7 @@ SPEC = ModelSpec(
     ),
     action=ActionSpec(horizon=1, dt_s=0.2, gripper="binary"),
 )
-SPEC_HASH = "3fbc4087e6c8144d"
+SPEC_HASH = "724d0c938d8c3e6d"
 """Pinned: workers and command nodes of different builds must agree on it."""
 
 
@@ -100,6 +100,7 @@ OTHER_VALUES: dict[tuple[str, ...], list[Any]] = {
     ("action", "gripper_open_is_high"): [False],
     ("action", "gripper_threshold"): [0.4],
     ("action", "normalisation"): ["bridge_orig"],
+    ("action", "pace"): ["soonest"],
 }
 
 

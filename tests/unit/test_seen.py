@@ -30,7 +30,7 @@ def seen(**fields: Any) -> Seen:
     given: dict[str, Any] = {
         "worker": "openvla",
         "chunk_seq": 7,
-        "spec_hash": "3fbc4087e6c8144d",
+        "spec_hash": "724d0c938d8c3e6d",
         "episode": 2,
         "observation_stamp_ns": 10**18,
         "prompt": "put the red brick in the box",

@@ -31,14 +31,20 @@ from vla_zenoh.types import FloatArray
 
 PHASE, PERIOD, DEVIATION = 0.3, 0.1, 0.2
 """Gains of the clock of arrivals: its phase, its period, and the mean deviation from it."""
-SPARE = 2.0
+FIRST_DEVIATION = 0.1
+"""Part of the asked period that arrivals are taken to deviate by before that is known."""
+SPARE = 3.0
 """Mean deviations for which the arm has a way to go when a chunk is late."""
-STEADY = 0.1
-"""A speed that differs from what is wanted by this part of it is kept."""
+CHANGE = 0.4
+"""Part of the way to the speed that is wanted which a moving arm takes at each goal."""
+MOVING = 0.3
+"""Part of that speed from which on the arm counts as moving."""
 SLOWEST = 1e-3
 """Least share of the velocity limits."""
 SOON_NS = 1_000_000
 MARGIN_NS = 10_000_000
+EASING = 0.1
+"""Part of the time by which what is kept in reserve may change."""
 
 
 class Arrivals:
@@ -50,13 +56,15 @@ class Arrivals:
     def restart(self) -> None:
         """Nothing has arrived yet."""
         self._last_ns: float | None = None
-        self._period_ns = self._deviation_ns = 0.0
+        self._period_ns = 0.0
+        self._deviation_ns = 0.0
         self._intervals = 0
 
     def arrived(self, now_ns: int, asked_period_ns: float) -> None:
         """A chunk arrived, of a worker that is asked for one in every `asked_period_ns`."""
         if self._last_ns is None:
             self._last_ns, self._period_ns = now_ns, asked_period_ns
+            self._deviation_ns = FIRST_DEVIATION * asked_period_ns
             return
         self._intervals += 1
         expected_ns = self._last_ns + self._period_ns
@@ -139,9 +147,10 @@ class StepTiming:
         lasts_ns = (steps - self._gone) * plan.dt_ns
         wait_ns = max(self._arrivals.next_ns - plan_ns, 0.0)
         self._stretch = max(1.0, wait_ns / lasts_ns)
-        self._spare_ns = MARGIN_NS + max(
-            0.0, wait_ns + self._arrivals.spare_ns - lasts_ns * self._stretch
-        )
+        covered_ns = lasts_ns * self._stretch - wait_ns
+        spare_ns = MARGIN_NS + max(0.0, self._arrivals.spare_ns - covered_ns)
+        most_ns = EASING * (plan_ns - self._begun_ns) if before is not None else math.inf
+        self._spare_ns += min(max(spare_ns - self._spare_ns, -most_ns), most_ns)
         self._plan, self._begun_ns = plan, plan_ns
 
     def _paced(
@@ -162,12 +171,14 @@ class StepTiming:
         leading = int(np.argmax(np.abs(way) / limits))
         most, jerk = self._box[1:, leading] / limits[leading]
         most, jerk = most * override**2, jerk * override**3
-        share = length / time_s
+        share = least = length / time_s
         for _ in range(3):
             stop_s = _stop_s(min(share, 1.0), most, jerk)
-            share = length / max(min(time_s + 0.5 * stop_s, left_s - 0.6 * stop_s), 1e-3)
-        if (1 - STEADY) * share < now < share:
-            share = now
+            share = length / (time_s + 0.5 * stop_s)
+            least = length / max(left_s - 0.6 * stop_s, 1e-3)
+        if MOVING * share < now:
+            share = now + CHANGE * (share - now)
+        share = max(share, least)
         return min(max(share, SLOWEST), 1.0)
 
 
