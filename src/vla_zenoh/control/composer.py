@@ -20,7 +20,7 @@ from vla_zenoh.control.actions import rotation_of, step_pose, step_width
 from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
 from vla_zenoh.control.limits import LimitHit, bound_step
 from vla_zenoh.control.reach import Bounded, Shadow
-from vla_zenoh.control.slowdown import APPROACH, LEAST, Slowdown, going_on
+from vla_zenoh.control.slowdown import APPROACH, LEAST, Slowdown, full_speed_s, going_on
 from vla_zenoh.control.so3 import Pose, between, distance
 from vla_zenoh.errors import RecordError
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec
@@ -40,6 +40,9 @@ PATIENCE = 24
 """After so many for one chunk it comes in force with the steps that are bounded."""
 LOOK_AHEAD = 8
 """Steps that are bounded before they are due."""
+
+BEHIND_S = 0.3
+"""An arm is behind its goal by up to this where an approach ends."""
 
 
 @dataclass(slots=True)
@@ -246,7 +249,8 @@ class Composer:
             plan.made = max(plan.made, index + 1)
         if step.slowdown is not None and (slower is None or step.slowdown.share < slower.share):
             slower = step.slowdown
-        slower = self._going_on(plan, pose, slower)
+        most_s = self._limits.lead_m / self._limits.translation.velocity_m_s
+        slower = going_on(step.start.slowdown, slower, plan.dt_ns / 1e9, most_s)
         plan.goals[index] = Goal(pose, step.width_m, joints_rad, slower)
         plan.bounded, plan.under_way = index + 1, None
         plan.note(hits)
@@ -288,22 +292,10 @@ class Composer:
             plan.announced = True
             plan.note([LimitHit(APPROACH, far, step, where=unit)])
         needed_s = max(far_m / limits.approach_m_s, far_rad / limits.approach_rad_s)
-        along_m = float(np.abs(target.position_m - start.position_m).max())
-        full_s = max(
-            along_m / limits.translation.velocity_m_s, far_rad / limits.rotation.velocity_rad_s
-        )
+        full_s = full_speed_s(limits, start, target)
         share = min(max(full_s / needed_s, LEAST), 1.0)
         part = min(plan.dt_ns / 1e9 / needed_s, 1 / steps)
-        return between(start, target, part), Slowdown(APPROACH, share, far, step, "")
-
-    def _going_on(self, plan: ChunkPlan, pose: Pose, now: Slowdown | None) -> Slowdown | None:
-        """The slowdown of a step to `pose`, which may begin late."""
-        late = plan.start.slowdown
-        if self._reach is None or late is None or late.late_s <= 0.0:
-            return now
-        full_s = self._reach.time_s(plan.start.pose, pose)
-        most_s = self._limits.lead_m / self._limits.translation.velocity_m_s
-        return going_on(late, now, full_s, plan.dt_ns / 1e9, most_s)
+        return between(start, target, part), Slowdown(APPROACH, share, far, step, "", BEHIND_S)
 
     # -- the whole chunk ----------------------------------------------------------------------
     def _mistake(self, action: ActionSpec, steps: FloatArray, before: Goal) -> Refusal | None:

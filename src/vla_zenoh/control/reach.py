@@ -21,7 +21,6 @@ shortened: such joints leap to another solution.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Generator, Sequence
 from typing import NamedTuple
 
@@ -32,7 +31,7 @@ from vla_zenoh.control.barriers import Barriers, Margins
 from vla_zenoh.control.ik import Approach, IkSettings, InverseKinematics, pose_error
 from vla_zenoh.control.kinematics import Kinematics
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.slowdown import LEAST, SLOWEST, Slowdown
+from vla_zenoh.control.slowdown import LEAST, SLOWEST, Slowdown, full_speed_s
 from vla_zenoh.control.so3 import Pose, exp3, orthonormal
 from vla_zenoh.errors import RecordError
 from vla_zenoh.profile import Limits
@@ -270,9 +269,9 @@ class Shadow:
                 self.barriers.names[index],
                 float(end.barriers[index] + self.barriers.stop[index]),
                 float(start.floor[index] + self.barriers.stop[index]),
-                where=self.barriers.where(int(index)),
+                where=self.barriers.where(index),
             )
-            for index in (end.barriers < start.floor).nonzero()[0]
+            for index in (end.barriers < start.floor).nonzero()[0].tolist()
         ]
         leaving = here.barriers[0] < 0 and end.barriers[0] > here.barriers[0]
         if not hits and not leaving:
@@ -294,7 +293,7 @@ class Shadow:
     def _out_of_range(self, start: _Start, joints_rad: FloatArray) -> LimitHit | None:
         lower, upper = start.lower_rad, start.upper_rad
         excess = np.maximum(lower - joints_rad, joints_rad - upper)
-        joint = int(np.argmax(excess))
+        joint = int(excess.argmax())
         if excess[joint] <= 0:
             return None
         value = float(joints_rad[joint])
@@ -310,7 +309,9 @@ class Shadow:
         joint_s = np.abs(end.joints_rad - start.joints_rad) / self._velocity_rad_s
         joint = int(joint_s.argmax())
         needed_s = float(joint_s[joint])
-        full_s = self.time_s(start.pose, end.pose)
+        if needed_s <= dt_s:
+            return None
+        full_s = full_speed_s(self._limits, start.pose, end.pose)
         time_s = max(dt_s, full_s)
         if needed_s <= time_s:
             return None
@@ -322,14 +323,6 @@ class Shadow:
             limit,
             self.kinematics.arm_joints[joint],
             needed_s - dt_s,
-        )
-
-    def time_s(self, before: Pose, after: Pose) -> float:
-        """How long a step takes the TCP at full speed."""
-        error = pose_error(after, before).tolist()
-        return max(
-            math.hypot(*error[:3]) / self._limits.translation.velocity_m_s,
-            math.hypot(*error[3:]) / self._limits.rotation.velocity_rad_s,
         )
 
 

@@ -20,6 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vla_zenoh.control.smoothing import ROTATION_BOX
+from vla_zenoh.control.so3 import Pose, log3
+from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
 APPROACH = "approach"
@@ -82,22 +85,36 @@ def slowdown(
     return Slowdown(names[index], share, value, float(slow[index]), where(index))
 
 
+def full_speed_s(limits: Limits, before: Pose, after: Pose) -> float:
+    """Time (s) that a step takes at full speed, whose limits are those of `Smoother.box`."""
+    way_m = after.position_m - before.position_m
+    turn = log3(before.rotation.T @ after.rotation)
+    return max(
+        max(map(abs, way_m.tolist())) / limits.translation.velocity_m_s,
+        max(map(abs, turn.tolist())) / (ROTATION_BOX * limits.rotation.velocity_rad_s),
+    )
+
+
 def going_on(
-    before: Slowdown | None, now: Slowdown | None, full_s: float, dt_s: float, most_s: float
+    before: Slowdown | None, now: Slowdown | None, dt_s: float, most_s: float
 ) -> Slowdown | None:
     """The slowdown of a step whose beginning the arm comes late to.
 
     Args:
         before: of the step before it.
         now: its own.
-        full_s: time it takes at full speed.
         dt_s: time it has.
-        most_s: nobody is later than this, at full speed: the leash sees to it.
+        most_s: at full speed nobody is later than this: the leash sees to it.
     """
     if before is None or before.late_s <= 0.0:
         return now
-    slower = before if now is None or before.share < now.share else now
-    late_s = before.late_s + full_s / slower.share - dt_s
-    if late_s <= 0.0:
+    added_s = 0.0 if now is None else now.late_s
+    if now is not None and now.name == APPROACH:
+        late_s = max(before.late_s - dt_s, added_s)
+    else:
+        late_s = before.late_s + (added_s or -dt_s)
+    if now is not None and now.share <= before.share:
+        before = now
+    elif late_s <= 0.0:
         return now
-    return slower._replace(late_s=min(late_s, most_s / slower.share))
+    return before._replace(late_s=max(min(late_s, most_s / before.share), 0.0))
