@@ -55,6 +55,7 @@ class ChunkPlan(Plan):
         before: what they stand on, W_0.
         approaches: a target of it is further away than a step,
         announced: and that is told already.
+        first_ns: time that its first step has to approach it.
         spent: evaluations made for it.
         hits: limits that acted on it, each once by name and place, the first along the path first.
         told: so many of them are told.
@@ -66,6 +67,7 @@ class ChunkPlan(Plan):
     before: Goal = field(kw_only=True)
     approaches: bool = False
     announced: bool = False
+    first_ns: int = -1
     spent: int = 0
     hits: list[LimitHit] = field(default_factory=list)
     told: int = 0
@@ -178,8 +180,10 @@ class Composer:
         )
         if count < len(record.steps):
             plan.note([LimitHit("open_loop", len(record.steps) * action.dt_s, self._open_loop_s)])
-        # What goes on is not told again.
-        plan.announced = isinstance(standing_on, ChunkPlan) and standing_on.approaches
+        if isinstance(standing_on, ChunkPlan) and standing_on.approaches:
+            # What goes on is not told again, nor faster the more often a model is asked.
+            plan.announced = True
+            plan.first_ns = min(plan.dt_ns, max(observed_ns - standing_on.start_ns, 0))
         if standing_on.episode == record.episode:
             plan.begun = standing_on.steps_asked_until(observed_ns)
             if done and standing_on.done:  # it only says the last of its steps again
@@ -294,7 +298,8 @@ class Composer:
         needed_s = max(far_m / limits.approach_m_s, far_rad / limits.approach_rad_s)
         full_s = full_speed_s(limits, start, target)
         share = min(max(full_s / needed_s, LEAST), 1.0)
-        part = min(plan.dt_ns / 1e9 / needed_s, 1 / steps)
+        has_ns = plan.dt_ns if plan.bounded or plan.first_ns < 0 else plan.first_ns
+        part = min(has_ns / 1e9 / needed_s, 1 / steps)
         return between(start, target, part), Slowdown(APPROACH, share, far, step, "", BEHIND_S)
 
     # -- the whole chunk ----------------------------------------------------------------------
