@@ -15,6 +15,7 @@ import numpy as np
 
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.preflight import Surroundings
+from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.so3 import exp3, log3, quat_from_rotation, rotation_from_quat
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile
@@ -23,6 +24,7 @@ from vla_zenoh.types import (
     Event,
     GripperState,
     Header,
+    JointState,
     PoseCommand,
     PoseState,
     Stamped,
@@ -57,9 +59,16 @@ def model_spec(name: str = WORKER, **action: Any) -> ModelSpec:
 class Rig:
     """See the module."""
 
-    def __init__(self, of: Profile | None = None, *, dry_run: bool = False, **action: Any) -> None:
+    def __init__(
+        self,
+        of: Profile | None = None,
+        *,
+        dry_run: bool = False,
+        reach: Shadow | None = None,
+        **action: Any,
+    ) -> None:
         self.profile = of or profile()
-        self.commander = Commander(self.profile, dry_run=dry_run)
+        self.commander = Commander(self.profile, reach=reach, dry_run=dry_run)
         self.spec = model_spec(**action)
         self.now_ns = START_NS
         self.period_ns = round(1e9 / self.profile.timing.command_hz)
@@ -96,6 +105,7 @@ class Rig:
         inputs = Inputs(put, list(chunks), around=self.around)
         if not self.silent:
             inputs.pose, inputs.gripper = self.pose_state(), self.gripper_state()
+            inputs.joint = self.joint_state()
         out = self.commander.step(inputs, self.now_ns, ticks)
         self.events += out.events
         self.refused.update(refusal.reason for refusal in out.refusals)
@@ -139,6 +149,15 @@ class Rig:
             held.position_m if held else self.position_m,
             held.quat_xyzw if held else self.quat_xyzw,
         )
+        return Stamped(self.header("sim", "sim-1"), record, self.now_ns)
+
+    def joint_state(self) -> Stamped[JointState] | None:
+        """Where the shadow stands; only an arm that does not move has these joints."""
+        reach = self.commander.reach
+        if reach is None:
+            return None
+        still = np.zeros(reach.kinematics.size)
+        record = JointState(reach.kinematics.arm_joints, reach.joints_rad, still, still)
         return Stamped(self.header("sim", "sim-1"), record, self.now_ns)
 
     def gripper_state(self) -> Stamped[GripperState]:

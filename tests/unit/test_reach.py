@@ -353,20 +353,41 @@ def test_a_start_out_of_reach_may_only_come_nearer() -> None:
 
 
 # -- other -------------------------------------------------------------------------------------
-def test_a_step_in_too_little_time_is_shortened_to_what_the_joints_can_do() -> None:
+def test_a_step_for_which_the_joints_are_too_slow_is_kept_and_taken_slower() -> None:
     near = at(MIDDLE_RAD)
     steps = walk(near, STEP_M * FORWARD, STILL, 28)
     before, joints = steps.poses[-1], near.joints_rad
     asked = moved(before, 0.008 * FORWARD, STILL)
-    slow, hits = near.bound(before, asked, dt_s=0.5, start_rad=joints)
+    calm, hits = near.bound(before, asked, dt_s=0.5, start_rad=joints)
     assert hits == []
+    assert near.slowdown is None or near.slowdown.name == "singularity"
     fast, hits = near.bound(before, asked, dt_s=0.016, start_rad=joints)
+    assert hits == []
+    assert fast is calm is asked
+    slower = near.slowdown
+    assert slower is not None
+    assert (slower.name, slower.where, slower.limit) == ("joint_velocity", "panda_joint4", 2.175)
+    assert slower.value > slower.limit
+    # At that share of the TCP's speed the joint is just as fast as it may be.
+    takes_s = 0.008 / (slower.share * Limits().translation.velocity_m_s)
+    moved_rad = np.abs(near.joints_rad - joints)[KINEMATICS.arm_joints.index("panda_joint4")]
+    assert moved_rad / takes_s == pytest.approx(2.175)
+    assert slower.late_s == pytest.approx(takes_s - 0.016)
+
+
+def test_joints_that_would_need_ten_times_as_long_leap_and_the_step_is_shortened() -> None:
+    near = at(MIDDLE_RAD)
+    before = walk(near, STEP_M * FORWARD, STILL, 28).poses[-1]
+    slow = Shadow(
+        KINEMATICS,
+        near.joints_rad,
+        known_good_rad=[HOME_RAD],
+        velocity_rad_s=np.full(KINEMATICS.size, 0.1),
+    )
+    asked = moved(before, 0.008 * FORWARD, STILL)
+    pose, hits = slow.bound(before, asked, dt_s=0.016)
     assert [hit.name for hit in hits] == ["joint_velocity"]
-    assert isinstance(hits[0], LimitHit)
-    assert hits[0].where == "panda_joint4"
-    assert hits[0].limit == 2.175
-    gone_m = np.linalg.norm(fast.position_m - before.position_m)
-    assert gone_m < np.linalg.norm(slow.position_m - before.position_m)
+    assert np.linalg.norm(pose.position_m - before.position_m) < 0.008
 
 
 def test_a_step_that_starts_elsewhere_is_judged_from_there() -> None:

@@ -39,7 +39,7 @@ class Lease:
         source: the one source whose chunks count; a second process of the same name is foreign.
         since_ns: observations older than this were made before the arm was given to the worker.
         last_seq: of the newest chunk seen.
-        last_observation_ns: of the newest chunk carried out.
+        last_observation_ns: of the newest chunk taken to be carried out.
     """
 
     spec: ModelSpec
@@ -106,7 +106,7 @@ def _refuse_by_time(
         late_s = (now_ns - record.valid_until_ns) / 1e9
         return Refusal("expired", f"it was valid until {late_s:.3f} s ago", late_s, 0.0)
     if record.observation_stamp_ns <= lease.last_observation_ns:
-        return Refusal("out_of_order", "its observation is not newer than the last one carried out")
+        return Refusal("out_of_order", "its observation is not newer than the last one taken")
     return None
 
 

@@ -84,6 +84,7 @@ class Barriers:
         slows_m = np.where(hand, limits.table_slow_m, limits.collision_slow_m)
         self.stop = np.array([limits.singularity_stop, *stops_m])
         self.slow = np.array([limits.singularity_slow, *slows_m])
+        self._zone = self.slow - self.stop
 
     def at(self, joints_rad: FloatArray, jacobian: FloatArray) -> FloatArray:
         """(n,) of an arm in these joints, whose Jacobian is (6, n) m and rad."""
@@ -94,8 +95,11 @@ class Barriers:
 
     def floor(self, before: FloatArray) -> FloatArray:
         """(n,) what they may come down to in one step from `before`."""
-        zone = self.slow - self.stop
-        return np.where(before > 0, np.minimum(zone, (1 - DECAY) * before), before - NOISE)
+        floor = np.minimum(self._zone, (1 - DECAY) * before)
+        past = before <= 0
+        if past.any():
+            floor[past] = before[past] - NOISE
+        return floor
 
     def where(self, index: int) -> str:
         """What of the arm number `index` is about; empty: the whole of it."""

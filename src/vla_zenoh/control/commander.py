@@ -10,11 +10,12 @@ Here are states and settings. `composer` makes plans of chunks, `mover` makes co
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 
 from vla_zenoh.control.acceptance import Lease, Refusal, refuse
 from vla_zenoh.control.compose import Goal
-from vla_zenoh.control.composer import Composer
+from vla_zenoh.control.composer import ChunkPlan, Composer
 from vla_zenoh.control.gripper import GripperArbiter
 from vla_zenoh.control.holding import Holding
 from vla_zenoh.control.joint_fit import reasons_joints_do_not_fit
@@ -39,6 +40,9 @@ from vla_zenoh.types import (
 )
 
 __all__ = ["Commander", "Inputs", "Outputs", "Setting"]
+
+MOST_WAITING = 4
+"""Of a heap of chunks the newest few; the newest of them that is no mistake is carried out."""
 
 
 class Commander:
@@ -73,6 +77,8 @@ class Commander:
         self._around = Surroundings()
         self._shadow: dict[str, Stamped[ActionChunk]] = {}
         self._composer = Composer(profile, reach)
+        self._waiting: deque[Stamped[ActionChunk]] = deque()
+        self._coming: tuple[Stamped[ActionChunk], ChunkPlan] | None = None
         self._mover = Mover(profile, reach, self._composer)
         self._watch = Watch(profile)
         self._out = Outputs()
@@ -95,8 +101,10 @@ class Commander:
             self._change(Trigger.STOP, "emergency stop")
         for setting in inputs.settings:
             self._take_setting(setting, now_ns, stopped)
+        self._composer.tick()
         for chunk in inputs.chunks:
             self._take_chunk(chunk, now_ns)
+        self._compose(now_ns)
         self._look_around(now_ns)
         if not self._mover.advance(
             self.state, self.task, self._watch.deadline_ns, now_ns, ticks, self._out
@@ -325,24 +333,51 @@ class Commander:
         if self.state not in OBEYING or worker != self.task.worker or self.lease is None:
             self._shadow[worker] = chunk
             return
-        refusal = self._carry_out(chunk, self.lease, now_ns)
+        timing = self.profile.timing
+        refusal = refuse(chunk, self.lease, self.task, timing.max_observation_age_s, now_ns)
         if refusal is not None:
             self._out.refuse(refusal, worker)
             return
-        self._shadow[worker] = chunk
         self.lease.last_observation_ns = chunk.record.observation_stamp_ns
-        self.progress.chunks += 1
-        self._change(Trigger.FRESH, "fresh chunk")
+        if len(self._waiting) == MOST_WAITING:
+            self._overtaken(self._waiting.popleft())
+        self._waiting.append(chunk)
 
-    def _carry_out(self, chunk: Stamped[ActionChunk], lease: Lease, now_ns: int) -> Refusal | None:
-        timeline, timing = self._mover.timeline, self.profile.timing
-        assert timeline is not None
-        refusal = refuse(chunk, lease, self.task, timing.max_observation_age_s, now_ns)
-        if refusal is not None:
-            return refusal
-        plan = self._composer.compose(chunk, lease.spec.action, timeline, self._out)
+    def _compose(self, now_ns: int) -> None:
+        """Go on with the chunk that becomes a plan, then with the newest that waits.
+
+        One that came meanwhile stands on it, so it is begun when that is in force.
+        """
+        if self._coming is not None:
+            self._go_on(*self._coming, now_ns)
+        while self._coming is None and self._waiting:
+            self._begin(self._waiting.pop(), now_ns)
+
+    def _begin(self, chunk: Stamped[ActionChunk], now_ns: int) -> None:
+        timeline, lease = self._mover.timeline, self.lease
+        if timeline is None or lease is None or self._superseded(chunk):
+            return
+        plan = self._composer.begin(chunk, lease.spec.action, timeline)
         if isinstance(plan, Refusal):
-            return plan
+            self._out.refuse(plan, chunk.record.worker)
+            return
+        while self._waiting:
+            self._overtaken(self._waiting.popleft())
+        self._coming = chunk, plan
+        self._go_on(chunk, plan, now_ns)
+
+    def _go_on(self, chunk: Stamped[ActionChunk], plan: ChunkPlan, now_ns: int) -> None:
+        timeline, worker = self._mover.timeline, chunk.record.worker
+        if timeline is None or self._superseded(chunk):
+            self._coming = None
+            return
+        ready = self._composer.go_on(plan, now_ns)
+        if ready is False:
+            return
+        self._coming = None
+        if isinstance(ready, Refusal):
+            self._out.refuse(ready, worker)
+            return
         if self.state is State.HOLDING:
             self._resumed_ns = now_ns
         # Until then the arm stood, and what was seen of it stands on that: chunks that come in a
@@ -351,7 +386,22 @@ class Commander:
         timeline.add(plan, now_ns)
         self._watch.expect_next(max(plan.end_ns, now_ns), self.task.rate_hz, now_ns)
         self._out.accepted = plan.cause
-        return None
+        self._out.shortened(plan.news())
+        self._shadow[worker] = chunk
+        self.progress.chunks += 1
+        self._change(Trigger.FRESH, "fresh chunk")
+
+    def _superseded(self, chunk: Stamped[ActionChunk]) -> bool:
+        """The arm was stopped, or is told something else, since it came."""
+        if self.state in OBEYING and chunk.record.episode == self.task.episode:
+            return False
+        why = "the arm was stopped or told something else meanwhile"
+        self._out.refuse(Refusal("superseded", why, quiet=True), chunk.record.worker)
+        return True
+
+    def _overtaken(self, chunk: Stamped[ActionChunk]) -> None:
+        why = "a newer one came before it was begun"
+        self._out.refuse(Refusal("overtaken", why, quiet=True), chunk.record.worker)
 
     # -- watching -----------------------------------------------------------------------------
     def _look_around(self, now_ns: int) -> None:

@@ -108,7 +108,10 @@ class Plan:
         dt_ns: length of a step's window.
         goals: one per step.
         cause: the chunk it came from, None for a hold.
-        bounded: so many of the goals are known to be within what the arm can do.
+        bounded: so many of the goals are known to be within what the arm can do, by default all;
+            the last of them stays in force, and is all that was asked for, until the next one is.
+        made: so many of the goals are made at all; the others stand for steps that are looked at
+            when they come due.
         episode: the chunk's.
         begun: steps of the episode that had been asked for when its observation was taken.
         most: steps of the episode that there are at all, as far as the policy has said.
@@ -123,30 +126,39 @@ class Plan:
     dt_ns: int
     goals: list[Goal]
     cause: Cause | None = None
-    bounded: int = 0
+    bounded: int = -1
     episode: int = 0
     begun: float = 0.0
     most: float = math.inf
     done: bool = False
     arrival_ns: int = 0
+    made: int = -1
     clock: PlanClock = WALL_CLOCK
     soonest: bool = False
+
+    def __post_init__(self) -> None:
+        if self.bounded < 0:
+            self.bounded = self.made = len(self.goals)
 
     def lasted_ns(self, t_ns: int) -> int:
         """Plan time from the observation to `t_ns`."""
         return self.clock.at(t_ns) - self.clock.at(self.start_ns)
 
-    def index_at(self, t_ns: int) -> int:
-        """Index of the step in force at `t_ns`."""
+    def due_at(self, t_ns: int) -> int:
+        """Index of the step whose time it is at `t_ns`."""
         return min(max(self.lasted_ns(t_ns) // self.dt_ns, 0), len(self.goals) - 1)
+
+    def index_at(self, t_ns: int) -> int:
+        """Index of the step in force at `t_ns`: that one, or the last that is bounded."""
+        return min(self.due_at(t_ns), self.bounded - 1)
 
     def asked_until(self, t_ns: int) -> Goal:
         """What its steps have asked for until `t_ns`, its first step at least."""
         done, part_ns = divmod(self.lasted_ns(t_ns), self.dt_ns)
         if done < 1:
             return self.goals[0]
-        if done >= len(self.goals) or part_ns == 0:
-            return self.goals[min(done, len(self.goals)) - 1]
+        if done >= self.bounded or part_ns == 0:
+            return self.goals[min(done, self.bounded) - 1]
         last, coming, share = self.goals[done - 1], self.goals[done], part_ns / self.dt_ns
         return Goal(
             between(last.pose, coming.pose, share),
@@ -156,7 +168,7 @@ class Plan:
     def steps_asked_until(self, t_ns: int) -> float:
         """Steps of the episode that have been asked for until `t_ns`, parts of one included."""
         had = self.lasted_ns(t_ns) / self.dt_ns
-        return min(self.begun + min(max(had, 1.0), len(self.goals)), self.most)
+        return min(self.begun + min(max(had, 1.0), self.bounded), self.most)
 
     def steps_in_force(self, t_ns: int) -> float:
         """Likewise those that have come in force, the present one as a whole."""
@@ -172,7 +184,7 @@ class Plan:
         """Move the goals from `index` on; what leaves the workspace stays at its border."""
         # Elsewhere than checked: looked at again when they come due. Goal 0 has none before it.
         self.bounded = min(self.bounded, max(index, 1))
-        for later in range(index, len(self.goals)):
+        for later in range(index, self.made):
             goal = self.goals[later]
             inside, _ = into_workspace(limits, goal.pose.position_m + way_m, goal.pose.position_m)
             turned = orthonormal(goal.pose.rotation @ turn)

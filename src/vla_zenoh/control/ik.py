@@ -138,14 +138,13 @@ class InverseKinematics:
         settings = self.settings
         lower, upper = self.bounds(start_rad)
         joints = wanted = start_rad
-        pull = settings.posture_gain
         last, stalls = math.inf, 0
         for iteration in range(settings.max_iterations + 1):
             here, jacobian = self.kinematics.pose_and_jacobian(joints)
             error = pose_error(pose, here)
-            squared = float(error @ error)
-            error_m = math.sqrt(float(error[:3] @ error[:3]))
-            error_rad = math.sqrt(float(error[3:] @ error[3:]))
+            x, y, z, rx, ry, rz = error.tolist()
+            error_m, error_rad = math.hypot(x, y, z), math.hypot(rx, ry, rz)
+            squared = error_m * error_m + error_rad * error_rad
             solved = (
                 error_m <= settings.position_tolerance_m
                 and error_rad <= settings.rotation_tolerance_rad
@@ -155,13 +154,10 @@ class InverseKinematics:
             if solved or stalls == 3 or iteration == settings.max_iterations:
                 return Approach(joints, error_m, error_rad, solved, wanted, jacobian)
             last = squared
-            drift = pull * (self.posture_rad - joints)
-            farthest = float(np.abs(drift).max())
-            if farthest > settings.max_posture_step_rad:
-                drift *= settings.max_posture_step_rad / farthest
-            pull = 0.0  # the pose has the last word
+            # After the first iteration the pose has the last word.
+            drift = self._drift(joints) if iteration == 0 else None
             step = self._step(error, jacobian, drift, 0.5 * squared + settings.damping_bias)
-            largest = float(np.abs(step).max())
+            largest = max(map(abs, step.tolist()))
             if largest > settings.max_joint_step_rad:
                 step *= settings.max_joint_step_rad / largest
             wanted = joints + step
@@ -175,11 +171,21 @@ class InverseKinematics:
         """Least and greatest joints (n,): no joint goes further out than it was."""
         return np.minimum(self.lower_rad, start_rad), np.maximum(self.upper_rad, start_rad)
 
+    def _drift(self, joints: FloatArray) -> FloatArray:
+        """(n,) the step towards the posture."""
+        drift = self.settings.posture_gain * (self.posture_rad - joints)
+        farthest = max(map(abs, drift.tolist()))
+        if farthest > self.settings.max_posture_step_rad:
+            drift *= self.settings.max_posture_step_rad / farthest
+        return drift
+
     @staticmethod
     def _step(
-        error: FloatArray, jacobian: FloatArray, drift: FloatArray, damping: float
+        error: FloatArray, jacobian: FloatArray, drift: FloatArray | None, damping: float
     ) -> FloatArray:
         left = jacobian @ jacobian.T + damping * _IDENTITY_6
+        if drift is None:
+            return jacobian.T @ np.linalg.solve(left, error)
         return drift + jacobian.T @ np.linalg.solve(left, error - jacobian @ drift)
 
     def _inside(
@@ -188,12 +194,14 @@ class InverseKinematics:
         joints: FloatArray,
         error: FloatArray,
         jacobian: FloatArray,
-        drift: FloatArray,
+        drift: FloatArray | None,
         squared: float,
         lower: FloatArray,
         upper: FloatArray,
     ) -> FloatArray:
         """`wanted`, or the best step of the other joints once those past a bound stand on it."""
+        if ((wanted >= lower) & (wanted <= upper)).all():
+            return wanted
         held = np.zeros(len(joints), dtype=bool)
         step = wanted - joints
         while True:
@@ -207,6 +215,5 @@ class InverseKinematics:
             onto = np.where(held, np.clip(wanted, lower, upper) - joints, 0.0)
             free = np.where(held, 0.0, jacobian)
             damping = 0.5 * squared + self.settings.damping_bias + 1e-6
-            step = onto + self._step(
-                error - jacobian @ onto, free, np.where(held, 0.0, drift), damping
-            )
+            aside = None if drift is None else np.where(held, 0.0, drift)
+            step = onto + self._step(error - jacobian @ onto, free, aside, damping)

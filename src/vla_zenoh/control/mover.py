@@ -14,7 +14,7 @@ from vla_zenoh.control.joint_stage import JointStage
 from vla_zenoh.control.limits import leash
 from vla_zenoh.control.ports import Outputs
 from vla_zenoh.control.reach import Shadow
-from vla_zenoh.control.slowdown import Slowdown
+from vla_zenoh.control.slowdown import APPROACH, Slowdown
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother, motion_limits
 from vla_zenoh.control.so3 import Pose, held_pose, log3, pose_of, quat_from_rotation
 from vla_zenoh.control.states import OBEYING, State
@@ -233,8 +233,7 @@ class Mover:
         out: Outputs,
     ) -> Cause | None:
         plans = self._aggregator.plans(timeline, now_ns)
-        for plan in plans:
-            self._composer.bound_until(plan, plan.index_at(now_ns), out)
+        out.shortened(self._composer.bound_until(plans, now_ns))
         goal = self._aggregator.goal(plans, now_ns)
         if self._override == 0.0:
             self._stand(smoother)
@@ -298,7 +297,7 @@ class Mover:
 
     def _slow_down(self, slower: Slowdown | None, out: Outputs) -> None:
         """Take over the speed of a goal; tell each reason once in every activation."""
-        if slower is not None and slower.name not in self._slowed_by:
+        if slower is not None and slower.name not in (APPROACH, *self._slowed_by):
             self._slowed_by.add(slower.name)
             where = f" at {slower.where}" if slower.where else ""
             out.tell("info", "limit", slower.name, f"slower{where}", slower.value, slower.limit)
@@ -328,6 +327,8 @@ class Mover:
         self.goal = None
         if timeline.plan.cause is not None and smoother.at_rest:
             timeline.hold(Goal(smoother.motion.pose, timeline.at(now_ns).width_m), now_ns)
+            if self._timing is not None:
+                self._timing.restart()
 
     def _must_stream(self, state: State, now_ns: int) -> bool:
         if state in OBEYING or not self.at_rest:

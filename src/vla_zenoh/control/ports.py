@@ -10,6 +10,7 @@ from typing import NamedTuple
 from vla_zenoh.control.acceptance import Refusal
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.preflight import Surroundings
+from vla_zenoh.control.slowdown import APPROACH
 from vla_zenoh.types import (
     MAX_TEXT,
     ActionChunk,
@@ -101,7 +102,11 @@ class Outputs:
             self.tell("warning", "refusal", refusal.reason, why, refusal.value, refusal.limit)
 
     def shortened(self, hits: Sequence[LimitHit]) -> None:
-        """Tell the last bound that acted on a chunk: what stands in the way now."""
-        for hit in hits[-1:]:
+        """Tell what acted on the steps of a chunk, see `Composer`."""
+        for hit in hits:
+            if hit.name == APPROACH:
+                why = f"its target is {hit.value:.3g} {hit.where} away, over a step: gone to slowly"
+                self.tell("info", "limit", hit.name, why, hit.value, hit.limit)
+                continue
             where = f" at {hit.where}" if hit.where else ""
             self.tell("warning", "limit", hit.name, f"shortened{where}", hit.value, hit.limit)

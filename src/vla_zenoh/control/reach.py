@@ -13,11 +13,15 @@ functions for safety-critical control of discrete systems", RSS 2017) with a dec
 A joint outside of its range may only move inwards. The elbow of a redundant arm is where pose and
 posture put it, because that is what a Cartesian controller does with it: a solution that would need
 the elbow to swing aside is none. `free_elbow` is for arms whose joints are commanded.
+
+A step for which the joints alone are too slow is kept and told to be taken slower, see
+`vla_zenoh.control.slowdown`; only where that would take more than ten times as long it is
+shortened: such joints leap to another solution.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +31,7 @@ from vla_zenoh.control.barriers import Barriers, Margins
 from vla_zenoh.control.ik import Approach, IkSettings, InverseKinematics, pose_error
 from vla_zenoh.control.kinematics import Kinematics
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.slowdown import Slowdown
+from vla_zenoh.control.slowdown import LEAST, SLOWEST, Slowdown, full_speed_s
 from vla_zenoh.control.so3 import Pose, exp3, orthonormal
 from vla_zenoh.errors import RecordError
 from vla_zenoh.profile import Limits
@@ -44,6 +48,23 @@ SOLVER_ITERATIONS = 12
 SAME_POSE = 1e-9
 
 
+class Bounded(NamedTuple):
+    """What became of a step.
+
+    Args:
+        pose: where it ends: the pose asked for itself where nothing acted, that from where it began
+            where nothing is left of it.
+        hits: what acted.
+        joints_rad: (n,) of the shadow there.
+        slowdown: why it is to be taken slower than at full speed.
+    """
+
+    pose: Pose
+    hits: list[LimitHit]
+    joints_rad: FloatArray
+    slowdown: Slowdown | None
+
+
 class _Stand(NamedTuple):
     """The shadow in one place: `pose` was asked for, `barriers` are those at `joints_rad`."""
 
@@ -51,6 +72,15 @@ class _Stand(NamedTuple):
     joints_rad: FloatArray
     error: float
     barriers: FloatArray
+
+
+class _Start(NamedTuple):
+    """Where a step begins, and what its end must keep: barriers, and joints' ranges."""
+
+    here: _Stand
+    floor: FloatArray
+    lower_rad: FloatArray
+    upper_rad: FloatArray
 
 
 class Shadow:
@@ -131,29 +161,49 @@ class Shadow:
         dt_s: float = 0.1,
         start_rad: FloatArray | None = None,
     ) -> tuple[Pose, list[LimitHit]]:
-        """The furthest pose on the way from `before` to `asked` that the arm can take.
+        """`bounding` at once: where the step ends, and what acted."""
+        pieces = self.bounding(before, asked, dt_s, start_rad)
+        while True:
+            try:
+                next(pieces)
+            except StopIteration as end:
+                return end.value.pose, end.value.hits
+
+    def bounding(
+        self, before: Pose, asked: Pose, dt_s: float, start_rad: FloatArray | None = None
+    ) -> Generator[None, None, Bounded]:
+        """The furthest pose on the way from `before` to `asked` that the arm can take, in pieces.
+
+        It stops before every evaluation (joints for a pose, and how near that is to what): what
+        one costs is known, and how many there are is not, some 10 where a limit cuts.
 
         Args:
             before: where the step starts, usually the pose bounded last.
             asked: where it is to end.
             dt_s: time the step has.
-            start_rad: joints at `before`, where known; None: those of the last bounded pose.
+            start_rad: joints at `before`, where known; None: near those of the last bounded pose.
 
         Returns:
-            `asked` itself where nothing acted, `before` itself where nothing is left of the step,
-            and what acted. The shadow stands there afterwards.
+            what became of it. The shadow stands there afterwards.
         """
-        start = self._stand_at(before, start_rad)
+        here = self._here
+        if not _same(before, here.pose) or not (
+            start_rad is None or np.array_equal(start_rad, here.joints_rad)
+        ):
+            yield
+            here = self._stand_at(before, here.joints_rad if start_rad is None else start_rad)
+        start = _Start(here, self._floor(here), *self._solver.bounds(here.joints_rad))
+        yield
         end, hits = self._try(start, asked, dt_s)
         if not hits:
-            self._settle(start, end)
-            return asked, []
+            return self._settle(start, end, asked, hits, dt_s)
         step = pose_error(asked, before)
-        best, low, high = start, 0.0, 1.0
+        best, low, high = here, 0.0, 1.0
         fraction = self._guess(start, end, hits)
         for _ in range(HALVINGS):
             if fraction < SMALLEST_FRACTION:
                 break
+            yield
             end, found = self._try(start, _part(before, step, fraction), dt_s)
             if not found:
                 best, low = end, fraction
@@ -162,33 +212,39 @@ class Shadow:
         if low > 0.0:
             for _ in range(REFINEMENTS):
                 fraction = 0.5 * (low + high)
+                yield
                 end, found = self._try(start, _part(before, step, fraction), dt_s)
                 if found:
                     high, hits = fraction, found
                 else:
                     best, low = end, fraction
-        self._settle(start, best)
-        return (best.pose if low > 0.0 else before), list(hits)
+        return self._settle(start, best, best.pose if low > 0.0 else before, hits, dt_s)
 
-    def _settle(self, start: _Stand, end: _Stand) -> None:
+    def _settle(
+        self, start: _Start, end: _Stand, pose: Pose, hits: list[LimitHit], dt_s: float
+    ) -> Bounded:
         self._here = end
-        self.slowdown = self.barriers.slowdown(start.barriers, end.barriers)
+        slower = self.barriers.slowdown(start.here.barriers, end.barriers)
+        late = self._late(start.here, end, dt_s)
+        if slower is None or (late is not None and late.share < slower.share):
+            slower = late
+        self.slowdown = slower
+        return Bounded(pose, hits, end.joints_rad, slower)
 
-    def _guess(self, start: _Stand, end: _Stand, hits: Sequence[LimitHit]) -> float:
+    def _guess(self, start: _Start, end: _Stand, hits: Sequence[LimitHit]) -> float:
         """Where to begin to look for the feasible part, from how the whole step failed."""
-        if end is start or start.error > 0 or start.barriers.min() <= 0:
+        here = start.here
+        if end is here or here.error > 0 or here.barriers.min() <= 0:
             return 0.5
         if hits[0].name == "joint_velocity":
             return GUESS_SHORT * hits[0].limit / hits[0].value
-        room = start.barriers - self._floor(start)
-        fall = np.maximum(start.barriers - end.barriers, 1e-12)
+        room = here.barriers - start.floor
+        fall = np.maximum(here.barriers - end.barriers, 1e-12)
         return GUESS_SHORT * min(1.0, float((room / fall).min()))
 
     # -- one place ----------------------------------------------------------------------------
-    def _stand_at(self, pose: Pose, start_rad: FloatArray | None) -> _Stand:
-        if start_rad is None and _same(pose, self._here.pose):
-            return self._here
-        found = self._approach(pose, self._here.joints_rad if start_rad is None else start_rad)
+    def _stand_at(self, pose: Pose, start_rad: FloatArray) -> _Stand:
+        found = self._approach(pose, start_rad)
         self._here = self._stand(pose, found)
         return self._here
 
@@ -197,29 +253,31 @@ class Shadow:
         barriers = self.barriers.at(found.joints_rad, found.jacobian)
         return _Stand(pose, found.joints_rad, error, barriers)
 
-    def _try(self, start: _Stand, pose: Pose, dt_s: float) -> tuple[_Stand, list[LimitHit]]:
+    def _try(self, start: _Start, pose: Pose, dt_s: float) -> tuple[_Stand, list[LimitHit]]:
         """Where a step would lead, and what forbids it."""
-        found = self._approach(pose, start.joints_rad)
+        here = start.here
+        found = self._approach(pose, here.joints_rad)
         # Where the start has no solution itself, coming nearer to having one is the way out.
-        if not found.solved and found.error_m + found.error_rad >= start.error * (1 - 1e-6):
-            return start, [self._out_of_range(start, found.wanted_rad) or self._out_of_reach(found)]
+        if not found.solved and found.error_m + found.error_rad >= here.error * (1 - 1e-6):
+            return here, [self._out_of_range(start, found.wanted_rad) or self._out_of_reach(found)]
         outside = self._out_of_range(start, found.joints_rad)
         if outside is not None:
-            return start, [outside]
+            return here, [outside]
         end = self._stand(pose, found)
-        floor = self._floor(start)
         hits = [
             LimitHit(
                 self.barriers.names[index],
                 float(end.barriers[index] + self.barriers.stop[index]),
-                float(floor[index] + self.barriers.stop[index]),
-                where=self.barriers.where(int(index)),
+                float(start.floor[index] + self.barriers.stop[index]),
+                where=self.barriers.where(index),
             )
-            for index in np.flatnonzero(end.barriers < floor)
+            for index in (end.barriers < start.floor).nonzero()[0].tolist()
         ]
-        leaving = start.barriers[0] < 0 and end.barriers[0] > start.barriers[0]
+        leaving = here.barriers[0] < 0 and end.barriers[0] > here.barriers[0]
         if not hits and not leaving:
-            hits = self._too_fast(start, end, dt_s)
+            late = self._late(here, end, dt_s)
+            if late is not None and late.value > late.limit / SLOWEST:
+                hits = [LimitHit(late.name, late.value, late.limit, where=late.where)]
         return end, hits
 
     def _floor(self, start: _Stand) -> FloatArray:
@@ -232,10 +290,10 @@ class Shadow:
     def _approach(self, pose: Pose, start_rad: FloatArray) -> Approach:
         return self._solver.approach(pose, start_rad, bounded=self._free_elbow)
 
-    def _out_of_range(self, start: _Stand, joints_rad: FloatArray) -> LimitHit | None:
-        lower, upper = self._solver.bounds(start.joints_rad)
+    def _out_of_range(self, start: _Start, joints_rad: FloatArray) -> LimitHit | None:
+        lower, upper = start.lower_rad, start.upper_rad
         excess = np.maximum(lower - joints_rad, joints_rad - upper)
-        joint = int(np.argmax(excess))
+        joint = int(excess.argmax())
         if excess[joint] <= 0:
             return None
         value = float(joints_rad[joint])
@@ -246,20 +304,26 @@ class Shadow:
         tolerance = self._solver.settings.position_tolerance_m
         return LimitHit("reach", found.error_m + found.error_rad, tolerance)
 
-    def _too_fast(self, start: _Stand, end: _Stand, dt_s: float) -> list[LimitHit]:
-        error = pose_error(end.pose, start.pose)
-        time_s = max(
-            dt_s,
-            float(np.linalg.norm(error[:3])) / self._limits.translation.velocity_m_s,
-            float(np.linalg.norm(error[3:])) / self._limits.rotation.velocity_rad_s,
-        )
-        speed = np.abs(end.joints_rad - start.joints_rad) / time_s
-        joint = int(np.argmax(speed / self._velocity_rad_s))
+    def _late(self, start: _Stand, end: _Stand, dt_s: float) -> Slowdown | None:
+        """Why a step takes longer than the `dt_s` it has, where its joints are too slow for it."""
+        joint_s = np.abs(end.joints_rad - start.joints_rad) / self._velocity_rad_s
+        joint = int(joint_s.argmax())
+        needed_s = float(joint_s[joint])
+        if needed_s <= dt_s:
+            return None
+        full_s = full_speed_s(self._limits, start.pose, end.pose)
+        time_s = max(dt_s, full_s)
+        if needed_s <= time_s:
+            return None
         limit = float(self._velocity_rad_s[joint])
-        if speed[joint] <= limit:
-            return []
-        name = self.kinematics.arm_joints[joint]
-        return [LimitHit("joint_velocity", float(speed[joint]), limit, where=name)]
+        return Slowdown(
+            "joint_velocity",
+            max(full_s / needed_s, LEAST),
+            limit * needed_s / time_s,
+            limit,
+            self.kinematics.arm_joints[joint],
+            needed_s - dt_s,
+        )
 
 
 def _same(a: Pose, b: Pose) -> bool:

@@ -109,6 +109,8 @@ class Limits(Section):
         reach: what joints, singularities, the arm itself and the table allow.
         step_m: largest translation of one model step.
         step_rad: largest rotation of one model step.
+        approach_m_s: an absolute target further away than a step is gone to at this speed.
+        approach_rad_s: likewise.
         out_of_bounds: ``clamp`` shortens to the bound and tells, ``refuse`` drops the whole chunk.
         lead_m: leash: the goal may run ahead of the commanded pose by this much.
         lead_rad: likewise.
@@ -123,6 +125,8 @@ class Limits(Section):
     reach: ReachLimits = ReachLimits()
     step_m: float = Field(default=0.05, gt=0, le=0.2)
     step_rad: float = Field(default=0.2, gt=0, le=0.8)
+    approach_m_s: float = Field(default=0.1, gt=0, le=0.5)
+    approach_rad_s: float = Field(default=0.5, gt=0, le=1.5)
     out_of_bounds: Literal["clamp", "refuse"] = "clamp"
     lead_m: float = Field(default=0.15, gt=0, le=0.5)
     lead_rad: float = Field(default=0.6, gt=0, le=1.5)
