@@ -124,7 +124,7 @@ class Judge:
         self._box("command outside the box", self._position_m)
         self._wandering(twist, acceleration)
         self._ways(twist, acceleration)
-        self._lines()
+        self._lines(twist)
 
     def _joints(self) -> None:
         records = [t.record for t in self._told]
@@ -164,38 +164,33 @@ class Judge:
         period_s = 1.0 / self._case.profile.timing.command_hz
         even = ok & (np.abs(step_s[:, 0] - period_s) < 0.1 * period_s)
         two, three = even[1:] & even[:-1], even[2:] & even[1:-1] & even[:-2]
+        v, a, j = "velocity", "acceleration", "jerk"
+        told, place = "as told", "by its positions"
         rows = (
-            ("velocity", 0, LIMIT_RTOL, velocity, None, 0),
-            ("velocity", 0, LIMIT_RTOL, moved / step_s, ok, 1),
-            ("acceleration", 1, LIMIT_RTOL, acceleration, None, 0),
-            ("acceleration", 1, LIMIT_RTOL, np.diff(velocity, axis=0) / step_s, ok, 1),
-            ("acceleration", 1, LIMIT_RTOL, np.diff(moved, axis=0) / period_s**2, two, 2),
-            ("jerk", 2, jerk_rtol, np.diff(acceleration, axis=0) / step_s, ok, 1),
-            ("jerk", 2, jerk_rtol, np.diff(moved, 2, axis=0) / period_s**3, three, 3),
+            (v, 0, LIMIT_RTOL, velocity, None, 0, told),
+            (v, 0, LIMIT_RTOL, moved / step_s, ok, 1, place),
+            (a, 1, LIMIT_RTOL, acceleration, None, 0, told),
+            (a, 1, LIMIT_RTOL, np.diff(velocity, axis=0) / step_s, ok, 1, "by its velocities"),
+            (a, 1, LIMIT_RTOL, np.diff(moved, axis=0) / period_s**2, two, 2, place),
+            (j, 2, jerk_rtol, np.diff(acceleration, axis=0) / step_s, ok, 1, told),
+            (j, 2, jerk_rtol, np.diff(moved, 2, axis=0) / period_s**3, three, 3, place),
         )
         worst: dict[str, Violation] = {}
-        for order, index, rtol, values, where, shift in rows:
+        for order, index, rtol, values, where, shift, source in rows:
             share = (size(values) / np.asarray(limits[index])).max(axis=1)
             if where is not None:
                 share = np.where(where, share, 0.0)
-            self._most(worst, f"command {name} {order}", share, 1.0 + rtol, shift, "x limit")
+            many = int((share > 1.0 + rtol).sum())
+            if many:
+                at, title = int(share.argmax()), f"command {name} {order}"
+                if any(t.anchored for t in self._told[at : at + shift + 1]):
+                    source += ", at an activation"
+                found = Violation(
+                    title, int(self._at[at + shift]), float(share[at]), "x limit", many, source
+                )
+                if title not in worst or worst[title].size < found.size:
+                    worst[title] = found
         self.found += worst.values()
-
-    def _most(
-        self,
-        worst: dict[str, Violation],
-        name: str,
-        share: Array,
-        limit: float,
-        shift: int,
-        unit: str,
-    ) -> None:
-        many = int((share > limit).sum())
-        if many:
-            at = int(share.argmax())
-            found = Violation(name, int(self._at[at + shift]), float(share[at]), unit, many)
-            if name not in worst or worst[name].size < found.size:
-                worst[name] = found
 
     def _tell(self, name: str, sizes: Array, limit: float, unit: str, factor: float = 1.0) -> None:
         """`sizes` of every command, beyond `limit` or not."""
@@ -313,44 +308,60 @@ class Judge:
 
     def _ways(self, twist: Array, acceleration: Array) -> None:
         """Every axis stays between its start, its goal and where a brake would have ended."""
-        goal_m, _ = self._goal_arrays()
-        limits = axis_limits(self._limits)[:, 0]
-        usable = self._active & np.append(False, self._goes_on) & np.append(
-            False, self._active[:-1]
-        )
+        goal_m, goal_rotation = self._goal_arrays()
+        usable = self._active & np.append(False, self._goes_on)
+        usable &= np.append(False, self._active[:-1])
+        fresh = np.append(True, np.abs(np.diff(goal_m, axis=0)).max(axis=1) > 1e-10)
+        turned = log_of(np.einsum("nji,njk->nik", self._rotation[:-1], goal_rotation[1:]))
+        fresh |= np.append(True, norms(np.diff(goal_rotation.reshape(-1, 9), axis=0))[:, 0] > 1e-10)
+        fresh |= np.append(True, ~usable[:-1])
+        fresh &= usable
+        begins = np.flatnonzero(fresh)
+        if not len(begins):
+            return
+        before = begins - 1
+        body = self._rotation[before].transpose(0, 2, 1)
+        place = self._position_m[before]
+        motion = [
+            np.hstack([part[before, :3], np.einsum("nij,nj->ni", body, part[before, 3:])])
+            for part in (twist, acceleration)
+        ]
+        ahead = np.hstack([goal_m[begins] - place, turned[before]])
+        low, high = ends_of(*motion, ahead, axis_limits(self._limits))
+        # An axis whose own goal stays keeps the ends it had.
+        stays = np.abs(goal_m[begins[1:]] - goal_m[begins[1:] - 1]) <= 1e-10
+        stays &= usable[begins[1:] - 1, None]
+        low, high = low[:, :3] + place, high[:, :3] + place
+        for n, kept in enumerate(stays):
+            low[n + 1] = np.where(kept, np.minimum(low[n], low[n + 1]), low[n + 1])
+            high[n + 1] = np.where(kept, np.maximum(high[n], high[n + 1]), high[n + 1])
+        which = np.cumsum(fresh) - 1
+        inside = usable & (which >= 0)
+        where = self._position_m[inside]
+        beyond = np.maximum(low[which[inside]] - where, where - high[which[inside]])
         sizes = np.zeros(len(goal_m))
-        for axis in range(3):
-            goal, place = goal_m[:, axis], self._position_m[:, axis]
-            fresh = np.append(True, np.abs(np.diff(goal)) > 1e-10) | ~usable
-            begins = np.flatnonzero(fresh & usable)
-            if not len(begins):
-                continue
-            before = begins - 1
-            low, high = brake_range(
-                place[before], twist[before, axis], acceleration[before, axis], limits
-            )
-            low, high = np.minimum(low, goal[begins]), np.maximum(high, goal[begins])
-            which = np.cumsum(fresh & usable) - 1
-            inside = usable & (which >= 0)
-            low, high = low[which[inside]], high[which[inside]]
-            beyond = np.maximum(low - place[inside], place[inside] - high)
-            sizes[inside] = np.maximum(sizes[inside], beyond)
+        sizes[inside] = beyond.max(axis=1)
         self._tell("a way leaves its ends", sizes, WANDER_M, "mm", 1e3)
 
-    def _lines(self) -> None:
+    def _lines(self, twist: Array) -> None:
         """While goals stay on a line from where the arm stood, so does the arm."""
         goal_m, goal_rotation = self._goal_arrays()
+        stands = np.abs(twist[:, :3]).max(axis=1) < STILL
+        # The arm does not turn meanwhile: what turns it may take its own time.
+        turns = np.append(True, norms(np.diff(goal_rotation.reshape(-1, 9), axis=0))[:, 0] > SAME)
+        turns |= np.abs(twist[:, 3:]).max(axis=1) > STILL
         moves = np.append(True, norms(np.diff(goal_m, axis=0))[:, 0] > 1e-9)
         sizes = np.zeros(len(goal_m))
         origin = line = None
         for i in range(1, len(goal_m)):
-            if not (self._active[i] and self._goes_on[i - 1] and self._active[i - 1]):
+            on = self._active[i] and self._active[i - 1] and self._goes_on[i - 1]
+            if turns[i] or not on:
                 origin = line = None
                 continue
             place = self._position_m[i]
             if origin is None:
                 before = self._position_m[i - 1]
-                if np.abs(before - goal_m[i - 1]).max() < 1e-8 and moves[i]:
+                if stands[i - 1] and np.abs(before - goal_m[i - 1]).max() < THERE and moves[i]:
                     origin, line = before, None
             if origin is None:
                 continue
@@ -365,7 +376,6 @@ class Judge:
             apart = place - origin
             sizes[i] = np.linalg.norm(apart - (apart @ line) * line)
         self._tell("a straight motion leaves its line", sizes, WANDER_M, "mm", 1e3)
-        del goal_rotation
 
     # -- the guard ----------------------------------------------------------------------------
     def _guard(self) -> None:
@@ -488,6 +498,39 @@ def brake_range(p: Array, v: Array, a: Array, limits: Array) -> tuple[Array, Arr
         p = p + v * phase_s + 0.5 * a * phase_s**2 + rate * phase_s**3 / 6
         v = v + a * phase_s + 0.5 * rate * phase_s**2
         a = a + rate * phase_s
+    return low, high
+
+
+def ends_of(v: Array, a: Array, ahead: Array, limits: Array) -> tuple[Array, Array]:
+    """Between what ends, from where it is, each axis stays on the way to a goal, (n, 6) each.
+
+    That is here, the goal, and where a brake would end: each axis by itself, or, of a motion that
+    is straight and told to stay so, all together within the limits of the tightest.
+
+    Args:
+        v: (n, 6) how fast.
+        a: (n, 6) acceleration.
+        ahead: (n, 6) way to the goal.
+        limits: (3, 6).
+    """
+    low, high = np.minimum(ahead, 0.0), np.maximum(ahead, 0.0)
+    scale = np.linalg.norm(v, axis=1), np.linalg.norm(a, axis=1), np.linalg.norm(ahead, axis=1)
+    straight = np.ones(len(v), bool)
+    along = np.where((scale[0] > 1e-9)[:, None], v, ahead)
+    along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+    for part, length in zip((v, a, ahead), scale, strict=True):
+        off = part - (part * along).sum(axis=1, keepdims=True) * along
+        straight &= np.linalg.norm(off, axis=1) <= 1e-6 * length + 1e-9
+    for axis in range(v.shape[1]):
+        share = np.ones(len(v))
+        for shared in (False, True):
+            if shared:
+                ratio = np.abs(along) / limits[1]
+                share = np.abs(along[:, axis]) / limits[1, axis] / np.maximum(ratio.max(axis=1), 1e-300)
+                share = np.where(straight, np.maximum(share, 1e-9), 1.0)
+            one = limits[:, axis, None] * share
+            down, up = brake_range(np.zeros(len(v)), v[:, axis], a[:, axis], one)
+            low[:, axis], high[:, axis] = np.minimum(low[:, axis], down), np.maximum(high[:, axis], up)
     return low, high
 
 

@@ -223,19 +223,18 @@ class Rig:
             trace.references.append(reference)
             trace.guard_tick.append(at)
             self._guard_ns += self._guard_period_ns
-            if not blocked:
-                self._follow(reference)
+            self._follow(reference, 0.0 if blocked else self._share)
 
-    def _follow(self, reference: Any) -> None:
+    def _follow(self, reference: Any, share: float) -> None:
         """The arm goes where the reference is, or part of the way."""
-        share = self._share
         if self.case.joint:
-            assert self._kinematics is not None
             self._held_joints = reference.position_rad
-            self._rates = reference.velocity_rad_s
+            self._rates = reference.velocity_rad_s if share else np.zeros(len(self._joints))
             self._joints = self._joints + share * (reference.position_rad - self._joints)
             return
         here = self._held = Pose(reference.position_m, reference.rotation)
+        if not share:
+            return
         if share < 1.0:
             was = self._measured
             turn = log3(here.rotation @ was.rotation.T)
