@@ -134,9 +134,7 @@ class Judge:
         )
         most = joint_motion_limits(self._case.profile)
         moved = np.diff(position, axis=0)
-        self._differences(
-            "joint", moved, velocity, acceleration, most, np.abs, JOINT_JERK - 1.0
-        )
+        self._differences("joint", moved, velocity, acceleration, most, np.abs, JOINT_JERK - 1.0)
         places = [kinematics().forward(joints) for joints in position]
         self._position_m = np.array([place.position_m for place in places])
         self._rotation = np.array([place.rotation for place in places])
@@ -248,8 +246,10 @@ class Judge:
         spun = np.einsum("nji,nj->ni", self._rotation, twist[:, 3:])
         change = np.einsum("nji,nj->ni", self._rotation, acceleration[:, 3:])
         v, a = np.hstack([twist[:, :3], spun]), np.hstack([acceleration[:, :3], change])
-        return stop_time_s(v, a, box).max(axis=1) + STOP_S + 2 * (
-            1.0 / self._case.profile.timing.command_hz
+        return (
+            stop_time_s(v, a, box).max(axis=1)
+            + STOP_S
+            + 2 * (1.0 / self._case.profile.timing.command_hz)
         )
 
     def _stops(self, needed_s: Array, speed: Array, rest: float) -> None:
@@ -471,26 +471,22 @@ def brake_range(p: Array, v: Array, a: Array, limits: Array) -> tuple[Array, Arr
         limits: (3,) of the axis.
     """
     _, most, jerk = limits
-    # To no acceleration by full jerk, what is left of the speed says which way to brake.
+    # To no acceleration by full jerk: what is left of the speed says which way to brake.
     left = v + a * np.abs(a) / (2 * jerk)
     way = np.where(np.abs(left) > 1e-12, -np.sign(left), 0.0)
-    # Acceleration rises from a to a peak in the direction of `way`, and falls back to zero.
-    peak = np.sqrt(np.maximum(0.5 * a * a + jerk * np.abs(v) * (way * v < 0), 0.0))
-    # (peak^2 - a^2/2) / jerk is the change of speed of both flanks when a is not against it.
-    peak = np.sqrt(np.maximum(0.5 * a * a - way * v * jerk, 0.0))
-    long = peak > most
-    peak = np.minimum(peak, most)
-    first_s = np.maximum((peak - way * a) / jerk, 0.0)
-    last_s = peak / jerk
-    gained = way * a * first_s + 0.5 * jerk * first_s**2 + 0.5 * peak * last_s
-    flat_s = np.where(long, np.maximum(-way * v - gained, 0.0) / most, 0.0)
-    # Nothing left: full jerk against the acceleration alone.
+    # That way the acceleration goes to a peak, stays there, and falls back to zero.
+    peak = np.minimum(np.sqrt(np.maximum(0.5 * a * a - way * v * jerk, 0.0)), most)
+    first_s, last_s = np.abs(peak - way * a) / jerk, peak / jerk
+    gained = 0.5 * (way * a + peak) * first_s + 0.5 * peak * last_s
+    flat_s = np.maximum(-way * v - gained, 0.0) / most
+    push = np.sign(peak - way * a) * way * jerk
+    # Nothing is left: full jerk against the acceleration alone.
     alone = way == 0.0
     first_s = np.where(alone, np.abs(a) / jerk, first_s)
     flat_s, last_s = np.where(alone, 0.0, flat_s), np.where(alone, 0.0, last_s)
-    push = np.where(alone, -np.sign(a), way) * jerk
+    push = np.where(alone, -np.sign(a) * jerk, push)
     low, high = np.array(p), np.array(p)
-    for phase_s, rate in ((first_s, push), (flat_s, 0.0 * push), (last_s, -push)):
+    for phase_s, rate in ((first_s, push), (flat_s, 0.0 * push), (last_s, -way * jerk)):
         for part in np.linspace(0.0, 1.0, 33)[1:]:
             t = part * phase_s
             at = p + v * t + 0.5 * a * t * t + rate * t**3 / 6
@@ -521,16 +517,15 @@ def ends_of(v: Array, a: Array, ahead: Array, limits: Array) -> tuple[Array, Arr
     for part, length in zip((v, a, ahead), scale, strict=True):
         off = part - (part * along).sum(axis=1, keepdims=True) * along
         straight &= np.linalg.norm(off, axis=1) <= 1e-6 * length + 1e-9
-    for axis in range(v.shape[1]):
-        share = np.ones(len(v))
-        for shared in (False, True):
-            if shared:
-                ratio = np.abs(along) / limits[1]
-                share = np.abs(along[:, axis]) / limits[1, axis] / np.maximum(ratio.max(axis=1), 1e-300)
-                share = np.where(straight, np.maximum(share, 1e-9), 1.0)
-            one = limits[:, axis, None] * share
-            down, up = brake_range(np.zeros(len(v)), v[:, axis], a[:, axis], one)
-            low[:, axis], high[:, axis] = np.minimum(low[:, axis], down), np.maximum(high[:, axis], up)
+    ratio = np.abs(along) / limits[1]
+    together = ratio / np.maximum(ratio.max(axis=1, keepdims=True), 1e-300)
+    together = np.where(straight[:, None], np.maximum(together, 1e-9), 1.0)
+    for share in (np.ones(v.shape), together):
+        for axis in range(v.shape[1]):
+            scaled = limits[:, axis, None] * share[:, axis]
+            down, up = brake_range(np.zeros(len(v)), v[:, axis], a[:, axis], scaled)
+            low[:, axis] = np.minimum(low[:, axis], down)
+            high[:, axis] = np.maximum(high[:, axis], up)
     return low, high
 
 

@@ -368,9 +368,7 @@ class Rig:
         return Stamped(Header(now_ns - 1_000_000, self._seq, SOURCE), record, now_ns)
 
     # -- people and trouble -------------------------------------------------------------------
-    def _person(
-        self, at: int, settings: list[Setting], chunks: list[Stamped[ActionChunk]]
-    ) -> None:
+    def _person(self, at: int, settings: list[Setting], chunks: list[Stamped[ActionChunk]]) -> None:
         """Activates an arm that does not obey, some time later."""
         state = self.commander.state.value
         if state in OBEYING:

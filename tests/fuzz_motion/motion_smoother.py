@@ -10,8 +10,17 @@ import zlib
 
 import numpy as np
 from motion_case import DOWN, START_M
-from motion_judge import JERK_RTOL, LIMIT_RTOL, WANDER_M, WANDER_RAD, Array, Violation, ends_of
-from motion_judge import log_of, norms
+from motion_judge import (
+    JERK_RTOL,
+    LIMIT_RTOL,
+    WANDER_M,
+    WANDER_RAD,
+    Array,
+    Violation,
+    ends_of,
+    log_of,
+    norms,
+)
 
 from vla_zenoh.control.smoothing import ROTATION_BOX, Motion, MotionLimits, Smoother
 from vla_zenoh.control.so3 import Pose, exp3
@@ -142,29 +151,24 @@ def _judged(
     beyond = np.zeros(6)
     for n, begin in enumerate(begins):
         end = begins[n + 1] if n + 1 < len(begins) else len(motions)
-        moved = np.hstack(
-            [place[begin:end] - place[at[n]], log_of(body[n] @ rotation[begin:end])]
-        )
+        moved = np.hstack([place[begin:end] - place[at[n]], log_of(body[n] @ rotation[begin:end])])
         over = np.maximum(low[n] - moved, moved - high[n]).max(axis=0)
         beyond = np.maximum(beyond, over)
     if beyond[:3].max() > WANDER_M:
-        bad.append(("smoother: a way leaves its ends", beyond[:3].max() * 1e3, "mm", shape))
+        bad.append(("smoother: a way leaves its ends", float(beyond[:3].max()) * 1e3, "mm", shape))
     if beyond[3:].max() > WANDER_RAD:
-        bad.append(("smoother: a turn leaves its ends", beyond[3:].max() * 1e3, "mrad", shape))
-    if shape == "line":
-        apart = place - place[0]
+        bad.append(
+            ("smoother: a turn leaves its ends", float(beyond[3:].max()) * 1e3, "mrad", shape)
+        )
+    if shape in ("line", "turn"):
+        straight = shape == "line"
+        apart = place - place[0] if straight else log_of(rotation @ rotation[0].T)
         along = apart[np.abs(apart).sum(axis=1).argmax()]
         along = along / max(float(np.linalg.norm(along)), 1e-12)
-        off = norms(apart - (apart @ along)[:, None] * along)
-        if off.max() > WANDER_M:
-            bad.append(("smoother: a straight motion leaves its line", off.max() * 1e3, "mm", shape))
-    if shape == "turn":
-        apart = log_of(rotation @ rotation[0].T)
-        along = apart[np.abs(apart).sum(axis=1).argmax()]
-        along = along / max(float(np.linalg.norm(along)), 1e-12)
-        off = norms(apart - (apart @ along)[:, None] * along)
-        if off.max() > WANDER_RAD:
-            bad.append(("smoother: a turn leaves its axis", off.max() * 1e3, "mrad", shape))
+        off = float(norms(apart - (apart @ along)[:, None] * along).max())
+        if off > (WANDER_M if straight else WANDER_RAD):
+            what = "a straight motion leaves its line" if straight else "a turn leaves its axis"
+            bad.append((f"smoother: {what}", off * 1e3, "mm" if straight else "mrad", shape))
     left = max(
         float(np.abs(place[-1] - wanted[-1]).max()),
         float(norms(log_of((rotation[-1].T @ targets[-1].rotation)[None]))[0, 0]),
