@@ -37,7 +37,7 @@ class Run(NamedTuple):
         seed: of everything random in it.
         label: how the arm was commanded.
         ticks: calls of the commander, or of the smoother.
-        seconds: it took.
+        seconds: of processor time it took.
         violations: what did not hold.
     """
 
@@ -51,14 +51,14 @@ class Run(NamedTuple):
 
 def run(family: str, seed: int, ticks: int = TICKS) -> Run:
     """One run, judged."""
-    begun_s = time.perf_counter()
+    begun_s = time.process_time()
     if family == SMOOTHER:
         label, (done, found) = SMOOTHER, run_smoother(seed, ticks)
     else:
         case = make_case(family, seed)
         trace = Rig(case).run(ticks)
         label, done, found = case.label, len(trace.ticks), Judge(case, trace).judge()
-    return Run(family, seed, label, done, time.perf_counter() - begun_s, found)
+    return Run(family, seed, label, done, time.process_time() - begun_s, found)
 
 
 def command(one: Run, ticks: int) -> str:
