@@ -15,7 +15,7 @@ AGAIN := --reruns 1 -r fEsR
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow fuzz soak test-ros2 test-models check format bench bench-faults bench-ros2 build ros2-bridge clean
+.PHONY: help setup demo test slow fuzz fuzz-motion soak test-ros2 test-models check format bench bench-faults bench-ros2 build ros2-bridge clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -41,6 +41,9 @@ slow: $(READY) ## Run the tests that take long, too, and search for new examples
 
 fuzz: $(READY) ## Feed every reader of foreign bytes with nonsense; SECONDS=600 for longer
 	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(ARGS)
+
+fuzz-motion: $(READY) ## Fuzz command node and guard with a perfect arm; MINUTES=10 for less
+	$(BIN)/python tests/fuzz_motion/fuzz_motion.py --minutes $(MINUTES) $(ARGS)
 
 soak: $(READY) ## Run the whole chain with random faults; MINUTES=3 for a short one
 	$(BIN)/python tests/soak/soak.py --minutes $(MINUTES) $(ARGS)

@@ -1,0 +1,132 @@
+"""What the benchmarks in lockstep share: a perfect arm, and one activated loop."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.control.arm import make_kinematics, make_shadow
+from vla_zenoh.control.impedance import Reference
+from vla_zenoh.control.joint_impedance import JointReference
+from vla_zenoh.control.so3 import log3, quat_from_rotation
+from vla_zenoh.lockstep import Delays, Lockstep
+from vla_zenoh.nodes.sim import build_world
+from vla_zenoh.policy import Policy
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
+
+WARM_UP_S, LOOK_S = 1.2, 0.25
+DAMPING = 1e-6
+
+
+class PerfectArm:
+    """In place of the simulated world: an arm that is where its reference is, without physics.
+
+    Args:
+        profile: of the robot.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        self._kinematics = make_kinematics(profile)
+        names = profile.robot.arm_joints
+        self._joints = self._kinematics.ordered(names, profile.robot.home_rad)
+        self._rates = np.zeros(len(names))
+        self._pose = self._kinematics.forward(self._joints)
+        self._width_m = profile.robot.gripper.max_width_m
+
+    @property
+    def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest position of every arm joint, (n,) each."""
+        return self._kinematics.lower_rad, self._kinematics.upper_rad
+
+    def tick(self, reference: Reference) -> None:
+        """A millisecond: the TCP is there, and the joints follow without their elbow."""
+        pose, jacobian = self._kinematics.pose_and_jacobian(self._joints)
+        turn = log3(reference.rotation @ pose.rotation.T)
+        apart = np.concatenate([reference.position_m - pose.position_m, turn])
+        square = jacobian @ jacobian.T + DAMPING * np.eye(6)
+        step = jacobian.T @ np.linalg.solve(square, apart)
+        self._joints, self._rates = self._joints + step, step * 1e3
+        self._pose = self._pose._replace(
+            position_m=reference.position_m, rotation=reference.rotation
+        )
+
+    def tick_joint(self, reference: JointReference) -> None:
+        """A millisecond: the joints are there."""
+        self._joints, self._rates = reference.position_rad, reference.velocity_rad_s
+        self._pose = self._kinematics.forward(self._joints)
+
+    def joint_state(self) -> JointState:
+        """Measured."""
+        still = np.zeros(len(self._joints))
+        return JointState(
+            self._kinematics.arm_joints, self._joints, self._rates, still, self._joints
+        )
+
+    def tcp(self) -> tuple[FloatArray, FloatArray]:
+        """Measured position (3,) in m, and rotation (3, 3)."""
+        return self._pose.position_m, self._pose.rotation
+
+    def pose_state(self, _: Reference | JointReference) -> PoseState:
+        """Measured, which is what is held."""
+        quat, place = quat_from_rotation(self._pose.rotation), self._pose.position_m
+        return PoseState(place, quat, np.zeros(6), np.zeros(6), place, quat)
+
+    def gripper_state(self) -> GripperState:
+        """As commanded."""
+        return GripperState(self._width_m, moving=False, holding=False)
+
+    def set_gripper(self, width_m: float, _speed_m_s: float, _force_n: float) -> None:
+        """Takes no time."""
+        self._width_m = width_m
+
+
+def activated(
+    profile: Profile, policy: Policy, delays: Delays, rate_hz: float, seed: int, *, perfect: bool
+) -> Lockstep:
+    """A loop whose arm obeys the policy, in a state to be judged from here on.
+
+    Raises:
+        RuntimeError: it could not be activated; says why.
+    """
+    world: Any = PerfectArm(profile) if perfect else build_world(profile)
+    loop = Lockstep(profile, world, policy, delays=delays, reach=make_shadow(profile), seed=seed)
+    loop.put("rate", rate_hz)
+    loop.run(WARM_UP_S)
+    loop.put("active", True)
+    loop.run(0.01)
+    if loop.commander.state.value != "active":
+        raise RuntimeError(f"the arm was not activated: {loop.commander.why}")
+    return loop
+
+
+def in_processes(
+    work: Callable[..., Any], jobs: Iterable[tuple[Any, ...]], many: int | None
+) -> Iterator[Any]:
+    """``work(*job)`` of every job, as they end, so many processes at a time (None: one a core)."""
+    waiting = list(jobs)
+    count = min(many or os.cpu_count() or 1, len(waiting) or 1)
+    if count == 1:
+        yield from (work(*job) for job in waiting)
+        return
+    with multiprocessing.get_context("spawn").Pool(count, initializer=_begin) as pool:
+        yield from pool.imap_unordered(_Call(work), waiting)
+
+
+class _Call:
+    """`work` for a pool, which gives one argument."""
+
+    def __init__(self, work: Callable[..., Any]) -> None:
+        self._work = work
+
+    def __call__(self, job: tuple[Any, ...]) -> Any:
+        return self._work(*job)
+
+
+def _begin() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends us

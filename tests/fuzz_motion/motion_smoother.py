@@ -1,0 +1,187 @@
+"""The smoother by itself: retargeted in motion, with rounding noise on what stands.
+
+Many more states than a whole command node gets into in the same time.
+"""
+
+from __future__ import annotations
+
+import random
+import zlib
+
+import numpy as np
+from motion_case import DOWN, START_M
+from motion_judge import (
+    JERK_RTOL,
+    LIMIT_RTOL,
+    WANDER_M,
+    WANDER_RAD,
+    Array,
+    Violation,
+    ends_of,
+    log_of,
+    norms,
+)
+
+from vla_zenoh.control.smoothing import ROTATION_BOX, Motion, MotionLimits, Smoother
+from vla_zenoh.control.so3 import Pose, exp3
+
+SHIPPED = MotionLimits((0.5, 2.0, 20.0), (1.5, 6.0, 60.0))
+LIMITS = (
+    *(SHIPPED, SHIPPED, SHIPPED),
+    MotionLimits((1.7, 13.0, 6500.0), (2.5, 25.0, 12500.0)),
+    MotionLimits((0.005, 2.0, 20.0), (0.05, 6.0, 60.0)),
+    MotionLimits((0.5, 0.05, 20.0), (1.5, 0.2, 60.0)),
+)
+DT_S = (0.004, 0.004, 0.004, 0.001, 0.02)
+NOISE = (0.0, 1e-17, 1e-16, 1e-15, 1e-14, 1e-13, 1e-12)
+SHAPES = ("axis", "plane", "line", "turn", "any", "any")
+MOST_TICKS = 4000
+REACHED = 1e-6
+TICKS_A_CASE = 300
+"""About so many, which is how long a run of so many ticks is told."""
+
+
+def run_smoother(seed: int, ticks: int) -> tuple[int, list[Violation]]:
+    """So many ticks of cases, and what did not hold in them; `Violation.tick` is the case."""
+    found: dict[str, Violation] = {}
+    done = case = 0
+    while done < ticks:
+        rng = random.Random(zlib.crc32(f"smoother {seed} {case}".encode()))
+        made, bad = _case(rng)
+        done += made
+        for name, size, unit, note in bad:
+            known = found.get(name)
+            count = 1 + (known.count if known else 0)
+            if known is None or size > known.size:
+                found[name] = Violation(name, case, size, unit, count, note)
+            else:
+                found[name] = known._replace(count=count)
+        case += 1
+    return done, list(found.values())
+
+
+def _case(rng: random.Random) -> tuple[int, list[tuple[str, float, str, str]]]:
+    limits, dt_s, noise = rng.choice(LIMITS), rng.choice(DT_S), rng.choice(NOISE)
+    shape = rng.choice(SHAPES)
+    start = Pose(START_M, exp3(_vector(rng)) @ DOWN)
+    box = np.array(
+        [[t] * 3 + [r * ROTATION_BOX] * 3 for t, r in zip(*limits, strict=True)], dtype=np.float64
+    )
+    smoother = Smoother(start, dt_s, limits)
+    failures = smoother.failures
+    # Ways are about as long as the arm needs some tenths of a second for.
+    way_m = min(0.15, 0.4 * limits.translation[0], 0.1 * limits.translation[1])
+    way_rad = min(0.5, 0.4 * limits.rotation[0], 0.1 * limits.rotation[1])
+    direction, about = _unit(rng), _unit(rng)
+    motions: list[Motion] = [smoother.motion]
+    begins: list[int] = []
+    targets: list[Pose] = []
+    turns = rng.randint(2, 7)
+    for turn in range(turns):
+        ways, turned = np.zeros(3), np.zeros(3)
+        size_m, size_rad = rng.uniform(-1, 1) * way_m, rng.uniform(-1, 1) * way_rad
+        if shape == "axis":
+            ways[rng.randrange(3)] = size_m
+        elif shape == "plane":
+            ways[:2] = [size_m, rng.uniform(-1, 1) * way_m]
+            if rng.random() < 0.5:
+                turned[:2] = [size_rad, rng.uniform(-1, 1) * way_rad]
+        elif shape == "line":
+            ways = size_m * direction
+        elif shape == "turn":
+            turned = size_rad * about
+        else:
+            ways, turned = _vector(rng) * way_m, _vector(rng) * way_rad
+        shaken = noise * _vector(rng)
+        target = Pose(start.position_m + ways + shaken, exp3(turned + shaken) @ start.rotation)
+        begins.append(len(motions))
+        targets.append(target)
+        smoother.target(target)
+        last = turn == turns - 1
+        for _ in range(MOST_TICKS if last else rng.choice([1, 3, 10, 30, 60])):
+            motions.append(smoother.tick())
+            if last and smoother.at_rest:
+                break
+    return len(motions), _judged(motions, begins, targets, box, dt_s, shape, smoother, failures)
+
+
+def _judged(
+    motions: list[Motion],
+    begins: list[int],
+    targets: list[Pose],
+    box: Array,
+    dt_s: float,
+    shape: str,
+    smoother: Smoother,
+    failures: int,
+) -> list[tuple[str, float, str, str]]:
+    bad: list[tuple[str, float, str, str]] = []
+    if smoother.failures > failures:
+        bad.append(("smoother finds no trajectory", 1.0, "", shape))
+    place = np.array([m.pose.position_m for m in motions])
+    rotation = np.array([m.pose.rotation for m in motions])
+    twist = np.array([m.twist for m in motions])
+    change = np.array([m.acceleration for m in motions])
+    if not np.isfinite(place).all() or not np.isfinite(rotation).all():
+        return [*bad, ("smoother gives NaN", 1.0, "", shape)]
+    whole = box.copy()
+    whole[:, 3:] /= ROTATION_BOX
+    jerk = np.diff(change, axis=0) / dt_s
+    for name, values, limit, rtol in (
+        ("velocity", twist, whole[0], LIMIT_RTOL),
+        ("acceleration", change, whole[1], LIMIT_RTOL),
+        ("jerk", jerk, whole[2], JERK_RTOL),
+    ):
+        share = max(
+            float((np.abs(values[:, :3]) / limit[:3]).max()),
+            float((norms(values[:, 3:])[:, 0] / limit[3]).max()),
+        )
+        if share > 1 + rtol:
+            bad.append((f"smoother {name}", share, "x limit", shape))
+    # Each way from its target on: in the axes of the rotation it began at.
+    at = np.array(begins) - 1
+    body = rotation[at].transpose(0, 2, 1)
+    v, a = (
+        np.hstack([part[at, :3], np.einsum("nij,nj->ni", body, part[at, 3:])])
+        for part in (twist, change)
+    )
+    wanted = np.array([target.position_m for target in targets])
+    turned = log_of(np.einsum("nij,njk->nik", body, np.array([t.rotation for t in targets])))
+    low, high = ends_of(v, a, np.hstack([wanted - place[at], turned]), box)
+    beyond = np.zeros(6)
+    for n, begin in enumerate(begins):
+        end = begins[n + 1] if n + 1 < len(begins) else len(motions)
+        moved = np.hstack([place[begin:end] - place[at[n]], log_of(body[n] @ rotation[begin:end])])
+        over = np.maximum(low[n] - moved, moved - high[n]).max(axis=0)
+        beyond = np.maximum(beyond, over)
+    if beyond[:3].max() > WANDER_M:
+        bad.append(("smoother: a way leaves its ends", float(beyond[:3].max()) * 1e3, "mm", shape))
+    if beyond[3:].max() > WANDER_RAD:
+        bad.append(
+            ("smoother: a turn leaves its ends", float(beyond[3:].max()) * 1e3, "mrad", shape)
+        )
+    if shape in ("line", "turn"):
+        straight = shape == "line"
+        apart = place - place[0] if straight else log_of(rotation @ rotation[0].T)
+        along = apart[np.abs(apart).sum(axis=1).argmax()]
+        along = along / max(float(np.linalg.norm(along)), 1e-12)
+        off = float(norms(apart - (apart @ along)[:, None] * along).max())
+        if off > (WANDER_M if straight else WANDER_RAD):
+            what = "a straight motion leaves its line" if straight else "a turn leaves its axis"
+            bad.append((f"smoother: {what}", off * 1e3, "mm" if straight else "mrad", shape))
+    left = max(
+        float(np.abs(place[-1] - wanted[-1]).max()),
+        float(norms(log_of((rotation[-1].T @ targets[-1].rotation)[None]))[0, 0]),
+    )
+    if left > REACHED:
+        bad.append(("smoother does not arrive", left, "m or rad", shape))
+    return bad
+
+
+def _vector(rng: random.Random) -> Array:
+    return np.array([rng.uniform(-1.0, 1.0) for _ in range(3)])
+
+
+def _unit(rng: random.Random) -> Array:
+    way = np.array([rng.gauss(0.0, 1.0) for _ in range(3)])
+    return way / np.linalg.norm(way)

@@ -1,0 +1,24 @@
+"""Whatever policies, people and networks do, commands and references keep what is promised.
+
+The same runs, for longer and of other seeds: ``make fuzz-motion``.
+"""
+
+from __future__ import annotations
+
+import pytest
+from fuzz_motion import CYCLE, command, run, told
+
+TICKS, JOINT_TICKS = 10_000, 5_000
+"""Kinematics take their time."""
+SLOW = ("joint", "joint net", "reach")
+SEEDS = {family: range(101, 101 + 2 * CYCLE.count(family)) for family in dict.fromkeys(CYCLE)}
+
+
+@pytest.mark.parametrize(
+    ("family", "seed"), [(family, seed) for family, seeds in SEEDS.items() for seed in seeds]
+)
+def test_nothing_that_happens_breaks_a_promise(family: str, seed: int) -> None:
+    ticks = JOINT_TICKS if family in SLOW else TICKS
+    one = run(family, seed, ticks)
+    found = "\n".join(told(one, each) for each in one.violations)
+    assert not found, f"{one.label}\n{found}\n{command(one, ticks)}"
