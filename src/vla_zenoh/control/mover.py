@@ -16,7 +16,7 @@ from vla_zenoh.control.ports import Outputs
 from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.slowdown import APPROACH, Slowdown
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother, motion_limits
-from vla_zenoh.control.so3 import Pose, held_pose, log3, pose_of, quat_from_rotation
+from vla_zenoh.control.so3 import Pose, distance, exp3, held_pose, log3, pose_of, quat_from_rotation
 from vla_zenoh.control.states import OBEYING, State
 from vla_zenoh.control.step_timing import StepTiming
 from vla_zenoh.errors import ProfileError
@@ -36,6 +36,8 @@ LINGER_NS = 500_000_000
 """The stream goes on for this long after the arm stands, so that its last pose is not lost."""
 SAME_WIDTH_M = 0.005
 """A gripper this near to the width last sent has reached it."""
+HELD_M, HELD_RAD = 0.002, 0.01
+"""A robot that holds a pose this near to what is streamed to it obeys: no stream begins."""
 LEAST_OVERRIDE = 0.01
 """A speed override below this is none: the arm stands."""
 ROUNDING_M = 1e-4
@@ -122,7 +124,7 @@ class Mover:
         if self._smoother is None:
             self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits))
             self._timing = StepTiming(self._smoother.box)
-        elif standing:
+        elif standing and not self._held(self._smoother.motion.pose, start):
             # Also at rest: a robot that braked by itself stands elsewhere than we command.
             self._smoother.reset(start)
         if self._joints is not None and joint is not None and standing:
@@ -140,6 +142,11 @@ class Mover:
         else:
             self.timeline.restart(goal, now_ns)
         self.goal = None if blocked else goal
+
+    def _held(self, commanded: Pose, held: Pose) -> bool:
+        """The robot still holds what is streamed to it: a step in the stream would be one of it."""
+        apart_m, apart_rad = distance(commanded, held)
+        return self.streaming and apart_m <= HELD_M and apart_rad <= HELD_RAD
 
     def _box_around(self, pose: Pose) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corner (3,) m of the workspace, and of where the arm begins outside."""
@@ -239,7 +246,8 @@ class Mover:
             self._stand(smoother)
             return timeline.plan.cause
         slowed = self._slowing and _within(smoother, self._override)
-        pose, hits = leash(self._limits, goal.pose, smoother.motion.pose)
+        # Of where the arm will be with this tick: it may be on its way from there.
+        pose, hits = leash(self._limits, goal.pose, _ahead(smoother.motion, self._dt_s))
         if goal is not self.goal or hits or slowed:
             if hits:
                 cut = self._shorten(plans, goal, pose, now_ns)
@@ -355,10 +363,17 @@ class Mover:
         )
 
 
+def _ahead(motion: Motion, dt_s: float) -> Pose:
+    """Where a motion will be in a moment."""
+    (position_m, rotation), twist, acceleration = motion
+    way = dt_s * (twist + 0.5 * dt_s * acceleration)
+    return Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
+
+
 def _within(smoother: Smoother, override: float) -> bool:
-    """Whether the arm moves as slowly as it would at this override."""
-    motion, box = smoother.motion, smoother.box * (1 + 1e-6)
+    """Whether the arm moves as slowly as it would at this override, and will go on so."""
+    most = smoother.box * override ** np.array([[1.0], [2.0], [3.0]])
+    speed, change = np.abs(smoother.motion.twist), np.abs(smoother.motion.acceleration)
     return bool(
-        (np.abs(motion.twist) <= override * box[0]).all()
-        and (np.abs(motion.acceleration) <= override**2 * box[1]).all()
+        (change <= most[1]).all() and (speed + change**2 / (2 * most[2]) <= most[0] * 1.001).all()
     )

@@ -7,8 +7,9 @@ starts at zero, stays small, never wraps at pi, and velocity and acceleration ca
 
 A motion that already goes along the straight way to its target, or stands, is planned as one
 degree of freedom along that way: it stays on the line whatever the limits become. The same holds
-for its translation or its rotation alone. What is left has a degree of freedom for each axis; all
-of them are synchronised in time.
+for its translation or its rotation alone, where what moves beside the way is little: that has
+degrees of freedom of its own. Any other motion has one for each axis. Those along the way, or of
+all axes, are synchronised in time.
 
 Ruckig solves for profiles of a given duration by root finding with a precision of 1e-8. An axis
 that stands at its target but carries rounding noise (a velocity of 1e-16) while another axis takes
@@ -36,12 +37,12 @@ from ruckig import (
     Trajectory,
 )
 
-from vla_zenoh.control.so3 import Pose, body_rates, exp3, log3, orthonormal
+from vla_zenoh.control.so3 import Pose, body_rates, exp3, log3, norm3, orthonormal
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
 AXES = 6
-ALL, TRANSLATION, ROTATION = slice(0, 6), slice(0, 3), slice(3, 6)
+TRANSLATION, ROTATION = slice(0, 3), slice(3, 6)
 REST_VELOCITY = 1e-6
 """m/s and rad/s: slower counts as standing."""
 REST_OFFSET = 1e-6
@@ -52,6 +53,10 @@ QUIET = (1e-8, 1e-8, 1e-6)
 of Ruckig's solver; such an acceleration changes a velocity by less than that within a tick."""
 ASTRAY = 1e-6
 """m and rad: a plan may leave the range between start, target and stop by this much: rounding."""
+
+BESIDE = 0.01
+"""Part of the limits that motion beside the way may have: a goal is a float32, and 30 nm aside."""
+TINY, MOST = 1e-12, 1e9
 
 ROTATION_BOX = 0.55
 """Share of a rotation limit given to each axis, so that the norm over three axes (sqrt 3 of it) and
@@ -217,45 +222,66 @@ class Smoother:
         """The plan of a motion by `way` (6,): together where no coordinate goes astray."""
         if not np.isfinite(way).all():
             return None
-        basis = self._basis(way)
-        ask = self._ask(basis, limits)
+        basis, parts = self._coordinates(way, limits)
+        ask = self._ask(basis, limits, parts)
         ask.target_position = (basis.T @ way).tolist()
         for synchronization in (Synchronization.Time, Synchronization.No):
-            ask.synchronization = synchronization
+            # What is beside the way ends as soon as it can, whatever the others do.
+            ask.per_dof_synchronization = [
+                Synchronization.No if part == BESIDE else synchronization for part in parts
+            ]
             path = self._calculated(ask)
             if path is not None and (
                 synchronization is Synchronization.No
-                or len(basis.T) == 1
+                or len(parts) == 1
                 or not self._goes_astray(path, ask)
             ):
                 return _Plan(self._state.position, basis, path)
         return None
 
-    def _basis(self, way: FloatArray) -> FloatArray:
-        """(6, k) the fewest directions that a motion by `way` needs.
+    def _coordinates(self, way: FloatArray, limits: FloatArray) -> tuple[FloatArray, list[float]]:
+        """(6, k) the fewest directions that a motion by `way` needs, and of the limits their parts.
 
-        One, where it goes along its way already; else one for translation or rotation, whichever
-        does so, and the axes for the other.
+        One, where all goes along the way already. Else those of translation and rotation: the way,
+        and what is left beside it where that is little; or the axes.
         """
-        for groups in ((ALL,), (TRANSLATION, ROTATION)):
-            columns = [self._directions(way, axes) for axes in groups]
-            if len(groups) > 1 or len(columns[0].T) <= 1:
-                break
-        basis = np.concatenate(columns, axis=1)
-        return basis if basis.size else np.eye(AXES)[:, :1]
+        velocity, acceleration = self._state[1:]
+        whole = way / max(math.sqrt(float(way @ way)), TINY)
+        if all(
+            (np.abs(value - float(whole @ value) * whole) <= quiet).all()
+            for value, quiet in ((velocity, QUIET[1]), (acceleration, QUIET[2]))
+        ):
+            return whole[:, None], [1.0]
+        columns: list[FloatArray] = []
+        parts: list[float] = []
+        for axes in (TRANSLATION, ROTATION):
+            found, shares = self._directions(way[axes], limits[:, axes], axes)
+            columns.append(np.zeros((AXES, len(shares))))
+            columns[-1][axes] = found
+            parts += shares
+        return np.concatenate(columns, axis=1), parts
 
-    def _directions(self, way: FloatArray, axes: slice) -> FloatArray:
-        """(6, k) the same for these axes alone: none, one or all of them."""
-        _, velocity, acceleration = self._state
-        part = np.zeros(AXES)
-        part[axes] = way[axes]
-        length = math.sqrt(float(part @ part))
-        direction = part / length if length else part
-        for value, quiet in ((velocity, QUIET[1]), (acceleration, QUIET[2])):
-            beside = value - float(direction @ value) * direction
-            if (np.abs(beside[axes]) > quiet).any():
-                return np.eye(AXES)[:, axes]
-        return direction[:, None] if length else np.zeros((AXES, 0))
+    def _directions(
+        self, way: FloatArray, limits: FloatArray, axes: slice
+    ) -> tuple[FloatArray, list[float]]:
+        """The same of three axes: (3, k), with `way` (3,) and `limits` (3, 3) of those."""
+        motion = np.array([self._state.velocity[axes], self._state.acceleration[axes]])
+        length = norm3(way)
+        if length == 0.0:
+            return (np.eye(3), [1.0] * 3) if motion.any() else (np.zeros((3, 0)), [])
+        along = way / length
+        beside = motion - np.outer(motion @ along, along)
+        if (np.abs(beside) <= np.array(QUIET[1:])[:, None]).all():
+            return along[:, None], [1.0]
+        least = np.eye(3)[int(np.argmin(np.abs(along)))]
+        across = np.cross(along, least)
+        across /= norm3(across)
+        others = np.stack([across, np.cross(along, across)])
+        with np.errstate(divide="ignore"):
+            most = BESIDE * (limits[:2, None, :] / np.abs(others)).min(axis=2)
+        if (np.abs(beside @ others.T) <= most).all():
+            return np.stack([along, *others], axis=1), [1.0 - 2 * BESIDE, BESIDE, BESIDE]
+        return np.eye(3), [1.0] * 3
 
     def _goes_astray(self, path: Trajectory, ask: InputParameter) -> bool:
         """Whether a coordinate leaves the range between its start, target and where it can stop."""
@@ -265,9 +291,11 @@ class Smoother:
         if (low >= least).all() and (high <= most).all():
             return False
         ask.control_interface = ControlInterface.Velocity
+        together, ask.per_dof_synchronization = ask.per_dof_synchronization, None
         ask.synchronization = Synchronization.No
         stop = self._calculated(ask)
         ask.control_interface = ControlInterface.Position
+        ask.per_dof_synchronization = together
         if stop is None:
             return True
         stop_low, stop_high = _extrema(stop)
@@ -278,7 +306,7 @@ class Smoother:
 
     def _stop(self, limits: FloatArray, *, together: bool) -> _Plan | None:
         basis = np.eye(AXES)
-        ask = self._ask(basis, limits)
+        ask = self._ask(basis, limits, [1.0] * AXES)
         ask.control_interface = ControlInterface.Velocity
         for synchronization in [Synchronization.Phase] * together + [Synchronization.No]:
             ask.synchronization = synchronization
@@ -287,16 +315,16 @@ class Smoother:
                 return _Plan(self._state.position, basis, path)
         return None
 
-    def _ask(self, basis: FloatArray, limits: FloatArray) -> InputParameter:
-        """What Ruckig is asked, along the columns of `basis` (6, k), each within all limits."""
+    def _ask(self, basis: FloatArray, limits: FloatArray, parts: list[float]) -> InputParameter:
+        """What Ruckig is asked along the columns of `basis` (6, k), each by its part of limits."""
         _, velocity, acceleration = self._state
         with np.errstate(divide="ignore"):
-            along = (limits[:, :, None] / np.abs(basis)).min(axis=1)
-        ask = InputParameter(len(basis.T))
-        ask.current_position = [0.0] * len(basis.T)
+            along = (limits[:, :, None] / np.abs(basis)).min(axis=1) * np.array(parts)
+        ask = InputParameter(len(parts))
+        ask.current_position = [0.0] * len(parts)
         ask.current_velocity = (velocity @ basis).tolist()
         ask.current_acceleration = (acceleration @ basis).tolist()
-        ask.max_velocity, ask.max_acceleration, ask.max_jerk = along.tolist()
+        ask.max_velocity, ask.max_acceleration, ask.max_jerk = np.minimum(along, MOST).tolist()
         return ask
 
     def _calculated(self, ask: InputParameter) -> Trajectory | None:
