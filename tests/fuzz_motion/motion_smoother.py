@@ -137,6 +137,8 @@ class _Way(NamedTuple):
     def judged(self, failures: int) -> list[Found]:
         """What did not hold: name, size, unit, shape."""
         motions, begins, targets, parts, box, dt_s, shape = self
+        if any(min(part) < 1.0 for part in parts):
+            shape += ", with parts of the limits"
         bad: list[Found] = []
         if failures:
             bad.append(("smoother finds no trajectory", 1.0, "", shape))
@@ -191,14 +193,15 @@ class _Way(NamedTuple):
         ):
             if over > limit:
                 bad.append((f"smoother: a {name} leaves its ends", over * 1e3, unit, shape))
-        if shape in ("line", "turn"):
-            straight = shape == "line"
+        if self.shape in ("line", "turn"):
+            straight = self.shape == "line"
             apart = place - place[0] if straight else log_of(rotation @ rotation[0].T)
             along = apart[np.abs(apart).sum(axis=1).argmax()]
             along = along / max(float(np.linalg.norm(along)), 1e-12)
             off = float(norms(apart - (apart @ along)[:, None] * along).max())
             if off > (WANDER_M if straight else WANDER_RAD):
                 what = "a straight motion leaves its line" if straight else "a turn leaves its axis"
+                what += " as its limits shrink" if shape != self.shape else ""
                 bad.append((f"smoother: {what}", off * 1e3, "mm" if straight else "mrad", shape))
         left = max(
             float(np.abs(place[-1] - wanted[-1]).max()),
