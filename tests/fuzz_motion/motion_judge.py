@@ -120,7 +120,8 @@ class Judge:
             self._differences(name, values, *change, limit, size, JERK_RTOL)
         self._stops(self._stop_s(twist, acceleration), norms(twist)[:, 0], REST)
         if HAS_SPEED:
-            self._slower(twist, self._stop_s(twist, acceleration))
+            everywhere = np.ones(len(twist), bool)
+            self._slower(self._over_speed(twist), everywhere, self._stop_s(twist, acceleration))
         self._box("command outside the box", self._position_m)
         self._wandering(twist, acceleration)
         self._ways(twist, acceleration)
@@ -143,7 +144,12 @@ class Judge:
         needed_s = np.abs(velocity) / most.acceleration_rad_s2
         needed_s += most.acceleration_rad_s2 / most.jerk_rad_s3
         needed_s = JOINT_LONGER * needed_s.max(axis=1) + JOINT_STOP_S + fade_s
-        self._stops(needed_s, np.abs(velocity).max(axis=1), JOINT_REST)
+        speed = np.abs(velocity).max(axis=1)
+        self._stops(needed_s, speed, JOINT_REST)
+        if HAS_SPEED:  # what the joints' own limits allow at another speed is not said
+            stands = np.array([t.percent == 0.0 for t in self._told])
+            moves = np.where(stands, np.maximum(speed - JOINT_REST, 0.0), 0.0)
+            self._slower(moves, stands, needed_s)
 
     def _differences(
         self,
@@ -263,22 +269,26 @@ class Judge:
             sizes[at:end] = np.where(moving, speed[at:end], 0.0)
         self._tell("still moves after a stop", sizes, 0.0, "m/s or rad/s")
 
-    def _slower(self, twist: Array, needed_s: Array) -> None:
-        """Where a speed was asked for, no more of the limits is used, and none of them at 0 %."""
-        percent = np.array([t.percent for t in self._told]) / 100.0
+    def _slower(self, over: Array, applies: Any, needed_s: Array) -> None:
+        """Nothing is `over` what a speed allows, as soon as a stop would have been done."""
+        percent = np.array([t.percent for t in self._told])
+        set_at = np.append(0, np.flatnonzero(np.diff(percent) != 0) + 1)
+        sizes = np.zeros(len(over))
+        for at, end in zip(set_at, [*set_at[1:], len(over)], strict=True):
+            due_s = self._time_s[at] + needed_s[max(at - 1, 0)] + SLOWER_S
+            late = (self._time_s[at:end] > due_s) & applies[at:end]
+            sizes[at:end] = np.where(late, over[at:end], 0.0)
+        self._tell("faster than the speed that was set", sizes, 1e-5, "over")
+
+    def _over_speed(self, twist: Array) -> Array:
+        """(n,) share of the speed limits beyond what the speed in force allows."""
         most = motion_limits(self._limits)
         share = np.maximum(
             np.abs(twist[:, :3]).max(axis=1) / most.translation[0],
             norms(twist[:, 3:])[:, 0] / most.rotation[0],
         )
-        set_at = np.append(0, np.flatnonzero(np.diff(percent) != 0) + 1)
-        sizes = np.zeros(len(share))
-        for at, end in zip(set_at, [*set_at[1:], len(share)], strict=True):
-            due_s = self._time_s[at] + needed_s[max(at - 1, 0)] + SLOWER_S
-            late = self._time_s[at:end] > due_s
-            over = share[at:end] - percent[at:end] * (1 + JERK_RTOL)
-            sizes[at:end] = np.where(late, over, 0.0)
-        self._tell("faster than the speed that was set", sizes, 1e-5, "share of limit")
+        percent = np.array([t.percent for t in self._told])
+        return share - percent / 100.0 * (1 + JERK_RTOL)
 
     # -- paths --------------------------------------------------------------------------------
     def _goal_arrays(self) -> tuple[Array, Array]:

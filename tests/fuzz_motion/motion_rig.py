@@ -66,7 +66,7 @@ class Tick(NamedTuple):
         anchored: the arm was activated in it.
         record: the command, None: nothing was streamed.
         goal: the goal in force, None: none is.
-        percent: speed that was asked for.
+        percent: of the speed, in force.
     """
 
     time_ns: int
@@ -151,7 +151,6 @@ class Rig:
         self._person_at = 2
         self._offered = False
         self._share = -math.expm1(-1.0 / (case.guard_hz * case.lag_s)) if case.lag_s else 1.0
-        self._percent = 100.0
         self._rate_hz = 5.0
         self._age_s = self._rng.uniform(0.02, 0.3)
         self._names = [n for n in HAPPENINGS if n != "speed" or HAS_SPEED]
@@ -202,7 +201,7 @@ class Rig:
                 before not in OBEYING and state in OBEYING,
                 record,
                 goal.pose if goal is not None else None,
-                self._percent,
+                float(getattr(self.commander.task, "speed_percent", 100.0)),
             )
         )
         if record is not None:
@@ -424,6 +423,5 @@ class Rig:
         elif what == "fault":
             self._sore_until = at + round(rng.uniform(0.01, 0.5) * second)
         elif what == "speed":
-            self._percent = rng.choice([0.0, 1.0, 10.0, 50.0, 100.0, 100.0])
-            settings.append(Setting("speed", self._percent))
+            settings.append(Setting("speed", rng.choice([0.0, 1.0, 10.0, 50.0, 100.0, 100.0])))
         return 1
