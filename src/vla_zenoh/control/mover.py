@@ -40,8 +40,6 @@ HELD_M, HELD_RAD = 0.002, 0.01
 """A robot that holds a pose this near to what is streamed to it obeys: no stream begins."""
 LEAST_OVERRIDE = 0.01
 """A speed override below this is none: the arm stands."""
-ROUNDING_M = 1e-4
-"""A command is put back into the workspace where it is outside by less."""
 
 
 class Mover:
@@ -136,7 +134,6 @@ class Mover:
         goal = Goal(actual if blocked else self._smoother.resting_pose(), width_m)
         assert self._timing is not None
         self._timing.restart()
-        self._box_m = self._box_around(start)
         if self.timeline is None:
             self.timeline = GoalTimeline(goal, now_ns)
         else:
@@ -147,12 +144,6 @@ class Mover:
         """The robot still holds what is streamed to it: a step in the stream would be one of it."""
         apart_m, apart_rad = distance(commanded, held)
         return self.streaming and apart_m <= HELD_M and apart_rad <= HELD_RAD
-
-    def _box_around(self, pose: Pose) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner (3,) m of the workspace, and of where the arm begins outside."""
-        box = self._limits.workspace
-        low, high = np.array([box.x_m, box.y_m, box.z_m]).T
-        return np.minimum(low, pose.position_m), np.maximum(high, pose.position_m)
 
     def _held_joints(self, joint: JointState) -> FloatArray:
         """Joints the robot's controller holds, or where they are."""
@@ -194,7 +185,9 @@ class Mover:
         self._cause = None
         self._take_override(task.speed_percent / 100.0, self.timeline, now_ns)
         if state is State.ACTIVE:
-            self._cause = self._follow(self._smoother, self.timeline, task, overdue_ns, now_ns, out)
+            self._cause = self._follow(
+                self._smoother, self.timeline, task, overdue_ns, now_ns, ticks, out
+            )
         else:
             self._brake(self._smoother, self.timeline, now_ns)
         went_on, self.streaming = self.streaming, self._must_stream(state, now_ns)
@@ -237,6 +230,7 @@ class Mover:
         task: Task,
         overdue_ns: int,
         now_ns: int,
+        ticks: int,
         out: Outputs,
     ) -> Cause | None:
         plans = self._aggregator.plans(timeline, now_ns)
@@ -247,7 +241,7 @@ class Mover:
             return timeline.plan.cause
         slowed = self._slowing and _within(smoother, self._override)
         # Of where the arm will be with this tick: it may be on its way from there.
-        pose, hits = leash(self._limits, goal.pose, _ahead(smoother.motion, self._dt_s))
+        pose, hits = leash(self._limits, goal.pose, _ahead(smoother.motion, ticks * self._dt_s))
         if goal is not self.goal or hits or slowed:
             if hits:
                 cut = self._shorten(plans, goal, pose, now_ns)
@@ -348,11 +342,8 @@ class Mover:
 
     def _pose_command(self, motion: Motion, state: State) -> PoseCommand:
         goal = self.goal.pose if self.goal else motion.pose
-        inside_m = np.clip(motion.pose.position_m, *self._box_m)
-        if float(np.abs(inside_m - motion.pose.position_m).max()) > ROUNDING_M:
-            inside_m = motion.pose.position_m  # to put it back would be a jump
         return PoseCommand(
-            inside_m,
+            motion.pose.position_m,
             quat_from_rotation(motion.pose.rotation),
             motion.twist,
             motion.acceleration,

@@ -278,8 +278,12 @@ class Smoother:
         across /= norm3(across)
         others = np.stack([across, np.cross(along, across)])
         with np.errstate(divide="ignore"):
-            most = BESIDE * (limits[:2, None, :] / np.abs(others)).min(axis=2)
-        if (np.abs(beside @ others.T) <= most).all():
+            most = BESIDE * (limits[:, None, :] / np.abs(others)).min(axis=2)
+        # It may be this fast once its acceleration has ended, and goes this far until it stops.
+        fast, change = np.abs(beside @ others.T)
+        fast = fast + change**2 / (2 * most[2])
+        goes = fast * np.sqrt(fast / most[2]) + fast**2 / most[1]
+        if (goes < ASTRAY).all() and (fast < most[0]).all() and (change < most[1]).all():
             return np.stack([along, *others], axis=1), [1.0 - 2 * BESIDE, BESIDE, BESIDE]
         return np.eye(3), [1.0] * 3
 
@@ -320,10 +324,15 @@ class Smoother:
         _, velocity, acceleration = self._state
         with np.errstate(divide="ignore"):
             along = (limits[:, :, None] / np.abs(basis)).min(axis=1) * np.array(parts)
+        velocity, acceleration = velocity @ basis, acceleration @ basis
+        # Slowing down, and slow enough once that ends: to slow down harder would turn round.
+        speed = np.abs(velocity)
+        slows = velocity * acceleration < 0
+        after = speed - acceleration**2 / (2 * along[2])
+        along[0] = np.where(slows & (after <= along[0]), np.maximum(speed, along[0]), along[0])
         ask = InputParameter(len(parts))
         ask.current_position = [0.0] * len(parts)
-        ask.current_velocity = (velocity @ basis).tolist()
-        ask.current_acceleration = (acceleration @ basis).tolist()
+        ask.current_velocity, ask.current_acceleration = velocity.tolist(), acceleration.tolist()
         ask.max_velocity, ask.max_acceleration, ask.max_jerk = np.minimum(along, MOST).tolist()
         return ask
 
