@@ -87,6 +87,11 @@ def norm3(vector: FloatArray) -> float:
     return math.hypot(*vector.tolist())
 
 
+def cross3(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross product of vectors (3,); `numpy.cross` costs ten times as much."""
+    return pin.skew(a) @ b
+
+
 def angle_between(a: FloatArray, b: FloatArray) -> float:
     """Geodesic distance of two rotation matrices in rad."""
     return norm3(log3(b @ a.T))
@@ -168,3 +173,37 @@ def body_rates(
         + c * (pin.skew(rate) @ r_rate)
     )
     return velocity, acceleration
+
+
+def spatial_rates(
+    rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Angular velocity and acceleration of ``exp3(r(t)) R0`` in the fixed axes: see `body_rates`.
+
+    With ``Jl(r) = Jr(-r)`` they are those that `body_rates` finds for -r, turned round.
+    """
+    velocity, acceleration = body_rates(-rotvec, -rate, -rate_change)
+    return -velocity, -acceleration
+
+
+def rates_of(
+    rotvec: FloatArray, velocity: FloatArray, acceleration: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The inverse of `spatial_rates`: r' and r'' of velocity and acceleration in the fixed axes.
+
+    With ``Jl^-1(r) = I - [r]/2 + D [r]^2``, ``D = 1/t^2 - (1 + cos t)/(2 t sin t)``, ``t = |r|``,
+    which is below pi.
+
+    Source: Sola, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 146.
+    """
+    squared = float(rotvec @ rotvec)
+    angle = math.sqrt(squared)
+    if angle < 1e-2:
+        d = 1 / 12 + squared / 720
+    else:
+        d = 1 / squared - (1 + math.cos(angle)) / (2 * angle * math.sin(angle))
+    skew = pin.skew(rotvec)
+    inverse = np.eye(3) - 0.5 * skew + d * (skew @ skew)
+    rate = inverse @ velocity
+    _, of_rate = spatial_rates(rotvec, rate, np.zeros(3))
+    return rate, inverse @ (acceleration - of_rate)
