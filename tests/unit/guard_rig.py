@@ -42,7 +42,7 @@ class Link:
         holdup_s: most of what the link is held up for; then all that waited arrives in a heap.
         holdups: how often, of every command.
         twice: share that arrives twice.
-        late: share of the ticks of the guard that are late, by up to `late_s`.
+        late: how often a second the guard is late, by up to `late_s`.
         late_s: see there.
         dies: how often, of every command, the writer is gone without a stop.
     """
@@ -68,7 +68,7 @@ def ill(rng: random.Random) -> Link:
         holdup_s=rng.choice([0.0, 0.05, 0.25]),
         holdups=rng.choice([0.002, 0.01]),
         twice=rng.choice([0.0, 0.1]),
-        late=rng.choice([0.0, 0.01]),
+        late=rng.choice([0.0, 1.0]),
         late_s=rng.choice([0.01, 0.09]),
         dies=rng.choice([0.0, 0.002]),
     )
@@ -182,7 +182,7 @@ def drive(
     tick_s: float,
     duration_s: float,
     profile: Profile = PROFILE,
-    each: Callable[[Any], None] = lambda _: None,
+    each: Callable[[Any, Any], None] = lambda *_: None,
 ) -> Trace:
     """Lead a guard over a link for so long, begin, stop, begin again and fall silent."""
     rng = random.Random(seed)
@@ -233,15 +233,15 @@ def drive(
                         arrives = now_ns + round(rng.uniform(0, link.delay_s) * 1e9)
                         arrives = max(arrives, held_until_ns)
                         arrivals.append((arrives, Stamped(header, record, arrives)))
-        if link.late and rng.random() < link.late:
+        if link.late and rng.random() < link.late * tick_s:
             late_until_ns = now_ns + round(rng.uniform(0, link.late_s) * 1e9)
         if now_ns < late_until_ns:
             continue
         arrivals.sort(key=lambda arrival: arrival[0])
         while arrivals and arrivals[0][0] <= now_ns:
             refused += guard.offer(arrivals.pop(0)[1], now_ns) is not None
-        each(guard)
         motions.append(guard.tick(now_ns))
+        each(guard, record if writer is not None else None)
     return _trace(motions, tick_s, guard.silences, refused)
 
 

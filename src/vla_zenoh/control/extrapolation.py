@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Generic
 
 import numpy as np
@@ -11,6 +12,8 @@ from vla_zenoh.types import FloatArray
 
 BELIEVED_S = 0.02
 """For how long a command's acceleration is believed; its velocity is until the stream times out."""
+FADING_S = 0.08
+"""For so long it then fades, where there is room for it: what is made believe has to be undone."""
 
 
 class Extrapolation(Generic[Told]):
@@ -38,34 +41,43 @@ class Extrapolation(Generic[Told]):
         if before is not None and 0.0 < gap_s <= BELIEVED_S:
             was = space.apart(before, self._base).change
             # Who accelerates as much as it may will not do so more and more.
-            later = acceleration_limit * space.bounded((2 * change - was) / acceleration_limit)
-            jerk = jerk_limit * space.bounded((later - change) / (gap_s * jerk_limit))
+            later = _cut(space, 2 * change - was, acceleration_limit)
+            jerk = _cut(space, (later - change) / gap_s, jerk_limit)
         else:
             gap_s = 0.0
         self._jerk, self._gap_s = jerk, gap_s
         self._first = Way(np.zeros(len(rate)), rate, change)
-        self._then = _on(self._first, jerk, gap_s)
-        _, rate, change = self._then
-        fading_s = np.abs(change) / jerk_limit
-        speed = np.abs(rate)
-        room = np.where(rate * change < 0, speed, velocity_limit - speed)
-        room -= 0.5 * np.abs(change) * fading_s
-        steady_s = np.clip(room / np.maximum(np.abs(change), 1e-9), 0.0, BELIEVED_S - gap_s)
-        self._steady_s = np.where(jerk * change < 0, 0.0, steady_s)
-        self._fading_s, self._fade = fading_s, -np.sign(change) * jerk_limit
+        self._limits = velocity_limit, jerk_limit
+
+    @cached_property
+    def _later(self) -> tuple[Way, FloatArray, FloatArray, FloatArray]:
+        """What comes when the next command does not: from where, how long steady, fading, how."""
+        velocity_limit, jerk_limit = self._limits
+        then = _on(self._first, self._jerk, self._gap_s)
+        change, speed = np.maximum(np.abs(then.change), 1e-9), np.abs(then.rate)
+        turning = then.rate * then.change < 0
+        # Twice the time for which the acceleration may last before the motion is too fast or turns.
+        room_s = 2 * np.where(turning, speed, velocity_limit - speed) / change
+        fading_s = np.maximum(np.minimum(room_s, FADING_S), change / jerk_limit)
+        steady_s = np.clip((room_s - fading_s) / 2, 0.0, BELIEVED_S - self._gap_s)
+        steady_s[self._jerk * then.change < 0] = 0.0
+        return then, steady_s, fading_s, -then.change / fading_s
 
     def at(self, ahead_s: float) -> Told:
         """The motion `ahead_s` after the command."""
         if ahead_s <= self._gap_s:
             return self._space.beside(self._base, _on(self._first, self._jerk, ahead_s))
-        left_s = ahead_s - self._gap_s
-        way = _on(self._then, 0.0, np.minimum(left_s, self._steady_s))
-        fading_s = np.clip(left_s - self._steady_s, 0.0, self._fading_s)
-        way = _on(way, self._fade, fading_s)
-        rest_s = np.maximum(left_s - self._steady_s - self._fading_s, 0.0)
-        faded = fading_s >= self._fading_s
-        way = way._replace(change=np.where(faded, 0.0, way.change))
-        return self._space.beside(self._base, _on(way, 0.0, rest_s))
+        way, steady_s, fading_s, fade = self._later
+        left_s = ahead_s - self._gap_s - steady_s
+        way = _on(way, 0.0, np.minimum(left_s, 0.0) + steady_s)
+        way = _on(way, fade, np.clip(left_s, 0.0, fading_s))
+        left_s = np.maximum(left_s - fading_s, 0.0)
+        way.change[left_s > 0.0] = 0.0
+        return self._space.beside(self._base, _on(way, 0.0, left_s))
+
+
+def _cut(space: Space[Told], values: FloatArray, limits: FloatArray) -> FloatArray:
+    return values / np.maximum(space.sizes(values / limits), 1.0)
 
 
 def _on(way: Way, jerk: FloatArray | float, time_s: FloatArray | float) -> Way:

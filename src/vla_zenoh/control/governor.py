@@ -17,11 +17,20 @@ states", RSS 2021.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterable
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
-from ruckig import RuckigError as PlanError
+from numpy.typing import NDArray
+from ruckig import (
+    ControlInterface,
+    InputParameter,
+    Ruckig,
+    RuckigError,
+    Synchronization,
+    Trajectory,
+)
 
 from vla_zenoh.types import FloatArray
 
@@ -31,7 +40,7 @@ limits."""
 ORDINARY = 1.15
 """Part of the stream's limits of jerk within which what is told is taken as it is. The difference
 has what is left of `BRAKE_MARGIN`."""
-SETTLE_S = 0.2
+SETTLE_S = 0.15
 """A small difference is gone after about this time, with less jerk than it might have; a large one
 takes as long as its limits make it."""
 UNIT_S = 0.1
@@ -40,7 +49,10 @@ NOTHING = 1e-7
 """In these units. Ruckig answers noise with all the jerk there is."""
 LEAST_JERK = 1e-3
 """Part of the jerk that is planned with at least."""
-GRID = 12
+SLACK, LEAST = 0.1, 0.25
+"""Parts of the stream's limits: when what is told has taken so much more of them since, the
+difference is planned anew; and so much the difference has at least."""
+GRID = 8
 
 Told = TypeVar("Told")
 
@@ -72,12 +84,8 @@ class Space(Protocol[Told]):
         """The way `motion` is beside `base`: the inverse of `beside`."""
         ...
 
-    def greatest(self, shares: FloatArray) -> float:
-        """Of numbers (..., n), in parts of their limits, the greatest that counts."""
-        ...
-
-    def bounded(self, shares: FloatArray) -> FloatArray:
-        """(n,) in parts of their limits, cut to 1."""
+    def sizes(self, shares: FloatArray) -> FloatArray:
+        """Of numbers (..., n), in parts of their limits, what counts for each axis."""
         ...
 
 
@@ -103,7 +111,7 @@ def _tests() -> FloatArray:
     ``m_i`` is the integral of ``j(s) (1 - s)^i`` over the unit interval: the change of acceleration
     and velocity, and twice that of position. What a bounded jerk can do is convex, and its bounds
     are touched by jerks that change their sign at most twice: by polynomials of degree 2 with their
-    roots there. `GRID` of them a side bound it from outside within a hundredth.
+    roots there. `GRID` of them a side bound it from outside within two hundredths.
     """
     u = (np.arange(2000) + 0.5) / 2000
     places = np.arange(GRID + 1) / GRID
@@ -116,30 +124,6 @@ def _tests() -> FloatArray:
 _TESTS = _tests()
 _EVEN = np.array([1.0, 1 / 2, 1 / 3])
 """Moments of a jerk of 1."""
-
-
-class _Path:
-    """A motion of n axes to rest, each by itself.
-
-    Args:
-        trajectory: in units of `length` and `UNIT_S`.
-        length: (n,).
-    """
-
-    def __init__(self, trajectory: Trajectory, length: FloatArray) -> None:
-        self._trajectory, self._length = trajectory, length
-        self._rate, self._change = length / UNIT_S, length / UNIT_S**2
-        self._time_s = 0.0
-        self.duration_s = trajectory.duration * UNIT_S
-
-    def tick(self, dt_s: float) -> Way:
-        self._time_s += dt_s
-        value, rate, change = self._trajectory.at_time(self._time_s / UNIT_S)
-        return Way(value * self._length, rate * self._rate, change * self._change)
-
-    @property
-    def over(self) -> bool:
-        return self._time_s >= self.duration_s
 
 
 class Governor(Generic[Told]):
@@ -158,35 +142,34 @@ class Governor(Generic[Told]):
 
     def __init__(self, space: Space[Told], motion: Told, dt_s: float, brake: Limits) -> None:
         self._space, self._dt_s = space, dt_s
-        self._brake = np.array(brake[:3]) * brake.axis
-        self._beside = self._brake * ((BRAKE_MARGIN - ORDINARY) / BRAKE_MARGIN)
-        self._told_jerk = brake.jerk * (ORDINARY / BRAKE_MARGIN)
-        jerk = self._told_jerk
+        limits = np.array(brake[:3])
+        self._brake = limits * brake.axis
+        self._own = limits / BRAKE_MARGIN
+        jerk = self._told_jerk = ORDINARY * self._own[2]
         self._reach = np.stack([jerk * dt_s, jerk * dt_s**2, jerk * (dt_s**3 / 2)])
-        size = len(brake.jerk)
-        self._ruckig, self._size = Ruckig(size), size
+        self._axis = brake.axis
+        velocity, acceleration, jerk = self._own
+        changes = [acceleration * dt_s / velocity, jerk * dt_s / acceleration, 0.0 * jerk]
+        self._slack = np.maximum(SLACK, ORDINARY * np.stack(changes))
+        size = len(jerk)
+        self._ruckig, self._ask = Ruckig(size), InputParameter(size)
+        self._ask.synchronization = Synchronization.No
+        self._ask.max_jerk = [1.0] * size
+        self._trajectory = Trajectory(size)
+        self._time_s, self._length, self._taken = 0.0, jerk, limits
         self.put(motion)
 
     def put(self, motion: Told) -> None:
         """Stand where `motion` is, whatever was before."""
         self.told = self.motion = self._space.rest(motion)
-        self._path: _Path | None = None
-        self._stopping = False
+        self._way: Way | None = None
+        self._cramped: NDArray[np.bool_] | None = None
+        self._planned = self._stopping = False
 
     @property
     def moving(self) -> bool:
         """The reference is not at rest at what it goes to, or that moves."""
-        return self._path is not None or bool(self._space.speed(self.told).rate.any())
-
-    @property
-    def stopping(self) -> bool:
-        """It comes to rest wherever that is, and goes to nothing that was told."""
-        return self._stopping
-
-    def tick(self) -> None:
-        """Go on where nothing new is told: to rest, or to what was told last, which stands."""
-        way = self._advance()
-        self.motion = self.told if way is None else self._space.beside(self.told, way)
+        return self._way is not None or bool(self._space.speed(self.told).rate.any())
 
     def follow(self, told: Told, *, steady: bool) -> None:
         """Go on as told.
@@ -195,44 +178,47 @@ class Governor(Generic[Told]):
             told: where to be now.
             steady: it is known to go on from what was told a tick ago.
         """
-        way, space = self._advance(), self._space
-        if self._stopping or not steady:
+        space, goes_on, on = self._space, steady, told
+        if self._stopping:
+            self._advance()
+            goes_on, on = False, self.told
+        elif not steady or self._cramped is not None:
             on, share = self._went_on(told)
-            if self._stopping or not self._could(space.apart(told, on), share):
-                on = self.told if self._stopping else on
-                way = space.apart(on if way is None else space.beside(on, way), told)
-                self._stopping = False
-                if not self._settle(way):
-                    self.motion = space.beside(told, way)
-                    self.stop()
-                    return
-                way = way if self._path else None
+            goes_on = self._cramped is None and self._could(space.apart(told, on), share)
+            self._advance(told, share)
+        elif self._way is not None:
+            self._advance(told, self._share_of(told))
+        if not goes_on:
+            at = on if self._way is None else space.beside(on, self._way)
+            self._way, self._planned, self._stopping = space.apart(at, told), False, False
         self.told = told
-        self.motion = told if way is None else space.beside(told, way)
+        self.motion = told if self._way is None else space.beside(told, self._way)
 
     def rest(self) -> None:
-        """Nobody tells anything any more: go to where was told last."""
+        """Go on where nobody tells anything: to where was told last, or to the end of a stop."""
         if not self._stopping:
-            self.follow(self._space.rest(self.told), steady=False)
+            moved = self._space.speed(self.told).rate.any()
+            self.follow(self._space.rest(self.told), steady=not moved)
+            return
+        self._advance()
+        self.motion = self.told if self._way is None else self._space.beside(self.told, self._way)
 
     def stop(self) -> None:
-        """Come to rest as fast as the limits allow, each axis by itself."""
-        speed = self._space.speed(self.motion)
+        """Come to rest from now on as fast as the limits allow, each axis by itself."""
+        self._way, self._cramped = self._space.speed(self.motion), None
         self.told = self._space.rest(self.motion)
         self._stopping = True
-        if not self._plan(speed, self._brake, ControlInterface.Velocity) or self._path is None:
+        self._plan(self._way, self._brake, ControlInterface.Velocity)
+        if not self._planned:  # there is nothing to stop, or nothing was found: stand at once
             self.put(self.motion)
 
-    def _advance(self) -> Way | None:
-        if self._path is None:
-            return None
-        way = self._path.tick(self._dt_s)
-        if not self._path.over:
-            return way
-        self._path = None
-        if self._stopping:
-            self.put(self._space.beside(self.told, way))
-        return None
+    # -- what is told -------------------------------------------------------------------------
+    def _share_of(self, told: Told) -> FloatArray:
+        """The jerk (n,) that leads to `told`, in parts of its limit and not above it."""
+        change = self._space.speed(told).change - self._space.speed(self.told).change
+        share = change / (self._dt_s * self._told_jerk)
+        share = share / np.maximum(self._space.sizes(share), 1.0)
+        return share if self._cramped is None else np.where(self._cramped, 0.0, share)
 
     def _went_on(self, told: Told) -> tuple[Told, FloatArray]:
         """What was told a tick ago, gone on with the jerk that brings it nearest to `told`.
@@ -240,10 +226,9 @@ class Governor(Generic[Told]):
         Returns:
             that, and the jerk (n,) in parts of its limit.
         """
-        space, dt_s, jerk = self._space, self._dt_s, self._told_jerk
+        space, dt_s, share = self._space, self._dt_s, self._share_of(told)
         _, rate, change = space.speed(self.told)
-        share = space.bounded((space.speed(told).change - change) / (dt_s * jerk))
-        jerk = jerk * share
+        jerk = self._told_jerk * share
         gone = Way(
             (rate + (change + jerk * (dt_s / 3)) * (dt_s / 2)) * dt_s,
             rate + (change + jerk * (dt_s / 2)) * dt_s,
@@ -254,38 +239,66 @@ class Governor(Generic[Told]):
     def _could(self, away: Way, share: FloatArray) -> bool:
         """Whether some jerk within its limit leads so far from where this share of it does."""
         moments = np.array(away[::-1]) / self._reach + np.multiply.outer(_EVEN, share)
-        return self._space.greatest(_TESTS @ moments) <= 1.0
+        return float(self._space.sizes(_TESTS @ moments).max()) <= 1.0
 
-    def _settle(self, way: Way) -> bool:
-        """Plan the difference to zero."""
+    # -- the difference -----------------------------------------------------------------------
+    def _advance(self, told: Told | None = None, share: FloatArray | None = None) -> None:
+        """Let a tick pass for the difference.
+
+        Args:
+            told: what is told at its end; None: nothing is.
+            share: (n,) of its jerk that it has meanwhile.
+        """
+        if self._way is None:
+            return
+        if told is not None and share is not None:
+            _, rate, change = self._space.speed(told)
+            taken = self._space.sizes(np.stack([rate, change, self._told_jerk * share]) / self._own)
+            if not self._planned or (taken > self._taken).any():
+                self._settle(self._way, taken)
+        if not self._planned:
+            return
+        self._time_s += self._dt_s
+        value, rate, change = self._trajectory.at_time(self._time_s / UNIT_S)
+        length = self._length
+        self._way = Way(value * length, rate * length / UNIT_S, change * length / UNIT_S**2)
+        if self._time_s >= self._trajectory.duration * UNIT_S:
+            if self._stopping:
+                self.put(self._space.beside(self.told, self._way))
+            self._way, self._planned, self._cramped = None, False, None
+
+    def _settle(self, way: Way, taken: FloatArray) -> None:
+        """Plan the difference to zero, within what is left beside what is told (3, n)."""
         value, rate, change = np.abs(way)
         t = SETTLE_S
         needed = (32 * value / t + 16 * rate) / t**2 + 6 * change / t
-        velocity, acceleration, jerk = self._beside
-        jerk = np.clip(needed, LEAST_JERK * jerk, jerk)
-        return self._plan(way, np.stack([velocity, acceleration, jerk]), ControlInterface.Position)
+        self._taken = taken + self._slack
+        left = np.maximum(BRAKE_MARGIN - self._taken, LEAST)
+        velocity, acceleration, jerk = left * self._own * self._axis
+        cramped = needed > (BRAKE_MARGIN - ORDINARY) * self._own[2] * self._axis
+        self._cramped = cramped if cramped.any() else None
+        jerk = np.minimum(np.maximum(needed, LEAST_JERK * jerk), jerk)
+        self._plan(way, (velocity, acceleration, jerk), ControlInterface.Position)
+        if not self._planned:
+            self._way = self._cramped = None
 
-    def _plan(self, way: Way, limits: FloatArray, interface: ControlInterface) -> bool:
-        """Whether a path to rest could be planned; where there is nothing to do, there is none."""
+    def _plan(
+        self, way: Way, limits: Iterable[FloatArray], interface: ControlInterface
+    ) -> None:
+        """Plan the way to rest, in numbers near 1: each axis has units of its own."""
         velocity, acceleration, jerk = limits
-        length = jerk * UNIT_S**3
+        length = self._length = jerk * UNIT_S**3
         units = np.stack([length, length / UNIT_S, length / UNIT_S**2])
         start = np.array(way) / units
-        nothing = (np.abs(start) < NOTHING).all(axis=0)
-        if nothing.all():
-            self._path = None
-            return True
-        start[:, nothing] = 0.0
-        ask, trajectory = InputParameter(self._size), Trajectory(self._size)
+        start[:, (np.abs(start) < NOTHING).all(axis=0)] = 0.0
+        self._planned, self._time_s = False, 0.0
+        if not start.any():
+            return
+        ask = self._ask
         ask.control_interface = interface
-        ask.synchronization = Synchronization.No
         ask.current_position, ask.current_velocity, ask.current_acceleration = start.tolist()
         ask.max_velocity = (velocity / units[1]).tolist()
         ask.max_acceleration = (acceleration / units[2]).tolist()
-        ask.max_jerk = [1.0] * self._size
-        try:
-            self._ruckig.calculate(ask, trajectory)
-        except (PlanError, ValueError):
-            return False
-        self._path = _Path(trajectory, length)
-        return True
+        with contextlib.suppress(RuckigError, ValueError):
+            self._ruckig.calculate(ask, self._trajectory)
+            self._planned = True

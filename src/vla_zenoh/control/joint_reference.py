@@ -75,13 +75,9 @@ class JointSpace:
         """See `vla_zenoh.control.governor.Space`."""
         return Way(motion[0] - base[0], motion[1] - base[1], motion[2] - base[2])
 
-    def greatest(self, shares: FloatArray) -> float:
+    def sizes(self, shares: FloatArray) -> FloatArray:
         """Every joint counts."""
-        return float(np.abs(shares).max())
-
-    def bounded(self, shares: FloatArray) -> FloatArray:
-        """Likewise."""
-        return np.minimum(np.maximum(shares, -1.0), 1.0)
+        return np.abs(shares)
 
 
 class JointGuard(StreamGuard[JointReference]):

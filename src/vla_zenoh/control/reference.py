@@ -29,8 +29,8 @@ from vla_zenoh.control.stream_guard import StreamGuard
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, PoseCommand, Stamped
 
-ROTATION_AXIS = 0.57
-"""Part of a limit of rotation that one axis may have by itself: three of it have the norm 1."""
+TURN_AXIS = 0.55
+"""Part of a limit of rotation that each axis may have, so that the norm of three keeps it."""
 
 
 class GuardLimits(NamedTuple):
@@ -78,9 +78,11 @@ class PoseSpace:
         turn = exp3(way.value[3:])
         spin, spin_change = spatial_rates(way.value[3:], way.rate[3:], way.change[3:])
         twist, acceleration = base.twist + way.rate, base.acceleration + way.change
-        carried = turn @ base.twist[3:]
-        twist[3:] = carried + spin
-        acceleration[3:] = turn @ base.acceleration[3:] + spin_change + cross3(spin, carried)
+        if base.twist is not _STILL:
+            carried = turn @ base.twist[3:]
+            spin_change += turn @ base.acceleration[3:] + cross3(spin, carried)
+            spin += carried
+        twist[3:], acceleration[3:] = spin, spin_change
         pose = Pose(base.pose.position_m + way.value[:3], turn @ base.pose.rotation)
         return Motion(pose, twist, acceleration)
 
@@ -96,16 +98,11 @@ class PoseSpace:
         value = np.concatenate([motion.pose.position_m - base.pose.position_m, rotvec])
         return Way(value, rate, change)
 
-    def greatest(self, shares: FloatArray) -> float:
+    def sizes(self, shares: FloatArray) -> FloatArray:
         """Of translation an axis counts, of rotation the norm."""
-        turned = np.sqrt((shares[..., 3:] ** 2).sum(axis=-1))
-        return max(float(np.abs(shares[..., :3]).max()), float(turned.max()))
-
-    def bounded(self, shares: FloatArray) -> FloatArray:
-        """Likewise."""
-        bounded = np.minimum(np.maximum(shares, -1.0), 1.0)
-        bounded[3:] = shares[3:] / max(norm3(shares[3:]), 1.0)
-        return bounded
+        sizes = np.abs(shares)
+        sizes[..., 3:] = np.sqrt((shares[..., 3:] ** 2).sum(axis=-1, keepdims=True))
+        return sizes
 
 
 _STILL = np.zeros(6)
@@ -182,7 +179,7 @@ def _governed(limits: MotionLimits) -> Limits:
         np.repeat([straight, turning], 3)
         for straight, turning in zip(limits.translation, limits.rotation, strict=True)
     )
-    return Limits(*orders, axis=np.repeat([1.0, ROTATION_AXIS], 3))
+    return Limits(*orders, axis=np.repeat([1.0, TURN_AXIS], 3))
 
 
 def guard_limits(profile: Profile) -> GuardLimits:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,7 +90,12 @@ def norm3(vector: FloatArray) -> float:
 
 def cross3(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross product of vectors (3,); `numpy.cross` costs ten times as much."""
-    return pin.skew(a) @ b
+    return np.array(_cross(a.tolist(), b.tolist()))
+
+
+def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
+    (ax, ay, az), (bx, by, bz) = a, b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> float:
@@ -123,6 +129,20 @@ def between(start: Pose, end: Pose, share: float) -> Pose:
     )
 
 
+def _coefficients(squared: float) -> tuple[float, float, float, float]:
+    """Of ``t^2``: ``B = (1 - cos t)/t^2``, ``C = (t - sin t)/t^3``, ``B'/t`` and ``C'/t``."""
+    angle = math.sqrt(squared)
+    if angle < 1e-3:  # series: the closed forms lose all digits here
+        return 0.5 - squared / 24, 1 / 6 - squared / 120, -1 / 12, -1 / 60
+    sine, cosine = math.sin(angle), math.cos(angle)
+    return (
+        (1 - cosine) / squared,
+        (angle - sine) / (squared * angle),
+        (angle * sine - 2 * (1 - cosine)) / squared**2,
+        ((1 - cosine) * angle - 3 * (angle - sine)) / (squared**2 * angle),
+    )
+
+
 def body_rates(
     rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -147,17 +167,7 @@ def body_rates(
 
     Source: Sola, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 143, differentiated.
     """
-    squared = float(rotvec @ rotvec)
-    angle = math.sqrt(squared)
-    if angle < 1e-3:  # series: the closed forms lose all digits here
-        b, c = 0.5 - squared / 24, 1 / 6 - squared / 120
-        db_over_angle, dc_over_angle = -1 / 12, -1 / 60
-    else:
-        sine, cosine = math.sin(angle), math.cos(angle)
-        b = (1 - cosine) / squared
-        c = (angle - sine) / (squared * angle)
-        db_over_angle = (angle * sine - 2 * (1 - cosine)) / squared**2
-        dc_over_angle = ((1 - cosine) * angle - 3 * (angle - sine)) / (squared**2 * angle)
+    b, c, db_over_angle, dc_over_angle = _coefficients(float(rotvec @ rotvec))
     cross = pin.skew(rotvec)
     along = float(rotvec @ rate)
     r_rate = cross @ rate
@@ -180,10 +190,22 @@ def spatial_rates(
 ) -> tuple[FloatArray, FloatArray]:
     """Angular velocity and acceleration of ``exp3(r(t)) R0`` in the fixed axes: see `body_rates`.
 
-    With ``Jl(r) = Jr(-r)`` they are those that `body_rates` finds for -r, turned round.
+    With ``Jl(r) = Jr(-r) = I + B [r] + C [r]^2``, written out: it runs in every tick of a guard.
     """
-    velocity, acceleration = body_rates(-rotvec, -rate, -rate_change)
-    return -velocity, -acceleration
+    r, r1, r2 = rotvec.tolist(), rate.tolist(), rate_change.tolist()
+    squared = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
+    along = r[0] * r1[0] + r[1] * r1[1] + r[2] * r1[2]
+    b, c, b_rate, c_rate = _coefficients(squared)
+    b_rate, c_rate = b_rate * along, c_rate * along
+    p = _cross(r, r1)
+    q = _cross(r, p)
+    s = _cross(r, r2)
+    t, u = _cross(r, s), _cross(r1, p)
+    velocity = [r1[i] + b * p[i] + c * q[i] for i in range(3)]
+    acceleration = [
+        r2[i] + b * s[i] + b_rate * p[i] + c_rate * q[i] + c * (t[i] + u[i]) for i in range(3)
+    ]
+    return np.array(velocity), np.array(acceleration)
 
 
 def rates_of(
@@ -196,14 +218,18 @@ def rates_of(
 
     Source: Sola, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 146.
     """
-    squared = float(rotvec @ rotvec)
-    angle = math.sqrt(squared)
+    angle = norm3(rotvec)
     if angle < 1e-2:
-        d = 1 / 12 + squared / 720
+        d = 1 / 12 + angle * angle / 720
     else:
-        d = 1 / squared - (1 + math.cos(angle)) / (2 * angle * math.sin(angle))
-    skew = pin.skew(rotvec)
-    inverse = np.eye(3) - 0.5 * skew + d * (skew @ skew)
-    rate = inverse @ velocity
-    _, of_rate = spatial_rates(rotvec, rate, np.zeros(3))
-    return rate, inverse @ (acceleration - of_rate)
+        d = 1 / angle**2 - (1 + math.cos(angle)) / (2 * angle * math.sin(angle))
+    r = rotvec.tolist()
+
+    def inverse(of: Sequence[float]) -> FloatArray:
+        p = _cross(r, of)
+        q = _cross(r, p)
+        return np.array([of[i] - 0.5 * p[i] + d * q[i] for i in range(3)])
+
+    rate = inverse(velocity.tolist())
+    _, of_rate = spatial_rates(rotvec, rate, _ORIGIN)
+    return rate, inverse((acceleration - of_rate).tolist())

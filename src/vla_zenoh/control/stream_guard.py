@@ -92,12 +92,10 @@ class StreamGuard(Generic[Told]):
             return governor.motion
         if self._stream.newest is not None:
             self._stream.end()
-            if float(np.abs(self._space.speed(governor.told).rate).max()) < STILL:
-                governor.rest()
-                return governor.motion
-            self.silences += 1
-            self.braking = True
-            governor.stop()
-        governor.tick()
+            if float(np.abs(self._space.speed(governor.told).rate).max()) >= STILL:
+                self.silences += 1
+                self.braking = True
+                governor.stop()
+        governor.rest()
         self.braking = self.braking and governor.moving
         return governor.motion
