@@ -12,7 +12,7 @@ from vla_zenoh.types import FloatArray
 
 BELIEVED_S = 0.02
 """For how long a command's acceleration is believed; its velocity is until the stream times out."""
-FADING_S = 0.08
+FADING_S = 0.07
 """For so long it then fades, where there is room for it: what is made believe has to be undone."""
 
 

@@ -40,9 +40,10 @@ limits."""
 ORDINARY = 1.15
 """Part of the stream's limits of jerk within which what is told is taken as it is. The difference
 has what is left of `BRAKE_MARGIN`."""
-SETTLE_S = 0.15
+SETTLE_S = 0.08
 """A small difference is gone after about this time, with less jerk than it might have; a large one
 takes as long as its limits make it."""
+LONG_S = 0.6
 UNIT_S = 0.1
 """Of the numbers that Ruckig is given: it calls everything below 1e-8 zero, whatever it is."""
 NOTHING = 1e-7
@@ -269,22 +270,18 @@ class Governor(Generic[Told]):
 
     def _settle(self, way: Way, taken: FloatArray) -> None:
         """Plan the difference to zero, within what is left beside what is told (3, n)."""
-        value, rate, change = np.abs(way)
-        t = SETTLE_S
-        needed = (32 * value / t + 16 * rate) / t**2 + 6 * change / t
+        needed = _jerk(way, SETTLE_S)
         self._taken = taken + self._slack
         left = np.maximum(BRAKE_MARGIN - self._taken, LEAST)
         velocity, acceleration, jerk = left * self._own * self._axis
-        cramped = needed > (BRAKE_MARGIN - ORDINARY) * self._own[2] * self._axis
+        cramped = _jerk(way, LONG_S) > (BRAKE_MARGIN - ORDINARY) * self._own[2] * self._axis
         self._cramped = cramped if cramped.any() else None
         jerk = np.minimum(np.maximum(needed, LEAST_JERK * jerk), jerk)
         self._plan(way, (velocity, acceleration, jerk), ControlInterface.Position)
         if not self._planned:
             self._way = self._cramped = None
 
-    def _plan(
-        self, way: Way, limits: Iterable[FloatArray], interface: ControlInterface
-    ) -> None:
+    def _plan(self, way: Way, limits: Iterable[FloatArray], interface: ControlInterface) -> None:
         """Plan the way to rest, in numbers near 1: each axis has units of its own."""
         velocity, acceleration, jerk = limits
         length = self._length = jerk * UNIT_S**3
@@ -302,3 +299,9 @@ class Governor(Generic[Told]):
         with contextlib.suppress(RuckigError, ValueError):
             self._ruckig.calculate(ask, self._trajectory)
             self._planned = True
+
+
+def _jerk(way: Way, time_s: float) -> FloatArray:
+    """About the jerk (n,) with which a way comes to rest at zero within this time."""
+    value, rate, change = np.abs(way)
+    return (32 * value / time_s + 16 * rate) / time_s**2 + 6 * change / time_s

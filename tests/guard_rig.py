@@ -1,7 +1,8 @@
-"""Command streams over an ill link to a guard, and what its references are as finite differences."""
+"""Command streams over an ill link to a guard, and its references as finite differences."""
 
 from __future__ import annotations
 
+import itertools
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -154,7 +155,6 @@ class Trace(NamedTuple):
         moves: (k, n) from the reference before: m, or rad; of a rotation its vector, base axes.
         rate: as told.
         change: as told.
-        apart: (k, n) from the command that is sent at that time, where one is.
         tick_s: between two.
         silences: how often the guard braked.
         refused: how many commands.
@@ -183,8 +183,20 @@ def drive(
     duration_s: float,
     profile: Profile = PROFILE,
     each: Callable[[Any, Any], None] = lambda *_: None,
+    aside: bool = True,
 ) -> Trace:
-    """Lead a guard over a link for so long, begin, stop, begin again and fall silent."""
+    """Lead a guard over a link for so long, begin, stop, begin again and fall silent.
+
+    Args:
+        mode: of the stream.
+        seed: of all that is drawn.
+        link: between writer and guard.
+        tick_s: of the guard.
+        duration_s: in all.
+        profile: whose limits count.
+        each: is given the guard after each tick, and the command that was written last.
+        aside: a stream may begin a little aside of the reference.
+    """
     rng = random.Random(seed)
     guard: Any
     if mode == "pose":
@@ -195,6 +207,7 @@ def drive(
     motions = [guard.motion]
     arrivals: list[tuple[int, Stamped[Any]]] = []
     writer: Any = None
+    record: Any = None
     seq = refused = linger = held_until_ns = late_until_ns = silent_until_ns = 0
     source = ""
     tick_ns = round(tick_s * 1e9)
@@ -209,14 +222,14 @@ def drive(
                     writer = PoseWriter(profile, here.pose, rng)
                 else:
                     writer = JointWriter(profile, here.position_rad, rng)
-                writer.aside(rng.choice([0.0, rng.uniform(-1, 1)]))
+                writer.aside(aside * rng.choice([0.0, rng.uniform(-1, 1)]))
                 source = source if rng.random() < 0.5 else f"command#{now_ns}"
                 linger = 0
             if writer is not None:
                 if linger and writer.at_rest:
                     linger += 1
                     if linger > LINGER:
-                        writer.aside(rng.choice([0.0, rng.uniform(-0.4, 0.4)]))
+                        writer.aside(aside * rng.choice([0.0, rng.uniform(-0.4, 0.4)]))
                         linger = 0
                 elif not linger and rng.random() < 0.008:
                     writer.brake()
@@ -249,7 +262,7 @@ def _trace(motions: list[Any], tick_s: float, silences: int, refused: int) -> Tr
     if isinstance(motions[0], JointReference):
         position, rate, change = map(np.array, zip(*motions, strict=True))
         return Trace(np.diff(position, axis=0), rate[1:], change[1:], tick_s, silences, refused)
-    moves = [_move(*pair) for pair in zip(motions, motions[1:], strict=False)]
+    moves = [_move(*pair) for pair in itertools.pairwise(motions)]
     rate = np.array([motion.twist for motion in motions[1:]])
     change = np.array([motion.acceleration for motion in motions[1:]])
     return Trace(np.array(moves), rate, change, tick_s, silences, refused)
