@@ -7,12 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.governor import BRAKE_MARGIN, Governor, Limits
+from vla_zenoh.control.governor import Governor, Limits
 from vla_zenoh.control.joint_impedance import JointReference
 from vla_zenoh.control.joint_reference import JointSpace
 from vla_zenoh.control.reference import GuardLimits, PoseSpace, ReferenceGuard
 from vla_zenoh.control.smoothing import Motion, MotionLimits
 from vla_zenoh.control.so3 import Pose, angle_between, exp3
+from vla_zenoh.control.stream import BRAKE_MARGIN
 from vla_zenoh.types import FloatArray, Header, PoseCommand, Stamped
 
 DT_S = 1e-3
@@ -29,8 +30,9 @@ def standing(*value: float) -> JointReference:
 
 
 def governor(axes: int = 1) -> Governor[JointReference]:
-    limits = (np.full(axes, BRAKE_MARGIN * limit) for limit in OWN)
-    return Governor(JointSpace(), standing(*[0.0] * axes), DT_S, Limits(*limits, np.ones(axes)))
+    velocity, acceleration, jerk = (np.full(axes, BRAKE_MARGIN * limit) for limit in OWN)
+    limits = Limits(velocity, acceleration, jerk, np.ones(axes), np.ones(axes))
+    return Governor(JointSpace(), standing(*[0.0] * axes), DT_S, limits)
 
 
 def led(side: Governor[JointReference], told: JointReference, ticks: int) -> FloatArray:

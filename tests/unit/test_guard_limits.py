@@ -22,12 +22,14 @@ from guard_rig import (
     ratios,
 )
 
-from vla_zenoh.control.governor import BRAKE_MARGIN, ORDINARY
+from vla_zenoh.control.governor import ORDINARY
+from vla_zenoh.control.stream import BRAKE_MARGIN
 
 TICKS_S = [STREAM_S, 0.001]
 """An arm of one's own and a ROS 2 controller, and the simulator's law."""
 DURATION_S = 4.0
-ROUNDING = 1e-3
+TURNED = 1.02
+"""A stop that turns is planned by axes of its own, which adds so much to its jerk in space."""
 MOVING = 1.04
 """Velocity and acceleration of what is told may grow in the tick in which that is noticed."""
 FR3 = {
@@ -56,7 +58,7 @@ def test_over_whatever_link_every_difference_keeps_to_the_margin(
     velocity, acceleration, jerk = ratios(mode, trace)
     assert velocity <= BRAKE_MARGIN * MOVING
     assert acceleration <= BRAKE_MARGIN * MOVING
-    assert jerk <= BRAKE_MARGIN * (1 + ROUNDING)
+    assert jerk <= BRAKE_MARGIN * TURNED
 
 
 @pytest.mark.parametrize("tick_s", TICKS_S)

@@ -7,20 +7,20 @@ from typing import Generic
 
 import numpy as np
 
-from vla_zenoh.control.governor import BRAKE_MARGIN, Limits, Space, Told, Way
+from vla_zenoh.control.governor import Limits, Space, Told, Way
+from vla_zenoh.control.stream import ACCELERATE_S, BRAKE_MARGIN
 from vla_zenoh.types import FloatArray
 
-BELIEVED_S = 0.02
-"""For how long a command's acceleration is believed; its velocity is until the stream times out."""
 FADING_S = 0.07
-"""For so long it then fades, where there is room for it: what is made believe has to be undone."""
+"""For so long a command's acceleration then fades, where there is room for it: what is done in vain
+has to be undone."""
 
 
 class Extrapolation(Generic[Told]):
     """A motion from one command on, within the limits of the stream.
 
     For as long as there were between this command and the one before it the acceleration goes on
-    changing as it did; then it stays until the command is `BELIEVED_S` old, or less where the
+    changing as it did; then it stays until the command is `ACCELERATE_S` old, or less where the
     motion would get too fast or turn round; then it fades to zero, jerk-limited.
 
     Args:
@@ -38,7 +38,7 @@ class Extrapolation(Generic[Told]):
         _, rate, change = space.speed(command)
         velocity_limit, acceleration_limit, jerk_limit = np.array(brake[:3]) / BRAKE_MARGIN
         jerk = np.zeros(len(rate))
-        if before is not None and 0.0 < gap_s <= BELIEVED_S:
+        if before is not None and 0.0 < gap_s <= ACCELERATE_S:
             was = space.apart(before, self._base).change
             # Who accelerates as much as it may will not do so more and more.
             later = _cut(space, 2 * change - was, acceleration_limit)
@@ -59,7 +59,7 @@ class Extrapolation(Generic[Told]):
         # Twice the time for which the acceleration may last before the motion is too fast or turns.
         room_s = 2 * np.where(turning, speed, velocity_limit - speed) / change
         fading_s = np.maximum(np.minimum(room_s, FADING_S), change / jerk_limit)
-        steady_s = np.clip((room_s - fading_s) / 2, 0.0, BELIEVED_S - self._gap_s)
+        steady_s = np.clip((room_s - fading_s) / 2, 0.0, ACCELERATE_S - self._gap_s)
         steady_s[self._jerk * then.change < 0] = 0.0
         return then, steady_s, fading_s, -then.change / fading_s
 

@@ -32,11 +32,9 @@ from ruckig import (
     Trajectory,
 )
 
+from vla_zenoh.control.stream import BRAKE_MARGIN
 from vla_zenoh.types import FloatArray
 
-BRAKE_MARGIN = 2.0
-"""The robot's own stop, and what makes up for a step, may use this multiple of the stream's
-limits."""
 ORDINARY = 1.15
 """Part of the stream's limits of jerk within which what is told is taken as it is. The difference
 has what is left of `BRAKE_MARGIN`."""
@@ -97,13 +95,15 @@ class Limits(NamedTuple):
         velocity: per axis.
         acceleration: likewise.
         jerk: likewise.
-        axis: part of each that one axis may have by itself, where they bound a norm.
+        axis: part of each that one axis may have by itself in a stop, where they bound a norm.
+        beside: likewise in a difference, which also turns with what it is beside.
     """
 
     velocity: FloatArray
     acceleration: FloatArray
     jerk: FloatArray
     axis: FloatArray
+    beside: FloatArray
 
 
 def _tests() -> FloatArray:
@@ -148,7 +148,7 @@ class Governor(Generic[Told]):
         self._own = limits / BRAKE_MARGIN
         jerk = self._told_jerk = ORDINARY * self._own[2]
         self._reach = np.stack([jerk * dt_s, jerk * dt_s**2, jerk * (dt_s**3 / 2)])
-        self._axis = brake.axis
+        self._axis = brake.beside
         velocity, acceleration, jerk = self._own
         changes = [acceleration * dt_s / velocity, jerk * dt_s / acceleration, 0.0 * jerk]
         self._slack = np.maximum(SLACK, ORDINARY * np.stack(changes))

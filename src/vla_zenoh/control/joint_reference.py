@@ -18,8 +18,9 @@ from ruckig import (
     Trajectory,
 )
 
-from vla_zenoh.control.governor import BRAKE_MARGIN, Limits, Way
+from vla_zenoh.control.governor import Limits, Way
 from vla_zenoh.control.joint_impedance import JointReference
+from vla_zenoh.control.stream import BRAKE_MARGIN
 from vla_zenoh.control.stream_guard import StreamGuard
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, JointCommand, Stamped
@@ -100,7 +101,8 @@ class JointGuard(StreamGuard[JointReference]):
         self._names = tuple(names)
         self._limits = limits
         still = JointReference.at_rest(position_rad)
-        brake = Limits(*limits.brake, axis=np.ones(len(position_rad)))
+        whole = np.ones(len(position_rad))
+        brake = Limits(*limits.brake, axis=whole, beside=whole)
         super().__init__(JointSpace(), still, dt_s, limits.timeout_s, brake)
 
     def restart(self, position_rad: FloatArray) -> None:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.governor import BRAKE_MARGIN, Limits, Way
+from vla_zenoh.control.governor import Limits, Way
 from vla_zenoh.control.smoothing import Motion, MotionLimits, motion_limits
 from vla_zenoh.control.so3 import (
     Pose,
@@ -25,12 +25,14 @@ from vla_zenoh.control.so3 import (
     rotation_from_quat,
     spatial_rates,
 )
+from vla_zenoh.control.stream import BRAKE_MARGIN
 from vla_zenoh.control.stream_guard import StreamGuard
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, PoseCommand, Stamped
 
-TURN_AXIS = 0.55
-"""Part of a limit of rotation that each axis may have, so that the norm of three keeps it."""
+TURN_STOP, TURN_BESIDE = 0.55, 0.5
+"""Parts of a limit of rotation that each axis may have, so that the norm of three keeps it: in a
+stop, and beside a motion that turns as well."""
 
 
 class GuardLimits(NamedTuple):
@@ -179,7 +181,8 @@ def _governed(limits: MotionLimits) -> Limits:
         np.repeat([straight, turning], 3)
         for straight, turning in zip(limits.translation, limits.rotation, strict=True)
     )
-    return Limits(*orders, axis=np.repeat([1.0, TURN_AXIS], 3))
+    shares = (np.repeat([1.0, share], 3) for share in (TURN_STOP, TURN_BESIDE))
+    return Limits(*orders, *shares)
 
 
 def guard_limits(profile: Profile) -> GuardLimits:

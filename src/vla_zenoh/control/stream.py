@@ -8,6 +8,10 @@ from vla_zenoh.types import Header, Stamped
 
 CLOCK_DRIFT = 1e-3
 """Share by which two clocks may drift apart; a real one does by a tenth of that."""
+ACCELERATE_S = 0.02
+"""For how long a command's acceleration is believed; its velocity is until the stream times out."""
+BRAKE_MARGIN = 2.0
+"""The robot's own stop may use this multiple of the stream's limits."""
 
 Command = TypeVar("Command")
 

@@ -52,7 +52,7 @@ class StreamGuard(Generic[Told]):
 
     @property
     def moving(self) -> bool:
-        """The reference is not at rest for good."""
+        """A stream is being followed, or what was followed last is still brought to rest."""
         return self.following or self._governor.moving
 
     def stand(self) -> None:
