@@ -42,6 +42,8 @@ SETTLE_S = 0.08
 """A small difference is gone after about this time, with less jerk than it might have; a large one
 takes as long as its limits make it."""
 LONG_S = 0.6
+"""A difference that would take longer beside a stream that has all of its own jerk is large: what
+is told then moves on without jerk, all of that goes into the difference, and that has it all."""
 UNIT_S = 0.1
 """Of the numbers that Ruckig is given: it calls everything below 1e-8 zero, whatever it is."""
 NOTHING = 1e-7
@@ -157,7 +159,8 @@ class Governor(Generic[Told]):
         self._ask.synchronization = Synchronization.No
         self._ask.max_jerk = [1.0] * size
         self._trajectory = Trajectory(size)
-        self._time_s, self._length, self._taken = 0.0, jerk, limits
+        self._time_s, self._length = 0.0, jerk
+        self._taken = self._known = limits
         self.put(motion)
 
     def put(self, motion: Told) -> None:
@@ -188,7 +191,12 @@ class Governor(Generic[Told]):
             goes_on = self._cramped is None and self._could(space.apart(told, on), share)
             self._advance(told, share)
         elif self._way is not None:
-            self._advance(told, self._share_of(told))
+            change = space.speed(told).change
+            changed = np.array([change, (change - space.speed(self.told).change) / self._dt_s])
+            if self._planned and (np.abs(changed) <= self._known).all():
+                self._advance()
+            else:
+                self._advance(told, self._share_of(told))
         if not goes_on:
             at = on if self._way is None else space.beside(on, self._way)
             self._way, self._planned, self._stopping = space.apart(at, told), False, False
@@ -217,7 +225,7 @@ class Governor(Generic[Told]):
     def _share_of(self, told: Told) -> FloatArray:
         """The jerk (n,) that leads to `told`, in parts of its limit and not above it."""
         change = self._space.speed(told).change - self._space.speed(self.told).change
-        share = change / (self._dt_s * self._told_jerk)
+        share = change / self._reach[0]
         share = share / np.maximum(self._space.sizes(share), 1.0)
         return share if self._cramped is None else np.where(self._cramped, 0.0, share)
 
@@ -254,10 +262,14 @@ class Governor(Generic[Told]):
             return
         if told is not None and share is not None:
             _, rate, change = self._space.speed(told)
-            taken = self._space.sizes(np.stack([rate, change, self._told_jerk * share]) / self._own)
+            taken = self._space.sizes(np.array([rate, change, self._told_jerk * share]) / self._own)
             if not self._planned or (taken > self._taken).any():
                 self._settle(self._way, taken)
-        if not self._planned:
+        if self._way is None:
+            return
+        if not self._planned:  # none was found: it goes on for a tick, and another is looked for
+            value, rate, change = self._way
+            self._way = Way(value + self._dt_s * rate, rate, np.zeros(len(rate)))
             return
         self._time_s += self._dt_s
         value, rate, change = self._trajectory.at_time(self._time_s / UNIT_S)
@@ -272,24 +284,24 @@ class Governor(Generic[Told]):
         """Plan the difference to zero, within what is left beside what is told (3, n)."""
         needed = _jerk(way, SETTLE_S)
         self._taken = taken + self._slack
+        self._known = self._taken[1:] * self._own[1:]
         left = np.maximum(BRAKE_MARGIN - self._taken, LEAST)
         velocity, acceleration, jerk = left * self._own * self._axis
         cramped = _jerk(way, LONG_S) > (BRAKE_MARGIN - ORDINARY) * self._own[2] * self._axis
         self._cramped = cramped if cramped.any() else None
         jerk = np.minimum(np.maximum(needed, LEAST_JERK * jerk), jerk)
         self._plan(way, (velocity, acceleration, jerk), ControlInterface.Position)
-        if not self._planned:
-            self._way = self._cramped = None
 
     def _plan(self, way: Way, limits: Iterable[FloatArray], interface: ControlInterface) -> None:
         """Plan the way to rest, in numbers near 1: each axis has units of its own."""
         velocity, acceleration, jerk = limits
         length = self._length = jerk * UNIT_S**3
-        units = np.stack([length, length / UNIT_S, length / UNIT_S**2])
+        units = np.array([length, length / UNIT_S, length / UNIT_S**2])
         start = np.array(way) / units
         start[:, (np.abs(start) < NOTHING).all(axis=0)] = 0.0
         self._planned, self._time_s = False, 0.0
         if not start.any():
+            self._way = self._cramped = None
             return
         ask = self._ask
         ask.control_interface = interface
