@@ -36,13 +36,14 @@ STREAM_S, RAMP_S = 0.004, 0.2
 SWING_RAD = np.array([0.2, -0.1, 0.15, 0.1, -0.2, 0.3, -0.3])
 
 
-def swing(time_s: float, period_s: float = 3.0) -> JointReference:
-    """A smooth motion of every joint from rest at home."""
+def swing(time_s: float, period_s: float = 3.3) -> JointReference:
+    """A smooth motion of every joint from rest at home, where it begins without acceleration."""
     w = 2 * np.pi / period_s
+    once, twice = w * time_s, 2 * w * time_s
     return JointReference(
-        HOME_RAD + SWING_RAD * (1 - np.cos(w * time_s)),
-        SWING_RAD * w * np.sin(w * time_s),
-        SWING_RAD * w * w * np.cos(w * time_s),
+        HOME_RAD + SWING_RAD * (0.75 - np.cos(once) + 0.25 * np.cos(twice)),
+        SWING_RAD * w * (np.sin(once) - 0.5 * np.sin(twice)),
+        SWING_RAD * w * w * (np.cos(once) - np.cos(twice)),
     )
 
 
@@ -124,18 +125,14 @@ def test_a_command_that_was_held_up_meets_the_path_its_predecessors_foretold() -
 
 
 def test_joints_in_another_order_are_put_in_the_arms() -> None:
-    guard = make_guard()
-    turned = tuple(reversed(NAMES))
-    wanted = JointReference(
-        HOME_RAD + np.linspace(-0.001, 0.001, 7),
-        np.linspace(0.01, 0.07, 7),
-        np.linspace(-1.0, 1.0, 7),
-    )
-    backwards = JointReference(*(column[::-1] for column in wanted))
-    assert guard.offer(stamped(backwards, 0, START_NS, names=turned), START_NS) is None
-    motion = guard.tick(START_NS)
-    for got, expected in zip(motion, wanted, strict=True):
-        np.testing.assert_array_equal(got, expected)
+    guard, turned = make_guard(), tuple(reversed(NAMES))
+    for now_ns, expected in streamed(make_guard(), 0.5):
+        tick = (now_ns - START_NS) // TICK_NS
+        if tick % COMMAND_TICKS == 0:
+            backwards = JointReference(*(column[::-1] for column in swing(tick * TICK_S)))
+            assert guard.offer(stamped(backwards, tick, now_ns, names=turned), now_ns) is None
+        for got, wanted in zip(guard.tick(now_ns), expected, strict=True):
+            np.testing.assert_array_equal(got, wanted)
 
 
 # -- refusing ---------------------------------------------------------------------------------
@@ -209,7 +206,7 @@ def test_a_stream_that_goes_on_after_the_robots_own_brake_makes_no_step(
             guard.offer(stamped(sent, k, now_ns), now_ns)
         motion = guard.tick(now_ns)
         step = motion.position_rad - last.position_rad - last.velocity_rad_s * dt_s
-        assert np.abs(step).max() < STEP_RAD
+        assert np.abs(step).max() < 0.5 * LIMITS.brake.acceleration_rad_s2[0] * dt_s**2 * 1.1
         last = motion
     assert guard.silences == 1
 
@@ -283,12 +280,14 @@ def test_a_command_is_taken_once_and_in_order() -> None:
 
 
 def test_a_refused_command_changes_nothing() -> None:
-    guard, now_ns = in_motion()
-    before = guard.tick(now_ns)
+    (guard, now_ns), (other, _) = in_motion(), in_motion()
+    here = guard.motion.position_rad
     refusal(guard, now_ns, still(HOME_RAD - 0.5))
-    refusal(guard, now_ns, JointReference(before.position_rad, np.full(7, 9.0), np.zeros(7)))
-    for got, expected in zip(guard.tick(now_ns), before, strict=True):
-        np.testing.assert_array_equal(got, expected)
+    refusal(guard, now_ns, JointReference(here, np.full(7, 9.0), np.zeros(7)))
+    for tick in range(1, 20):
+        after = now_ns + tick * TICK_NS
+        for got, expected in zip(guard.tick(after), other.tick(after), strict=True):
+            np.testing.assert_array_equal(got, expected)
 
 
 # -- silence ----------------------------------------------------------------------------------
@@ -404,5 +403,9 @@ def test_limits_may_be_given_for_any_arm() -> None:
     )
     guard = JointGuard(("a", "b"), np.zeros(2), TICK_S, two)
     command = JointCommand(("b", "a"), [0.001, 0.002], [0, 0], [0, 0], "active")
-    assert guard.offer(Stamped(Header(START_NS, 0, "x"), command, START_NS), START_NS) is None
-    np.testing.assert_array_equal(guard.tick(START_NS).position_rad, [0.002, 0.001])
+    for tick in range(500):
+        now_ns = START_NS + tick * TICK_NS
+        given = Stamped(Header(now_ns, tick, "x"), command, now_ns)
+        assert guard.offer(given, now_ns) is None
+        motion = guard.tick(now_ns)
+    np.testing.assert_array_equal(motion.position_rad, [0.002, 0.001])

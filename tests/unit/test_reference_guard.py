@@ -22,39 +22,44 @@ BRAKE = MotionLimits((1.0, 4.0, 40.0), (3.0, 12.0, 120.0))
 LIMITS = GuardLimits(0.1, BRAKE)
 START = Pose(np.array([0.43, 0.0, 0.3]), exp3(np.array([3.0, 0.1, 0.0])))
 SOURCE = "command-1"
-RAMP_S = 0.16
+RAMP_S = 0.4
+SETTLED_MS = 550
+RAMP_ATOL_M = 5e-6  # while its jerk changes: that is known only where the next command comes
 LATE_ATOL_MS = 20.0
 PATH_ATOL_M = 5e-5  # what clocks may drift apart while a command is held up
 FOLLOWED_M, FOLLOWED_RAD = 1e-4, 1e-3
-STEP_M, STEP_M_S = (
-    6e-4,
-    0.2,
-)  # beside its own motion; 0.2 m/s in a tick of 4 ms is for an ill stream
-EVEN_M_S2 = 13.0  # 60 ms of a drift of 1e-3 at 0.2 m/s, made up for in one tick; a stop is 200
+STEP_M, STEP_M_S = 4e-5, 0.017  # beside its own motion, in a tick of 4 ms: at 4 m/s^2
 SHORT_STEP_M, CAUGHT_UP_M = 1e-4, 1e-5
 RTOL = 1e-6
 
 
 class Line:
-    """Commands along x, stamped on the clock of their writer: from rest to a constant speed."""
+    """Commands along x, stamped on the clock of their writer: from rest to a constant speed.
+
+    The speed grows as a cosine does, within the half of `BRAKE` that a stream has.
+    """
 
     def __init__(self, speed: float, ahead_ns: int = 0) -> None:
         self.speed, self.ahead_ns, self.seq = speed, ahead_ns, 0
 
     def x(self, t_ns: int) -> float:
         t_s = t_ns / 1e9
-        ramp_s = min(t_s, RAMP_S)
-        way_m = self.speed * (ramp_s * ramp_s / (2 * RAMP_S) + t_s - ramp_s)
+        ramp_s, w = min(t_s, RAMP_S), np.pi / RAMP_S
+        way_m = self.speed * ((ramp_s - np.sin(w * ramp_s) / w) / 2 + t_s - ramp_s)
         return float(START.position_m[0]) + way_m
 
     def v(self, t_ns: int) -> float:
-        return self.speed * min(t_ns / 1e9 / RAMP_S, 1.0)
+        return self.speed * (1 - np.cos(np.pi * min(t_ns / 1e9 / RAMP_S, 1.0))) / 2
+
+    def a(self, t_ns: int) -> float:
+        share = min(t_ns / 1e9 / RAMP_S, 1.0)
+        return self.speed * np.pi / RAMP_S * float(np.sin(np.pi * share)) / 2
 
     def at(self, t_ns: int, arrives_ns: int | None = None, **how: Any) -> Stamped[PoseCommand]:
         self.seq += 1
         header = Header(10**15 + t_ns + self.ahead_ns, self.seq, SOURCE)
         arrives_ns = t_ns if arrives_ns is None else arrives_ns
-        how = {"acceleration": self.speed / RAMP_S if t_ns < RAMP_S * 1e9 else 0.0, **how}
+        how = {"acceleration": self.a(t_ns), **how}
         return command(self.x(t_ns), self.v(t_ns), header, arrives_ns, **how)
 
 
@@ -96,25 +101,25 @@ def test_between_two_commands_it_goes_on_along_the_path_whatever_clock_they_are_
     ahead_ns: int,
 ) -> None:
     side, line = guard(), Line(0.3, ahead_ns)
-    for t in range(500):
+    for t in range(800):
         if t % 4 == 0:
             assert side.offer(line.at(t * MS), now(t * MS)) is None
         x = float(side.tick(now(t * MS)).pose.position_m[0])
-        assert x == pytest.approx(line.x(t * MS), abs=1e-9)
+        assert x == pytest.approx(line.x(t * MS), abs=RAMP_ATOL_M if t < SETTLED_MS else 1e-9)
 
 
 @pytest.mark.parametrize("held_up_ms", [5, 30, 80])
 def test_a_command_that_was_held_up_on_its_way_does_not_pull_it_back(held_up_ms: int) -> None:
     side, line, before = guard(), Line(0.4), 0.0
-    for t in range(600):
-        if t == 200 + held_up_ms:  # all that were held up arrive at once
-            for late in range(200, t, 4):
+    for t in range(900):
+        if t == 500 + held_up_ms:  # all that were held up arrive at once
+            for late in range(500, t, 4):
                 side.offer(line.at(late * MS, arrives_ns=t * MS), now(t * MS))
-        if t % 4 == 0 and not 200 <= t < 200 + held_up_ms:
+        if t % 4 == 0 and not 500 <= t < 500 + held_up_ms:
             side.offer(line.at(t * MS), now(t * MS))
         x = float(side.tick(now(t * MS)).pose.position_m[0])
         assert x == pytest.approx(line.x(t * MS), abs=PATH_ATOL_M)
-        assert x > before
+        assert x > before or t < 4
         before = x
 
 
@@ -139,25 +144,25 @@ def test_a_stream_that_comes_later_and_later_ends_as_one_that_fell_silent() -> N
 @pytest.mark.parametrize("step_ns", [-2 * 10**9, 2 * 10**9])
 def test_a_writer_whose_clock_is_set_is_followed_on(step_ns: int) -> None:
     side, line = guard(), Line(0.3)
-    for t in range(600):
+    for t in range(900):
         if t % 4 == 0:
-            line.ahead_ns = step_ns if t >= 300 else 0
+            line.ahead_ns = step_ns if t >= 600 else 0
             assert side.offer(line.at(t * MS), now(t * MS)) is None
         x = float(side.tick(now(t * MS)).pose.position_m[0])
-        assert x == pytest.approx(line.x(t * MS), abs=1e-6)
+        assert x == pytest.approx(line.x(t * MS), abs=RAMP_ATOL_M if t < SETTLED_MS else 1e-6)
 
 
 def test_one_stamp_from_the_future_does_not_spoil_the_clock() -> None:
     side, line = guard(), Line(0.3)
-    for t in range(0, 400, 4):
+    for t in range(0, 900, 4):
         given = line.at(t * MS)
-        if t == 200:
+        if t == 600:
             header = Header(given.header.stamp_wall_ns + 5 * 10**9, given.header.seq, SOURCE)
             given = Stamped(header, given.record, given.received_ns)
         side.offer(given, now(t * MS))
         for ms in range(t, t + 4):
             x = float(side.tick(now(ms * MS)).pose.position_m[0])
-            assert x == pytest.approx(line.x(ms * MS), abs=1e-6)
+            assert x == pytest.approx(line.x(ms * MS), abs=RAMP_ATOL_M if t < SETTLED_MS else 1e-6)
 
 
 def test_a_real_stream_is_followed_closely() -> None:
@@ -289,7 +294,7 @@ def test_silence_after_a_command_that_was_held_up_does_not_stop_it_within_a_tick
             assert side.offer(line.at(396 * MS, t * MS), now(t * MS)) is None
         x_m.append(side.tick(now(t * MS)).pose.position_m[0])
     hardest_m_s2 = np.abs(np.diff(x_m, 2)).max() / TICK_S**2
-    assert hardest_m_s2 < max(line.speed / RAMP_S, BRAKE.translation[1]) + EVEN_M_S2
+    assert hardest_m_s2 <= BRAKE.translation[1] * (1 + RTOL)
     assert side.silences == 1
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -12,9 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
+from guard_rig import JointWriter
 
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
+from vla_zenoh.control.joint_reference import joint_motion_limits
+from vla_zenoh.control.stream import BRAKE_MARGIN
 from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes import arm_hearing, slots
 from vla_zenoh.nodes.arm import ArmNode
@@ -223,6 +227,49 @@ def test_a_loop_that_is_too_slow_to_brake_ends_in_time_and_says_so(turns: Turns)
     assert (turns.turn - turns.last) * SLOW_S < 2 * LEAST_S
     (event,) = turns.told("not_braked")
     assert "the loop came too late" in event.why
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_over_an_ill_link_what_move_is_given_keeps_the_limits(turns: Turns, seed: int) -> None:
+    """As one computes velocity, acceleration and jerk who is given positions alone."""
+    rng, profile = random.Random(seed), turns.node.node.profile
+    writer, waiting = JointWriter(profile, turns.home_rad, rng), []
+    held_until = 0
+
+    def lead() -> None:
+        nonlocal held_until
+        if turns.turn % 60 == 1:
+            writer.aim()
+        stamp_ns = turns.node.node.clock.wall_at(turns.mono_ns)
+        header = Header(stamp_ns, turns.turn, "command#1")
+        if rng.random() < 0.01:
+            held_until = turns.turn + rng.randint(2, 20)
+        if rng.random() < 0.85:
+            arrives = max(turns.turn + rng.randint(0, 4), held_until)
+            waiting.append((arrives, header, writer.tick()))
+        else:
+            writer.tick()
+        for each in [each for each in waiting if each[0] <= turns.turn]:
+            waiting.remove(each)
+            turns.session.put(
+                turns.node.node.keys.command_joint,
+                records.encode(each[2]),
+                attachment=header_codec.encode(each[1]),
+            )
+
+    turns.lead = lead  # type: ignore[method-assign]
+    turns.last = 6 * MOVING
+    for late in (1, 3):
+        turns.script[late * MOVING] = lambda: setattr(turns, "period_s", 0.03)
+        turns.script[late * MOVING + 1] = lambda: setattr(turns, "period_s", TICK_S)
+    turns.run()
+    stood = np.repeat([turns.home_rad], 3, axis=0)
+    path = np.vstack([stood, turns.arm.moves])
+    for order, limit in enumerate(joint_motion_limits(profile, BRAKE_MARGIN), start=1):
+        differences = np.abs(np.diff(path, order, axis=0)) / TICK_S**order
+        assert (differences.max(axis=0) <= 1.04 * limit).all()
+        assert differences.max() > 0.3 * limit.min()
+    assert len(path) > 5 * MOVING
 
 
 # -- what is raised ---------------------------------------------------------------------------

@@ -80,6 +80,11 @@ class ArmGuard:
         return self._in_charge.following
 
     @property
+    def moving(self) -> bool:
+        """A stream is being followed, or what was followed last is still brought to rest."""
+        return self._in_charge.moving
+
+    @property
     def writer(self) -> str:
         """Source of the stream that is being followed, empty where none is."""
         return self._writer if self.following else ""

@@ -18,18 +18,12 @@ from ruckig import (
     Trajectory,
 )
 
-from vla_zenoh.control.correction import Correction
+from vla_zenoh.control.governor import Limits, Way
 from vla_zenoh.control.joint_impedance import JointReference
-from vla_zenoh.control.stream import ACCELERATE_S, BRAKE_MARGIN, CommandStream
+from vla_zenoh.control.stream import BRAKE_MARGIN
+from vla_zenoh.control.stream_guard import StreamGuard
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, JointCommand, Stamped
-
-STILL_RAD_S = 1e-4
-"""A stream that ends slower than this has ended on purpose."""
-
-SMOOTHED_RAD, SMOOTHED_RAD_S = 0.002, 0.1
-"""A reference that would step by this much, beyond its own motion, goes over instead: see
-`vla_zenoh.control.reference`."""
 
 
 class JointMotionLimits(NamedTuple):
@@ -62,7 +56,32 @@ class JointGuardLimits(NamedTuple):
     begin_rad_s: float = 0.1
 
 
-class JointGuard:
+class JointSpace:
+    """Joint positions (n,); a way beside one is their difference."""
+
+    def rest(self, motion: JointReference) -> JointReference:
+        """Standing where `motion` is."""
+        return JointReference.at_rest(motion.position_rad)
+
+    def speed(self, motion: JointReference) -> Way:
+        """Velocity and acceleration."""
+        _, velocity_rad_s, acceleration_rad_s2 = motion
+        return Way(np.zeros(len(velocity_rad_s)), velocity_rad_s, acceleration_rad_s2)
+
+    def beside(self, base: JointReference, way: Way) -> JointReference:
+        """See `vla_zenoh.control.governor.Space`."""
+        return JointReference(base[0] + way[0], base[1] + way[1], base[2] + way[2])
+
+    def apart(self, motion: JointReference, base: JointReference) -> Way:
+        """See `vla_zenoh.control.governor.Space`."""
+        return Way(motion[0] - base[0], motion[1] - base[1], motion[2] - base[2])
+
+    def sizes(self, shares: FloatArray) -> FloatArray:
+        """Every joint counts."""
+        return np.abs(shares)
+
+
+class JointGuard(StreamGuard[JointReference]):
     """See the module.
 
     Args:
@@ -81,13 +100,10 @@ class JointGuard:
     ) -> None:
         self._names = tuple(names)
         self._limits = limits
-        self._dt_s = dt_s
-        self._stream: CommandStream[JointReference] = CommandStream(limits.timeout_s)
-        self._correction = Correction(len(position_rad), dt_s)
-        self._brake: Trajectory | None = None
-        self._brake_s = 0.0
-        self.silences = 0
-        self.motion = JointReference.at_rest(position_rad)
+        still = JointReference.at_rest(position_rad)
+        whole = np.ones(len(position_rad))
+        brake = Limits(*limits.brake, axis=whole, beside=whole)
+        super().__init__(JointSpace(), still, dt_s, limits.timeout_s, brake)
 
     def restart(self, position_rad: FloatArray) -> None:
         """The robot was put elsewhere; follow nobody and stand."""
@@ -96,24 +112,7 @@ class JointGuard:
 
     def anchor(self, position_rad: FloatArray) -> None:
         """Somebody else moved the robot; follow nobody and stand. Commands heard stay heard."""
-        self._stream.end()
-        self._correction.clear()
-        self._brake = None
-        self.motion = JointReference.at_rest(position_rad)
-
-    def stand(self) -> None:
-        """Follow nobody and stand where the reference is: the arm stopped there by itself."""
-        self.anchor(self.motion.position_rad)
-
-    @property
-    def following(self) -> bool:
-        """A command stream is being followed."""
-        return self._stream.newest is not None
-
-    @property
-    def braking(self) -> bool:
-        """The stream fell silent in motion."""
-        return self._brake is not None
+        self._put(JointReference.at_rest(position_rad))
 
     def offer(self, command: Stamped[JointCommand], now_ns: int) -> str | None:
         """Take a command, or say in one word why not.
@@ -122,17 +121,15 @@ class JointGuard:
             None, or ``foreign``, ``replayed``, ``late``, ``braking``, ``names`` (not exactly the
             arm's joints), ``jump``, ``too_fast``, ``out_of_range``.
         """
-        objection = self._stream.objection(command.header, command.received_ns)
+        objection = self._objection(command.header, command.received_ns)
         if objection is not None:
             return objection
-        if self.braking:
-            return "braking"
         wanted = self._ordered(command.record)
         if wanted is None:
             return "names"
         here, limits = self.motion.position_rad, self._limits
         jump_rad = limits.jump_rad if self.following else limits.begin_rad
-        if (np.abs(wanted.position_rad - here) > jump_rad).any():
+        if (np.abs(wanted.position_rad - self._expected.position_rad) > jump_rad).any():
             return "jump"
         if (np.abs(wanted.velocity_rad_s) > limits.brake.velocity_rad_s).any() or (
             np.abs(wanted.acceleration_rad_s2) > limits.brake.acceleration_rad_s2
@@ -145,7 +142,7 @@ class JointGuard:
             wanted.position_rad > np.maximum(limits.upper_rad, here)
         ).any():
             return "out_of_range"
-        self._stream.take(Stamped(command.header, wanted, command.received_ns))
+        self._take(Stamped(command.header, wanted, command.received_ns))
         return None
 
     def _ordered(self, record: JointCommand) -> JointReference | None:
@@ -157,71 +154,6 @@ class JointGuard:
             return None
         order = [record.names.index(name) for name in self._names]
         return JointReference(*(column[order] for column in columns))
-
-    def tick(self, now_ns: int) -> JointReference:
-        """The reference to follow at `now_ns`."""
-        command = self._stream.live(now_ns)
-        if command is not None:
-            self._correction.tick()
-            told = self._extrapolate(command, self._stream.ahead_s(now_ns))
-            may_step = self._stream.may_step(now_ns, self._dt_s)
-            self.motion = self._joined(told) if may_step else self._corrected(told)
-            return self.motion
-        if self._stream.newest is not None:
-            self._end_of_stream()
-        if self._brake is None:
-            self.motion = JointReference.at_rest(self.motion.position_rad)
-            return self.motion
-        self._brake_s += self._dt_s
-        self.motion = JointReference(*map(np.array, self._brake.at_time(self._brake_s)))
-        if self._brake_s >= self._brake.duration:
-            self._brake = None
-        return self.motion
-
-    def _joined(self, told: JointReference) -> JointReference:
-        """What is told, so that it goes on from the reference of the tick before without a step."""
-        motion, dt_s, last = self._corrected(told), self._dt_s, self.motion
-        velocity = last.velocity_rad_s + last.acceleration_rad_s2 * dt_s
-        position = last.position_rad + (last.velocity_rad_s + velocity) * (0.5 * dt_s)
-        if (
-            float(np.abs(motion.position_rad - position).max()) > SMOOTHED_RAD
-            or float(np.abs(motion.velocity_rad_s - velocity).max()) > SMOOTHED_RAD_S
-        ):
-            self._correction.begin(position - told.position_rad, velocity - told.velocity_rad_s)
-            return self._corrected(told)
-        return motion
-
-    def _corrected(self, motion: JointReference) -> JointReference:
-        rest = self._correction.now
-        if rest is None:
-            return motion
-        return JointReference(
-            motion.position_rad + rest.value,
-            motion.velocity_rad_s + rest.rate,
-            motion.acceleration_rad_s2 + rest.change,
-        )
-
-    def _end_of_stream(self) -> None:
-        self._stream.end()
-        self._correction.clear()
-        if float(np.abs(self.motion.velocity_rad_s).max()) < STILL_RAD_S:
-            return
-        self.silences += 1
-        self._brake = stop_from(self.motion, self._limits.brake)
-        self._brake_s = 0.0
-
-    @staticmethod
-    def _extrapolate(command: JointReference, ahead_s: float) -> JointReference:
-        believed_s = min(ahead_s, ACCELERATE_S)
-        position_rad, velocity_rad_s, acceleration_rad_s2 = command
-        velocity_rad_s = velocity_rad_s + acceleration_rad_s2 * believed_s
-        return JointReference(
-            position_rad
-            + velocity_rad_s * ahead_s
-            - acceleration_rad_s2 * (0.5 * believed_s * believed_s),
-            velocity_rad_s,
-            np.zeros(len(position_rad)) if ahead_s > believed_s else acceleration_rad_s2,
-        )
 
 
 def stop_from(motion: JointReference, limits: JointMotionLimits) -> Trajectory | None:

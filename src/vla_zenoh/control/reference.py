@@ -12,29 +12,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.correction import Correction
-from vla_zenoh.control.smoothing import Motion, MotionLimits, Smoother, motion_limits
+from vla_zenoh.control.governor import Limits, Way
+from vla_zenoh.control.smoothing import Motion, MotionLimits, motion_limits
 from vla_zenoh.control.so3 import (
     Pose,
     angle_between,
+    cross3,
     exp3,
     log3,
     norm3,
-    orthonormal,
+    rates_of,
     rotation_from_quat,
+    spatial_rates,
 )
-from vla_zenoh.control.stream import ACCELERATE_S, BRAKE_MARGIN, CommandStream
+from vla_zenoh.control.stream import BRAKE_MARGIN
+from vla_zenoh.control.stream_guard import StreamGuard
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import PoseCommand, Stamped
+from vla_zenoh.types import FloatArray, PoseCommand, Stamped
 
-STILL = 1e-4
-"""m/s and rad/s: a stream that ends slower than this has ended on purpose."""
-
-
-SMOOTHED_M, SMOOTHED_RAD = 0.0005, 0.002
-SMOOTHED_M_S, SMOOTHED_RAD_S = 0.03, 0.1
-"""A reference that would step by this much, beyond its own motion, goes over instead: a command was
-late or lost, the stream began a little aside, or this side itself was woken late."""
+TURN_STOP, TURN_BESIDE = 0.55, 0.5
+"""Parts of a limit of rotation that each axis may have, so that the norm of three keeps it: in a
+stop, and beside a motion that turns as well."""
 
 
 class GuardLimits(NamedTuple):
@@ -62,7 +60,57 @@ class GuardLimits(NamedTuple):
     begin_rad_s: float = 0.1
 
 
-class ReferenceGuard:
+class PoseSpace:
+    """Poses; a way beside one is of the position, and of the rotation vector r of ``exp3(r) R``.
+
+    Its rates are exact however large r is, so that the twist of what lies beside a motion is that
+    of its poses.
+    """
+
+    def rest(self, motion: Motion) -> Motion:
+        """Standing where `motion` is."""
+        return Motion(motion.pose, _STILL, _STILL)
+
+    def speed(self, motion: Motion) -> Way:
+        """Twist and acceleration."""
+        return Way(_STILL, motion.twist, motion.acceleration)
+
+    def beside(self, base: Motion, way: Way) -> Motion:
+        """See `vla_zenoh.control.governor.Space`."""
+        turn = exp3(way.value[3:])
+        spin, spin_change = spatial_rates(way.value[3:], way.rate[3:], way.change[3:])
+        twist, acceleration = base.twist + way.rate, base.acceleration + way.change
+        if base.twist is not _STILL:
+            carried = turn @ base.twist[3:]
+            spin_change += turn @ base.acceleration[3:] + cross3(spin, carried)
+            spin += carried
+        twist[3:], acceleration[3:] = spin, spin_change
+        pose = Pose(base.pose.position_m + way.value[:3], turn @ base.pose.rotation)
+        return Motion(pose, twist, acceleration)
+
+    def apart(self, motion: Motion, base: Motion) -> Way:
+        """See `vla_zenoh.control.governor.Space`."""
+        turn = motion.pose.rotation @ base.pose.rotation.T
+        rotvec = log3(turn)
+        carried = turn @ base.twist[3:]
+        spin = motion.twist[3:] - carried
+        spin_change = motion.acceleration[3:] - turn @ base.acceleration[3:] - cross3(spin, carried)
+        rate, change = motion.twist - base.twist, motion.acceleration - base.acceleration
+        rate[3:], change[3:] = rates_of(rotvec, spin, spin_change)
+        value = np.concatenate([motion.pose.position_m - base.pose.position_m, rotvec])
+        return Way(value, rate, change)
+
+    def sizes(self, shares: FloatArray) -> FloatArray:
+        """Of translation an axis counts, of rotation the norm."""
+        sizes = np.abs(shares)
+        sizes[..., 3:] = np.sqrt((shares[..., 3:] ** 2).sum(axis=-1, keepdims=True))
+        return sizes
+
+
+_STILL = np.zeros(6)
+
+
+class ReferenceGuard(StreamGuard[Motion]):
     """See the module.
 
     Args:
@@ -73,14 +121,9 @@ class ReferenceGuard:
 
     def __init__(self, pose: Pose, dt_s: float, limits: GuardLimits) -> None:
         self._limits = limits
-        self._dt_s = dt_s
-        self._smoother = Smoother(pose, dt_s, limits.brake)
-        self._brake_limits = limits.brake
-        self._stream: CommandStream[PoseCommand] = CommandStream(limits.timeout_s)
-        self._correction = Correction(6, dt_s)
-        self.braking = False
-        self.silences = 0
-        self.motion = self._smoother.motion
+        super().__init__(
+            PoseSpace(), _standing(pose), dt_s, limits.timeout_s, _governed(limits.brake)
+        )
 
     def restart(self, pose: Pose) -> None:
         """The robot was put elsewhere; follow nobody and stand."""
@@ -89,20 +132,7 @@ class ReferenceGuard:
 
     def anchor(self, pose: Pose) -> None:
         """Somebody else moved the robot; follow nobody and stand. Commands heard stay heard."""
-        self._stream.end()
-        self._correction.clear()
-        self.braking = False
-        self._smoother.reset(pose)
-        self.motion = self._smoother.motion
-
-    def stand(self) -> None:
-        """Follow nobody and stand where the reference is: the arm stopped there by itself."""
-        self.anchor(self.motion.pose)
-
-    @property
-    def following(self) -> bool:
-        """A command stream is being followed."""
-        return self._stream.newest is not None
+        self._put(_standing(pose))
 
     def offer(self, command: Stamped[PoseCommand], now_ns: int) -> str | None:
         """Take a command, or say in one word why not.
@@ -111,13 +141,11 @@ class ReferenceGuard:
             None, or ``foreign``, ``replayed``, ``late``, ``braking``, ``jump``, ``too_fast``.
         """
         record = command.record
-        objection = self._stream.objection(command.header, command.received_ns)
+        objection = self._objection(command.header, command.received_ns)
         if objection is not None:
             return objection
-        if self.braking:
-            return "braking"
         rotation = rotation_from_quat(record.quat_xyzw)
-        here, limits = self.motion.pose, self._limits
+        here, limits = self._expected.pose, self._limits
         jump_m, jump_rad = (
             (limits.jump_m, limits.jump_rad)
             if self.following
@@ -129,89 +157,32 @@ class ReferenceGuard:
         ):
             return "jump"
         for values, order in ((record.twist, 0), (record.acceleration, 1)):
-            if float(np.abs(values[:3]).max()) > self._brake_limits.translation[order]:
+            if float(np.abs(values[:3]).max()) > limits.brake.translation[order]:
                 return "too_fast"
-            if float(np.linalg.norm(values[3:])) > self._brake_limits.rotation[order]:
+            if float(np.linalg.norm(values[3:])) > limits.brake.rotation[order]:
                 return "too_fast"
         if not self.following and (
             norm3(record.twist[:3]) > limits.begin_m_s
             or norm3(record.twist[3:]) > limits.begin_rad_s
         ):
             return "too_fast"
-        self._stream.take(command)
+        motion = Motion(Pose(record.position_m, rotation), record.twist, record.acceleration)
+        self._take(Stamped(command.header, motion, command.received_ns))
         return None
 
-    def tick(self, now_ns: int) -> Motion:
-        """The reference to follow at `now_ns`."""
-        command = self._stream.live(now_ns)
-        if command is not None:
-            self._correction.tick()
-            told = self._extrapolate(command, now_ns)
-            may_step = self._stream.may_step(now_ns, self._dt_s)
-            self.motion = self._joined(told) if may_step else self._corrected(told)
-            return self.motion
-        if self._stream.newest is not None:
-            self._end_of_stream()
-        if self.braking:
-            self.motion = self._smoother.tick()
-            self.braking = not self._smoother.at_rest
-            return self.motion
-        self.motion = Motion(self.motion.pose, np.zeros(6), np.zeros(6))
-        return self.motion
 
-    def _joined(self, told: Motion) -> Motion:
-        """What is told, so that it goes on from the reference of the tick before without a step."""
-        motion, dt_s, last = self._corrected(told), self._dt_s, self.motion
-        twist = last.twist + last.acceleration * dt_s
-        way = (last.twist + twist) * (0.5 * dt_s)
-        position_m = last.pose.position_m + way[:3]
-        rotation = exp3(way[3:]) @ last.pose.rotation
-        if (
-            norm3(motion.pose.position_m - position_m) <= SMOOTHED_M
-            and angle_between(motion.pose.rotation, rotation) <= SMOOTHED_RAD
-            and norm3(motion.twist[:3] - twist[:3]) <= SMOOTHED_M_S
-            and norm3(motion.twist[3:] - twist[3:]) <= SMOOTHED_RAD_S
-        ):
-            return motion
-        apart_m = position_m - told.pose.position_m
-        turned = log3(rotation @ told.pose.rotation.T)
-        self._correction.begin(np.concatenate([apart_m, turned]), twist - told.twist)
-        return self._corrected(told)
+def _standing(pose: Pose) -> Motion:
+    position_m = np.array(pose.position_m, dtype=np.float64)
+    return Motion(Pose(position_m, np.array(pose.rotation)), _STILL, _STILL)
 
-    def _corrected(self, motion: Motion) -> Motion:
-        rest = self._correction.now
-        if rest is None:
-            return motion
-        return Motion(
-            Pose(
-                motion.pose.position_m + rest.value[:3],
-                orthonormal(exp3(rest.value[3:]) @ motion.pose.rotation),
-            ),
-            motion.twist + rest.rate,
-            motion.acceleration + rest.change,
-        )
 
-    def _end_of_stream(self) -> None:
-        self._stream.end()
-        self._correction.clear()
-        if float(np.abs(self.motion.twist).max()) < STILL:
-            return
-        self.silences += 1
-        self.braking = True
-        self._smoother.brake_from(self.motion)
-
-    def _extrapolate(self, record: PoseCommand, now_ns: int) -> Motion:
-        ahead_s = self._stream.ahead_s(now_ns)
-        believed_s = min(ahead_s, ACCELERATE_S)
-        twist = record.twist + record.acceleration * believed_s
-        step = twist * ahead_s - record.acceleration * (0.5 * believed_s * believed_s)
-        still = ahead_s > believed_s
-        rotation = rotation_from_quat(record.quat_xyzw)
-        return Motion(
-            Pose(record.position_m + step[:3], orthonormal(exp3(step[3:]) @ rotation)),
-            twist,
-            np.zeros(6) if still else record.acceleration,
-        )
+def _governed(limits: MotionLimits) -> Limits:
+    orders = (
+        np.repeat([straight, turning], 3)
+        for straight, turning in zip(limits.translation, limits.rotation, strict=True)
+    )
+    shares = (np.repeat([1.0, share], 3) for share in (TURN_STOP, TURN_BESIDE))
+    return Limits(*orders, *shares)
 
 
 def guard_limits(profile: Profile) -> GuardLimits:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -87,6 +88,16 @@ def norm3(vector: FloatArray) -> float:
     return math.hypot(*vector.tolist())
 
 
+def cross3(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross product of vectors (3,); `numpy.cross` costs ten times as much."""
+    return np.array(_cross(a.tolist(), b.tolist()))
+
+
+def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
+    (ax, ay, az), (bx, by, bz) = a, b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
 def angle_between(a: FloatArray, b: FloatArray) -> float:
     """Geodesic distance of two rotation matrices in rad."""
     return norm3(log3(b @ a.T))
@@ -118,6 +129,20 @@ def between(start: Pose, end: Pose, share: float) -> Pose:
     )
 
 
+def _coefficients(squared: float) -> tuple[float, float, float, float]:
+    """Of ``t^2``: ``B = (1 - cos t)/t^2``, ``C = (t - sin t)/t^3``, ``B'/t`` and ``C'/t``."""
+    angle = math.sqrt(squared)
+    if angle < 1e-3:  # series: the closed forms lose all digits here
+        return 0.5 - squared / 24, 1 / 6 - squared / 120, -1 / 12, -1 / 60
+    sine, cosine = math.sin(angle), math.cos(angle)
+    return (
+        (1 - cosine) / squared,
+        (angle - sine) / (squared * angle),
+        (angle * sine - 2 * (1 - cosine)) / squared**2,
+        ((1 - cosine) * angle - 3 * (angle - sine)) / (squared**2 * angle),
+    )
+
+
 def body_rates(
     rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -142,17 +167,7 @@ def body_rates(
 
     Source: Sola, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 143, differentiated.
     """
-    squared = float(rotvec @ rotvec)
-    angle = math.sqrt(squared)
-    if angle < 1e-3:  # series: the closed forms lose all digits here
-        b, c = 0.5 - squared / 24, 1 / 6 - squared / 120
-        db_over_angle, dc_over_angle = -1 / 12, -1 / 60
-    else:
-        sine, cosine = math.sin(angle), math.cos(angle)
-        b = (1 - cosine) / squared
-        c = (angle - sine) / (squared * angle)
-        db_over_angle = (angle * sine - 2 * (1 - cosine)) / squared**2
-        dc_over_angle = ((1 - cosine) * angle - 3 * (angle - sine)) / (squared**2 * angle)
+    b, c, db_over_angle, dc_over_angle = _coefficients(float(rotvec @ rotvec))
     cross = pin.skew(rotvec)
     along = float(rotvec @ rate)
     r_rate = cross @ rate
@@ -168,3 +183,53 @@ def body_rates(
         + c * (pin.skew(rate) @ r_rate)
     )
     return velocity, acceleration
+
+
+def spatial_rates(
+    rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Angular velocity and acceleration of ``exp3(r(t)) R0`` in the fixed axes: see `body_rates`.
+
+    With ``Jl(r) = Jr(-r) = I + B [r] + C [r]^2``, written out: it runs in every tick of a guard.
+    """
+    r, r1, r2 = rotvec.tolist(), rate.tolist(), rate_change.tolist()
+    squared = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
+    along = r[0] * r1[0] + r[1] * r1[1] + r[2] * r1[2]
+    b, c, b_rate, c_rate = _coefficients(squared)
+    b_rate, c_rate = b_rate * along, c_rate * along
+    p = _cross(r, r1)
+    q = _cross(r, p)
+    s = _cross(r, r2)
+    t, u = _cross(r, s), _cross(r1, p)
+    velocity = [r1[i] + b * p[i] + c * q[i] for i in range(3)]
+    acceleration = [
+        r2[i] + b * s[i] + b_rate * p[i] + c_rate * q[i] + c * (t[i] + u[i]) for i in range(3)
+    ]
+    return np.array(velocity), np.array(acceleration)
+
+
+def rates_of(
+    rotvec: FloatArray, velocity: FloatArray, acceleration: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The inverse of `spatial_rates`: r' and r'' of velocity and acceleration in the fixed axes.
+
+    With ``Jl^-1(r) = I - [r]/2 + D [r]^2``, ``D = 1/t^2 - (1 + cos t)/(2 t sin t)``, ``t = |r|``,
+    which is below pi.
+
+    Source: Sola, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 146.
+    """
+    angle = norm3(rotvec)
+    if angle < 1e-2:
+        d = 1 / 12 + angle * angle / 720
+    else:
+        d = 1 / angle**2 - (1 + math.cos(angle)) / (2 * angle * math.sin(angle))
+    r = rotvec.tolist()
+
+    def inverse(of: Sequence[float]) -> FloatArray:
+        p = _cross(r, of)
+        q = _cross(r, p)
+        return np.array([of[i] - 0.5 * p[i] + d * q[i] for i in range(3)])
+
+    rate = inverse(velocity.tolist())
+    _, of_rate = spatial_rates(rotvec, rate, _ORIGIN)
+    return rate, inverse((acceleration - of_rate).tolist())

@@ -134,9 +134,9 @@ class Lead:
     ) -> None:
         if away and self.sending:
             guard.anchor()  # who follows later must not be led on from where nobody went
-        was_braking = guard.braking
+        was_moving = guard.moving
         reference = guard.tick(mono_ns)
-        if guard.following or guard.braking or was_braking:
+        if guard.moving or was_moving:
             self._hold.sent(mono_ns)
             self._send(self._target(reference), now_ns)
         else:
@@ -195,7 +195,7 @@ class Lead:
     @property
     def sending(self) -> bool:
         """The robot is being sent targets."""
-        return self.following or self.braking
+        return self._guard is not None and self._guard.moving
 
     @property
     def writer(self) -> str:
