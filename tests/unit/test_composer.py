@@ -16,6 +16,7 @@ from vla_zenoh.control.compose import Goal, GoalTimeline
 from vla_zenoh.control.composer import PATIENCE, ChunkPlan, Composer
 from vla_zenoh.control.ik import Approach
 from vla_zenoh.control.reach import Shadow
+from vla_zenoh.control.slowdown import Slowdown, going_on
 from vla_zenoh.control.so3 import Pose, angle_between, norm3, rotation_from_quat
 from vla_zenoh.profile import Limits, Profile, ReachLimits
 from vla_zenoh.types import ActionChunk, FloatArray, Header, Stamped
@@ -390,3 +391,18 @@ def test_a_target_for_which_the_joints_are_too_slow_is_reached_slower() -> None:
         joints.append(slow._solver.approach(pose, joints[-1], bounded=False).joints_rad)
     speed = np.abs(np.diff(joints, axis=0)).max() * rig.profile.timing.command_hz
     assert speed < 0.3 * 1.25  # of a straight step whose middle needs more than its mean
+
+
+def test_what_slowed_a_step_lasts_until_the_arm_is_through_with_it() -> None:
+    slow = Slowdown("joint_velocity", 0.5, 3.0, 2.0, "joint1", late_s=0.15)
+    then = going_on(slow, None, 0.1, 0.3)
+    assert then is not None
+    assert (then.name, then.share, then.late_s) == ("joint_velocity", 0.5, pytest.approx(0.05))
+    assert going_on(then, None, 0.1, 0.3) is None
+    twice = going_on(slow, slow._replace(share=0.8), 0.1, 0.3)
+    assert twice is not None
+    assert (twice.share, twice.late_s) == (0.5, pytest.approx(0.3))
+    # Never longer than the way takes by which the leash lets the goal be ahead.
+    long = going_on(slow._replace(late_s=9.0), slow, 0.1, 0.3)
+    assert long is not None
+    assert long.late_s == pytest.approx(0.6)
