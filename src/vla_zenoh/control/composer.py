@@ -40,7 +40,6 @@ PATIENCE = 24
 """After so many for one chunk it comes in force with the steps that are bounded."""
 LOOK_AHEAD = 8
 """Steps that are bounded before they are due."""
-
 BEHIND_S = 0.3
 """An arm is behind its goal by up to this where an approach ends."""
 
@@ -237,14 +236,14 @@ class Composer:
             step = plan.under_way = self._ask(plan)
         found: Bounded | None = None
         while step.pieces is not None and found is None:
-            if self._left == 0:
+            if self._left <= 0 or self._reach is None:
                 return None
-            self._left -= 1
-            plan.spent += 1
             try:
                 next(step.pieces)
             except StopIteration as end:
                 found = end.value
+            self._left -= self._reach.cost
+            plan.spent += self._reach.cost
         index, pose, hits, slower, joints_rad = plan.bounded, step.pose, step.hits, None, None
         if found is not None:
             pose, joints_rad, slower = found.pose, found.joints_rad, found.slowdown

@@ -14,6 +14,7 @@ method", IEEE Trans. Robotics 27(5), 2011; here a metre weighs as much as a radi
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -27,6 +28,8 @@ from vla_zenoh.errors import RecordError
 from vla_zenoh.types import FloatArray
 
 _IDENTITY_6 = np.eye(6)
+HOLDING = 2
+"""Iterations that a round costs in which joints are put on their bounds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +67,7 @@ class Approach(NamedTuple):
         solved: within the tolerances.
         wanted_rad: (n,) the last iteration's joints before they were put on their bounds.
         jacobian: (6, n) at `joints_rad`.
+        effort: what it took, in iterations: some 3, and many times that at the ends of ranges.
     """
 
     joints_rad: FloatArray
@@ -72,6 +76,7 @@ class Approach(NamedTuple):
     solved: bool
     wanted_rad: FloatArray
     jacobian: FloatArray
+    effort: int
 
 
 def pose_error(goal: Pose, here: Pose) -> FloatArray:
@@ -138,7 +143,7 @@ class InverseKinematics:
         settings = self.settings
         lower, upper = self.bounds(start_rad)
         joints = wanted = start_rad
-        last, stalls = math.inf, 0
+        last, stalls, effort = math.inf, 0, 0
         for iteration in range(settings.max_iterations + 1):
             here, jacobian = self.kinematics.pose_and_jacobian(joints)
             error = pose_error(pose, here)
@@ -152,7 +157,8 @@ class InverseKinematics:
             # At a bound or out of reach the error shrinks by ever less: three rounds are proof.
             stalls = stalls + 1 if squared > 0.8 * last and iteration > 2 else 0
             if solved or stalls == 3 or iteration == settings.max_iterations:
-                return Approach(joints, error_m, error_rad, solved, wanted, jacobian)
+                effort += iteration
+                return Approach(joints, error_m, error_rad, solved, wanted, jacobian, effort)
             last = squared
             # After the first iteration the pose has the last word.
             drift = self._drift(joints) if iteration == 0 else None
@@ -162,7 +168,10 @@ class InverseKinematics:
                 step *= settings.max_joint_step_rad / largest
             wanted = joints + step
             if bounded:
-                joints = self._inside(wanted, joints, error, jacobian, drift, squared, lower, upper)
+                joints, rounds = self._inside(
+                    wanted, joints, error, jacobian, drift, squared, lower, upper
+                )
+                effort += HOLDING * rounds
             else:
                 joints = wanted
         raise AssertionError("the last iteration returns")
@@ -198,22 +207,26 @@ class InverseKinematics:
         squared: float,
         lower: FloatArray,
         upper: FloatArray,
-    ) -> FloatArray:
-        """`wanted`, or the best step of the other joints once those past a bound stand on it."""
+    ) -> tuple[FloatArray, int]:
+        """`wanted`, or the best step of the other joints once those past a bound stand on it.
+
+        And in how many rounds.
+        """
         if ((wanted >= lower) & (wanted <= upper)).all():
-            return wanted
+            return wanted, 0
         held = np.zeros(len(joints), dtype=bool)
         step = wanted - joints
-        while True:
+        for rounds in itertools.count(1):
             wanted = joints + step
             past = ~held & ((wanted < lower) | (wanted > upper))
             if not past.any():
-                return np.clip(wanted, lower, upper)
+                return np.clip(wanted, lower, upper), rounds
             held |= past
             if held.sum() > len(joints) - 1:
-                return np.clip(wanted, lower, upper)
+                return np.clip(wanted, lower, upper), rounds
             onto = np.where(held, np.clip(wanted, lower, upper) - joints, 0.0)
             free = np.where(held, 0.0, jacobian)
             damping = 0.5 * squared + self.settings.damping_bias + 1e-6
             aside = None if drift is None else np.where(held, 0.0, drift)
             step = onto + self._step(error - jacobian @ onto, free, aside, damping)
+        raise AssertionError("there are no more joints to hold")

@@ -45,6 +45,8 @@ GUESS_SHORT = 0.95
 """A linear guess of the feasible part is taken a little shorter: most barriers bend downwards."""
 SOLVER_ITERATIONS = 12
 """Steps are short and the start is near: who has not arrived by then will not."""
+EFFORT = 5
+"""Iterations of the solver that an evaluation may have; with more it counts as several."""
 SAME_POSE = 1e-9
 
 
@@ -143,6 +145,8 @@ class Shadow:
         self._here = _Stand(pose, joints, 0.0, self.barriers.at(joints, jacobian))
         self.slowdown: Slowdown | None = None
         """Why the step bounded last is to be taken slower than at full speed."""
+        self.cost = 1
+        """For how many the last evaluation counts."""
 
     @property
     def joints_rad(self) -> FloatArray:
@@ -175,7 +179,7 @@ class Shadow:
         """The furthest pose on the way from `before` to `asked` that the arm can take, in pieces.
 
         It stops before every evaluation (joints for a pose, and how near that is to what): what
-        one costs is known, and how many there are is not, some 10 where a limit cuts.
+        one costs is known, see `cost`, and how many there are is not, some 10 where a limit cuts.
 
         Args:
             before: where the step starts, usually the pose bounded last.
@@ -237,7 +241,7 @@ class Shadow:
         if end is here or here.error > 0 or here.barriers.min() <= 0:
             return 0.5
         if hits[0].name == "joint_velocity":
-            return GUESS_SHORT * hits[0].limit / hits[0].value
+            return GUESS_SHORT * hits[0].limit / (SLOWEST * hits[0].value)
         room = here.barriers - start.floor
         fall = np.maximum(here.barriers - end.barriers, 1e-12)
         return GUESS_SHORT * min(1.0, float((room / fall).min()))
@@ -288,7 +292,9 @@ class Shadow:
         return floor
 
     def _approach(self, pose: Pose, start_rad: FloatArray) -> Approach:
-        return self._solver.approach(pose, start_rad, bounded=self._free_elbow)
+        found = self._solver.approach(pose, start_rad, bounded=self._free_elbow)
+        self.cost = max(1, found.effort // EFFORT)
+        return found
 
     def _out_of_range(self, start: _Start, joints_rad: FloatArray) -> LimitHit | None:
         lower, upper = start.lower_rad, start.upper_rad
