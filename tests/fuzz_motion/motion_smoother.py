@@ -38,6 +38,8 @@ NOISE = (0.0, 1e-17, 1e-16, 1e-15, 1e-14, 1e-13, 1e-12)
 SHAPES = ("axis", "plane", "line", "turn", "any", "any")
 MOST_TICKS = 4000
 REACHED = 1e-6
+AGAIN = 6
+"""An arm that stands is told its target so often once more."""
 Found = tuple[str, float, str, str]
 
 
@@ -80,7 +82,8 @@ def _case(rng: random.Random) -> tuple[int, list[Found]]:
     shared = rng.random() < 0.3
     parts: list[Shares] = []
     turns = rng.randint(2, 7)
-    for turn in range(turns):
+    again = 0
+    for turn in range(turns + AGAIN):
         ways, turned = np.zeros(3), np.zeros(3)
         size_m, size_rad = rng.uniform(-1, 1) * way_m, rng.uniform(-1, 1) * way_rad
         if shape == "axis":
@@ -97,17 +100,22 @@ def _case(rng: random.Random) -> tuple[int, list[Found]]:
             ways, turned = _vector(rng) * way_m, _vector(rng) * way_rad
         shaken = noise * _vector(rng)
         target = Pose(start.position_m + ways + shaken, exp3(turned + shaken) @ start.rotation)
-        if targets and rng.random() < 0.15:  # once more, where it may stand already
+        again = max(again - 1, 0)
+        if turn >= turns and not again:
+            break
+        if again or (targets and rng.random() < 0.15):  # once more, where it may stand already
             target = Pose(targets[-1].position_m + shaken, targets[-1].rotation)
         begins.append(len(motions))
         targets.append(target)
         many = (rng.choice([0.1, 0.5, 1.0]), rng.choice([0.4, 1.0]), rng.choice([0.3, 1.0]))
         parts.append(Shares(*many) if shared else Shares())
         smoother.target(target, parts[-1])
-        to_rest = turn == turns - 1 or rng.random() < 0.15
-        for _ in range(MOST_TICKS if to_rest else rng.choice([1, 3, 10, 30, 60])):
+        to_rest = not again and (turn == turns - 1 or rng.random() < 0.15)
+        ticks = rng.choice([1, 2, 5] if again else [1, 3, 10, 30, 60])
+        for _ in range(MOST_TICKS if to_rest else ticks):
             motions.append(smoother.tick())
             if to_rest and smoother.at_rest:
+                again = rng.choice([0, AGAIN])
                 break
     way = _Way(motions, begins, targets, parts, box, dt_s, shape)
     return len(motions), way.judged(smoother.failures - failures)
