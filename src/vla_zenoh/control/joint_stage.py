@@ -69,7 +69,8 @@ class JointStage:
         self._limits = JointMotionLimits(velocity, acceleration, jerk)
         self._posture_rad = kinematics.ordered(robot.arm_joints, robot.home_rad)
         settings = FollowSettings(
-            acceleration_rad_s2=tuple(float(value) for value in acceleration),
+            acceleration_rad_s2=tuple(acceleration.tolist()),
+            jerk_rad_s3=tuple(jerk.tolist()),
             velocity_share=min(share, 1.0),
             joint_margin_rad=limits.reach.joint_margin_rad,
             singularity_stop=limits.reach.singularity_stop,
@@ -86,7 +87,6 @@ class JointStage:
         """Stand at these joints (chain order); only for an arm that is not streamed to."""
         still = np.zeros(len(joints_rad))
         self._now = JointMotion(np.array(joints_rad, dtype=np.float64), still)
-        self._acceleration = still
         self._pull = self._pull_rate_1_s = 0.0
         self._stop: Trajectory | None = None
         self._stop_s = 0.0
@@ -154,7 +154,7 @@ class JointStage:
         if not braking:
             self._stop = None
         elif self._stop is None and lag > 1.0:
-            reference = JointReference(*self._now, self._acceleration)
+            reference = JointReference(*self._now[:2], self._acceleration)
             self._stop, self._stop_s = stop_from(reference, self._limits), 0.0
         if self._stop is not None:
             self._stopping(self._stop, smoother)
@@ -162,10 +162,8 @@ class JointStage:
         self.pace = min(max((FAR - lag) / (FAR - 1.0), SLOWEST), 1.0)
         motion = smoother.tick(self.pace)
         self._follower.posture_rad = self._pulled_to(0.0 if braking else 1.0)
-        before = self._now.velocity_rad_s
         twist = self.pace * motion.twist
         self._now, _ = self._follower.step(self._now, motion.pose, twist, self._dt_s)
-        self._acceleration = (self._now.velocity_rad_s - before) / self._dt_s
 
     def _lag(self, pose: Pose) -> float:
         """How far the joints are from a pose, in times of what is near."""
@@ -178,7 +176,7 @@ class JointStage:
         position, velocity, acceleration = map(np.array, path.at_time(self._stop_s))
         if self._stop_s >= path.duration:
             velocity = acceleration = np.zeros(len(position))
-        self._now, self._acceleration = JointMotion(position, velocity), acceleration
+        self._now = JointMotion(position, velocity, acceleration)
         self._pull = self._pull_rate_1_s = 0.0
         pose, jacobian = self._kinematics.pose_and_jacobian(position)
         # Whoever takes this stop back plans from here: with no more than a plan may have.
@@ -201,4 +199,10 @@ class JointStage:
 
     def command(self, state: str, cause: Cause | None) -> JointCommand:
         """Where the joints have to be now."""
-        return JointCommand(self._names, *self._now, self._acceleration, state=state, cause=cause)
+        motion = self._now
+        return JointCommand(self._names, *motion[:2], self._acceleration, state=state, cause=cause)
+
+    @property
+    def _acceleration(self) -> FloatArray:
+        told = self._now.acceleration_rad_s2
+        return np.zeros(len(self._now.position_rad)) if told is None else told
