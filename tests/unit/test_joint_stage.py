@@ -18,7 +18,7 @@ from vla_zenoh.control.states import State
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import FloatArray, GripperState, JointCommand, JointState, PoseState
 
-PROFILE = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})
+PROFILE = override(load_profile("panda_sim"), {"robot": {"command": "joint", "posture": "home"}})
 KINEMATICS = make_kinematics(PROFILE)
 LIMITS = joint_motion_limits(PROFILE)
 HOME_RAD = KINEMATICS.ordered(PROFILE.robot.arm_joints, PROFILE.robot.home_rad)

@@ -357,6 +357,7 @@ class Commander:
         )
         if not lost and self.streaming and not self.dry_run:
             lost = self._watch.blocked()
+        lost = lost or self._mover.stuck
         if not lost and self._watch.forsaken(now_ns):
             lost = f"held for {self.profile.timing.max_hold_s:g} s, no fresh chunk came"
         lost = lost or self.holding.lost(self._around.holders)

@@ -40,6 +40,7 @@ from vla_zenoh.control.ik import pose_error
 from vla_zenoh.control.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.so3 import Pose
+from vla_zenoh.control.walls import Walls
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types import FloatArray
 
@@ -49,6 +50,11 @@ WATCHED = 4.0
 BACK_SHARE = 0.7
 """Part of the acceleration planned with on the way to a far target, whose path is curved."""
 HALVINGS = 8
+WALL_SHARE = 0.5
+"""Part of the joints' acceleration and jerk towards a wall that is reckoned with: they have their
+work besides."""
+ELBOW_COST = 1e-2
+"""Cost of a joint's motion beside that of the TCP's."""
 BACK_JERK = 0.4
 """Way is made up for at a rate of so many times jerk over acceleration, at most one tick's."""
 ROUNDING_RAD_S = 1e-9
@@ -108,6 +114,7 @@ class JointFollower:
         kinematics: of the arm.
         posture_rad: (n,) where a redundant arm prefers to be.
         settings: see `FollowSettings`.
+        walls: what the arm is held before; None: nothing.
 
     Raises:
         RecordError: settings that do not fit the arm.
@@ -118,8 +125,9 @@ class JointFollower:
         kinematics: Kinematics,
         posture_rad: ArrayLike,
         settings: FollowSettings | None = None,
+        walls: Walls | None = None,
     ) -> None:
-        self.kinematics = kinematics
+        self.kinematics, self.walls = kinematics, walls
         self.settings = settings = settings or FollowSettings()
         self.posture_rad = np.array(posture_rad, dtype=np.float64)
         self.acceleration_rad_s2, self.jerk_rad_s3 = (
@@ -187,15 +195,87 @@ class JointFollower:
             asked, limit = ratio * abs(float(wanted[joint])), float(self.velocity_rad_s[joint])
             name = self.kinematics.arm_joints[joint]
             hits.append(LimitHit("joint_velocity", asked, limit, where=name))
-        reached = np.clip(reached, low, high)
+        reached = self._before_walls(reached, low, high, now, here, jacobian, dt_s)
         acceleration = (reached - velocity) / dt_s
         return JointMotion(joints + reached * dt_s, reached, acceleration, wanted), hits
 
     def brake(self, now: JointMotion, dt_s: float) -> JointMotion:
-        """The joints one tick later when they are to stop as soon as they can."""
-        most = self.acceleration_rad_s2 * dt_s
-        velocity = now.velocity_rad_s - np.clip(now.velocity_rad_s, -most, most)
-        return JointMotion(now.position_rad + velocity * dt_s, velocity)
+        """The joints one tick later when they are to stop as soon as they can, each by itself."""
+        joints, velocity = now.position_rad, now.velocity_rad_s
+        speed, wanted = np.abs(velocity), np.zeros(len(joints))
+        slower = np.minimum(self._rampable(speed, dt_s), self.acceleration_rad_s2) * dt_s
+        reached = velocity - np.copysign(np.minimum(slower, speed), velocity)
+        here, jacobian = self.kinematics.pose_and_jacobian(joints)
+        low, high = self._allowed(now, dt_s)
+        reached = self._before_walls(reached, low, high, now, here, jacobian, dt_s)
+        acceleration = (reached - velocity) / dt_s
+        return JointMotion(joints + reached * dt_s, reached, acceleration, wanted)
+
+    def _before_walls(
+        self,
+        reached: FloatArray,
+        low: FloatArray,
+        high: FloatArray,
+        now: JointMotion,
+        here: Pose,
+        jacobian: FloatArray,
+        dt_s: float,
+    ) -> FloatArray:
+        """`reached`, within `low` and `high`, changed so that the arm can stop before each wall.
+
+        With as little change to the motion of the TCP as can be: another elbow costs least.
+        """
+        reached = np.minimum(np.maximum(reached, low), high)
+        if self.walls is None:
+            return reached
+        rows, left_m = self.walls.at(now.position_rad, here.position_m, jacobian)
+        most, jerk = (
+            WALL_SHARE * (np.abs(rows) @ limit)
+            for limit in (self.acceleration_rad_s2, self.jerk_rad_s3)
+        )
+        # At first what is certainly far enough.
+        fastest = np.maximum(rows @ reached, 0.0) + most * most / jerk
+        far = left_m > fastest * (dt_s + 2 * most / jerk + fastest / (2 * most))
+        before = rows @ now.velocity_rad_s
+        for wall in np.flatnonzero(~far).tolist():
+            row, nearer = rows[wall], float(rows[wall] @ reached)
+            if nearer <= 0:
+                continue
+            least = float(np.minimum(row * low, row * high).sum())
+            change = _towards_end(
+                float(left_m[wall]),
+                float(before[wall]),
+                (least - float(before[wall])) / dt_s,
+                (nearer - float(before[wall])) / dt_s,
+                float(most[wall]),
+                float(jerk[wall]),
+                dt_s,
+            )
+            allowed = float(before[wall]) + change * dt_s
+            if nearer > allowed:
+                reached = self._slower_along(row, allowed, reached, low, high, jacobian)
+        return reached
+
+    @staticmethod
+    def _slower_along(
+        row: FloatArray,
+        allowed: float,
+        reached: FloatArray,
+        low: FloatArray,
+        high: FloatArray,
+        jacobian: FloatArray,
+    ) -> FloatArray:
+        """`reached`, within its bounds, such that it is no faster along `row` than `allowed`."""
+        metric = jacobian.T @ jacobian + ELBOW_COST * np.eye(len(row))
+        for way in (np.linalg.solve(metric, row), row, row):
+            excess = float(row @ reached) - allowed
+            # Joints that are on their bound already cannot help.
+            free = np.where(np.where(way > 0, reached > low, reached < high), way, 0.0)
+            gain = float(row @ free)
+            if excess <= 0 or gain <= 0:
+                break
+            reached = np.minimum(np.maximum(reached - excess / gain * free, low), high)
+        return reached
 
     def _wanted(
         self,
@@ -290,39 +370,54 @@ class JointFollower:
             fastest = np.maximum(sign * velocity, 0.0) + most * dt_s
             near = left < fastest * (dt_s + most / self.jerk_rad_s3 + fastest / (2 * most))
             for joint in np.flatnonzero(near):
-                high[joint] = min(
-                    high[joint],
-                    self._towards_end(
-                        float(left[joint]),
-                        sign * float(velocity[joint]),
-                        float(least[joint] if sign > 0 else -greatest[joint]),
-                        float(greatest[joint] if sign > 0 else -least[joint]),
-                        int(joint),
-                        dt_s,
-                    ),
+                end = _towards_end(
+                    float(left[joint]),
+                    sign * float(velocity[joint]),
+                    float(least[joint] if sign > 0 else -greatest[joint]),
+                    float(greatest[joint] if sign > 0 else -least[joint]),
+                    float(most[joint]),
+                    float(self.jerk_rad_s3[joint]),
+                    dt_s,
                 )
+                high[joint] = min(high[joint], end)
             top.append(high)
         high = np.maximum(np.minimum(greatest, top[0]), least)
         low = np.minimum(np.maximum(least, -top[1]), greatest)
         return velocity + np.minimum(low, high) * dt_s, velocity + high * dt_s
 
-    def _towards_end(
-        self, left: float, velocity: float, least: float, greatest: float, joint: int, dt_s: float
-    ) -> float:
-        """Greatest acceleration after which a joint can still stop within `left`, by halving."""
-        most, jerk = float(self.acceleration_rad_s2[joint]), float(self.jerk_rad_s3[joint])
 
-        def fits(acceleration: float) -> bool:
-            after = velocity + acceleration * dt_s
-            return after * dt_s + _stop_way(after, acceleration, most, jerk) <= max(left, 0.0)
+def _towards_end(
+    left: float,
+    velocity: float,
+    least: float,
+    greatest: float,
+    most: float,
+    jerk: float,
+    dt_s: float,
+) -> float:
+    """Greatest acceleration after which what moves can still stop within `left`, by halving.
 
-        if fits(greatest):
-            return greatest
-        low, high = least, greatest
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if fits(middle) else (low, middle)
-        return low
+    Args:
+        left: of its way.
+        velocity: towards its end.
+        least: acceleration that it can have.
+        greatest: likewise.
+        most: acceleration it can stop with.
+        jerk: likewise.
+        dt_s: of the tick.
+    """
+
+    def fits(acceleration: float) -> bool:
+        after = velocity + acceleration * dt_s
+        return after * dt_s + _stop_way(after, acceleration, most, jerk) <= max(left, 0.0)
+
+    if fits(greatest):
+        return greatest
+    low, high = least, greatest
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
 
 
 def _stop_way(velocity: float, acceleration: float, most: float, jerk: float) -> float:

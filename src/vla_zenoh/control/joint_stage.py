@@ -10,13 +10,15 @@ where they have brought it. An arm that is told to stop does not make up for wha
 from __future__ import annotations
 
 import numpy as np
-from ruckig import Trajectory
 
+from vla_zenoh.control.barriers import Barriers
 from vla_zenoh.control.differential import FollowSettings, JointFollower, JointMotion
-from vla_zenoh.control.joint_reference import JointMotionLimits, JointReference, stop_from
+from vla_zenoh.control.joint_reference import JointMotionLimits
 from vla_zenoh.control.kinematics import Kinematics
+from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother
 from vla_zenoh.control.so3 import Pose, distance, exp3, log3
+from vla_zenoh.control.walls import Walls
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Cause, FloatArray, JointCommand
 
@@ -40,8 +42,12 @@ PLACES = 3
 """Places of a way at which it is looked."""
 BRAKE_BEND = 0.15
 """Likewise of a brake, which takes what it can get: it bends less and less as it gets slower."""
+LOOK_TICKS = 4
+"""Ticks from one look at what the arm is near to until the next."""
 BRAKE_S = 0.1
 """A brake leads about as far as the arm goes in this time."""
+CREEPING, STUCK_S = 0.05, 0.5
+"""A pose that goes on at less than this part of its pace for so long will not be reached."""
 LEAST_SHARE = 0.02
 NOTHING = 1e-9
 DAMPING = 1e-5
@@ -53,9 +59,12 @@ class JointStage:
     Args:
         profile: joint limits, home as posture, rate.
         kinematics: of the arm.
+        barriers: of the arm; None: only its TCP's box bounds the joints.
     """
 
-    def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
+    def __init__(
+        self, profile: Profile, kinematics: Kinematics, barriers: Barriers | None = None
+    ) -> None:
         robot, limits = profile.robot, profile.limits
         size = len(robot.arm_joints)
         # The follower's joints are in chain order, the profile's in its own.
@@ -67,7 +76,8 @@ class JointStage:
         share = float(np.min(velocity / kinematics.velocity_rad_s))
         velocity = np.minimum(velocity, share * kinematics.velocity_rad_s)
         self._limits = JointMotionLimits(velocity, acceleration, jerk)
-        self._posture_rad = kinematics.ordered(robot.arm_joints, robot.home_rad)
+        home_rad = kinematics.ordered(robot.arm_joints, robot.home_rad)
+        self._home_rad = home_rad if robot.posture == "home" else None
         settings = FollowSettings(
             acceleration_rad_s2=tuple(acceleration.tolist()),
             jerk_rad_s3=tuple(jerk.tolist()),
@@ -75,23 +85,31 @@ class JointStage:
             joint_margin_rad=limits.reach.joint_margin_rad,
             singularity_stop=limits.reach.singularity_stop,
         )
-        self._follower = JointFollower(kinematics, self._posture_rad, settings)
+        self._walls = Walls(limits, barriers)
+        self._follower = JointFollower(kinematics, home_rad, settings, self._walls)
         most = float(jerk.min()) / PULL_JERK / settings.posture_rad_s
         self._pull_1_s = min(PULL_1_S, most**0.5)
         self._longest_rad = settings.posture_rad_s / settings.posture_1_s
         self._dt_s = 1.0 / profile.timing.command_hz
         self._names = kinematics.arm_joints
-        self.restart(self._follower.posture_rad)
+        self._hits: list[LimitHit] = []
+        self.restart(home_rad)
 
     def restart(self, joints_rad: FloatArray) -> None:
         """Stand at these joints (chain order); only for an arm that is not streamed to."""
         still = np.zeros(len(joints_rad))
         self._now = JointMotion(np.array(joints_rad, dtype=np.float64), still)
         self._pull = self._pull_rate_1_s = 0.0
-        self._stop: Trajectory | None = None
-        self._stop_s = 0.0
+        self._stopping, self._ticks = False, 0
+        self.keep_elbow()
         self.pace = 1.0
         """Part of its own pace at which the pose goes on."""
+
+    def keep_elbow(self) -> None:
+        """An activation begins: the posture is that of these joints, or home."""
+        here_rad = self._now.position_rad
+        self._posture_rad = here_rad if self._home_rad is None else self._home_rad
+        self._waited_s = 0.0
 
     def shares(self, motion: Motion, goal: Pose, box: FloatArray, *, bend: float = BEND) -> Shares:
         """Of the limits of a straight motion to a pose, what the joints can follow.
@@ -151,36 +169,48 @@ class JointStage:
         An arm that brakes leaves its elbow where it is.
         """
         lag = self._lag(smoother.motion.pose)
-        if not braking:
-            self._stop = None
-        elif self._stop is None and lag > 1.0:
-            reference = JointReference(*self._now[:2], self._acceleration)
-            self._stop, self._stop_s = stop_from(reference, self._limits), 0.0
-        if self._stop is not None:
-            self._stopping(self._stop, smoother)
+        self._look()
+        self._stopping = braking and (self._stopping or lag > 1.0)
+        if self._stopping:
+            self._stop(smoother)
             return
         self.pace = min(max((FAR - lag) / (FAR - 1.0), SLOWEST), 1.0)
+        self._waited_s = self._waited_s + self._dt_s if self.pace < CREEPING else 0.0
         motion = smoother.tick(self.pace)
         self._follower.posture_rad = self._pulled_to(0.0 if braking else 1.0)
         twist = self.pace * motion.twist
-        self._now, _ = self._follower.step(self._now, motion.pose, twist, self._dt_s)
+        self._now, self._hits = self._follower.step(self._now, motion.pose, twist, self._dt_s)
+
+    @property
+    def stuck(self) -> str:
+        """Why the pose waits for the joints for good, empty while it does not."""
+        if self._waited_s < STUCK_S:
+            return ""
+        held = [f"{hit.name} {hit.where}".strip() for hit in self._hits]
+        return (
+            f"the joints cannot follow the pose: it has waited for them for {STUCK_S:g} s; "
+            f"they are held by {', '.join(held) or 'nothing, so the arm cannot have this pose'}"
+        )
 
     def _lag(self, pose: Pose) -> float:
         """How far the joints are from a pose, in times of what is near."""
         apart_m, apart_rad = distance(self._kinematics.forward(self._now.position_rad), pose)
         return max(apart_m / NEAR_M, apart_rad / NEAR_RAD)
 
-    def _stopping(self, path: Trajectory, smoother: Smoother) -> None:
+    def _look(self) -> None:
+        """See now and then what the arm is near to."""
+        if self._ticks % LOOK_TICKS == 0:
+            self._walls.look(self._now.position_rad)
+        self._ticks += 1
+
+    def _stop(self, smoother: Smoother) -> None:
         """The joints stop by themselves, and the pose is where that brings the TCP."""
-        self._stop_s += self._dt_s
-        position, velocity, acceleration = map(np.array, path.at_time(self._stop_s))
-        if self._stop_s >= path.duration:
-            velocity = acceleration = np.zeros(len(position))
-        self._now = JointMotion(position, velocity, acceleration)
+        self._now = self._follower.brake(self._now, self._dt_s)
+        position, velocity = self._now[:2]
         self._pull = self._pull_rate_1_s = 0.0
         pose, jacobian = self._kinematics.pose_and_jacobian(position)
         # Whoever takes this stop back plans from here: with no more than a plan may have.
-        change = np.clip(jacobian @ acceleration, -smoother.box[1], smoother.box[1])
+        change = np.clip(jacobian @ self._acceleration, -smoother.box[1], smoother.box[1])
         smoother.brake_from(Motion(pose, jacobian @ velocity, change))
 
     def _pulled_to(self, share: float) -> FloatArray:

@@ -56,7 +56,7 @@ class Mover:
         if profile.robot.command == "joint":
             if reach is None:
                 raise ProfileError("robot.command is joint, which needs the robot's kinematics")
-            self._joints = JointStage(profile, reach.kinematics)
+            self._joints = JointStage(profile, reach.kinematics, reach.barriers)
         self.gripper = GripperArbiter(profile.robot.gripper)
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
@@ -79,6 +79,11 @@ class Mover:
     def commanded(self) -> Pose | None:
         """The pose last streamed, None while nothing is."""
         return self._smoother.motion.pose if self._smoother and self.streaming else None
+
+    @property
+    def stuck(self) -> str:
+        """Why joints that are commanded will not come to the pose, empty while they follow."""
+        return "" if self._joints is None else self._joints.stuck
 
     @property
     def failures(self) -> int:
@@ -114,8 +119,10 @@ class Mover:
         elif standing:
             # Also at rest: a robot that braked by itself stands elsewhere than we command.
             self._smoother.reset(start)
-        if self._joints is not None and joint is not None and standing:
-            self._joints.restart(self._held_joints(joint))
+        if self._joints is not None and joint is not None:
+            if standing:
+                self._joints.restart(self._held_joints(joint))
+            self._joints.keep_elbow()
         width_m = self._width_to_keep(gripper)
         self.gripper.restart(width_m)
         # A blocked arm's controller is led back to where the arm is. Otherwise a brake under way
