@@ -49,6 +49,8 @@ WATCHED = 4.0
 """Times `damped_below` under which it is looked where the singular value goes."""
 BACK_SHARE = 0.7
 """Part of the acceleration planned with on the way to a far target, whose path is curved."""
+NEAR_END_RAD = 0.1
+"""A joint that is further from the end of its range is not held back by that."""
 HALVINGS = 8
 WALL_SHARE = 0.5
 """Part of the joints' acceleration and jerk towards a wall that is reckoned with: they have their
@@ -189,7 +191,8 @@ class JointFollower:
             onto[joint] = min(max(reached[joint], low[joint]), high[joint])
             bound = self.upper_rad if reached[joint] > high[joint] else self.lower_rad
             place, name = float(joints[joint]), self.kinematics.arm_joints[joint]
-            hits.append(LimitHit("joint_limit", place, float(bound[joint]), where=name))
+            if abs(float(bound[joint]) - place) < NEAR_END_RAD:
+                hits.append(LimitHit("joint_limit", place, float(bound[joint]), where=name))
         if ratio > 1.0 + 1e-9:
             joint = int(np.argmax(np.abs(wanted) / self.velocity_rad_s))
             asked, limit = ratio * abs(float(wanted[joint])), float(self.velocity_rad_s[joint])

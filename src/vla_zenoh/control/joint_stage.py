@@ -223,6 +223,11 @@ class JointStage:
         return self._now.position_rad + self._pull * shortened * way_rad
 
     @property
+    def position_rad(self) -> FloatArray:
+        """(n,) where the joints are to be now."""
+        return self._now.position_rad
+
+    @property
     def at_rest(self) -> bool:
         """No joint moves."""
         return float(np.abs(self._now.velocity_rad_s).max()) < REST_RAD_S

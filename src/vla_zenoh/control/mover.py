@@ -63,6 +63,8 @@ class Mover:
         self.streaming = False
         self.speed = 1.0
         """Share of the speed limits that the arm has to its goal."""
+        self._held_back: Slowdown | None = None
+        self._anew = False
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
         self._cause: Cause | None = None
@@ -79,6 +81,16 @@ class Mover:
     def commanded(self) -> Pose | None:
         """The pose last streamed, None while nothing is."""
         return self._smoother.motion.pose if self._smoother and self.streaming else None
+
+    @property
+    def joints_rad(self) -> FloatArray | None:
+        """(n,) joints commanded, None where poses are."""
+        return None if self._joints is None else self._joints.position_rad
+
+    def hold_back(self, slower: Slowdown | None) -> None:
+        """Go no faster than this from now on, whatever the goal allows; None: as it allows."""
+        if (slower and slower.share) != (self._held_back and self._held_back.share):
+            self._held_back, self._anew = slower, True
 
     @property
     def stuck(self) -> str:
@@ -110,6 +122,7 @@ class Mover:
             blocked: the arm is far from its controller's reference.
         """
         self._slowed_by.clear()
+        self._held_back = None
         if self._reach is not None and joint is not None:
             self._reach.reset(self._reach.kinematics.joints_of(joint))
         actual, start = pose_of(measured), held_pose(measured)
@@ -198,7 +211,8 @@ class Mover:
         for plan in plans:
             self._composer.bound_until(plan, plan.index_at(now_ns), out)
         goal = self._aggregator.goal(plans, now_ns)
-        if goal is not self.goal:
+        if goal is not self.goal or self._anew:
+            self._anew = False
             pose, hits = leash(self._limits, goal.pose, smoother.motion.pose)
             if hits:
                 goal = self._shorten(plans, goal, pose, now_ns)
@@ -218,6 +232,8 @@ class Mover:
 
     def _slow_down(self, slower: Slowdown | None, out: Outputs) -> None:
         """Take over the speed of a goal; tell each reason once in every activation."""
+        if self._held_back and (slower is None or self._held_back.share < slower.share):
+            slower = self._held_back
         if slower is not None and slower.name not in self._slowed_by:
             self._slowed_by.add(slower.name)
             where = f" at {slower.where}" if slower.where else ""

@@ -111,8 +111,18 @@ class Shadow:
             self._solver.posture_rad = joints.copy()
         pose, jacobian = self.kinematics.pose_and_jacobian(joints)
         self._here = _Stand(pose, joints, 0.0, self.barriers.at(joints, jacobian))
+        self._seat_rad: FloatArray | None = None
         self.slowdown: Slowdown | None = None
         """Why the step bounded last is to be taken slower than at full speed."""
+
+    def reseat(self, joints_rad: FloatArray) -> None:
+        """The arm itself has these joints (n,): the next step begins with its elbow."""
+        self._seat_rad = joints_rad
+
+    def elsewhere(self, joints_rad: FloatArray) -> FloatArray:
+        """Joints (n,) of the shadow with the TCP where these joints (n,) have it."""
+        pose = self.kinematics.forward(joints_rad)
+        return self._solver.approach(pose, self._here.joints_rad, bounded=False).joints_rad
 
     @property
     def joints_rad(self) -> FloatArray:
@@ -186,6 +196,12 @@ class Shadow:
 
     # -- one place ----------------------------------------------------------------------------
     def _stand_at(self, pose: Pose, start_rad: FloatArray | None) -> _Stand:
+        seat_rad, self._seat_rad = self._seat_rad, None
+        if seat_rad is not None:
+            found = self._approach(pose, seat_rad)
+            if found.solved:
+                self._here = self._stand(pose, found)
+                return self._here
         if start_rad is None and _same(pose, self._here.pose):
             return self._here
         found = self._approach(pose, self._here.joints_rad if start_rad is None else start_rad)
