@@ -198,7 +198,7 @@ class JointFollower:
             asked, limit = ratio * abs(float(wanted[joint])), float(self.velocity_rad_s[joint])
             name = self.kinematics.arm_joints[joint]
             hits.append(LimitHit("joint_velocity", asked, limit, where=name))
-        reached = self._before_walls(reached, low, high, now, here, jacobian, dt_s)
+        reached = self._before_walls(reached, low, high, now, here, jacobian, dt_s, hits)
         acceleration = (reached - velocity) / dt_s
         return JointMotion(joints + reached * dt_s, reached, acceleration, wanted), hits
 
@@ -210,7 +210,7 @@ class JointFollower:
         reached = velocity - np.copysign(np.minimum(slower, speed), velocity)
         here, jacobian = self.kinematics.pose_and_jacobian(joints)
         low, high = self._allowed(now, dt_s)
-        reached = self._before_walls(reached, low, high, now, here, jacobian, dt_s)
+        reached = self._before_walls(reached, low, high, now, here, jacobian, dt_s, [])
         acceleration = (reached - velocity) / dt_s
         return JointMotion(joints + reached * dt_s, reached, acceleration, wanted)
 
@@ -223,10 +223,12 @@ class JointFollower:
         here: Pose,
         jacobian: FloatArray,
         dt_s: float,
+        hits: list[LimitHit],
     ) -> FloatArray:
         """`reached`, within `low` and `high`, changed so that the arm can stop before each wall.
 
-        With as little change to the motion of the TCP as can be: another elbow costs least.
+        With as little change to the motion of the TCP as can be: another elbow costs least. What
+        it is held before is added to `hits`.
         """
         reached = np.minimum(np.maximum(reached, low), high)
         if self.walls is None:
@@ -256,6 +258,7 @@ class JointFollower:
             )
             allowed = float(before[wall]) + change * dt_s
             if nearer > allowed:
+                hits.append(self.walls.hit(wall, float(left_m[wall])))
                 reached = self._slower_along(row, allowed, reached, low, high, jacobian)
         return reached
 

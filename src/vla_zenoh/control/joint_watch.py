@@ -8,8 +8,9 @@ Goals are bounded by an arm that is reckoned with. This looks at the one there i
 
 An arm may be that much off its command, and leans on a stop while it works there. A value gets
 nearer when it leaves a band that follows it: noise within the band is none, a creep is one. And no
-joint may be far from where the arm is believed to have it at the same pose of the TCP: beyond
-``limits.elbow_rad`` the arm gets slower, and brakes at twice that.
+joint may be far from where it is commanded, or, where poses are, from where the arm that is
+reckoned with has it when its TCP is led along the measured one: beyond ``limits.elbow_rad`` the arm
+gets slower, and brakes at twice that.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ class JointWatch:
     def forget(self) -> None:
         """Nothing moves the arm: where it is then is no approach."""
         self._edge: FloatArray | None = None
+        self._believed_rad: FloatArray | None = None
         self._next_ns = 0
         self._elbow_next = False
         self.elbow_rad = 0.0
@@ -111,7 +113,11 @@ class JointWatch:
     def _elbow(self, measured_rad: FloatArray, commanded_rad: FloatArray | None) -> LimitHit | None:
         believed_rad = commanded_rad
         if believed_rad is None:
-            believed_rad = self._reach.elsewhere(measured_rad)
+            start_rad = measured_rad if self._believed_rad is None else self._believed_rad
+            pose = self._reach.kinematics.forward(measured_rad)
+            believed_rad = self._believed_rad = self._reach.followed(pose, start_rad)
+        if believed_rad is None:
+            return None
         apart_rad = np.abs(measured_rad - believed_rad)
         worst = int(np.argmax(apart_rad))
         self.elbow_rad, limit_rad = float(apart_rad[worst]), self._elbow_limit_rad

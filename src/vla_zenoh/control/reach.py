@@ -119,10 +119,10 @@ class Shadow:
         """The arm itself has these joints (n,): the next step begins with its elbow."""
         self._seat_rad = joints_rad
 
-    def elsewhere(self, joints_rad: FloatArray) -> FloatArray:
-        """Joints (n,) of the shadow with the TCP where these joints (n,) have it."""
-        pose = self.kinematics.forward(joints_rad)
-        return self._solver.approach(pose, self._here.joints_rad, bounded=False).joints_rad
+    def followed(self, pose: Pose, joints_rad: FloatArray) -> FloatArray | None:
+        """Joints (n,) of an arm that went there from these (n,), None where it has none."""
+        found = self._solver.approach(pose, joints_rad, bounded=False)
+        return found.joints_rad if found.solved else None
 
     @property
     def joints_rad(self) -> FloatArray:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from vla_zenoh.control.barriers import Barriers
+from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
@@ -29,6 +30,7 @@ class Walls:
         self._low_m, self._high_m = box[:, 0], box[:, 1]
         self._barriers = barriers
         self._at_rad: FloatArray | None = None
+        self._near = np.zeros(0, dtype=np.intp)
         self._rows, self._left_m = np.zeros((0, 0)), np.zeros(0)
 
     def look(self, joints_rad: FloatArray) -> None:
@@ -37,10 +39,18 @@ class Walls:
             return
         collisions, stop_m = self._barriers.collisions, self._barriers.stop[1:]
         distances_m = collisions.distances(joints_rad)
-        near = np.flatnonzero(distances_m < self._barriers.slow[1:])
+        self._near = near = np.flatnonzero(distances_m < self._barriers.slow[1:])
         self._at_rad = joints_rad
         self._rows = -collisions.slopes(joints_rad, near)
         self._left_m = (distances_m - stop_m)[near]
+
+    def hit(self, wall: int, left_m: float) -> LimitHit:
+        """What the wall of this number is, so far from the arm."""
+        if wall < 6 or self._barriers is None:
+            return LimitHit("workspace", -left_m, 0.0)
+        index = int(self._near[wall - 6]) + 1
+        barriers, stop_m = self._barriers, float(self._barriers.stop[index])
+        return LimitHit(barriers.names[index], left_m + stop_m, stop_m, where=barriers.where(index))
 
     def at(
         self, joints_rad: FloatArray, position_m: FloatArray, jacobian: FloatArray
