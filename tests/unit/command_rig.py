@@ -15,14 +15,17 @@ import numpy as np
 
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.preflight import Surroundings
+from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.so3 import exp3, log3, quat_from_rotation, rotation_from_quat
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import (
     ActionChunk,
     Event,
+    FloatArray,
     GripperState,
     Header,
+    JointState,
     PoseCommand,
     PoseState,
     Stamped,
@@ -57,9 +60,17 @@ def model_spec(name: str = WORKER, **action: Any) -> ModelSpec:
 class Rig:
     """See the module."""
 
-    def __init__(self, of: Profile | None = None, *, dry_run: bool = False, **action: Any) -> None:
+    def __init__(
+        self,
+        of: Profile | None = None,
+        *,
+        dry_run: bool = False,
+        reach: Shadow | None = None,
+        **action: Any,
+    ) -> None:
         self.profile = of or profile()
-        self.commander = Commander(self.profile, dry_run=dry_run)
+        self.commander = Commander(self.profile, reach=reach, dry_run=dry_run)
+        self.joints_rad: FloatArray | None = None
         self.spec = model_spec(**action)
         self.now_ns = START_NS
         self.period_ns = round(1e9 / self.profile.timing.command_hz)
@@ -96,6 +107,7 @@ class Rig:
         inputs = Inputs(put, list(chunks), around=self.around)
         if not self.silent:
             inputs.pose, inputs.gripper = self.pose_state(), self.gripper_state()
+            inputs.joint = self.joint_state()
         out = self.commander.step(inputs, self.now_ns, ticks)
         self.events += out.events
         self.refused.update(refusal.reason for refusal in out.refusals)
@@ -140,6 +152,15 @@ class Rig:
             held.quat_xyzw if held else self.quat_xyzw,
         )
         return Stamped(self.header("sim", "sim-1"), record, self.now_ns)
+
+    def joint_state(self) -> Stamped[JointState] | None:
+        """Of an arm whose joints are known, wherever its TCP is said to be."""
+        if self.joints_rad is None:
+            return None
+        zero = np.zeros(len(self.joints_rad))
+        names = self.profile.robot.arm_joints
+        record = JointState(names, self.joints_rad, zero, zero, self.joints_rad)
+        return Stamped(self.header("joint", "sim-1"), record, self.now_ns)
 
     def gripper_state(self) -> Stamped[GripperState]:
         return Stamped(self.header("sim", "sim-1"), self.gripper, self.now_ns)

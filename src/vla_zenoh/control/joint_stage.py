@@ -15,7 +15,7 @@ from vla_zenoh.control.barriers import Barriers
 from vla_zenoh.control.differential import FollowSettings, JointFollower, JointMotion
 from vla_zenoh.control.joint_reference import JointMotionLimits
 from vla_zenoh.control.kinematics import Kinematics
-from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.limits import LimitHit, into_workspace
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother
 from vla_zenoh.control.so3 import Pose, distance, exp3, log3
 from vla_zenoh.control.walls import Walls
@@ -48,6 +48,8 @@ BRAKE_S = 0.1
 """A brake leads about as far as the arm goes in this time."""
 CREEPING, STUCK_S = 0.05, 0.5
 """A pose that goes on at less than this part of its pace for so long will not be reached."""
+OUTSIDE_M = 1e-4
+"""An arm that is further outside of the box began there, and is led in."""
 LEAST_SHARE = 0.02
 NOTHING = 1e-9
 DAMPING = 1e-5
@@ -85,6 +87,7 @@ class JointStage:
             joint_margin_rad=limits.reach.joint_margin_rad,
             singularity_stop=limits.reach.singularity_stop,
         )
+        self._bounds = limits
         self._walls = Walls(limits, barriers)
         self._follower = JointFollower(kinematics, home_rad, settings, self._walls)
         most = float(jerk.min()) / PULL_JERK / settings.posture_rad_s
@@ -168,7 +171,8 @@ class JointStage:
 
         An arm that brakes leaves its elbow where it is.
         """
-        lag = self._lag(smoother.motion.pose)
+        here = self._kinematics.forward(self._now.position_rad)
+        lag = self._lag(here, smoother.motion.pose)
         self._look()
         self._stopping = braking and (self._stopping or lag > 1.0)
         if self._stopping:
@@ -179,7 +183,8 @@ class JointStage:
         motion = smoother.tick(self.pace)
         self._follower.posture_rad = self._pulled_to(0.0 if braking else 1.0)
         twist = self.pace * motion.twist
-        self._now, self._hits = self._follower.step(self._now, motion.pose, twist, self._dt_s)
+        pose = self._inside(here, motion.pose)
+        self._now, self._hits = self._follower.step(self._now, pose, twist, self._dt_s)
 
     @property
     def stuck(self) -> str:
@@ -192,9 +197,16 @@ class JointStage:
             f"they are held by {', '.join(held) or 'nothing, so the arm cannot have this pose'}"
         )
 
-    def _lag(self, pose: Pose) -> float:
-        """How far the joints are from a pose, in times of what is near."""
-        apart_m, apart_rad = distance(self._kinematics.forward(self._now.position_rad), pose)
+    def _inside(self, here: Pose, pose: Pose) -> Pose:
+        """A pose in the box, of an arm that is in it."""
+        inside_m, outside_m = into_workspace(self._bounds, pose.position_m)
+        if not outside_m or into_workspace(self._bounds, here.position_m)[1] > OUTSIDE_M:
+            return pose
+        return Pose(inside_m, pose.rotation)
+
+    def _lag(self, here: Pose, pose: Pose) -> float:
+        """How far the joints, whose TCP is here, are from a pose, in times of what is near."""
+        apart_m, apart_rad = distance(here, self._inside(here, pose))
         return max(apart_m / NEAR_M, apart_rad / NEAR_RAD)
 
     def _look(self) -> None:

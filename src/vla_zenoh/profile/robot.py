@@ -9,6 +9,9 @@ from pydantic import Field, model_validator
 
 from vla_zenoh.profile.section import Name, Section, Word, Words, refuse
 
+POSE_JOINTS = 6
+"""So many joints, at least, has an arm whose TCP can take any pose around it."""
+
 
 class JointEnds(NamedTuple):
     """Where a finger joint is when the gripper is open, and when it is shut; ``rad`` or ``m``."""
