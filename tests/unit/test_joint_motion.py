@@ -193,11 +193,11 @@ def test_every_joint_keeps_its_jerk_and_the_tcp_its_box_whatever_is_asked_for(
     assert arm.jerk <= 1.0 + LEAST_JERK_RTOL
 
 
-@pytest.mark.parametrize("way_m", [[0.04, 0, 0], [0, 0.04, 0], [0.02, -0.03, 0], [0.03, 0, -0.02]])
+@pytest.mark.parametrize("way_m", [[0, 0.04, 0], [0, -0.02, 0.01], [-0.02, 0, 0.02], [0, 0, -0.03]])
 def test_a_pose_that_leaves_the_box_is_not_followed_out_of_it(way_m: list[float]) -> None:
     arm = Arm(profile())
     furthest_m = -1.0
-    for _ in range(25):
+    for _ in range(40):
         arm.step(np.array(way_m), np.zeros(3))
         furthest_m = max(furthest_m, beyond_box_m(KINEMATICS.forward(arm.joints_rad).position_m))
     assert beyond_box_m(arm.smoother.motion.pose.position_m) > 0.01

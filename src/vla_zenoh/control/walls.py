@@ -15,6 +15,9 @@ from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
+NEAR_M = 0.08
+"""What is further from its stop than this is no concern until the next look."""
+
 
 class Walls:
     """See the module.
@@ -39,7 +42,7 @@ class Walls:
             return
         collisions, stop_m = self._barriers.collisions, self._barriers.stop[1:]
         distances_m = collisions.distances(joints_rad)
-        self._near = near = np.flatnonzero(distances_m < self._barriers.slow[1:])
+        self._near = near = np.flatnonzero(distances_m < stop_m + NEAR_M)
         self._at_rad = joints_rad
         self._rows = -collisions.slopes(joints_rad, near)
         self._left_m = (distances_m - stop_m)[near]
