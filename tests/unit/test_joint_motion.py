@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from vla_zenoh.control.arm import make_kinematics, make_shadow
 from vla_zenoh.control.joint_reference import joint_motion_limits
 from vla_zenoh.control.joint_stage import FAR, NEAR_M, NEAR_RAD, JointStage
+from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.smoothing import Smoother, motion_limits
 from vla_zenoh.control.so3 import Pose, distance, exp3
 from vla_zenoh.profile import Profile, load_profile, override
@@ -185,7 +186,8 @@ def test_every_joint_keeps_its_jerk_and_the_tcp_its_box_whatever_is_asked_for(
     arm = Arm(profile())
     for way, times, stops in orders:
         for _ in range(times):
-            arm.step(3 * way[:3], 3 * way[3:])
+            goal_m, _ = into_workspace(BASE.limits, arm.goal.position_m + 3 * way[:3])
+            arm.step(goal_m - arm.goal.position_m, 3 * way[3:])
             assert beyond_box_m(KINEMATICS.forward(arm.joints_rad).position_m) <= BEYOND_BOX_M
         if stops:
             arm.stop_s()

@@ -15,7 +15,7 @@ without overshoot. All joints are slowed by one factor to the velocity limits an
 acceleration limits. Each follows what is wanted of it within its jerk limit ``j``: with ``r`` the
 wanted velocity's own rate and ``d`` what is left to it beyond that, the acceleration is
 
-    r + sign(d) min(|d| / dt, j dt (sqrt(1/4 + 2 |d| / (j dt^2)) - 1/2))
+    r + sign(d) a,   a dt + (a - j dt) dt + (a - 2 j dt) dt + ... = |d|
 
 which comes back to ``r`` as ``d`` comes to nothing. No joint gets faster than it may be, or than it
 can stop before the end of its range, in ticks and within both limits; a joint held back at its end
@@ -52,9 +52,9 @@ BACK_SHARE = 0.7
 NEAR_END_RAD = 0.1
 """A joint that is further from the end of its range is not held back by that."""
 HALVINGS = 8
-WALL_SHARE = 0.5
-"""Part of the joints' acceleration and jerk towards a wall that is reckoned with: they have their
-work besides."""
+WALL_SHARE, FAR_SHARE = 0.7, 0.1
+"""Part of the joints' acceleration and jerk that is reckoned with before a wall: they have their
+work besides. And before one that is far."""
 ELBOW_COST = 1e-2
 """Cost of a joint's motion beside that of the TCP's."""
 BACK_JERK = 0.4
@@ -203,16 +203,21 @@ class JointFollower:
         return JointMotion(joints + reached * dt_s, reached, acceleration, wanted), hits
 
     def brake(self, now: JointMotion, dt_s: float) -> JointMotion:
-        """The joints one tick later when they are to stop as soon as they can, each by itself."""
+        """The joints one tick later when they are to stop as soon as they can, all at once.
+
+        So the TCP keeps its direction. Held before a wall a joint brakes less, and never speeds up.
+        """
         joints, velocity = now.position_rad, now.velocity_rad_s
-        speed, wanted = np.abs(velocity), np.zeros(len(joints))
+        speed = np.maximum(np.abs(velocity), ROUNDING_RAD_S)
         slower = np.minimum(self._rampable(speed, dt_s), self.acceleration_rad_s2) * dt_s
-        reached = velocity - np.copysign(np.minimum(slower, speed), velocity)
+        reached = velocity * (1.0 - min(float(np.min(slower / speed)), 1.0))
         here, jacobian = self.kinematics.pose_and_jacobian(joints)
         low, high = self._allowed(now, dt_s)
-        reached = self._before_walls(reached, low, high, now, here, jacobian, dt_s, [])
+        least = np.minimum(high, np.maximum(low, np.minimum(velocity, 0.0)))
+        most = np.maximum(low, np.minimum(high, np.maximum(velocity, 0.0)))
+        reached = self._before_walls(reached, least, most, now, here, jacobian, dt_s, [])
         acceleration = (reached - velocity) / dt_s
-        return JointMotion(joints + reached * dt_s, reached, acceleration, wanted)
+        return JointMotion(joints + reached * dt_s, reached, acceleration, np.zeros(len(joints)))
 
     def _before_walls(
         self,
@@ -235,45 +240,48 @@ class JointFollower:
             return reached
         rows, left_m = self.walls.at(now.position_rad, here.position_m, jacobian)
         most, jerk = (
-            WALL_SHARE * (np.abs(rows) @ limit)
+            FAR_SHARE * (np.abs(rows) @ limit)
             for limit in (self.acceleration_rad_s2, self.jerk_rad_s3)
         )
         # At first what is certainly far enough.
         fastest = np.maximum(rows @ reached, 0.0) + most * most / jerk
         far = left_m > fastest * (dt_s + 2 * most / jerk + fastest / (2 * most))
         before = rows @ now.velocity_rad_s
+        metric = jacobian.T @ jacobian + ELBOW_COST * np.eye(jacobian.shape[1])
         for wall in np.flatnonzero(~far).tolist():
             row, nearer = rows[wall], float(rows[wall] @ reached)
             if nearer <= 0:
                 continue
+            way = np.linalg.solve(metric, row)
+            way /= float(row @ way)
             least = float(np.minimum(row * low, row * high).sum())
+            effort = np.maximum(np.abs(way), ROUNDING_RAD_S)
             change = _towards_end(
                 float(left_m[wall]),
                 float(before[wall]),
                 (least - float(before[wall])) / dt_s,
                 (nearer - float(before[wall])) / dt_s,
-                float(most[wall]),
-                float(jerk[wall]),
+                WALL_SHARE * float(np.min(self.acceleration_rad_s2 / effort)),
+                WALL_SHARE * float(np.min(self.jerk_rad_s3 / effort)),
                 dt_s,
             )
             allowed = float(before[wall]) + change * dt_s
             if nearer > allowed:
                 hits.append(self.walls.hit(wall, float(left_m[wall])))
-                reached = self._slower_along(row, allowed, reached, low, high, jacobian)
+                reached = self._slower_along(row, way, allowed, reached, low, high)
         return reached
 
     @staticmethod
     def _slower_along(
         row: FloatArray,
+        first: FloatArray,
         allowed: float,
         reached: FloatArray,
         low: FloatArray,
         high: FloatArray,
-        jacobian: FloatArray,
     ) -> FloatArray:
         """`reached`, within its bounds, such that it is no faster along `row` than `allowed`."""
-        metric = jacobian.T @ jacobian + ELBOW_COST * np.eye(len(row))
-        for way in (np.linalg.solve(metric, row), row, row):
+        for way in (first, row, row):
             excess = float(row @ reached) - allowed
             # Joints that are on their bound already cannot help.
             free = np.where(np.where(way > 0, reached > low, reached < high), way, 0.0)
@@ -342,19 +350,13 @@ class JointFollower:
         rate = (wanted - (velocity if before is None else before)) / dt_s
         rate = np.minimum(np.maximum(rate, -most), most)
         left = wanted - velocity - rate * dt_s
-        acceleration = rate + np.copysign(
-            np.minimum(np.abs(left) / dt_s, self._rampable(np.abs(left), dt_s)), left
-        )
+        acceleration = rate + np.copysign(self._rampable(np.abs(left), dt_s), left)
         excess = float(np.max(np.abs(acceleration) / most))
         return velocity + acceleration * (dt_s / max(excess, 1.0))
 
     def _rampable(self, change: FloatArray, dt_s: float) -> FloatArray:
-        """Acceleration (n,) that comes down to nothing again within a change of velocity (n,).
-
-        With ``a dt + (a - j dt) dt + ... = change``.
-        """
-        tick = self.jerk_rad_s3 * dt_s
-        return tick * (np.sqrt(0.25 + 2.0 * change / (tick * dt_s)) - 0.5)
+        """Acceleration (n,) that comes down to nothing again within a change of velocity (n,)."""
+        return _stoppable(change, self.jerk_rad_s3, dt_s)
 
     def _allowed(self, now: JointMotion, dt_s: float) -> tuple[FloatArray, FloatArray]:
         """Least and greatest velocities (n,) that every joint can have one tick later.

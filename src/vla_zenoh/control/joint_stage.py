@@ -2,9 +2,9 @@
 
 The pose stream has limits of its own, and joints have theirs. What joints cannot do is met in three
 places: the way to a goal is planned with the shares of the pose's limits that the joints can take
-(`JointStage.shares`); where they lag behind all the same the pose waits for them (`pace`); and a
-brake that finds them lagging is theirs: each joint stops within its limits, and the pose is then
-where they have brought it. An arm that is told to stop does not make up for what it lagged.
+(`JointStage.shares`); where they lag behind all the same the pose waits for them (`pace`), for a
+while; and a brake that finds them lagging is theirs: they stop within their limits, and the pose is
+then where they have brought it. An arm that is told to stop does not make up for what it lagged.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from vla_zenoh.control.barriers import Barriers
 from vla_zenoh.control.differential import FollowSettings, JointFollower, JointMotion
 from vla_zenoh.control.joint_reference import JointMotionLimits
 from vla_zenoh.control.kinematics import Kinematics
-from vla_zenoh.control.limits import LimitHit, into_workspace
+from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother
 from vla_zenoh.control.so3 import Pose, distance, exp3, log3
 from vla_zenoh.control.walls import Walls
@@ -48,7 +48,7 @@ BRAKE_S = 0.1
 """A brake leads about as far as the arm goes in this time."""
 CREEPING, STUCK_S = 0.05, 0.5
 """A pose that goes on at less than this part of its pace for so long will not be reached."""
-OUTSIDE_M = 1e-4
+OUTSIDE_M = 1e-3
 """An arm that is further outside of the box began there, and is led in."""
 LEAST_SHARE = 0.02
 NOTHING = 1e-9
@@ -95,7 +95,7 @@ class JointStage:
         self._longest_rad = settings.posture_rad_s / settings.posture_1_s
         self._dt_s = 1.0 / profile.timing.command_hz
         self._names = kinematics.arm_joints
-        self._hits: list[LimitHit] = []
+        self._held: set[str] = set()
         self.restart(home_rad)
 
     def restart(self, joints_rad: FloatArray) -> None:
@@ -179,19 +179,22 @@ class JointStage:
             self._stop(smoother)
             return
         self.pace = min(max((FAR - lag) / (FAR - 1.0), SLOWEST), 1.0)
-        self._waited_s = self._waited_s + self._dt_s if self.pace < CREEPING else 0.0
+        waits = self.pace < CREEPING
+        self._waited_s = self._waited_s + self._dt_s if waits else 0.0
         motion = smoother.tick(self.pace)
         self._follower.posture_rad = self._pulled_to(0.0 if braking else 1.0)
         twist = self.pace * motion.twist
         pose = self._inside(here, motion.pose)
-        self._now, self._hits = self._follower.step(self._now, pose, twist, self._dt_s)
+        self._now, hits = self._follower.step(self._now, pose, twist, self._dt_s)
+        found = {f"{hit.name} {hit.where}".strip() for hit in hits}
+        self._held = found | (self._held if waits else set())
 
     @property
     def stuck(self) -> str:
         """Why the pose waits for the joints for good, empty while it does not."""
         if self._waited_s < STUCK_S:
             return ""
-        held = [f"{hit.name} {hit.where}".strip() for hit in self._hits]
+        held = sorted(self._held)
         return (
             f"the joints cannot follow the pose: it has waited for them for {STUCK_S:g} s; "
             f"they are held by {', '.join(held) or 'nothing, so the arm cannot have this pose'}"
