@@ -22,6 +22,7 @@ from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import (
     ActionChunk,
     Event,
+    FloatArray,
     GripperState,
     Header,
     JointState,
@@ -69,6 +70,7 @@ class Rig:
     ) -> None:
         self.profile = of or profile()
         self.commander = Commander(self.profile, reach=reach, dry_run=dry_run)
+        self.joints_rad: FloatArray | None = None
         self.spec = model_spec(**action)
         self.now_ns = START_NS
         self.period_ns = round(1e9 / self.profile.timing.command_hz)
@@ -152,13 +154,16 @@ class Rig:
         return Stamped(self.header("sim", "sim-1"), record, self.now_ns)
 
     def joint_state(self) -> Stamped[JointState] | None:
-        """Where the shadow stands; only an arm that does not move has these joints."""
-        reach = self.commander.reach
-        if reach is None:
+        """Those of the test, wherever its TCP is said to be, else where the shadow stands."""
+        reach, joints_rad = self.commander.reach, self.joints_rad
+        names = self.profile.robot.arm_joints
+        if joints_rad is None and reach is not None:
+            joints_rad, names = reach.joints_rad, reach.kinematics.arm_joints
+        if joints_rad is None:
             return None
-        still = np.zeros(reach.kinematics.size)
-        record = JointState(reach.kinematics.arm_joints, reach.joints_rad, still, still)
-        return Stamped(self.header("sim", "sim-1"), record, self.now_ns)
+        zero = np.zeros(len(joints_rad))
+        record = JointState(names, joints_rad, zero, zero, joints_rad)
+        return Stamped(self.header("joint", "sim-1"), record, self.now_ns)
 
     def gripper_state(self) -> Stamped[GripperState]:
         return Stamped(self.header("sim", "sim-1"), self.gripper, self.now_ns)

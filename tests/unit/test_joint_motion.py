@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.arm import make_kinematics
+from vla_zenoh.control.arm import make_kinematics, make_shadow
 from vla_zenoh.control.joint_reference import joint_motion_limits
 from vla_zenoh.control.joint_stage import FAR, NEAR_M, NEAR_RAD, JointStage
+from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.smoothing import Smoother, motion_limits
 from vla_zenoh.control.so3 import Pose, distance, exp3
 from vla_zenoh.profile import Profile, load_profile, override
@@ -163,3 +164,107 @@ def test_a_stop_of_the_joints_that_is_called_off_goes_on_from_where_they_are(tic
         furthest_m = max(furthest_m, distance(arm.smoother.motion.pose, arm.goal)[0])
     assert furthest_m < OVERSHOOT_M
     assert arm.smoother.at_rest
+
+
+# -- what is held whatever is asked for ------------------------------------------------------------
+BOX = BASE.limits.workspace
+BEYOND_BOX_M = 1e-4
+BEYOND_STOP_M = 1e-3
+LEAST_JERK_RTOL = 1e-6
+
+
+def beyond_box_m(position_m: FloatArray) -> float:
+    low, high = np.array([BOX.x_m, BOX.y_m, BOX.z_m]).T
+    return float(np.maximum(low - position_m, position_m - high).max())
+
+
+@given(st.lists(st.tuples(ways, st.integers(1, 10), st.booleans()), min_size=2, max_size=5))
+@settings(max_examples=12, deadline=None)
+def test_every_joint_keeps_its_jerk_and_the_tcp_its_box_whatever_is_asked_for(
+    orders: list[tuple[FloatArray, int, bool]],
+) -> None:
+    arm = Arm(profile())
+    for way, times, stops in orders:
+        for _ in range(times):
+            goal_m, _ = into_workspace(BASE.limits, arm.goal.position_m + 3 * way[:3])
+            arm.step(goal_m - arm.goal.position_m, 3 * way[3:])
+            assert beyond_box_m(KINEMATICS.forward(arm.joints_rad).position_m) <= BEYOND_BOX_M
+        if stops:
+            arm.stop_s()
+            arm.goal = arm.smoother.motion.pose
+    assert arm.jerk <= 1.0 + LEAST_JERK_RTOL
+
+
+@pytest.mark.parametrize("way_m", [[0, 0.04, 0], [0, -0.02, 0.01], [-0.02, 0, 0.02], [0, 0, -0.03]])
+def test_a_pose_that_leaves_the_box_is_not_followed_out_of_it(way_m: list[float]) -> None:
+    arm = Arm(profile())
+    furthest_m = -1.0
+    for _ in range(40):
+        arm.step(np.array(way_m), np.zeros(3))
+        furthest_m = max(furthest_m, beyond_box_m(KINEMATICS.forward(arm.joints_rad).position_m))
+    assert beyond_box_m(arm.smoother.motion.pose.position_m) > 0.01
+    assert -0.001 < furthest_m <= BEYOND_BOX_M
+
+
+def test_an_arm_that_begins_outside_of_the_box_is_led_in() -> None:
+    arm = Arm(profile())
+    inside = KINEMATICS.forward(HOME_RAD)
+    arm.stage = JointStage(
+        override(profile(), {"limits": {"workspace": {"x_m": [0.2, 0.4]}}}), KINEMATICS
+    )
+    arm.stage.restart(HOME_RAD)
+    assert inside.position_m[0] > 0.42
+    for _ in range(8):
+        arm.step(np.array([-0.01, 0, 0]), np.zeros(3))
+    for _ in range(100):
+        arm.tick()
+    assert KINEMATICS.forward(arm.joints_rad).position_m[0] < 0.4
+    assert arm.jerk <= 1.0 + LEAST_JERK_RTOL
+
+
+@pytest.mark.parametrize(
+    ("way_m", "turn_rad", "name"),
+    [
+        ([0.01, 0, -0.03], [0, 0, 0], "table_distance"),
+        ([-0.02, 0, 0.01], [0, 0.1, 0], "self_collision"),
+        ([0, 0.01, -0.01], [0.15, 0, 0], "table_distance"),
+    ],
+)
+def test_commanded_joints_stop_before_the_arm_touches_itself_or_the_table(
+    way_m: list[float], turn_rad: list[float], name: str
+) -> None:
+    """Whoever bounds the goals: here nobody does."""
+    low = override(BASE, {"limits": {"workspace": {"z_m": [-0.3, 0.9], "x_m": [-0.3, 0.75]}}})
+    of = override(low, {"robot": {"command": "joint"}})
+    barriers = make_shadow(of, KINEMATICS).barriers
+    arm = Arm(of)
+    arm.stage = JointStage(of, KINEMATICS, barriers)
+    arm.stage.restart(HOME_RAD)
+    nearest_m = 1.0
+    for _ in range(40):
+        arm.step(np.array(way_m), np.array(turn_rad))
+        left_m = barriers.collisions.distances(arm.joints_rad) - barriers.stop[1:]
+        nearest_m = min(nearest_m, float(left_m.min()))
+    assert -BEYOND_STOP_M < nearest_m < 0.005
+    assert name in arm.stage.stuck
+    assert arm.jerk <= 1.0 + LEAST_JERK_RTOL
+
+
+def test_slopes_of_distances_are_those_of_small_steps() -> None:
+    collisions = make_shadow(BASE, KINEMATICS).barriers.collisions
+    random, compared = np.random.default_rng(0), 0
+    for _ in range(40):
+        joints_rad = np.clip(
+            HOME_RAD + 0.4 * random.normal(size=7), KINEMATICS.lower_rad, KINEMATICS.upper_rad
+        )
+        near = np.flatnonzero(np.abs(collisions.distances(joints_rad) - 0.05) < 0.04)
+        slopes = collisions.slopes(joints_rad, near)
+        for joint, unit in enumerate(np.eye(7) * 1e-5):
+            apart = collisions.distances(joints_rad + unit) - collisions.distances(
+                joints_rad - unit
+            )
+            error = np.abs(slopes[:, joint] - apart[near] / 2e-5)
+            assert (error < 0.1).all()  # m/rad; the nearest corner changes
+            compared += len(near)
+            assert not len(near) or np.median(error) < 0.01
+    assert compared > 100

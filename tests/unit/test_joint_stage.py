@@ -13,12 +13,12 @@ from vla_zenoh.control.joint_stage import JointStage
 from vla_zenoh.control.mover import Mover
 from vla_zenoh.control.ports import Outputs
 from vla_zenoh.control.smoothing import Smoother, motion_limits
-from vla_zenoh.control.so3 import quat_from_rotation
+from vla_zenoh.control.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.control.states import State
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import FloatArray, GripperState, JointCommand, JointState, PoseState
 
-PROFILE = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})
+PROFILE = override(load_profile("panda_sim"), {"robot": {"command": "joint", "posture": "home"}})
 KINEMATICS = make_kinematics(PROFILE)
 LIMITS = joint_motion_limits(PROFILE)
 HOME_RAD = KINEMATICS.ordered(PROFILE.robot.arm_joints, PROFILE.robot.home_rad)
@@ -90,3 +90,40 @@ def test_a_stream_begins_at_rest_however_late_its_first_tick_is() -> None:
     robot.activate(ELBOW_OUT_RAD)
     first = robot.tick(ticks=20)
     assert (np.abs(first.velocity_rad_s) <= LIMITS.jerk_rad_s3 * TICK_S**2).all()
+
+
+def test_an_arm_that_is_asked_for_nothing_keeps_its_elbow_unless_the_profile_says_home() -> None:
+    for posture, moves in (("start", False), ("home", True)):
+        of = override(PROFILE, {"robot": {"posture": posture}})
+        stage = JointStage(of, KINEMATICS)
+        stage.restart(ELBOW_OUT_RAD)
+        pose = KINEMATICS.forward(ELBOW_OUT_RAD)
+        standing = Smoother(pose, TICK_S, motion_limits(of.limits))
+        for _ in range(500):
+            stage.tick(standing)
+        moved_rad = np.abs(stage.position_rad - ELBOW_OUT_RAD).max()
+        assert (moved_rad > 0.05) == moves
+        assert moves or (moved_rad < 1e-6 and stage.at_rest)
+
+
+def test_a_pose_that_the_joints_cannot_have_is_said_and_not_waited_for_for_ever() -> None:
+    stage = JointStage(PROFILE, KINEMATICS)
+    stage.restart(HOME_RAD)
+    pose = KINEMATICS.forward(HOME_RAD)
+    stream = Smoother(pose, TICK_S, motion_limits(PROFILE.limits))
+    ahead = Pose(pose.position_m, exp3(np.array([0.0, 0.0, 1.2])) @ pose.rotation)
+    out_m = Pose(pose.position_m + [0.0, 0.0, 1.0], ahead.rotation)  # further than it reaches
+    stream.target(out_m)
+    assert stage.stuck == ""
+    for _ in range(2500):
+        stage.tick(stream)
+        if stage.stuck:
+            break
+    assert stage.stuck.startswith("the joints cannot follow the pose: it has waited for them")
+    for _ in range(500):
+        stage.brake(stream)
+        stage.tick(stream, braking=True)
+    assert stage.at_rest
+    assert stream.at_rest
+    stage.keep_elbow()
+    assert stage.stuck == ""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from vla_zenoh.check.finding import Finding, error, note, warning
 from vla_zenoh.policy import CameraSpec, ModelSpec
-from vla_zenoh.profile import Profile
+from vla_zenoh.profile import POSE_JOINTS, Profile
 
 SHAPE_TOLERANCE = 0.02
 """Width by height may be stretched by this share before somebody is told."""
@@ -26,6 +26,7 @@ def findings(
     rate_hz = rate_hz or profile.task.rate_hz
     return [
         *_cameras(profile, spec),
+        *_joints(profile, spec),
         *_timing(profile, spec, rate_hz),
         *_task(profile, spec, worker),
     ]
@@ -57,6 +58,24 @@ def _cameras(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
             f"at {slowest:g} Hz pictures may lie {1 / slowest:.3f} s apart, the spec allows "
             f"{wanted.max_skew_s:g} s: many observations will be refused",
         )
+
+
+def _joints(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
+    joints = len(profile.robot.arm_joints)
+    if joints >= POSE_JOINTS:
+        return
+    short = f"robot {profile.robot.name!r} has {joints} arm joints, a pose of the TCP needs six"
+    if spec.action.kind == "absolute":
+        yield error(
+            "too_few_joints",
+            f"{short}: it cannot go straight from one absolute pose to the next, also where joint "
+            "positions were made into poses; use a model whose action is delta",
+        )
+        return
+    yield warning(
+        "too_few_joints",
+        f"{short}: steps that it has no joint for are shortened, to nothing at worst (limit reach)",
+    )
 
 
 def _size(profile: Profile, camera: CameraSpec) -> Iterator[Finding]:

@@ -44,7 +44,7 @@ def make_shadow(profile: Profile, kinematics: Kinematics | None = None) -> Shado
         home_rad,
         profile.limits,
         free_elbow=commanded,
-        posture_rad=home_rad,
+        posture_rad=home_rad if profile.robot.posture == "home" else None,
         known_good_rad=[home_rad],
         velocity_rad_s=kinematics.ordered(names, most_rad_s) if commanded else None,
     )

@@ -95,6 +95,32 @@ class CollisionModel:
         pin.computeDistances(self._geometry, self._work)
         return np.array([result.min_distance for result in self._results])
 
+    def slopes(self, joints_rad: FloatArray, indices: Sequence[int]) -> FloatArray:
+        """(len(indices), n) m/rad: how these distances change with each joint.
+
+        Only after `distances` of the same joints. Nothing for two that are inside each other.
+        """
+        if not len(indices):
+            return np.zeros((0, len(joints_rad)))
+        pin.computeJointJacobians(self._model, self._data, joints_rad)
+        found = np.zeros((len(indices), len(joints_rad)))
+        for row, index in enumerate(indices):
+            result, pair = self._results[index], self._geometry.collisionPairs[int(index)]
+            normal = np.array(result.normal)
+            for sign, which, point in (
+                (-1.0, pair.first, result.getNearestPoint1()),
+                (1.0, pair.second, result.getNearestPoint2()),
+            ):
+                joint = self._geometry.geometryObjects[which].parentJoint
+                if joint == 0:
+                    continue
+                jacobian = pin.getJointJacobian(
+                    self._model, self._data, joint, pin.LOCAL_WORLD_ALIGNED
+                )
+                arm_m = np.array(point) - self._data.oMi[joint].translation
+                found[row] += sign * (normal @ (jacobian[:3] - pin.skew(arm_m) @ jacobian[3:]))
+        return found
+
     def _use(self, pairs: Sequence[tuple[int, int]]) -> None:
         self._geometry.removeAllCollisionPairs()
         for first, second in pairs:

@@ -18,7 +18,8 @@ from vla_zenoh.control.compose import Goal
 from vla_zenoh.control.composer import ChunkPlan, Composer
 from vla_zenoh.control.gripper import GripperArbiter
 from vla_zenoh.control.holding import Holding
-from vla_zenoh.control.joint_fit import reasons_joints_do_not_fit
+from vla_zenoh.control.joint_fit import JOINT_PATIENCE_S, reasons_joints_do_not_fit
+from vla_zenoh.control.joint_watch import JointWatch
 from vla_zenoh.control.mover import Mover
 from vla_zenoh.control.ports import Inputs, Outputs, Setting
 from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
@@ -81,6 +82,7 @@ class Commander:
         self._coming: tuple[Stamped[ActionChunk], ChunkPlan] | None = None
         self._mover = Mover(profile, reach, self._composer)
         self._watch = Watch(profile)
+        self._joint_watch = None if reach is None else JointWatch(profile, reach)
         self._out = Outputs()
 
     # -- one tick -----------------------------------------------------------------------------
@@ -106,6 +108,8 @@ class Commander:
             self._take_chunk(chunk, now_ns)
         self._compose(now_ns)
         self._look_around(now_ns)
+        if not inputs.chunks:  # those cost enough in one tick
+            self._look_at_joints(now_ns)
         if not self._mover.advance(
             self.state, self.task, self._watch.deadline_ns, now_ns, ticks, self._out
         ):
@@ -158,6 +162,11 @@ class Commander:
     def tracking_rad(self) -> float:
         """Likewise."""
         return self._watch.tracking_rad
+
+    @property
+    def elbow_rad(self) -> float:
+        """How far the worst measured joint is from where the arm is believed to have it."""
+        return 0.0 if self._joint_watch is None else self._joint_watch.elbow_rad
 
     # -- states and settings ------------------------------------------------------------------
     def _take_state(self, inputs: Inputs) -> None:
@@ -415,6 +424,7 @@ class Commander:
         )
         if not lost and self.streaming and not self.dry_run:
             lost = self._watch.blocked()
+        lost = lost or self._mover.stuck or self._joints_lost(now_ns)
         if not lost and self._watch.forsaken(now_ns):
             lost = f"held for {self.profile.timing.max_hold_s:g} s, no fresh chunk came"
         lost = lost or self.holding.lost(self._around.holders)
@@ -422,3 +432,36 @@ class Commander:
             self._change(Trigger.LOSE, lost)
         elif self._watch.starved(now_ns):
             self._change(Trigger.STARVE, "no fresh chunk within the watchdog")
+
+    def _joints_lost(self, now_ns: int) -> str:
+        """That the measured joints, which are watched, are not heard any more."""
+        if self._joint_watch is None or self.joint is None:
+            return ""
+        silent_s = (now_ns - self.joint.received_ns) / 1e9
+        patience_s = self.profile.timing.state_timeout_s + JOINT_PATIENCE_S
+        if silent_s <= patience_s:
+            return ""
+        return f"robot state lost: joints {silent_s:.3f} s old, at most {patience_s:g} s"
+
+    def _look_at_joints(self, now_ns: int) -> None:
+        """Hold the arm back, or brake it, where its measured joints come too near to something."""
+        watch, reach, mover = self._joint_watch, self.reach, self._mover
+        if watch is None or reach is None or self.joint is None:
+            return
+        if self.state not in OBEYING or not self.streaming:
+            watch.forget()
+            return
+        try:
+            measured_rad = reach.kinematics.joints_of(self.joint.record)
+        except RecordError as error:
+            self._change(Trigger.LOSE, str(error))
+            return
+        commanded_rad = mover.joints_rad
+        hit = watch.look(measured_rad, commanded_rad, now_ns)
+        mover.hold_back(watch.slowdown)
+        reach.reseat(measured_rad if commanded_rad is None else commanded_rad)
+        if hit is not None:
+            at = f" at {hit.where}" if hit.where else ""
+            self._out.tell("warning", "limit", hit.name, f"braked{at}", hit.value, hit.limit)
+            why = f"the measured arm is too near to a bound: {hit.name}{at} is {hit.value:.3g}"
+            self._change(Trigger.LOSE, f"{why}, the limit is {hit.limit:.3g}")

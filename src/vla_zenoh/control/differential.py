@@ -11,9 +11,15 @@ inverse damped near a singularity::
     J#        = J^T (J J^T + W)^-1,   W = wmax (1 - (s / s0)^2)^2 1 where s < s0, else 0
 
 `feed` makes a smooth stream exact; the bound on `back` makes a far target one that is reached
-without overshoot. All joints are slowed by one factor to the velocity limits, the change of
-velocity is shortened to the acceleration limits, and no joint gets faster towards the end of its
-range than it can brake; a joint held back so is taken out and the others carry on without it.
+without overshoot. All joints are slowed by one factor to the velocity limits and by one to the
+acceleration limits. Each follows what is wanted of it within its jerk limit ``j``: with ``r`` the
+wanted velocity's own rate and ``d`` what is left to it beyond that, the acceleration is
+
+    r + sign(d) a,   a dt + (a - j dt) dt + (a - 2 j dt) dt + ... = |d|
+
+which comes back to ``r`` as ``d`` comes to nothing. No joint gets faster than it may be, or than it
+can stop before the end of its range, in ticks and within both limits; a joint held back at its end
+is taken out and the others carry on without it.
 Towards a singularity all joints are slowed so that its singular value s falls no faster than
 ``ka (s - s_stop)``: an arm that has slipped through one would come back in another branch.
 
@@ -23,6 +29,7 @@ Sys. Meas. Control 108, 1986.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -33,6 +40,7 @@ from vla_zenoh.control.ik import pose_error
 from vla_zenoh.control.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.so3 import Pose
+from vla_zenoh.control.walls import Walls
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types import FloatArray
 
@@ -41,6 +49,16 @@ WATCHED = 4.0
 """Times `damped_below` under which it is looked where the singular value goes."""
 BACK_SHARE = 0.7
 """Part of the acceleration planned with on the way to a far target, whose path is curved."""
+NEAR_END_RAD = 0.1
+"""A joint that is further from the end of its range is not held back by that."""
+HALVINGS = 8
+WALL_SHARE, FAR_SHARE = 0.7, 0.1
+"""Part of the joints' acceleration and jerk that is reckoned with before a wall: they have their
+work besides. And before one that is far."""
+ELBOW_COST = 1e-2
+"""Cost of a joint's motion beside that of the TCP's."""
+BACK_JERK = 0.4
+"""Way is made up for at a rate of so many times jerk over acceleration, at most one tick's."""
 ROUNDING_RAD_S = 1e-9
 PEEK_RAD = 1e-3
 """How far the joints are moved to see that."""
@@ -52,6 +70,7 @@ class FollowSettings:
 
     Args:
         acceleration_rad_s2: of every joint, one number or one per joint.
+        jerk_rad_s3: likewise; the default is none that could be noticed.
         velocity_share: part of the URDF's joint velocities that is used.
         joint_margin_rad: kept from both ends of every joint's range.
         posture_1_s: rate at which a redundant arm goes to its posture.
@@ -63,6 +82,7 @@ class FollowSettings:
     """
 
     acceleration_rad_s2: float | tuple[float, ...] = 10.0
+    jerk_rad_s3: float | tuple[float, ...] = 1e6
     velocity_share: float = 1.0
     joint_margin_rad: float = 0.05
     posture_1_s: float = 1.0
@@ -74,10 +94,19 @@ class FollowSettings:
 
 
 class JointMotion(NamedTuple):
-    """Where the joints are to be: (n,) rad and (n,) rad/s."""
+    """Where the joints are to be, (n,) each.
+
+    Args:
+        position_rad: where.
+        velocity_rad_s: how fast.
+        acceleration_rad_s2: of the tick before; None: they stood.
+        wanted_rad_s: the velocity that was wanted of them; None: the one they have.
+    """
 
     position_rad: FloatArray
     velocity_rad_s: FloatArray
+    acceleration_rad_s2: FloatArray | None = None
+    wanted_rad_s: FloatArray | None = None
 
 
 class JointFollower:
@@ -87,6 +116,7 @@ class JointFollower:
         kinematics: of the arm.
         posture_rad: (n,) where a redundant arm prefers to be.
         settings: see `FollowSettings`.
+        walls: what the arm is held before; None: nothing.
 
     Raises:
         RecordError: settings that do not fit the arm.
@@ -97,21 +127,27 @@ class JointFollower:
         kinematics: Kinematics,
         posture_rad: ArrayLike,
         settings: FollowSettings | None = None,
+        walls: Walls | None = None,
     ) -> None:
-        self.kinematics = kinematics
+        self.kinematics, self.walls = kinematics, walls
         self.settings = settings = settings or FollowSettings()
         self.posture_rad = np.array(posture_rad, dtype=np.float64)
-        self.acceleration_rad_s2 = np.array(settings.acceleration_rad_s2, dtype=np.float64)
-        if self.acceleration_rad_s2.ndim == 0:
-            self.acceleration_rad_s2 = np.full(kinematics.size, float(self.acceleration_rad_s2))
-        for name in ("posture_rad", "acceleration_rad_s2"):
+        self.acceleration_rad_s2, self.jerk_rad_s3 = (
+            np.full(kinematics.size, given) if np.ndim(given) == 0 else np.array(given, dtype=float)
+            for given in (settings.acceleration_rad_s2, settings.jerk_rad_s3)
+        )
+        for name in ("posture_rad", "acceleration_rad_s2", "jerk_rad_s3"):
             values = getattr(self, name)
             if values.shape != (kinematics.size,) or not np.isfinite(values).all():
                 raise RecordError(
                     f"{name} must be {kinematics.size} finite numbers, got shape {values.shape}"
                 )
-        if not (self.acceleration_rad_s2 > 0).all() or not 0 < settings.velocity_share <= 1:
-            raise RecordError("acceleration_rad_s2 must be positive, velocity_share in (0, 1]")
+        bounds = np.concatenate([self.acceleration_rad_s2, self.jerk_rad_s3])
+        if not (bounds > 0).all() or not 0 < settings.velocity_share <= 1:
+            raise RecordError(
+                "acceleration_rad_s2 and jerk_rad_s3 must be positive, velocity_share in (0, 1]"
+            )
+        self._back_1_s = BACK_JERK * float(np.min(self.jerk_rad_s3 / self.acceleration_rad_s2))
         self.velocity_rad_s = settings.velocity_share * kinematics.velocity_rad_s
         self.lower_rad = kinematics.lower_rad + settings.joint_margin_rad
         self.upper_rad = kinematics.upper_rad - settings.joint_margin_rad
@@ -131,20 +167,22 @@ class JointFollower:
             joints within their ranges, velocities and accelerations, whatever the target; and
             what kept them from it: ``joint_velocity``, ``joint_limit``, ``singularity``.
         """
-        joints, velocity = now
+        joints, velocity = now.position_rad, now.velocity_rad_s
         here, jacobian = self.kinematics.pose_and_jacobian(joints)
         error = pose_error(target, here)
         singular_value = smallest_singular_value(jacobian)
         hits: list[LimitHit] = []
         if singular_value < self.settings.damped_below:
             hits.append(LimitHit("singularity", singular_value, self.settings.damped_below))
-        low, high = self._allowed(joints, velocity, dt_s)
+        low, high = self._allowed(now, dt_s)
         held = np.zeros(len(joints), dtype=bool)
         onto = np.zeros(len(joints))
         while True:
             wanted = self._wanted(joints, jacobian, error, twist, singular_value, held, onto, dt_s)
             wanted *= self._share_near_singularity(joints, wanted, singular_value)
-            reached, ratio = self._reachable(wanted, velocity, dt_s)
+            ratio = float(np.max(np.abs(wanted) / self.velocity_rad_s))
+            wanted /= max(ratio, 1.0)
+            reached = self._reachable(wanted, now, dt_s)
             excess = np.where(held, 0.0, np.maximum(reached - high, low - reached))
             joint = int(np.argmax(excess))
             if excess[joint] <= ROUNDING_RAD_S or held.sum() >= len(joints) - 1:
@@ -153,20 +191,105 @@ class JointFollower:
             onto[joint] = min(max(reached[joint], low[joint]), high[joint])
             bound = self.upper_rad if reached[joint] > high[joint] else self.lower_rad
             place, name = float(joints[joint]), self.kinematics.arm_joints[joint]
-            hits.append(LimitHit("joint_limit", place, float(bound[joint]), where=name))
+            if abs(float(bound[joint]) - place) < NEAR_END_RAD:
+                hits.append(LimitHit("joint_limit", place, float(bound[joint]), where=name))
         if ratio > 1.0 + 1e-9:
             joint = int(np.argmax(np.abs(wanted) / self.velocity_rad_s))
-            asked, limit = abs(float(wanted[joint])), float(self.velocity_rad_s[joint])
+            asked, limit = ratio * abs(float(wanted[joint])), float(self.velocity_rad_s[joint])
             name = self.kinematics.arm_joints[joint]
             hits.append(LimitHit("joint_velocity", asked, limit, where=name))
-        reached = np.clip(reached, low, high)
-        return JointMotion(joints + reached * dt_s, reached), hits
+        reached = self._before_walls(reached, low, high, now, here, jacobian, dt_s, hits)
+        acceleration = (reached - velocity) / dt_s
+        return JointMotion(joints + reached * dt_s, reached, acceleration, wanted), hits
 
     def brake(self, now: JointMotion, dt_s: float) -> JointMotion:
-        """The joints one tick later when they are to stop as soon as they can."""
-        most = self.acceleration_rad_s2 * dt_s
-        velocity = now.velocity_rad_s - np.clip(now.velocity_rad_s, -most, most)
-        return JointMotion(now.position_rad + velocity * dt_s, velocity)
+        """The joints one tick later when they are to stop as soon as they can, all at once.
+
+        So the TCP keeps its direction. Held before a wall a joint brakes less, and never speeds up.
+        """
+        joints, velocity = now.position_rad, now.velocity_rad_s
+        speed = np.maximum(np.abs(velocity), ROUNDING_RAD_S)
+        slower = np.minimum(self._rampable(speed, dt_s), self.acceleration_rad_s2) * dt_s
+        reached = velocity * (1.0 - min(float(np.min(slower / speed)), 1.0))
+        here, jacobian = self.kinematics.pose_and_jacobian(joints)
+        low, high = self._allowed(now, dt_s)
+        least = np.minimum(high, np.maximum(low, np.minimum(velocity, 0.0)))
+        most = np.maximum(low, np.minimum(high, np.maximum(velocity, 0.0)))
+        reached = self._before_walls(reached, least, most, now, here, jacobian, dt_s, [])
+        acceleration = (reached - velocity) / dt_s
+        return JointMotion(joints + reached * dt_s, reached, acceleration, np.zeros(len(joints)))
+
+    def _before_walls(
+        self,
+        reached: FloatArray,
+        low: FloatArray,
+        high: FloatArray,
+        now: JointMotion,
+        here: Pose,
+        jacobian: FloatArray,
+        dt_s: float,
+        hits: list[LimitHit],
+    ) -> FloatArray:
+        """`reached`, within `low` and `high`, changed so that the arm can stop before each wall.
+
+        With as little change to the motion of the TCP as can be: another elbow costs least. What
+        it is held before is added to `hits`.
+        """
+        reached = np.minimum(np.maximum(reached, low), high)
+        if self.walls is None:
+            return reached
+        rows, left_m = self.walls.at(now.position_rad, here.position_m, jacobian)
+        most, jerk = (
+            FAR_SHARE * (np.abs(rows) @ limit)
+            for limit in (self.acceleration_rad_s2, self.jerk_rad_s3)
+        )
+        # At first what is certainly far enough.
+        fastest = np.maximum(rows @ reached, 0.0) + most * most / jerk
+        far = left_m > fastest * (dt_s + 2 * most / jerk + fastest / (2 * most))
+        before = rows @ now.velocity_rad_s
+        metric = jacobian.T @ jacobian + ELBOW_COST * np.eye(jacobian.shape[1])
+        for wall in np.flatnonzero(~far).tolist():
+            row, nearer = rows[wall], float(rows[wall] @ reached)
+            if nearer <= 0:
+                continue
+            way = np.linalg.solve(metric, row)
+            way /= float(row @ way)
+            least = float(np.minimum(row * low, row * high).sum())
+            effort = np.maximum(np.abs(way), ROUNDING_RAD_S)
+            change = _towards_end(
+                float(left_m[wall]),
+                float(before[wall]),
+                (least - float(before[wall])) / dt_s,
+                (nearer - float(before[wall])) / dt_s,
+                WALL_SHARE * float(np.min(self.acceleration_rad_s2 / effort)),
+                WALL_SHARE * float(np.min(self.jerk_rad_s3 / effort)),
+                dt_s,
+            )
+            allowed = float(before[wall]) + change * dt_s
+            if nearer > allowed:
+                hits.append(self.walls.hit(wall, float(left_m[wall])))
+                reached = self._slower_along(row, way, allowed, reached, low, high)
+        return reached
+
+    @staticmethod
+    def _slower_along(
+        row: FloatArray,
+        first: FloatArray,
+        allowed: float,
+        reached: FloatArray,
+        low: FloatArray,
+        high: FloatArray,
+    ) -> FloatArray:
+        """`reached`, within its bounds, such that it is no faster along `row` than `allowed`."""
+        for way in (first, row, row):
+            excess = float(row @ reached) - allowed
+            # Joints that are on their bound already cannot help.
+            free = np.where(np.where(way > 0, reached > low, reached < high), way, 0.0)
+            gain = float(row @ free)
+            if excess <= 0 or gain <= 0:
+                break
+            reached = np.minimum(np.maximum(reached - excess / gain * free, low), high)
+        return reached
 
     def _wanted(
         self,
@@ -197,7 +320,7 @@ class JointFollower:
         right = np.stack([error / dt_s - taken, twist - taken, free @ posture], axis=1)
         solved = free.T @ np.linalg.solve(free @ free.T + damping * _IDENTITY_6, right)
         whole, feed = solved[:, 0], solved[:, 1]
-        back = whole - feed
+        back = min(1.0, self._back_1_s * dt_s) * (whole - feed)
         most = _stoppable(np.abs(back) * dt_s, BACK_SHARE * self.acceleration_rad_s2, dt_s)
         excess = float(np.max(np.abs(back) / np.maximum(most, 1e-12)))
         if excess > 1.0:
@@ -220,28 +343,107 @@ class JointFollower:
         allowed = settings.singularity_1_s * max(singular_value - settings.singularity_stop, 0.0)
         return share * allowed / fall_1_s if fall_1_s > allowed else 1.0
 
-    def _reachable(
-        self, wanted: FloatArray, velocity: FloatArray, dt_s: float
-    ) -> tuple[FloatArray, float]:
-        """`wanted` slowed to the velocity limits, then as near to it as one tick can get."""
-        ratio = float(np.max(np.abs(wanted) / self.velocity_rad_s))
-        if ratio > 1.0:
-            wanted = wanted / ratio
-        change = wanted - velocity
-        excess = float(np.max(np.abs(change) / (self.acceleration_rad_s2 * dt_s)))
-        return (velocity + change / excess if excess > 1.0 else wanted), ratio
+    def _reachable(self, wanted: FloatArray, now: JointMotion, dt_s: float) -> FloatArray:
+        """As near to `wanted` as one tick can get, on the way to having it without overshoot."""
+        velocity, before = now.velocity_rad_s, now.wanted_rad_s
+        most = self.acceleration_rad_s2
+        rate = (wanted - (velocity if before is None else before)) / dt_s
+        rate = np.minimum(np.maximum(rate, -most), most)
+        left = wanted - velocity - rate * dt_s
+        acceleration = rate + np.copysign(self._rampable(np.abs(left), dt_s), left)
+        excess = float(np.max(np.abs(acceleration) / most))
+        return velocity + acceleration * (dt_s / max(excess, 1.0))
 
-    def _allowed(
-        self, joints: FloatArray, velocity: FloatArray, dt_s: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Least and greatest velocities (n,) from which every joint can stop within its range."""
-        most = self.acceleration_rad_s2 * dt_s
-        up = _stoppable(np.maximum(self.upper_rad - joints, 0.0), self.acceleration_rad_s2, dt_s)
-        down = _stoppable(np.maximum(joints - self.lower_rad, 0.0), self.acceleration_rad_s2, dt_s)
-        # Where the two disagree (put outside its range, or found too fast) acceleration wins.
-        high = np.maximum(np.minimum(up, self.velocity_rad_s), velocity - most)
-        low = np.minimum(np.maximum(-down, -self.velocity_rad_s), velocity + most)
-        return np.maximum(low, velocity - most), np.minimum(high, velocity + most)
+    def _rampable(self, change: FloatArray, dt_s: float) -> FloatArray:
+        """Acceleration (n,) that comes down to nothing again within a change of velocity (n,)."""
+        return _stoppable(change, self.jerk_rad_s3, dt_s)
+
+    def _allowed(self, now: JointMotion, dt_s: float) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest velocities (n,) that every joint can have one tick later.
+
+        Within jerk and acceleration, and such that it can stay within its velocity and range. Where
+        these disagree (put outside its range, or found too fast) the former win.
+        """
+        joints, velocity = now.position_rad, now.velocity_rad_s
+        before = now.acceleration_rad_s2
+        before = np.zeros(len(joints)) if before is None else before
+        tick, most = self.jerk_rad_s3 * dt_s, self.acceleration_rad_s2
+        least = np.maximum(np.minimum(before - tick, most), -most)
+        greatest = np.minimum(np.maximum(before + tick, -most), most)
+        top, limit = [], self.velocity_rad_s
+        for sign, bound in ((1.0, self.upper_rad), (-1.0, self.lower_rad)):
+            room = limit - sign * velocity
+            high = np.where(room >= 0, self._rampable(np.maximum(room, 0.0), dt_s), room / dt_s)
+            left = sign * (bound - joints)
+            fastest = np.maximum(sign * velocity, 0.0) + most * dt_s
+            near = left < fastest * (dt_s + most / self.jerk_rad_s3 + fastest / (2 * most))
+            for joint in np.flatnonzero(near):
+                end = _towards_end(
+                    float(left[joint]),
+                    sign * float(velocity[joint]),
+                    float(least[joint] if sign > 0 else -greatest[joint]),
+                    float(greatest[joint] if sign > 0 else -least[joint]),
+                    float(most[joint]),
+                    float(self.jerk_rad_s3[joint]),
+                    dt_s,
+                )
+                high[joint] = min(high[joint], end)
+            top.append(high)
+        high = np.maximum(np.minimum(greatest, top[0]), least)
+        low = np.minimum(np.maximum(least, -top[1]), greatest)
+        return velocity + np.minimum(low, high) * dt_s, velocity + high * dt_s
+
+
+def _towards_end(
+    left: float,
+    velocity: float,
+    least: float,
+    greatest: float,
+    most: float,
+    jerk: float,
+    dt_s: float,
+) -> float:
+    """Greatest acceleration after which what moves can still stop within `left`, by halving.
+
+    Args:
+        left: of its way.
+        velocity: towards its end.
+        least: acceleration that it can have.
+        greatest: likewise.
+        most: acceleration it can stop with.
+        jerk: likewise.
+        dt_s: of the tick.
+    """
+
+    def fits(acceleration: float) -> bool:
+        after = velocity + acceleration * dt_s
+        return after * dt_s + _stop_way(after, acceleration, most, jerk) <= max(left, 0.0)
+
+    if fits(greatest):
+        return greatest
+    low, high = least, greatest
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
+
+
+def _stop_way(velocity: float, acceleration: float, most: float, jerk: float) -> float:
+    """How far a joint gets until it stops, as soon as acceleration and jerk allow."""
+    if velocity <= 0 and acceleration <= 0:
+        return 0.0
+    # Reckoned from where its acceleration will be nothing, or was.
+    ramp_s = abs(acceleration) / jerk
+    fastest = velocity + 0.5 * abs(acceleration) * ramp_s
+    if fastest <= 0:
+        return 0.0
+    if acceleration > 0:
+        before = velocity * ramp_s + acceleration * ramp_s**2 / 3
+    else:
+        before = acceleration * ramp_s**2 / -6 - fastest * ramp_s
+    if fastest < most * most / jerk:
+        return max(before + fastest * math.sqrt(fastest / jerk), 0.0)
+    return max(before + fastest * (fastest / most + most / jerk) / 2, 0.0)
 
 
 def _stoppable(distance: FloatArray, acceleration: FloatArray, dt_s: float) -> FloatArray:

@@ -2,21 +2,23 @@
 
 The pose stream has limits of its own, and joints have theirs. What joints cannot do is met in three
 places: the way to a goal is planned with the shares of the pose's limits that the joints can take
-(`JointStage.shares`); where they lag behind all the same the pose waits for them (`pace`); and a
-brake that finds them lagging is theirs: each joint stops within its limits, and the pose is then
-where they have brought it. An arm that is told to stop does not make up for what it lagged.
+(`JointStage.shares`); where they lag behind all the same the pose waits for them (`pace`), for a
+while; and a brake that finds them lagging is theirs: they stop within their limits, and the pose is
+then where they have brought it. An arm that is told to stop does not make up for what it lagged.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from ruckig import Trajectory
 
+from vla_zenoh.control.barriers import Barriers
 from vla_zenoh.control.differential import FollowSettings, JointFollower, JointMotion
-from vla_zenoh.control.joint_reference import JointMotionLimits, JointReference, stop_from
+from vla_zenoh.control.joint_reference import JointMotionLimits
 from vla_zenoh.control.kinematics import Kinematics
+from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother
 from vla_zenoh.control.so3 import Pose, distance, exp3, log3
+from vla_zenoh.control.walls import Walls
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Cause, FloatArray, JointCommand
 
@@ -40,8 +42,14 @@ PLACES = 3
 """Places of a way at which it is looked."""
 BRAKE_BEND = 0.15
 """Likewise of a brake, which takes what it can get: it bends less and less as it gets slower."""
+LOOK_TICKS = 4
+"""Ticks from one look at what the arm is near to until the next."""
 BRAKE_S = 0.1
 """A brake leads about as far as the arm goes in this time."""
+CREEPING, STUCK_S = 0.05, 0.5
+"""A pose that goes on at less than this part of its pace for so long will not be reached."""
+OUTSIDE_M = 1e-3
+"""An arm that is further outside of the box began there, and is led in."""
 LEAST_SHARE = 0.02
 NOTHING = 1e-9
 DAMPING = 1e-5
@@ -53,9 +61,12 @@ class JointStage:
     Args:
         profile: joint limits, home as posture, rate.
         kinematics: of the arm.
+        barriers: of the arm; None: only its TCP's box bounds the joints.
     """
 
-    def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
+    def __init__(
+        self, profile: Profile, kinematics: Kinematics, barriers: Barriers | None = None
+    ) -> None:
         robot, limits = profile.robot, profile.limits
         size = len(robot.arm_joints)
         # The follower's joints are in chain order, the profile's in its own.
@@ -67,31 +78,41 @@ class JointStage:
         share = float(np.min(velocity / kinematics.velocity_rad_s))
         velocity = np.minimum(velocity, share * kinematics.velocity_rad_s)
         self._limits = JointMotionLimits(velocity, acceleration, jerk)
-        self._posture_rad = kinematics.ordered(robot.arm_joints, robot.home_rad)
+        home_rad = kinematics.ordered(robot.arm_joints, robot.home_rad)
+        self._home_rad = home_rad if robot.posture == "home" else None
         settings = FollowSettings(
-            acceleration_rad_s2=tuple(float(value) for value in acceleration),
+            acceleration_rad_s2=tuple(acceleration.tolist()),
+            jerk_rad_s3=tuple(jerk.tolist()),
             velocity_share=min(share, 1.0),
             joint_margin_rad=limits.reach.joint_margin_rad,
             singularity_stop=limits.reach.singularity_stop,
         )
-        self._follower = JointFollower(kinematics, self._posture_rad, settings)
+        self._bounds = limits
+        self._walls = Walls(limits, barriers)
+        self._follower = JointFollower(kinematics, home_rad, settings, self._walls)
         most = float(jerk.min()) / PULL_JERK / settings.posture_rad_s
         self._pull_1_s = min(PULL_1_S, most**0.5)
         self._longest_rad = settings.posture_rad_s / settings.posture_1_s
         self._dt_s = 1.0 / profile.timing.command_hz
         self._names = kinematics.arm_joints
-        self.restart(self._follower.posture_rad)
+        self._held: set[str] = set()
+        self.restart(home_rad)
 
     def restart(self, joints_rad: FloatArray) -> None:
         """Stand at these joints (chain order); only for an arm that is not streamed to."""
         still = np.zeros(len(joints_rad))
         self._now = JointMotion(np.array(joints_rad, dtype=np.float64), still)
-        self._acceleration = still
         self._pull = self._pull_rate_1_s = 0.0
-        self._stop: Trajectory | None = None
-        self._stop_s = 0.0
+        self._stopping, self._ticks = False, 0
+        self.keep_elbow()
         self.pace = 1.0
         """Part of its own pace at which the pose goes on."""
+
+    def keep_elbow(self) -> None:
+        """An activation begins: the posture is that of these joints, or home."""
+        here_rad = self._now.position_rad
+        self._posture_rad = here_rad if self._home_rad is None else self._home_rad
+        self._waited_s = 0.0
 
     def shares(self, motion: Motion, goal: Pose, box: FloatArray, *, bend: float = BEND) -> Shares:
         """Of the limits of a straight motion to a pose, what the joints can follow.
@@ -150,39 +171,61 @@ class JointStage:
 
         An arm that brakes leaves its elbow where it is.
         """
-        lag = self._lag(smoother.motion.pose)
-        if not braking:
-            self._stop = None
-        elif self._stop is None and lag > 1.0:
-            reference = JointReference(*self._now, self._acceleration)
-            self._stop, self._stop_s = stop_from(reference, self._limits), 0.0
-        if self._stop is not None:
-            self._stopping(self._stop, smoother)
+        here = self._kinematics.forward(self._now.position_rad)
+        lag = self._lag(here, smoother.motion.pose)
+        self._look()
+        self._stopping = braking and (self._stopping or lag > 1.0)
+        if self._stopping:
+            self._stop(smoother)
             return
         self.pace = min(max((FAR - lag) / (FAR - 1.0), SLOWEST), 1.0)
+        waits = self.pace < CREEPING
+        self._waited_s = self._waited_s + self._dt_s if waits else 0.0
         motion = smoother.tick(self.pace)
         self._follower.posture_rad = self._pulled_to(0.0 if braking else 1.0)
-        before = self._now.velocity_rad_s
         twist = self.pace * motion.twist
-        self._now, _ = self._follower.step(self._now, motion.pose, twist, self._dt_s)
-        self._acceleration = (self._now.velocity_rad_s - before) / self._dt_s
+        pose = self._inside(here, motion.pose)
+        self._now, hits = self._follower.step(self._now, pose, twist, self._dt_s)
+        found = {f"{hit.name} {hit.where}".strip() for hit in hits}
+        self._held = found | (self._held if waits else set())
 
-    def _lag(self, pose: Pose) -> float:
-        """How far the joints are from a pose, in times of what is near."""
-        apart_m, apart_rad = distance(self._kinematics.forward(self._now.position_rad), pose)
+    @property
+    def stuck(self) -> str:
+        """Why the pose waits for the joints for good, empty while it does not."""
+        if self._waited_s < STUCK_S:
+            return ""
+        held = sorted(self._held)
+        return (
+            f"the joints cannot follow the pose: it has waited for them for {STUCK_S:g} s; "
+            f"they are held by {', '.join(held) or 'nothing, so the arm cannot have this pose'}"
+        )
+
+    def _inside(self, here: Pose, pose: Pose) -> Pose:
+        """A pose in the box, of an arm that is in it."""
+        inside_m, outside_m = into_workspace(self._bounds, pose.position_m)
+        if not outside_m or into_workspace(self._bounds, here.position_m)[1] > OUTSIDE_M:
+            return pose
+        return Pose(inside_m, pose.rotation)
+
+    def _lag(self, here: Pose, pose: Pose) -> float:
+        """How far the joints, whose TCP is here, are from a pose, in times of what is near."""
+        apart_m, apart_rad = distance(here, self._inside(here, pose))
         return max(apart_m / NEAR_M, apart_rad / NEAR_RAD)
 
-    def _stopping(self, path: Trajectory, smoother: Smoother) -> None:
+    def _look(self) -> None:
+        """See now and then what the arm is near to."""
+        if self._ticks % LOOK_TICKS == 0:
+            self._walls.look(self._now.position_rad)
+        self._ticks += 1
+
+    def _stop(self, smoother: Smoother) -> None:
         """The joints stop by themselves, and the pose is where that brings the TCP."""
-        self._stop_s += self._dt_s
-        position, velocity, acceleration = map(np.array, path.at_time(self._stop_s))
-        if self._stop_s >= path.duration:
-            velocity = acceleration = np.zeros(len(position))
-        self._now, self._acceleration = JointMotion(position, velocity), acceleration
+        self._now = self._follower.brake(self._now, self._dt_s)
+        position, velocity = self._now[:2]
         self._pull = self._pull_rate_1_s = 0.0
         pose, jacobian = self._kinematics.pose_and_jacobian(position)
         # Whoever takes this stop back plans from here: with no more than a plan may have.
-        change = np.clip(jacobian @ acceleration, -smoother.box[1], smoother.box[1])
+        change = np.clip(jacobian @ self._acceleration, -smoother.box[1], smoother.box[1])
         smoother.brake_from(Motion(pose, jacobian @ velocity, change))
 
     def _pulled_to(self, share: float) -> FloatArray:
@@ -195,10 +238,21 @@ class JointStage:
         return self._now.position_rad + self._pull * shortened * way_rad
 
     @property
+    def position_rad(self) -> FloatArray:
+        """(n,) where the joints are to be now."""
+        return self._now.position_rad
+
+    @property
     def at_rest(self) -> bool:
         """No joint moves."""
         return float(np.abs(self._now.velocity_rad_s).max()) < REST_RAD_S
 
     def command(self, state: str, cause: Cause | None) -> JointCommand:
         """Where the joints have to be now."""
-        return JointCommand(self._names, *self._now, self._acceleration, state=state, cause=cause)
+        motion = self._now
+        return JointCommand(self._names, *motion[:2], self._acceleration, state=state, cause=cause)
+
+    @property
+    def _acceleration(self) -> FloatArray:
+        told = self._now.acceleration_rad_s2
+        return np.zeros(len(self._now.position_rad)) if told is None else told

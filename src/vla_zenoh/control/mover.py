@@ -64,7 +64,7 @@ class Mover:
         if profile.robot.command == "joint":
             if reach is None:
                 raise ProfileError("robot.command is joint, which needs the robot's kinematics")
-            self._joints = JointStage(profile, reach.kinematics)
+            self._joints = JointStage(profile, reach.kinematics, reach.barriers)
         self.gripper = GripperArbiter(profile.robot.gripper)
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
@@ -72,6 +72,8 @@ class Mover:
         self.speed = 1.0
         """Share of the speed limits that the arm has to its goal, the override aside."""
         self._override, self._slowing = 1.0, False
+        self._held_back: Slowdown | None = None
+        self._anew = False
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
         self._timing: StepTiming | None = None
@@ -89,6 +91,21 @@ class Mover:
     def commanded(self) -> Pose | None:
         """The pose last streamed, None while nothing is."""
         return self._smoother.motion.pose if self._smoother and self.streaming else None
+
+    @property
+    def joints_rad(self) -> FloatArray | None:
+        """(n,) joints commanded, None where poses are."""
+        return None if self._joints is None else self._joints.position_rad
+
+    def hold_back(self, slower: Slowdown | None) -> None:
+        """Go no faster than this from now on, whatever the goal allows; None: as it allows."""
+        if (slower and slower.share) != (self._held_back and self._held_back.share):
+            self._held_back, self._anew = slower, True
+
+    @property
+    def stuck(self) -> str:
+        """Why joints that are commanded will not come to the pose, empty while they follow."""
+        return "" if self._joints is None else self._joints.stuck
 
     @property
     def failures(self) -> int:
@@ -115,6 +132,7 @@ class Mover:
             blocked: the arm is far from its controller's reference.
         """
         self._slowed_by.clear()
+        self._held_back = None
         if self._reach is not None and joint is not None:
             self._reach.reset(self._reach.kinematics.joints_of(joint))
         actual, start = pose_of(measured), held_pose(measured)
@@ -125,8 +143,10 @@ class Mover:
         elif standing and not self._held(self._smoother.motion.pose, start):
             # Also at rest: a robot that braked by itself stands elsewhere than we command.
             self._smoother.reset(start)
-        if self._joints is not None and joint is not None and standing:
-            self._joints.restart(self._held_joints(joint))
+        if self._joints is not None and joint is not None:
+            if standing:
+                self._joints.restart(self._held_joints(joint))
+            self._joints.keep_elbow()
         width_m = self._width_to_keep(gripper)
         self.gripper.restart(width_m)
         # A blocked arm's controller is led back to where the arm is. Otherwise a brake under way
@@ -242,7 +262,8 @@ class Mover:
         slowed = self._slowing and _within(smoother, self._override)
         # Of where the arm will be with this tick: it may be on its way from there.
         pose, hits = leash(self._limits, goal.pose, _ahead(smoother.motion, ticks * self._dt_s))
-        if goal is not self.goal or hits or slowed:
+        if goal is not self.goal or hits or slowed or self._anew:
+            self._anew = False
             if hits:
                 cut = self._shorten(plans, goal, pose, now_ns)
                 if goal is not self.goal:
@@ -299,6 +320,8 @@ class Mover:
 
     def _slow_down(self, slower: Slowdown | None, out: Outputs) -> None:
         """Take over the speed of a goal; tell each reason once in every activation."""
+        if self._held_back and (slower is None or self._held_back.share < slower.share):
+            slower = self._held_back
         if slower is not None and slower.name not in (APPROACH, *self._slowed_by):
             self._slowed_by.add(slower.name)
             where = f" at {slower.where}" if slower.where else ""

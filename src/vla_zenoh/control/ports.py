@@ -47,7 +47,7 @@ class Inputs:
         pose: newest TCP pose, or None when none came since.
         gripper: likewise.
         around: the nodes around; None: unchanged.
-        joint: newest joints, looked at when the arm is activated.
+        joint: newest joints, or None when none came since, or none were looked at.
     """
 
     settings: Sequence[Setting] = ()

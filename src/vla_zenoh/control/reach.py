@@ -143,10 +143,20 @@ class Shadow:
             self._solver.posture_rad = joints.copy()
         pose, jacobian = self.kinematics.pose_and_jacobian(joints)
         self._here = _Stand(pose, joints, 0.0, self.barriers.at(joints, jacobian))
+        self._seat_rad: FloatArray | None = None
         self.slowdown: Slowdown | None = None
         """Why the step bounded last is to be taken slower than at full speed."""
         self.cost = 1
         """For how many the last evaluation counts."""
+
+    def reseat(self, joints_rad: FloatArray) -> None:
+        """The arm itself has these joints (n,): the next step begins with its elbow."""
+        self._seat_rad = joints_rad
+
+    def followed(self, pose: Pose, joints_rad: FloatArray) -> FloatArray | None:
+        """Joints (n,) of an arm that went there from these (n,), None where it has none."""
+        found = self._solver.approach(pose, joints_rad, bounded=False)
+        return found.joints_rad if found.solved else None
 
     @property
     def joints_rad(self) -> FloatArray:
@@ -191,9 +201,8 @@ class Shadow:
             what became of it. The shadow stands there afterwards.
         """
         here = self._here
-        if not _same(before, here.pose) or not (
-            start_rad is None or np.array_equal(start_rad, here.joints_rad)
-        ):
+        stands = start_rad is None or np.array_equal(start_rad, here.joints_rad)
+        if self._seat_rad is not None or not stands or not _same(before, here.pose):
             yield
             here = self._stand_at(before, here.joints_rad if start_rad is None else start_rad)
         start = _Start(here, self._floor(here), *self._solver.bounds(here.joints_rad))
@@ -248,7 +257,10 @@ class Shadow:
 
     # -- one place ----------------------------------------------------------------------------
     def _stand_at(self, pose: Pose, start_rad: FloatArray) -> _Stand:
-        found = self._approach(pose, start_rad)
+        seat_rad, self._seat_rad = self._seat_rad, None
+        found = None if seat_rad is None else self._approach(pose, seat_rad)
+        if found is None or not found.solved:
+            found = self._approach(pose, start_rad)
         self._here = self._stand(pose, found)
         return self._here
 

@@ -25,6 +25,8 @@ ANYTHING = MAX_MESSAGE_BYTES
 """A stop is obeyed whatever it says, and never read."""
 WORDS = settings.MAX_SETTING_BYTES
 CLOCK_PERIOD_S = 0.1
+JOINT_PERIOD_S = 0.025
+"""Joints are looked at so often while nobody asks for the arm."""
 
 
 class CommandInputs:
@@ -56,7 +58,7 @@ class CommandInputs:
             kind: Speaker(node.profile.timing.state_timeout_s)
             for kind in (PoseState, JointState, GripperState)
         }
-        self._last_clock = 0.0
+        self._last_clock = self._last_joint = 0.0
 
     @property
     def chunks_dropped(self) -> int:
@@ -137,10 +139,16 @@ class CommandInputs:
         return newest
 
     def _joints(self, put: list[Setting]) -> Stamped[JointState] | None:
-        """Joints are looked at when the arm is given to somebody; decoding them costs."""
-        if not any(setting.name in ("active", "worker") for setting in put):
+        """The newest joints, where it is time to look at some: decoding them costs."""
+        given = any(setting.name in ("active", "worker") for setting in put)
+        if not given and time.monotonic() - self._last_joint < JOINT_PERIOD_S:
             return None
-        return self._state(JointState, self._joint_slot)
+        for arrival in reversed(self._joint_slot.take_all()):
+            found = self._node.read(JointState, arrival, self._speakers[JointState])
+            if found is not None:
+                self._last_joint = time.monotonic()
+                return found
+        return None
 
     def _check_clock(self) -> list[Setting]:
         if time.monotonic() - self._last_clock < CLOCK_PERIOD_S:

@@ -97,6 +97,7 @@ class CommandStatus:
                 "speed_share": round(mind.speed, 3),
                 "tracking_mm": round(mind.tracking_m * 1e3, 3),
                 "tracking_mrad": round(mind.tracking_rad * 1e3, 3),
+                "elbow_mrad": round(mind.elbow_rad * 1e3, 3),
                 "tick_us": self._cost_us.spread(),
                 "late_us": self._late_us.spread(),
                 "pose_age_ms": self._pose_age_ms.spread(),

@@ -12,11 +12,12 @@ from vla_zenoh.profile.load import (
     read_profile,
     to_yaml,
 )
-from vla_zenoh.profile.robot import GripperProfile, JointEnds, RobotProfile
+from vla_zenoh.profile.robot import POSE_JOINTS, GripperProfile, JointEnds, RobotProfile
 from vla_zenoh.profile.schema import CameraProfile, Composition, HostProfile, Profile, Timing
 from vla_zenoh.profile.session import SessionProfile
 
 __all__ = [
+    "POSE_JOINTS",
     "REACH_M",
     "REFUSE_FACTOR",
     "CameraProfile",

@@ -9,13 +9,20 @@ from vla_zenoh import resources
 from vla_zenoh.errors import MissingExtraError, ResourceError, WorkerError
 from vla_zenoh.loader import find_worker
 from vla_zenoh.profile.fit import cameras_of, workers_of
+from vla_zenoh.profile.robot import POSE_JOINTS
 from vla_zenoh.profile.schema import Profile
 from vla_zenoh.profile.session import ANYWHERE, address_of, is_loopback
 
 
 def advice(profile: Profile) -> list[str]:
     """Sentences, each beginning with the path it is about."""
-    return [*_network(profile), *_placement(profile), *_found_here(profile), *_timing(profile)]
+    return [
+        *_network(profile),
+        *_placement(profile),
+        *_joints(profile),
+        *_found_here(profile),
+        *_timing(profile),
+    ]
 
 
 def _network(profile: Profile) -> Iterator[str]:
@@ -75,6 +82,16 @@ def _placement(profile: Profile) -> Iterator[str]:
         for kind, named in (("camera", host.cameras), ("worker", host.workers)):
             if named is not None and kind not in host.nodes:
                 yield f"hosts.{name}.{kind}s: has no effect without {kind} in hosts.{name}.nodes"
+
+
+def _joints(profile: Profile) -> Iterator[str]:
+    joints = len(profile.robot.arm_joints)
+    if joints < POSE_JOINTS:
+        yield (
+            f"robot.arm_joints: with {joints} of them the TCP cannot have any pose around it, as "
+            "with six: models with absolute poses or joint positions are refused, and delta steps "
+            "are shortened to what the arm can do"
+        )
 
 
 def _found_here(profile: Profile) -> Iterator[str]:

@@ -49,8 +49,7 @@ class JointLimits(Section):
     Args:
         velocity_rad_s: of the commanded motion.
         acceleration_rad_s2: likewise.
-        jerk_rad_s3: of the elbow's own motion and of the robot's own stop; what the joints do for
-            the pose has the jerk limits of the pose alone.
+        jerk_rad_s3: likewise, and of the robot's own stop.
     """
 
     velocity_rad_s: Annotated[tuple[Velocity, ...], *_PerJoint] = (1.0875,)

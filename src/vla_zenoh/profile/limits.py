@@ -116,6 +116,8 @@ class Limits(Section):
         lead_rad: likewise.
         tracking_m: leash: commanded minus measured pose; more brakes the arm (it is blocked).
         tracking_rad: likewise.
+        elbow_rad: a measured joint may be so far from where the arm is believed to have it at the
+            same TCP pose; beyond it gets slower, at twice that it brakes.
     """
 
     workspace: Workspace = Workspace()
@@ -132,6 +134,7 @@ class Limits(Section):
     lead_rad: float = Field(default=0.6, gt=0, le=1.5)
     tracking_m: float = Field(default=0.05, gt=0, le=0.2)
     tracking_rad: float = Field(default=0.3, gt=0, le=1.0)
+    elbow_rad: float = Field(default=0.35, gt=0, le=1.5)
 
     @model_validator(mode="after")
     def _a_step_fits_the_leash(self) -> Limits:

@@ -9,6 +9,9 @@ from pydantic import Field, model_validator
 
 from vla_zenoh.profile.section import Name, Section, Word, Words, refuse
 
+POSE_JOINTS = 6
+"""So many joints, at least, has an arm whose TCP can take any pose around it."""
+
 
 class JointEnds(NamedTuple):
     """Where a finger joint is when the gripper is open, and when it is shut; ``rad`` or ``m``."""
@@ -91,7 +94,10 @@ class RobotProfile(Section):
         arm_joints: in the order in which every list of joint values in the profile is.
         finger_joints: of the gripper, whose joint states tell its width. Those that slide add up to
             it; of those that turn `gripper` has to say where they are open and shut.
-        home_rad: where a reset puts the simulated arm, and the posture a redundant arm keeps.
+        home_rad: where a reset puts the simulated arm.
+        posture: joints that a redundant arm keeps its elbow near to: ``start``, those it is
+            activated in, or ``home``, to which the elbow then moves at once where joints are
+            commanded.
         gripper: its own section.
     """
 
@@ -104,6 +110,7 @@ class RobotProfile(Section):
     arm_joints: Words = Field(min_length=1)
     finger_joints: Words = ()
     home_rad: tuple[float, ...] = Field(strict=False)
+    posture: Literal["start", "home"] = "start"
     gripper: GripperProfile = GripperProfile()
 
     @model_validator(mode="after")
