@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 from fuzz_motion import CYCLE, command, run, told
 
-TICKS, JOINT_TICKS = 10_000, 5_000
+TICKS, JOINT_TICKS = 10_000, 6_000
 """Kinematics take their time."""
 SLOW = ("joint", "joint net", "reach")
 SEEDS = {family: range(101, 101 + 2 * CYCLE.count(family)) for family in dict.fromkeys(CYCLE)}
