@@ -29,7 +29,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
     check_steps,
 )
-from vla_zenoh.profile import Limits, load_profile, override
+from vla_zenoh.profile import JointLimits, Limits, load_profile, override
 
 BROKEN = Path(__file__).with_name("broken_worker.py")
 RUNS = 40
@@ -242,6 +242,15 @@ def spec(*cameras: CameraSpec, **action: Any) -> ModelSpec:
 FRONT, WRIST = CameraSpec(camera="front"), CameraSpec(camera="wrist")
 
 
+FIVE_JOINTS = {
+    "robot": {
+        "arm_joints": [f"panda_joint{number}" for number in range(1, 6)],
+        "home_rad": [0.0, 0.0, 0.0, -2.6, 0.0],
+    },
+    "limits": {"joint": dict.fromkeys(JointLimits.model_fields, 1.0)},
+}
+
+
 @pytest.mark.parametrize(
     ("declared", "changes", "wanted"),
     [
@@ -266,6 +275,12 @@ FRONT, WRIST = CameraSpec(camera="front"), CameraSpec(camera="wrist")
         (spec(FRONT, gripper="none"), {}, {("note", "no_gripper")}),
         (spec(FRONT), {"task": {"prompt": ""}}, {("warning", "no_prompt")}),
         (spec(FRONT, horizon=1), {}, {("note", "gaps")}),
+        (spec(FRONT), FIVE_JOINTS, {("warning", "too_few_joints")}),
+        (
+            spec(FRONT, kind="absolute", rotation="quaternion"),
+            FIVE_JOINTS,
+            {("error", "too_few_joints")},
+        ),
     ],
 )
 def test_what_does_not_fit_a_profile_is_named(

@@ -10,6 +10,7 @@ from vla_zenoh.profile import advice, load_profile, override
 
 SIM = load_profile("panda_sim")
 ROBOT = {"robot": {"nodes": ["router", "sim", "camera", "command"]}}
+ONE_FOR_ALL = dict.fromkeys(("velocity_rad_s", "acceleration_rad_s2", "jerk_rad_s3"), 1.0)
 NET = "tls/10.0.0.2:7447"
 
 
@@ -63,6 +64,13 @@ def test_two_hosts_with_real_addresses_need_no_advice() -> None:
         (
             {"models": {"scripted": "/absent/nod.py"}},
             "models.scripted: on this computer: there is no file or folder '/absent/nod.py'",
+        ),
+        (
+            {
+                "robot": {"arm_joints": ["a", "b", "c", "d", "e"], "home_rad": [0.0] * 5},
+                "limits": {"joint": ONE_FOR_ALL},
+            },
+            "robot.arm_joints: with 5 of them the TCP cannot have any pose around it",
         ),
         (
             {"robot": {"description": "absent.urdf"}},
