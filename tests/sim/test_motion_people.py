@@ -184,7 +184,7 @@ def test_a_stop_while_something_is_held_does_not_drop_it() -> None:
     since = mark(loop)
     loop.put("stop")
     loop.run(1.5)
-    assert stop_time_s(loop, since) < BRAKE_STOP_S
+    assert stop_time_s(loop, since) <= BRAKE_STOP_S
     assert loop.world.gripper_state().holding
     slipped = loop.world.objects()["brick"][0] - loop.world.tcp()[0] - held
     assert np.linalg.norm(slipped) < SLIP_M

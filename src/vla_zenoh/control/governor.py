@@ -38,7 +38,7 @@ from vla_zenoh.types import FloatArray
 ORDINARY = 1.15
 """Part of the stream's limits of jerk within which what is told is taken as it is. The difference
 has what is left of `BRAKE_MARGIN`."""
-SETTLE_S = 0.08
+SETTLE_S = 0.02
 """A small difference is gone after about this time, with less jerk than it might have; a large one
 takes as long as its limits make it."""
 LONG_S = 0.6
