@@ -71,6 +71,7 @@ class Rig:
         self.profile = of or profile()
         self.commander = Commander(self.profile, reach=reach, dry_run=dry_run)
         self.joints_rad: FloatArray | None = None
+        self.joints_of_shadow = True
         self.spec = model_spec(**action)
         self.now_ns = START_NS
         self.period_ns = round(1e9 / self.profile.timing.command_hz)
@@ -157,7 +158,7 @@ class Rig:
         """Those of the test, wherever its TCP is said to be, else where the shadow stands."""
         reach, joints_rad = self.commander.reach, self.joints_rad
         names = self.profile.robot.arm_joints
-        if joints_rad is None and reach is not None:
+        if joints_rad is None and reach is not None and self.joints_of_shadow:
             joints_rad, names = reach.joints_rad, reach.kinematics.arm_joints
         if joints_rad is None:
             return None

@@ -16,7 +16,7 @@ from vla_zenoh.control.smoothing import Smoother, motion_limits
 from vla_zenoh.control.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.control.states import State
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.types import FloatArray, GripperState, JointCommand, JointState, PoseState
+from vla_zenoh.types import FloatArray, GripperState, JointCommand, JointState, PoseState, Task
 
 PROFILE = override(load_profile("panda_sim"), {"robot": {"command": "joint", "posture": "home"}})
 KINEMATICS = make_kinematics(PROFILE)
@@ -69,7 +69,9 @@ class Moved:
     def tick(self, ticks: int = 1) -> JointCommand:
         out = Outputs()
         self.now_ns += ticks * TICK_NS
-        self.mover.advance(State.ACTIVE, self.now_ns, ticks, out)
+        task = Task(0, True, "hold", "scripted", 5.0)
+        overdue_ns = self.now_ns + 10**9
+        self.mover.advance(State.ACTIVE, task, overdue_ns, self.now_ns, ticks, out)
         self.mover.command(State.ACTIVE, self.now_ns, None, out)
         assert out.joint is not None
         return out.joint

@@ -135,7 +135,7 @@ class Arm(Rig):
 
     def __init__(self) -> None:
         super().__init__(PROFILE, reach=make_shadow(PROFILE, KINEMATICS))
-        self.joints_rad = HOME_RAD
+        self.joints_rad, self.joints_of_shadow = HOME_RAD, False
         self.place(KINEMATICS.forward(HOME_RAD))
 
     def place(self, pose: Pose) -> None:
