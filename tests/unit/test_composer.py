@@ -311,8 +311,9 @@ def test_a_far_absolute_target_is_approached_straight_and_slowly(period_s: float
         gone = command.position_m - START_M
         for on_line, apart_m in ((gone, 2e-3), (command.goal_position_m - START_M, 1e-7)):
             assert norm3(on_line - (on_line @ direction) * direction) < apart_m
-        if away_m - gone @ direction > rig.profile.limits.step_m + 0.02:
-            assert norm3(command.twist[:3]) <= fastest * 1.05
+        # The arm is some centimetres behind its goal, which may go faster within the last step.
+        if away_m - gone @ direction > rig.profile.limits.step_m + 0.05:
+            assert norm3(command.twist[:3]) <= fastest * (1 + 1e-6)
     rig.assert_smooth()
 
 
