@@ -28,7 +28,7 @@ from vla_zenoh.control.stream import BRAKE_MARGIN
 TICKS_S = [STREAM_S, 0.001]
 """An arm of one's own and a ROS 2 controller, and the simulator's law."""
 DURATION_S = 4.0
-TURNED = 1.05
+TURNED = 1.1
 """What turns is planned axis by axis, which adds so much to its jerk in space."""
 MOVING = 1.04
 """Velocity and acceleration of what is told may grow in the tick in which that is noticed."""
