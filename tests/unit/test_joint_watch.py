@@ -153,8 +153,9 @@ def test_the_measured_arm_ends_the_activation_with_an_event_that_names_joint_val
     arm.activate()
     arm.send([[0, 0, 0.01, 0, 0, 0, 0]] * 16)
     slowest = 1.0
+    joints_rad = HOME_RAD
     for _ in range(400):
-        arm.joints_rad = arm.joints_rad - 0.002 * JOINT["panda_joint4"]
+        arm.joints_rad = joints_rad = joints_rad - 0.002 * JOINT["panda_joint4"]
         arm.tick()
         slowest = min(slowest, arm.commander.speed)
         if arm.state != "active":
