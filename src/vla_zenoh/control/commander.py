@@ -15,6 +15,7 @@ from dataclasses import replace
 from vla_zenoh.control.acceptance import Lease, Refusal, refuse
 from vla_zenoh.control.compose import Goal
 from vla_zenoh.control.composer import Composer
+from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper import GripperArbiter
 from vla_zenoh.control.holding import Holding
 from vla_zenoh.control.joint_fit import reasons_joints_do_not_fit
@@ -23,6 +24,7 @@ from vla_zenoh.control.ports import Inputs, Outputs, Setting
 from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
 from vla_zenoh.control.progress import Progress
 from vla_zenoh.control.reach import Shadow
+from vla_zenoh.control.retreat import Retreat
 from vla_zenoh.control.so3 import held_pose, pose_of
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watch import Watch
@@ -72,7 +74,10 @@ class Commander:
         self._around = Surroundings()
         self._shadow: dict[str, Stamped[ActionChunk]] = {}
         self._composer = Composer(profile, reach)
-        self._mover = Mover(profile, reach, self._composer)
+        self.contact = Contact(profile.limits.contact)
+        self._retreat = Retreat(profile.limits, self.contact)
+        self._mover = Mover(profile, reach, self._composer, self._retreat)
+        self._feels = True
         self._watch = Watch(profile)
         self._out = Outputs()
 
@@ -154,8 +159,11 @@ class Commander:
             self._around = inputs.around
         if inputs.pose is not None:
             self.pose = inputs.pose
+            self.contact.take_pose(inputs.pose)
+            self._retreat.see(pose_of(inputs.pose.record))
         if inputs.joint is not None:
             self.joint = inputs.joint
+            self.contact.take_joints(inputs.joint)
         if inputs.gripper is not None:
             self.gripper_state = inputs.gripper
             faults, mode = inputs.gripper.record.faults, inputs.gripper.record.mode
@@ -228,6 +236,7 @@ class Commander:
             return
         self.lease = lease
         self.holding.begin(holder)
+        self.contact.begin()
         self._resumed_ns = 0
         measured, joint = self.pose.record, self.joint.record if self.joint else None
         blocked = self._watch.begin(held_pose(measured), pose_of(measured))
@@ -295,6 +304,8 @@ class Commander:
         if new is self.state:
             return
         old, self.state, self.why = self.state, new, why
+        if new not in OBEYING:
+            self.contact.end()
         level = (
             "info"
             if new in OBEYING or trigger in (Trigger.DEACTIVATE, Trigger.RESET)
@@ -349,14 +360,18 @@ class Commander:
     def _look_around(self, now_ns: int) -> None:
         if self.pose is not None:
             self._watch.measure(self._mover.commanded, pose_of(self.pose.record))
+        if self._retreat.busy and not self._may_retreat(now_ns):
+            self._retreat.end()
         if self.state not in OBEYING:
             return
         assert self.pose is not None and self.gripper_state is not None and self.lease is not None
+        self._mover.pressed = self.contact.slowdown()
+        self._tell_whether_it_feels()
         lost = self._watch.lost(
             self.pose, self.gripper_state, self._around, self.task.worker, self.lease, now_ns
         )
         if not lost and self.streaming and not self.dry_run:
-            lost = self._watch.blocked()
+            lost = self._obstructed()
         if not lost and self._watch.forsaken(now_ns):
             lost = f"held for {self.profile.timing.max_hold_s:g} s, no fresh chunk came"
         lost = lost or self.holding.lost(self._around.holders)
@@ -364,3 +379,43 @@ class Commander:
             self._change(Trigger.LOSE, lost)
         elif self._watch.starved(now_ns):
             self._change(Trigger.STARVE, "no fresh chunk within the watchdog")
+
+    def _obstructed(self) -> str:
+        """Why the arm cannot go on, empty when it can; then it brakes and is led back."""
+        commanded, pressed = self._mover.commanded, self.contact.pressed()
+        if pressed is None:
+            why = self._watch.blocked()
+            # Who feels nothing is not blocked: its state is stuck, or it was made slow.
+            leads_back = bool(why) and not (self.contact.told and self.contact.quiet)
+        else:
+            name, value, limit, unit = pressed
+            self._out.tell("warning", "limit", name, "stopped", value, limit)
+            why = (
+                f"something presses against the arm: {name} {value:.1f} {unit}, "
+                f"at most {limit:g} {unit}; it is led back"
+            )
+            leads_back = True
+        if leads_back and commanded is not None:
+            self._retreat.begin(commanded)
+        return why
+
+    def _may_retreat(self, now_ns: int) -> bool:
+        """The robot is there, well, and says where the arm is."""
+        pose, gripper = self.pose, self.gripper_state
+        if pose is None or gripper is None or self._watch.unheard(pose, gripper, now_ns):
+            return False
+        there = self._around.robot_node in self._around.alive
+        return there and gripper.record.mode == "ready" and not gripper.record.faults
+
+    def _tell_whether_it_feels(self) -> None:
+        if self.contact.told is self._feels:
+            return
+        self._feels = self.contact.told
+        if self._feels:
+            self._out.tell("info", "notice", "contact_told", "the robot tells external forces")
+        else:
+            why = (
+                "the robot tells no external wrench: limits.contact has nothing to look at, and an "
+                "arm that is blocked is noticed by limits.tracking_m alone"
+            )
+            self._out.tell("warning", "notice", "contact_not_told", why)

@@ -145,10 +145,13 @@ class JointStage:
         ahead = Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
         smoother.brake(self.shares(smoother.motion, ahead, smoother.box, bend=BRAKE_BEND))
 
-    def tick(self, smoother: Smoother, *, braking: bool = False) -> None:
+    def tick(self, smoother: Smoother, *, braking: bool = False, elbow: bool = True) -> None:
         """Follow the pose for one tick, or stop; `smoother` is moved on.
 
-        An arm that brakes leaves its elbow where it is.
+        Args:
+            smoother: the pose.
+            braking: it comes to rest. An arm that brakes leaves its elbow where it is.
+            elbow: it may go to its posture.
         """
         lag = self._lag(smoother.motion.pose)
         if not braking:
@@ -161,7 +164,7 @@ class JointStage:
             return
         self.pace = min(max((FAR - lag) / (FAR - 1.0), SLOWEST), 1.0)
         motion = smoother.tick(self.pace)
-        self._follower.posture_rad = self._pulled_to(0.0 if braking else 1.0)
+        self._follower.posture_rad = self._pulled_to(1.0 if elbow and not braking else 0.0)
         before = self._now.velocity_rad_s
         twist = self.pace * motion.twist
         self._now, _ = self._follower.step(self._now, motion.pose, twist, self._dt_s)

@@ -12,7 +12,8 @@ from vla_zenoh.control.joint_stage import JointStage
 from vla_zenoh.control.limits import leash
 from vla_zenoh.control.ports import Outputs
 from vla_zenoh.control.reach import Shadow
-from vla_zenoh.control.slowdown import Slowdown
+from vla_zenoh.control.retreat import Retreat
+from vla_zenoh.control.slowdown import Slowdown, slowest
 from vla_zenoh.control.smoothing import Motion, Shares, Smoother, motion_limits
 from vla_zenoh.control.so3 import Pose, held_pose, pose_of, quat_from_rotation
 from vla_zenoh.control.states import OBEYING, State
@@ -41,12 +42,15 @@ class Mover:
         profile: limits, rate, and whether poses or joints are commanded.
         reach: see `Commander`.
         composer: bounds the goals that come due.
+        retreat: what leads a blocked arm back.
 
     Raises:
         ProfileError: joints are to be commanded and there are no kinematics.
     """
 
-    def __init__(self, profile: Profile, reach: Shadow | None, composer: Composer) -> None:
+    def __init__(
+        self, profile: Profile, reach: Shadow | None, composer: Composer, retreat: Retreat
+    ) -> None:
         self._limits = profile.limits
         self._dt_s = 1.0 / profile.timing.command_hz
         self._max_width_m = profile.robot.gripper.max_width_m
@@ -63,6 +67,10 @@ class Mover:
         self.streaming = False
         self.speed = 1.0
         """Share of the speed limits that the arm has to its goal."""
+        self.pressed: Slowdown | None = None
+        """What presses against the arm, and makes it slower wherever it goes."""
+        self.retreat = retreat
+        self._back: Pose | None = None
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
         self._cause: Cause | None = None
@@ -105,6 +113,7 @@ class Mover:
             blocked: the arm is far from its controller's reference.
         """
         self._slowed_by.clear()
+        self.retreat.end()
         if self._reach is not None and joint is not None:
             self._reach.reset(self._reach.kinematics.joints_of(joint))
         actual, start = pose_of(measured), held_pose(measured)
@@ -158,7 +167,7 @@ class Mover:
         if state is State.ACTIVE:
             self._cause = self._follow(self._smoother, self.timeline, now_ns, out)
         else:
-            self._brake(self._smoother, self.timeline, now_ns)
+            self._retreat_or_brake(self._smoother, self.timeline, state, now_ns, out)
         went_on, self.streaming = self.streaming, self._must_stream(state, now_ns)
         if not self.streaming:
             return True
@@ -168,7 +177,9 @@ class Mover:
             if self._joints is None:
                 self._smoother.tick()
             else:
-                self._joints.tick(self._smoother, braking=state is not State.ACTIVE)
+                active = state is State.ACTIVE
+                braking = not active and self._back is None
+                self._joints.tick(self._smoother, braking=braking, elbow=active)
         return self._smoother.failures == failures
 
     def command(
@@ -191,12 +202,13 @@ class Mover:
         for plan in plans:
             self._composer.bound_until(plan, plan.index_at(now_ns), out)
         goal = self._aggregator.goal(plans, now_ns)
-        if goal is not self.goal:
+        slower = slowest(goal.slowdown, self.pressed)
+        if goal is not self.goal or (slower.share if slower else 1.0) != self.speed:
             pose, hits = leash(self._limits, goal.pose, smoother.motion.pose)
             if hits:
                 goal = self._shorten(plans, goal, pose, now_ns)
                 out.tell("warning", "limit", hits[0].name, "leash", hits[0].value, hits[0].limit)
-            self._slow_down(goal.slowdown, out)
+            self._slow_down(slower, out)
             smoother.target(goal.pose, self._shares(smoother, goal.pose))
             self.goal = goal
             self.gripper.want(goal.width_m)
@@ -232,6 +244,19 @@ class Mover:
             plan.shift(plan.index_at(now_ns), way_m, turn, self._limits)
         return cut
 
+    def _retreat_or_brake(
+        self, smoother: Smoother, timeline: GoalTimeline, state: State, now_ns: int, out: Outputs
+    ) -> None:
+        if state is not State.INACTIVE:
+            self.retreat.end()
+        back = self.retreat.turn(smoother.motion.pose, now_ns, out, at_rest=self.at_rest)
+        if back is None:
+            self._brake(smoother, timeline, now_ns)
+        elif back is not self._back:
+            self.speed = self.retreat.speed
+            smoother.target(back, self._shares(smoother, back))
+        self._back = back
+
     def _brake(self, smoother: Smoother, timeline: GoalTimeline, now_ns: int) -> None:
         """Stop, and let the goal be where the arm stops, so that nothing pulls it further."""
         if self._joints is None:
@@ -243,7 +268,7 @@ class Mover:
             timeline.hold(Goal(smoother.motion.pose, timeline.at(now_ns).width_m), now_ns)
 
     def _must_stream(self, state: State, now_ns: int) -> bool:
-        if state in OBEYING or not self.at_rest:
+        if state in OBEYING or self.retreat.busy or not self.at_rest:
             self._rest_since_ns = None
             return state in OBEYING or self.streaming
         if self._rest_since_ns is None:

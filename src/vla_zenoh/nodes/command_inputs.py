@@ -135,8 +135,12 @@ class CommandInputs:
         return newest
 
     def _joints(self, put: list[Setting]) -> Stamped[JointState] | None:
-        """Joints are looked at when the arm is given to somebody; decoding them costs."""
-        if not any(setting.name in ("active", "worker") for setting in put):
+        """Joints are looked at when the arm is given to somebody; decoding them costs.
+
+        Also all the time, where the profile bounds their external torque.
+        """
+        watched = self._node.profile.limits.contact.effort_stop_nm is not None
+        if not watched and not any(setting.name in ("active", "worker") for setting in put):
             return None
         return self._state(JointState, self._joint_slot)
 
