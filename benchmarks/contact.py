@@ -1,12 +1,12 @@
 """What a blocked arm presses with: the whole loop in lockstep with MuJoCo, pushed on obstacles.
 
 The profile is `panda_sim`, with a table that the limits know nothing of. A worker pushes on at a
-speed, in steps of 0.1 s, until the activation ends; then the run goes on for three seconds. Forces
-are MuJoCo's contact forces on the robot, summed, each millisecond:
+speed, in steps of 0.1 s, until the activation ends and the command has come to rest; then the run
+goes on for three seconds. Forces are MuJoCo's contact forces on the robot, summed, each millisecond:
 
 - peak: the greatest of all, and the greatest mean over 50 ms (what ISO/TS 15066 calls quasi-static
   begins at 500 ms; a shorter mean is stricter);
-- lasting: the mean from 2 s to 3 s after the activation ended.
+- lasting: the mean from 2 s to 3 s after the command came to rest.
 
 A person is a pad of the body's effective mass on a spring of its stiffness, whose other end does not
 give way (a clamped hand, a back against a wall). Stiffness and mass are those of ISO/TS 15066:2016,
@@ -189,6 +189,7 @@ def push(obstacle: Obstacle, mode: str, speed_m_s: float, *, told: bool = True) 
         lambda: force_n() < 0 or loop.commander.state.value != "active",
         way_m / speed_m_s + PATIENCE_S,
     )
+    loop.run_until(lambda: force_n() < 0 or loop.commander.at_rest, AFTER_S)
     loop.run_until(lambda: force_n() < 0, AFTER_S)
     means = np.convolve(forces_n, np.full(MEAN_MS, 1.0 / MEAN_MS), "valid")
     return Pushed(

@@ -8,8 +8,8 @@ piled up. So after the brake the command goes
 2. to where the arm was when it was noticed, and on along the way on which it came there, `STEP_M`
    at a time, until nothing presses any more, but `RELIEF_M` at most.
 
-Where the robot tells no wrench nobody knows whether anything presses: then it goes `UNTOLD_M` of
-that way, and further only while the arm does not stand where it is commanded, as on something soft.
+Where the robot tells no wrench nobody knows whether anything presses: then it goes all of
+`RELIEF_M`, at once.
 """
 
 from __future__ import annotations
@@ -26,9 +26,6 @@ from vla_zenoh.types import FloatArray
 
 STEP_M = 0.005
 RELIEF_M = 0.02
-UNTOLD_M = 0.01
-THERE_M, THERE_RAD = 0.002, 0.01
-"""An arm this near to its command follows it."""
 SETTLE_NS = 50_000_000
 """After each step it is looked at for so long before the next one."""
 SPARE_NS = 4_000_000_000
@@ -113,7 +110,6 @@ class Retreat:
         self._begun: _Begun | None = None
         self._target: Pose | None = None
         self._ahead: list[Pose] = []
-        self._gone_m = 0.0
         self._until_ns = self._rest_ns = 0
 
     @property
@@ -163,19 +159,20 @@ class Retreat:
             return self._set_out(begun, commanded, measured, now_ns, out)
         if now_ns - self._rest_ns < SETTLE_NS:
             return self._target
-        if not self._pressed(measured):
-            self._finish(out, "")
+        told = self._contact.told
+        if told and self._contact.quiet:
+            self._finish(out, "it stands")
         elif not self._ahead or now_ns > self._until_ns:
-            self._finish(out, "something still presses")
+            self._finish(out, "something still presses" if told else "it stands")
         else:
-            self._step_back()
+            self._step_back(STEP_M if told else RELIEF_M)
         return self._target
 
     def _set_out(
         self, begun: _Begun, commanded: Pose, measured: Pose, now_ns: int, out: Outputs
     ) -> Pose | None:
         if self._contact.told and self._contact.quiet:
-            self._finish(out, "nothing presses any more")
+            self._finish(out, "no further than the brake, nothing presses any more")
             return None
         apart_m, apart_rad = distance(commanded, measured)
         braked_m, braked_rad = distance(begun.commanded, commanded)
@@ -184,7 +181,7 @@ class Retreat:
         if apart_m > most_m or apart_rad > most_rad:
             self.end()
             where = f"{apart_m:.3f} m and {apart_rad:.2f} rad from its command"
-            out.tell("warning", "notice", "no_retreat", f"the arm stands: it is {where}")
+            out.tell("warning", "notice", "retreat", f"the arm is not led back: it is {where}")
             return None
         on_m = norm3(measured.position_m - begun.measured.position_m)
         # Where it was pushed back since, by a person, it does not come again.
@@ -194,7 +191,6 @@ class Retreat:
             for pose in (begun.measured, *self._trail.back(RELIEF_M))
             if (_place(pose) - _place(measured)) @ into <= 0
         ]
-        self._gone_m = 0.0
         speed_m_s = self.speed * self._limits.translation.velocity_m_s
         speed_rad_s = self.speed * self._limits.rotation.velocity_rad_s
         way_s = (apart_m + on_m + RELIEF_M) / speed_m_s + apart_rad / speed_rad_s
@@ -203,28 +199,16 @@ class Retreat:
         self._target = measured
         return measured
 
-    def _pressed(self, measured: Pose) -> bool:
-        """Something presses, or may."""
-        if self._contact.told:
-            return not self._contact.quiet
-        assert self._target is not None
-        apart_m, apart_rad = distance(self._target, measured)
-        return self._gone_m < UNTOLD_M or apart_m > THERE_M or apart_rad > THERE_RAD
-
-    def _step_back(self) -> None:
+    def _step_back(self, step_m: float) -> None:
         assert self._target is not None
         start = _place(self._target)
-        target = self._target
         while self._ahead:
-            target = self._ahead.pop(0)
-            if np.linalg.norm(_place(target) - start) >= STEP_M:
+            self._target = self._ahead.pop(0)
+            if np.linalg.norm(_place(self._target) - start) >= step_m:
                 break
-        self._gone_m += float(np.linalg.norm(_place(target) - start))
-        self._target = target
 
     def _finish(self, out: Outputs, why: str) -> None:
         felt_n = self._contact.force_n
         felt = "" if felt_n is None else f", external force {felt_n:.1f} N"
-        level = "warning" if why else "info"
-        out.tell(level, "notice", "retreated", f"the arm was led back{felt}; {why or 'it stands'}")
+        out.tell("info", "notice", "retreat", f"the arm was led back: {why}{felt}")
         self.end()
