@@ -22,11 +22,11 @@ from vla_zenoh.control.slowdown import SLOWEST, Slowdown
 from vla_zenoh.profile import ContactLimits
 from vla_zenoh.types import JointState, PoseState, Stamped
 
-FILTER_S = 0.01
+FILTER_S = 0.02
 DRIFT_S = 10.0
 LONGEST_S = 0.1
 """A state that comes later than that after the one before does not say what was in between."""
-QUIET = 0.3
+QUIET = 0.2
 """Part of ``slow`` below which nothing presses."""
 STEPS = 10
 """The speed has so many shares: each change of it plans the motion anew."""

@@ -115,10 +115,10 @@ class ContactLimits(Section):
         retreat_m_s: how fast an arm that was blocked is led back to where it is, at most.
     """
 
-    force_slow_n: float = Field(default=10.0, gt=0, le=200)
-    force_stop_n: float = Field(default=25.0, gt=0, le=200)
-    torque_slow_nm: float = Field(default=4.0, gt=0, le=80)
-    torque_stop_nm: float = Field(default=10.0, gt=0, le=80)
+    force_slow_n: float = Field(default=15.0, gt=0, le=200)
+    force_stop_n: float = Field(default=40.0, gt=0, le=200)
+    torque_slow_nm: float = Field(default=6.0, gt=0, le=80)
+    torque_stop_nm: float = Field(default=15.0, gt=0, le=80)
     effort_slow_nm: float | None = Field(default=None, gt=0, le=200)
     effort_stop_nm: float | None = Field(default=None, gt=0, le=200)
     retreat_m_s: float = Field(default=0.15, gt=0, le=0.5)
