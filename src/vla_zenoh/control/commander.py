@@ -15,7 +15,6 @@ from dataclasses import replace
 from vla_zenoh.control.acceptance import Lease, Refusal, refuse
 from vla_zenoh.control.compose import Goal
 from vla_zenoh.control.composer import Composer
-from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper import GripperArbiter
 from vla_zenoh.control.holding import Holding
 from vla_zenoh.control.joint_fit import reasons_joints_do_not_fit
@@ -24,7 +23,6 @@ from vla_zenoh.control.ports import Inputs, Outputs, Setting
 from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
 from vla_zenoh.control.progress import Progress
 from vla_zenoh.control.reach import Shadow
-from vla_zenoh.control.retreat import Retreat
 from vla_zenoh.control.so3 import held_pose, pose_of
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watch import Watch
@@ -74,9 +72,8 @@ class Commander:
         self._around = Surroundings()
         self._shadow: dict[str, Stamped[ActionChunk]] = {}
         self._composer = Composer(profile, reach)
-        self.contact = Contact(profile.limits.contact)
-        self._retreat = Retreat(profile.limits, self.contact)
-        self._mover = Mover(profile, reach, self._composer, self._retreat)
+        self._mover = Mover(profile, reach, self._composer)
+        self.contact, self._retreat = self._mover.contact, self._mover.retreat
         self._feels = True
         self._watch = Watch(profile)
         self._out = Outputs()

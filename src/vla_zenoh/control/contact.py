@@ -1,7 +1,7 @@
 """What presses against the arm, and whether it is too much.
 
-A robot may tell the external wrench at its TCP (`PoseState.wrench`), and the torque of its joints
-(`JointState.effort_nm`, of use here where it is external too). Each kind is filtered::
+A robot may tell the external wrench at its TCP (`PoseState.wrench`), and efforts of its joints
+(`JointState.effort_nm`), which are of use here where they are external too. Each kind is filtered::
 
     f' = (told - f) / FILTER_S                      noise, and blows that are over at once
     b' = (f - b) / DRIFT_S,  |b - b_0| <= slow      a load that was taken up, a sensor that drifts
@@ -108,9 +108,7 @@ class Contact:
     """
 
     def __init__(self, limits: ContactLimits) -> None:
-        self._force = _Felt(
-            "contact_force", "N", limits.force_slow_n, limits.force_stop_n, _length
-        )
+        self._force = _Felt("contact_force", "N", limits.force_slow_n, limits.force_stop_n, _length)
         self._torque = _Felt(
             "contact_torque", "Nm", limits.torque_slow_nm, limits.torque_stop_nm, _length
         )
@@ -135,7 +133,7 @@ class Contact:
         self._torque.take(told[3:], dt_s, drifts=self._active)
 
     def take_joints(self, state: Stamped[JointState]) -> None:
-        """The newest joints; only looked at where a limit of their effort says they are external."""
+        """The newest joints; looked at where a limit says that their efforts are external."""
         if self._wants_effort:
             dt_s = _passed_s(self._joint_ns, state.header.stamp_wall_ns)
             self._joint_ns = state.header.stamp_wall_ns

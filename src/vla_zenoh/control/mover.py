@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from vla_zenoh.control.aggregate import Aggregator
 from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
 from vla_zenoh.control.composer import Composer
+from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper import GripperArbiter
 from vla_zenoh.control.joint_stage import JointStage
 from vla_zenoh.control.limits import leash
@@ -42,15 +43,12 @@ class Mover:
         profile: limits, rate, and whether poses or joints are commanded.
         reach: see `Commander`.
         composer: bounds the goals that come due.
-        retreat: what leads a blocked arm back.
 
     Raises:
         ProfileError: joints are to be commanded and there are no kinematics.
     """
 
-    def __init__(
-        self, profile: Profile, reach: Shadow | None, composer: Composer, retreat: Retreat
-    ) -> None:
+    def __init__(self, profile: Profile, reach: Shadow | None, composer: Composer) -> None:
         self._limits = profile.limits
         self._dt_s = 1.0 / profile.timing.command_hz
         self._max_width_m = profile.robot.gripper.max_width_m
@@ -69,7 +67,8 @@ class Mover:
         """Share of the speed limits that the arm has to its goal."""
         self.pressed: Slowdown | None = None
         """What presses against the arm, and makes it slower wherever it goes."""
-        self.retreat = retreat
+        self.contact = Contact(profile.limits.contact)
+        self.retreat = Retreat(profile.limits, self.contact)
         self._back: Pose | None = None
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None

@@ -88,9 +88,7 @@ class Watch:
         return ""
 
     # -- everything around --------------------------------------------------------------------
-    def unheard(
-        self, pose: Stamped[PoseState], gripper: Stamped[GripperState], now_ns: int
-    ) -> str:
+    def unheard(self, pose: Stamped[PoseState], gripper: Stamped[GripperState], now_ns: int) -> str:
         """What the robot does not say any more, empty when it says all."""
         patience_s = self._timing.state_timeout_s
         for what, state in (("pose", pose), ("gripper", gripper)):
