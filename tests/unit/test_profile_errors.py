@@ -83,7 +83,7 @@ def told(path: str) -> list[str]:
         ("limits: {step_m: 50}", "lab.yaml:2: limits.step_m: must be at most 0.2 (given: 50)"),
         ("limits: {step_m: 0}", "lab.yaml:2: limits.step_m: must be greater than 0 (given: 0)"),
         ("sim: {seed: 1.5}", "lab.yaml:2: sim.seed: wants a whole number (given: 1.5)"),
-        ("limits:", "lab.yaml:2: limits: wants a map of: contact, joint, lead_m, lead_rad, out_of_bounds,"),
+        ("limits:", "lab.yaml:2: limits: wants a map of: contact, joint, lead_m, lead_rad,"),
         ("limits: [1]", "lab.yaml:2: limits: wants a map of: contact, joint, lead_m,"),
         ("workers: scripted", "lab.yaml:2: workers: wants a list (given: 'scripted')"),
         ("workers: [scripted, a, a]", "lab.yaml:2: workers: a: given more than once"),
