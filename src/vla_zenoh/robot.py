@@ -46,12 +46,14 @@ class Reading:
     Args:
         position_rad: (n,) of the joints, in the order of ``robot.arm_joints``; m where they slide.
         velocity_rad_s: (n,); None: the robot does not say, they are made of differences.
-        effort_nm: (n,); None likewise: zero.
+        effort_nm: (n,); None likewise: zero. Where it is the external torque alone, give
+            ``limits.contact.effort_stop_nm``, so that it is looked at.
         width_m: of the gripper, None where there is none or it does not say: what was asked for
             last is believed.
         moving: the gripper moves.
         holding: it holds something.
-        wrench: (6,) external N and Nm in the base frame; None: not measured.
+        wrench: (6,) N and Nm from outside at the TCP, base axes, without the weight of arm and
+            tool; `limits.contact` looks at it. None: not measured.
         fault: why the robot does not move (emergency stop, reflex, protective stop); the arm is
             then stopped until it is gone and a person has put ``reset``. Say it however briefly it
             lasts, and also where nothing else is new.

@@ -17,6 +17,7 @@ from arm_rig import (
     Asked,
     activate,
     begin,
+    changed,
     check_motion,
     dropped,
     mark,
@@ -29,7 +30,7 @@ from arm_rig import (
 
 from vla_zenoh.control.impedance import Reference
 from vla_zenoh.lockstep import Lockstep, Message
-from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand
+from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand, PoseState
 
 EXACT_M = 1e-3
 BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.020
@@ -142,7 +143,13 @@ def test_activated_away_from_where_its_controller_holds_it_the_arm_is_not_pulled
     loop = begin("0 0.01 0")
     x_m, y_m, z_m = path_m(loop)[-1]
     loop.world.place("box", (x_m, y_m + 0.25, z_m + 0.05))
-    loop.run(3.0)
+    # It feels nothing, and is stopped before it is led back.
+    loop.tamper = changed(PoseState, wrench=None)
+    assert loop.run_until(lambda: loop.commander.state.value != "active", 3.0)
+    loop.put("stop")
+    loop.run(1.0)
+    loop.put("reset")
+    loop.run(0.1)
     at = path_m(loop)[-1]
     held = held_m(loop)
     assert np.linalg.norm(held - at) > 0.03

@@ -561,7 +561,10 @@ def test_an_arm_activated_again_while_blocked_is_led_back_to_where_it_is() -> No
     while rig.state == "active":
         rig.send([[0.04, 0, 0, 0, 0, 0, 0]])
         rig.run(0.096)
+    rig.put("stop")  # it is not led back before
     rig.run(2.0)
+    assert norm3(rig.commands[-1].position_m - rig.position_m) > rig.profile.limits.tracking_m
+    rig.put("reset")
     rig.activate()
     rig.run(1.0)
     assert rig.state == "active", rig.commander.why

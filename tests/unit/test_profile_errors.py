@@ -85,11 +85,11 @@ def told(path: str) -> list[str]:
         ("sim: {seed: 1.5}", "lab.yaml:2: sim.seed: wants a whole number (given: 1.5)"),
         (
             "limits:",
-            "lab.yaml:2: limits: wants a map of: approach_m_s, approach_rad_s, elbow_rad, joint,",
+            "lab.yaml:2: limits: wants a map of: approach_m_s, approach_rad_s, contact, elbow_rad,",
         ),
         (
             "limits: [1]",
-            "lab.yaml:2: limits: wants a map of: approach_m_s, approach_rad_s, elbow_rad, joint,",
+            "lab.yaml:2: limits: wants a map of: approach_m_s, approach_rad_s, contact, elbow_rad,",
         ),
         ("workers: scripted", "lab.yaml:2: workers: wants a list (given: 'scripted')"),
         ("workers: [scripted, a, a]", "lab.yaml:2: workers: a: given more than once"),

@@ -81,6 +81,8 @@ class Commander:
         self._waiting: deque[Stamped[ActionChunk]] = deque()
         self._coming: tuple[Stamped[ActionChunk], ChunkPlan] | None = None
         self._mover = Mover(profile, reach, self._composer)
+        self.contact, self._retreat = self._mover.contact, self._mover.retreat
+        self._feels = True
         self._watch = Watch(profile)
         self._joint_watch = None if reach is None else JointWatch(profile, reach)
         self._out = Outputs()
@@ -174,8 +176,11 @@ class Commander:
             self._around = inputs.around
         if inputs.pose is not None:
             self.pose = inputs.pose
+            self.contact.take_pose(inputs.pose)
+            self._retreat.see(pose_of(inputs.pose.record))
         if inputs.joint is not None:
             self.joint = inputs.joint
+            self.contact.take_joints(inputs.joint)
         if inputs.gripper is not None:
             self.gripper_state = inputs.gripper
             faults, mode = inputs.gripper.record.faults, inputs.gripper.record.mode
@@ -253,6 +258,7 @@ class Commander:
             return
         self.lease = lease
         self.holding.begin(holder)
+        self.contact.begin()
         self._resumed_ns = 0
         measured, joint = self.pose.record, self.joint.record if self.joint else None
         blocked = self._watch.begin(held_pose(measured), pose_of(measured))
@@ -320,6 +326,8 @@ class Commander:
         if new is self.state:
             return
         old, self.state, self.why = self.state, new, why
+        if new not in OBEYING:
+            self.contact.end()
         level = (
             "info"
             if new in OBEYING or trigger in (Trigger.DEACTIVATE, Trigger.RESET)
@@ -416,14 +424,18 @@ class Commander:
     def _look_around(self, now_ns: int) -> None:
         if self.pose is not None:
             self._watch.measure(self._mover.commanded, pose_of(self.pose.record))
+        if self._retreat.busy and not self._may_retreat(now_ns):
+            self._retreat.end()
         if self.state not in OBEYING:
             return
         assert self.pose is not None and self.gripper_state is not None and self.lease is not None
+        self._mover.pressed = self.contact.slowdown()
+        self._tell_whether_it_feels()
         lost = self._watch.lost(
             self.pose, self.gripper_state, self._around, self.task.worker, self.lease, now_ns
         )
         if not lost and self.streaming and not self.dry_run:
-            lost = self._watch.blocked()
+            lost = self._obstructed()
         lost = lost or self._mover.stuck or self._joints_lost(now_ns)
         if not lost and self._watch.forsaken(now_ns):
             lost = f"held for {self.profile.timing.max_hold_s:g} s, no fresh chunk came"
@@ -465,3 +477,43 @@ class Commander:
             self._out.tell("warning", "limit", hit.name, f"braked{at}", hit.value, hit.limit)
             why = f"the measured arm is too near to a bound: {hit.name}{at} is {hit.value:.3g}"
             self._change(Trigger.LOSE, f"{why}, the limit is {hit.limit:.3g}")
+
+    def _obstructed(self) -> str:
+        """Why the arm cannot go on, empty when it can; then it brakes and is led back."""
+        commanded, pressed = self._mover.commanded, self.contact.pressed()
+        if pressed is None:
+            why = self._watch.blocked()
+            # Who feels nothing is not blocked: its state is stuck, or it was made slow.
+            leads_back = bool(why) and not (self.contact.told and self.contact.quiet)
+        else:
+            name, value, limit, unit = pressed
+            self._out.tell("warning", "limit", name, "stopped", value, limit)
+            why = (
+                f"something presses against the arm: {name} {value:.1f} {unit}, "
+                f"at most {limit:g} {unit}; it is led back"
+            )
+            leads_back = True
+        if leads_back and commanded is not None:
+            self._retreat.begin(commanded)
+        return why
+
+    def _may_retreat(self, now_ns: int) -> bool:
+        """The robot is there, well, and says where the arm is."""
+        pose, gripper = self.pose, self.gripper_state
+        if pose is None or gripper is None or self._watch.unheard(pose, gripper, now_ns):
+            return False
+        there = self._around.robot_node in self._around.alive
+        return there and gripper.record.mode == "ready" and not gripper.record.faults
+
+    def _tell_whether_it_feels(self) -> None:
+        if self.contact.told is self._feels:
+            return
+        self._feels = self.contact.told
+        if self._feels:
+            self._out.tell("info", "notice", "contact_told", "the robot tells external forces")
+        else:
+            why = (
+                "the robot tells no external wrench: limits.contact has nothing to look at, and an "
+                "arm that is blocked is noticed by limits.tracking_m alone"
+            )
+            self._out.tell("warning", "notice", "contact_not_told", why)

@@ -166,10 +166,13 @@ class JointStage:
         ahead = Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
         smoother.brake(self.shares(smoother.motion, ahead, smoother.box, bend=BRAKE_BEND))
 
-    def tick(self, smoother: Smoother, *, braking: bool = False) -> None:
+    def tick(self, smoother: Smoother, *, braking: bool = False, elbow: bool = True) -> None:
         """Follow the pose for one tick, or stop; `smoother` is moved on.
 
-        An arm that brakes leaves its elbow where it is.
+        Args:
+            smoother: the pose.
+            braking: it comes to rest. An arm that brakes leaves its elbow where it is.
+            elbow: it may go to its posture.
         """
         here = self._kinematics.forward(self._now.position_rad)
         lag = self._lag(here, smoother.motion.pose)
@@ -182,7 +185,7 @@ class JointStage:
         waits = self.pace < CREEPING
         self._waited_s = self._waited_s + self._dt_s if waits else 0.0
         motion = smoother.tick(self.pace)
-        self._follower.posture_rad = self._pulled_to(0.0 if braking else 1.0)
+        self._follower.posture_rad = self._pulled_to(1.0 if elbow and not braking else 0.0)
         twist = self.pace * motion.twist
         pose = self._inside(here, motion.pose)
         self._now, hits = self._follower.step(self._now, pose, twist, self._dt_s)

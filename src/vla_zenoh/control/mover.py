@@ -9,12 +9,14 @@ import numpy as np
 from vla_zenoh.control.aggregate import Aggregator
 from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
 from vla_zenoh.control.composer import Composer
+from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper import GripperArbiter
 from vla_zenoh.control.joint_stage import JointStage
 from vla_zenoh.control.limits import leash
 from vla_zenoh.control.ports import Outputs
 from vla_zenoh.control.reach import Shadow
-from vla_zenoh.control.slowdown import APPROACH, Slowdown
+from vla_zenoh.control.retreat import Retreat
+from vla_zenoh.control.slowdown import APPROACH, Slowdown, slowest
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother, motion_limits
 from vla_zenoh.control.so3 import Pose, distance, exp3, held_pose, log3, pose_of, quat_from_rotation
 from vla_zenoh.control.states import OBEYING, State
@@ -73,7 +75,11 @@ class Mover:
         """Share of the speed limits that the arm has to its goal, the override aside."""
         self._override, self._slowing = 1.0, False
         self._held_back: Slowdown | None = None
-        self._anew = False
+        self.pressed: Slowdown | None = None
+        """What presses against the arm, and makes it slower wherever it goes."""
+        self.contact = Contact(profile.limits.contact)
+        self.retreat = Retreat(profile.limits, self.contact)
+        self._back: Pose | None = None
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
         self._timing: StepTiming | None = None
@@ -99,8 +105,7 @@ class Mover:
 
     def hold_back(self, slower: Slowdown | None) -> None:
         """Go no faster than this from now on, whatever the goal allows; None: as it allows."""
-        if (slower and slower.share) != (self._held_back and self._held_back.share):
-            self._held_back, self._anew = slower, True
+        self._held_back = slower
 
     @property
     def stuck(self) -> str:
@@ -133,6 +138,7 @@ class Mover:
         """
         self._slowed_by.clear()
         self._held_back = None
+        self.retreat.end()
         if self._reach is not None and joint is not None:
             self._reach.reset(self._reach.kinematics.joints_of(joint))
         actual, start = pose_of(measured), held_pose(measured)
@@ -209,7 +215,7 @@ class Mover:
                 self._smoother, self.timeline, task, overdue_ns, now_ns, ticks, out
             )
         else:
-            self._brake(self._smoother, self.timeline, now_ns)
+            self._retreat_or_brake(self._smoother, self.timeline, state, now_ns, out)
         went_on, self.streaming = self.streaming, self._must_stream(state, now_ns)
         if not self.streaming:
             return True
@@ -219,7 +225,9 @@ class Mover:
             if self._joints is None:
                 self._smoother.tick()
             else:
-                self._joints.tick(self._smoother, braking=state is not State.ACTIVE)
+                active = state is State.ACTIVE
+                braking = not active and self._back is None
+                self._joints.tick(self._smoother, braking=braking, elbow=active)
         return self._smoother.failures == failures
 
     def command(
@@ -262,8 +270,9 @@ class Mover:
         slowed = self._slowing and _within(smoother, self._override)
         # Of where the arm will be with this tick: it may be on its way from there.
         pose, hits = leash(self._limits, goal.pose, _ahead(smoother.motion, ticks * self._dt_s))
-        if goal is not self.goal or hits or slowed or self._anew:
-            self._anew = False
+        slower = slowest(goal.slowdown, self.pressed, self._held_back)
+        slowed |= (slower.share if slower else 1.0) != self.speed
+        if goal is not self.goal or hits or slowed:
             if hits:
                 cut = self._shorten(plans, goal, pose, now_ns)
                 if goal is not self.goal:
@@ -271,7 +280,7 @@ class Mover:
                         "warning", "limit", hits[0].name, "leash", hits[0].value, hits[0].limit
                     )
                 goal = cut
-            self._slow_down(goal.slowdown, out)
+            self._slow_down(slower, out)
             shares = self._shares(smoother, goal.pose, timeline.plan, task, overdue_ns, now_ns)
             smoother.target(goal.pose, shares)
             self.goal = goal
@@ -312,7 +321,10 @@ class Mover:
         # its jerk with the cube. Until a faster arm has slowed down it brakes as hard as it may.
         self._slowing = not _within(smoother, override)
         most = FULL if self._slowing else Shares(1.0, override**2, override**3)
-        shares = Shares(speed, most.acceleration, most.jerk)
+        return self._of_joints(smoother, goal, Shares(speed, most.acceleration, most.jerk))
+
+    def _of_joints(self, smoother: Smoother, goal: Pose, shares: Shares) -> Shares:
+        """No more than the joints can follow, where they are commanded."""
         if self._joints is None:
             return shares
         joints = self._joints.shares(smoother.motion, goal, smoother.box)
@@ -343,6 +355,19 @@ class Mover:
             plan.shift(plan.index_at(now_ns), way_m, turn, self._limits)
         return cut
 
+    def _retreat_or_brake(
+        self, smoother: Smoother, timeline: GoalTimeline, state: State, now_ns: int, out: Outputs
+    ) -> None:
+        if state is not State.INACTIVE:
+            self.retreat.end()
+        back = self.retreat.turn(smoother.motion.pose, now_ns, out, at_rest=self.at_rest)
+        if back is None:
+            self._brake(smoother, timeline, now_ns)
+        elif back is not self._back:
+            # Whatever the speed override: an arm that presses has to come free.
+            smoother.target(back, self._of_joints(smoother, back, Shares(self.retreat.speed)))
+        self._back = back
+
     def _brake(self, smoother: Smoother, timeline: GoalTimeline, now_ns: int) -> None:
         """Stop, and let the goal be where the arm stops, so that nothing pulls it further."""
         if self._joints is None:
@@ -356,7 +381,7 @@ class Mover:
                 self._timing.restart()
 
     def _must_stream(self, state: State, now_ns: int) -> bool:
-        if state in OBEYING or not self.at_rest:
+        if state in OBEYING or self.retreat.busy or not self.at_rest:
             self._rest_since_ns = None
             return state in OBEYING or self.streaming
         if self._rest_since_ns is None:

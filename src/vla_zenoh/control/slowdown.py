@@ -55,6 +55,11 @@ class Slowdown(NamedTuple):
     late_s: float = 0.0
 
 
+def slowest(*reasons: Slowdown | None) -> Slowdown | None:
+    """Of several reasons the one that leaves least speed."""
+    return min((r for r in reasons if r is not None), key=lambda r: r.share, default=None)
+
+
 def slowdown(
     before: FloatArray,
     after: FloatArray,

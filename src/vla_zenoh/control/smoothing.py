@@ -37,7 +37,7 @@ from ruckig import (
     Trajectory,
 )
 
-from vla_zenoh.control.so3 import Pose, body_rates, exp3, log3, norm3, orthonormal
+from vla_zenoh.control.so3 import Pose, body_rates, cross3, exp3, log3, norm3, orthonormal
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
@@ -274,9 +274,9 @@ class Smoother:
         if (np.abs(beside) <= np.array(QUIET[1:])[:, None]).all():
             return along[:, None], [1.0]
         least = np.eye(3)[int(np.argmin(np.abs(along)))]
-        across = np.cross(along, least)
+        across = cross3(along, least)
         across /= norm3(across)
-        others = np.stack([across, np.cross(along, across)])
+        others = np.stack([across, cross3(along, across)])
         with np.errstate(divide="ignore"):
             most = BESIDE * (limits[:, None, :] / np.abs(others)).min(axis=2)
         # It may be this fast once its acceleration has ended, and goes this far until it stops.

@@ -89,6 +89,18 @@ class Watch:
         return ""
 
     # -- everything around --------------------------------------------------------------------
+    def unheard(self, pose: Stamped[PoseState], gripper: Stamped[GripperState], now_ns: int) -> str:
+        """What the robot does not say any more, empty when it says all."""
+        patience_s = self._timing.state_timeout_s
+        for what, state in (("pose", pose), ("gripper", gripper)):
+            silent_s = (now_ns - state.received_ns) / 1e9
+            if silent_s > patience_s:
+                return f"robot state lost: {what} {silent_s:.3f} s old, at most {patience_s:g} s"
+            late_s = (now_ns - state.header.stamp_wall_ns) / 1e9 - CLOCK_TOLERANCE_S
+            if late_s > patience_s:
+                return f"robot state comes late: {what} by {late_s:.3f} s, at most {patience_s:g} s"
+        return ""
+
     def lost(
         self,
         pose: Stamped[PoseState],
@@ -99,14 +111,9 @@ class Watch:
         now_ns: int,
     ) -> str:
         """What is not there any more, empty when all is."""
-        patience_s = self._timing.state_timeout_s
-        for what, state in (("pose", pose), ("gripper", gripper)):
-            silent_s = (now_ns - state.received_ns) / 1e9
-            if silent_s > patience_s:
-                return f"robot state lost: {what} {silent_s:.3f} s old, at most {patience_s:g} s"
-            late_s = (now_ns - state.header.stamp_wall_ns) / 1e9 - CLOCK_TOLERANCE_S
-            if late_s > patience_s:
-                return f"robot state comes late: {what} by {late_s:.3f} s, at most {patience_s:g} s"
+        silent = self.unheard(pose, gripper, now_ns)
+        if silent:
+            return silent
         needed = [around.robot_node, worker_node(worker)]
         cameras = [camera.camera for camera in lease.spec.observation.cameras]
         needed += [around.camera_nodes.get(camera, "camera") for camera in cameras]

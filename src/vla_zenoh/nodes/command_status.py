@@ -105,6 +105,7 @@ class CommandStatus:
                 "dry_run": mind.dry_run,
                 **self._goal(),
                 **self._margins(),
+                **self._contact(),
             },
             ages_s=ages_s,
             rates_hz={"loop": self._rate.rate_hz},
@@ -120,6 +121,14 @@ class CommandStatus:
             "goal_m": [round(float(value), 6) for value in goal.pose.position_m],
             "goal_quat_xyzw": [round(float(v), 6) for v in quat_from_rotation(goal.pose.rotation)],
             "goal_width_m": round(goal.width_m, 5),
+        }
+
+    def _contact(self) -> dict[str, Any]:
+        """What presses against the arm; None where the robot does not tell."""
+        force_n, torque_nm = self._mind.contact.force_n, self._mind.contact.torque_nm
+        return {
+            "external_force_n": None if force_n is None else round(force_n, 2),
+            "external_torque_nm": None if torque_nm is None else round(torque_nm, 2),
         }
 
     def _margins(self) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from vla_zenoh.profile.advice import advice
 from vla_zenoh.profile.joint_limits import JointLimits
-from vla_zenoh.profile.limits import REACH_M, REFUSE_FACTOR, Limits, ReachLimits
+from vla_zenoh.profile.limits import REACH_M, REFUSE_FACTOR, ContactLimits, Limits, ReachLimits
 from vla_zenoh.profile.load import (
     as_robot,
     load_profile,
@@ -22,6 +22,7 @@ __all__ = [
     "REFUSE_FACTOR",
     "CameraProfile",
     "Composition",
+    "ContactLimits",
     "GripperProfile",
     "HostProfile",
     "JointEnds",

@@ -98,6 +98,47 @@ class ReachLimits(Section):
         return self
 
 
+class ContactLimits(Section):
+    """What the arm may press with before it gives up; see `vla_zenoh.control.contact`.
+
+    What the robot says of forces is looked at without what was there when it was activated.
+
+    Args:
+        force_slow_n: external force at the TCP above which the arm gets slower.
+        force_stop_n: above it the activation ends, and the arm goes back a little.
+        torque_slow_nm: likewise the external torque about the TCP.
+        torque_stop_nm: likewise.
+        effort_slow_nm: likewise the greatest external torque of a joint. For a robot whose
+            `JointState.effort_nm` tells that; ROS 2's and the simulator's is all that the motors
+            apply, the arm's own weight included. null: not looked at.
+        effort_stop_nm: likewise.
+        retreat_m_s: how fast an arm that was blocked is led back to where it is, at most.
+    """
+
+    force_slow_n: float = Field(default=15.0, gt=0, le=200)
+    force_stop_n: float = Field(default=40.0, gt=0, le=200)
+    torque_slow_nm: float = Field(default=6.0, gt=0, le=80)
+    torque_stop_nm: float = Field(default=15.0, gt=0, le=80)
+    effort_slow_nm: float | None = Field(default=None, gt=0, le=200)
+    effort_stop_nm: float | None = Field(default=None, gt=0, le=200)
+    retreat_m_s: float = Field(default=0.15, gt=0, le=0.5)
+
+    @model_validator(mode="after")
+    def _a_stop_lies_above_its_slow(self) -> ContactLimits:
+        refuse(
+            [
+                ((slow,), f"is {before}, which must be below {stop} ({at})")
+                for slow, before, stop, at in (
+                    ("force_slow_n", self.force_slow_n, "force_stop_n", self.force_stop_n),
+                    ("torque_slow_nm", self.torque_slow_nm, "torque_stop_nm", self.torque_stop_nm),
+                    ("effort_slow_nm", self.effort_slow_nm, "effort_stop_nm", self.effort_stop_nm),
+                )
+                if before is not None and (at is None or before >= at)
+            ]
+        )
+        return self
+
+
 class Limits(Section):
     """Bounds of every motion; upper bounds are Franka's published ones for the Panda.
 
@@ -107,6 +148,7 @@ class Limits(Section):
         rotation: likewise.
         joint: of a motion commanded by joint positions.
         reach: what joints, singularities, the arm itself and the table allow.
+        contact: what may press against the arm.
         step_m: largest translation of one model step.
         step_rad: largest rotation of one model step.
         approach_m_s: an absolute target further away than a step is gone to at this speed.
@@ -114,7 +156,8 @@ class Limits(Section):
         out_of_bounds: ``clamp`` shortens to the bound and tells, ``refuse`` drops the whole chunk.
         lead_m: leash: the goal may run ahead of the commanded pose by this much.
         lead_rad: likewise.
-        tracking_m: leash: commanded minus measured pose; more brakes the arm (it is blocked).
+        tracking_m: leash: commanded minus measured pose; more brakes the arm (it is blocked), and
+            leads it back to where it is.
         tracking_rad: likewise.
         elbow_rad: a measured joint may be so far from where the arm is believed to have it at the
             same TCP pose; beyond it gets slower, at twice that it brakes.
@@ -125,6 +168,7 @@ class Limits(Section):
     rotation: RotationLimits = RotationLimits()
     joint: JointLimits = JointLimits()
     reach: ReachLimits = ReachLimits()
+    contact: ContactLimits = ContactLimits()
     step_m: float = Field(default=0.05, gt=0, le=0.2)
     step_rad: float = Field(default=0.2, gt=0, le=0.8)
     approach_m_s: float = Field(default=0.1, gt=0, le=0.5)

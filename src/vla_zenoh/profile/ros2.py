@@ -126,7 +126,7 @@ class Ros2Profile(Section):
         joint_states: topic of sensor_msgs/JointState with the arm's joints.
         finger_states: likewise with those of the fingers, where they come on another topic.
         tcp: ``kinematics``: the TCP is where our own kinematics put it; ``tf``: where /tf says.
-        wrench: external wrench at the TCP.
+        wrench: external wrench at the TCP; without it ``limits.contact`` has nothing to look at.
         cameras: camera of the profile -> topic.
         pose_command: where poses go.
         joint_command: where joint positions go.

@@ -48,7 +48,9 @@ class SimulatedArm:
         self.tcp_position_m = data.site_xpos[self._tcp]
         self.tcp_rotation = data.site_xmat[self._tcp].reshape(3, 3)
         root = model.body_rootid[self._tcp_body]
-        self._own_geom = model.body_rootid[model.geom_bodyid] == root
+        # What stands on the ground presses against the ground, not against what moves.
+        moves = model.body_weldid[model.geom_bodyid] != 0
+        self._own_geom = moves & (model.body_rootid[model.geom_bodyid] == root)
         self._linear, self._angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
         self._inertia = np.zeros((model.nv, model.nv))
         self._elsewhere = mujoco.MjData(model)
@@ -94,14 +96,18 @@ class SimulatedArm:
         return np.concatenate([self._linear[:, self._dofs], self._angular[:, self._dofs]])
 
     def contact_wrench(self) -> FloatArray:
-        """(6,) what all that touches the robot exerts on it: N, and Nm about the TCP."""
+        """(6,) what all that touches the robot exerts on it: N, and Nm about the TCP, base axes.
+
+        The robot's parts against each other are left out; what the fingers squeeze presses on both
+        of them and cancels, so that its weight is left.
+        """
         model, data = self._model, self._data
         total, local = np.zeros(6), np.zeros(6)
-        for index in range(data.ncon):
-            contact = data.contact[index]
-            first, second = self._own_geom[contact.geom]
-            if first == second:
-                continue
+        if data.ncon == 0:
+            return total
+        own = self._own_geom[data.contact.geom]
+        for index in np.flatnonzero(own[:, 0] != own[:, 1]):
+            contact, second = data.contact[index], own[index, 1]
             mujoco.mj_contactForce(model, data, index, local)
             axes = contact.frame.reshape(3, 3)  # rows; the force acts on the second geom
             sign = 1.0 if second else -1.0

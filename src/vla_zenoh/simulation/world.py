@@ -35,6 +35,8 @@ from vla_zenoh.types import GripperState, JointState, PoseState, vector
 FloatArray = NDArray[np.float64]
 
 STEP_NS = round(STEP_S * 1e9)
+WRENCH_FILTER_S = 0.01
+"""A robot's estimate of forces is filtered likewise; a blow of one step means nothing."""
 
 
 class World:
@@ -98,6 +100,7 @@ class World:
         )
         self._in_charge: ImpedanceController | JointImpedanceController | None = None
         self._held_rad: FloatArray | None = None
+        self._felt = np.zeros(6)
         self.saturated = 0
         self.reset(seed)
 
@@ -120,6 +123,7 @@ class World:
         self._controller.reset(self._home_rad)
         self._forget_controllers()
         self._ticks = 0
+        self._felt = np.zeros(6)
         self.saturated = 0
         mujoco.mj_forward(model, data)
         self._fresh = True
@@ -177,7 +181,10 @@ class World:
 
     @property
     def wrench(self) -> FloatArray:
-        """(6,) what the surroundings exert on the robot at the TCP: N, Nm about the TCP."""
+        """(6,) what the surroundings exert on the robot right now: N, Nm about the TCP, base axes.
+
+        What it holds counts with its weight; what its parts exert on each other does not.
+        """
         self._refresh()
         return self._arm.contact_wrench()
 
@@ -202,7 +209,10 @@ class World:
         return self._arm.tcp_position_m.copy(), self._arm.tcp_rotation.copy()
 
     def pose_state(self, reference: Reference | JointReference) -> PoseState:
-        """Measured TCP pose, twist and wrench beside the reference held now."""
+        """Measured TCP pose, twist and wrench beside the reference held now.
+
+        The wrench is `wrench` after a low-pass of the first order with `WRENCH_FILTER_S`.
+        """
         position, rotation = self.tcp()
         if isinstance(reference, JointReference):
             held_m, held_rotation = self._arm.tcp_at(reference.position_rad)
@@ -212,7 +222,7 @@ class World:
             position_m=position,
             quat_xyzw=_quat_xyzw(rotation),
             twist=self._arm.jacobian() @ self._arm.velocity_rad_s,
-            wrench=self.wrench,
+            wrench=self._felt.copy(),
             reference_position_m=held_m,
             reference_quat_xyzw=_quat_xyzw(held_rotation),
         )
@@ -286,6 +296,7 @@ class World:
         mujoco.mj_step2(self.model, data)
         self._ticks += 1
         self._fresh = False
+        self._felt += (STEP_S / WRENCH_FILTER_S) * (self._arm.contact_wrench() - self._felt)
         if data.warning.number.any():
             self._raise_blown_up()
 

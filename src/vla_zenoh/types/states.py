@@ -26,7 +26,9 @@ class JointState:
         names: of the joints.
         position_rad: (n,) measured.
         velocity_rad_s: (n,) measured.
-        effort_nm: (n,) what the motors apply.
+        effort_nm: (n,) what the motors apply: of the simulator and of ROS 2's joint states all of
+            it, the arm's own weight included. A robot class may tell the external torque in its
+            place, and its profile then bounds it (``limits.contact.effort_stop_nm``).
         reference_rad: (n,) positions the robot's controller holds right now, or None where it
             holds none, or the robot does not tell.
     """
@@ -56,7 +58,8 @@ class PoseState:
         position_m: (3,).
         quat_xyzw: (4,) unit.
         twist: (6,) m/s and rad/s, base axes.
-        wrench: (6,) external N and Nm, or None where the robot does not know it.
+        wrench: (6,) N and Nm that the surroundings exert on the arm, as if they did at the TCP,
+            base axes; without the weight of arm and tool. None where the robot does not know it.
         reference_position_m: (3,) pose the robot's controller holds right now, or None.
         reference_quat_xyzw: (4,), or None. Both or neither.
     """
