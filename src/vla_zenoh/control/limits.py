@@ -62,6 +62,13 @@ def _bound_norm(name: str, vector: FloatArray, limit: float) -> tuple[FloatArray
     return vector * (limit / norm), [LimitHit(name, norm, limit, norm > REFUSE_FACTOR * limit)]
 
 
+def workspace_corners(limits: Limits) -> tuple[FloatArray, FloatArray]:
+    """Lower and upper corner (3,) m of the workspace box."""
+    box = limits.workspace
+    low, high = np.array([box.x_m, box.y_m, box.z_m]).T
+    return low, high
+
+
 def into_workspace(
     limits: Limits, position_m: FloatArray, before_m: FloatArray | None = None
 ) -> tuple[FloatArray, float]:

@@ -12,7 +12,7 @@ from vla_zenoh.control.composer import Composer
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper import GripperArbiter
 from vla_zenoh.control.joint_stage import JointStage
-from vla_zenoh.control.limits import leash
+from vla_zenoh.control.limits import leash, workspace_corners
 from vla_zenoh.control.ports import Outputs
 from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.retreat import Retreat
@@ -144,7 +144,9 @@ class Mover:
         actual, start = pose_of(measured), held_pose(measured)
         standing = not self.streaming or self.at_rest
         if self._smoother is None:
-            self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits))
+            # Joints that are commanded are kept in the box by what bounds them.
+            inside = workspace_corners(self._limits) if self._joints is None else None
+            self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits), inside)
             self._timing = StepTiming(self._smoother.box)
         elif standing and not self._held(self._smoother.motion.pose, start):
             # Also at rest: a robot that braked by itself stands elsewhere than we command.

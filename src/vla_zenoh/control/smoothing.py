@@ -127,6 +127,14 @@ class _Plan:
         self.end = start + basis @ path.at_time(path.duration)[0]
         """(6,) where it ends."""
 
+    def range_m(self) -> tuple[FloatArray, FloatArray]:
+        """(3,) at most as low and as high as this every axis of the translation goes."""
+        low, high = _extrema(self._path)
+        basis = self._basis[:3]
+        reached = np.stack([basis * low, basis * high])
+        start = self._start[:3]
+        return start + reached.min(axis=0).sum(axis=1), start + reached.max(axis=0).sum(axis=1)
+
     def at(self, time_s: float) -> _State:
         """State at `time_s` after its beginning."""
         if time_s >= self.duration_s:
@@ -143,10 +151,17 @@ class Smoother:
         pose: where it stands at first.
         dt_s: duration of a tick.
         limits: of the motion.
+        bounds_m: lower and upper corner (3,) of the box that it has to stay in; None: none.
     """
 
-    def __init__(self, pose: Pose, dt_s: float, limits: MotionLimits) -> None:
-        self._dt_s = dt_s
+    def __init__(
+        self,
+        pose: Pose,
+        dt_s: float,
+        limits: MotionLimits,
+        bounds_m: tuple[FloatArray, FloatArray] | None = None,
+    ) -> None:
+        self._dt_s, self.bounds_m = dt_s, bounds_m
         self._ruckigs: dict[int, Ruckig] = {}
         self.box = np.array([self._box(limits, order) for order in range(3)])
         """(3, 6) limits of velocity, acceleration and jerk of every axis at full shares."""
@@ -223,21 +238,40 @@ class Smoother:
         if not np.isfinite(way).all():
             return None
         basis, parts = self._coordinates(way, limits)
-        ask = self._ask(basis, limits, parts)
-        ask.target_position = (basis.T @ way).tolist()
-        for synchronization in (Synchronization.Time, Synchronization.No):
-            # What is beside the way ends as soon as it can, whatever the others do.
-            ask.per_dof_synchronization = [
-                Synchronization.No if part == BESIDE else synchronization for part in parts
-            ]
-            path = self._calculated(ask)
-            if path is not None and (
-                synchronization is Synchronization.No
-                or len(parts) == 1
-                or not self._goes_astray(path, ask)
-            ):
-                return _Plan(self._state.position, basis, path)
-        return None
+        plan: _Plan | None = None
+        # With less acceleration than it had an arm may not stop inside: then it takes all.
+        hardest = np.concatenate([limits[:1], self.box[1:]])
+        for most in (limits, hardest) if (limits[1:] < self.box[1:]).any() else (limits,):
+            ask = self._ask(basis, most, parts)
+            ask.target_position = (basis.T @ way).tolist()
+            for synchronization in (Synchronization.Time, Synchronization.No):
+                # What is beside the way ends as soon as it can, whatever the others do.
+                ask.per_dof_synchronization = [
+                    Synchronization.No if part == BESIDE else synchronization for part in parts
+                ]
+                path = self._calculated(ask)
+                if path is None:
+                    continue
+                plan = _Plan(self._state.position, basis, path)
+                if not self._leaves(plan) and not (
+                    synchronization is Synchronization.Time
+                    and len(parts) > 1
+                    and self._goes_astray(path, ask)
+                ):
+                    return plan
+        return plan
+
+    def _leaves(self, plan: _Plan) -> bool:
+        """Whether a planned motion leaves the box; from outside it may come in."""
+        if self.bounds_m is None:
+            return False
+        low, high = self.bounds_m
+        start, end = self._state.position[:3], plan.end[:3]
+        inside = np.minimum(start, end) >= low - ASTRAY, np.maximum(start, end) <= high + ASTRAY
+        least, most = plan.range_m()
+        return bool(
+            (inside[0] & (least < low - ASTRAY)).any() or (inside[1] & (most > high + ASTRAY)).any()
+        )
 
     def _coordinates(self, way: FloatArray, limits: FloatArray) -> tuple[FloatArray, list[float]]:
         """(6, k) the fewest directions that a motion by `way` needs, and of the limits their parts.
