@@ -83,6 +83,7 @@ class Judge:
         self._goes_on = (np.diff(self._at) == 1) & ~anew[1:]
         self._states = np.array([t.state for t in self._told])
         self._active = self._states == "active"
+        self._retreats = np.array([t.retreats for t in self._told], bool)
 
     def judge(self) -> list[Violation]:
         """All that did not hold."""
@@ -266,6 +267,7 @@ class Judge:
             end = at + int(later[0]) if len(later) else len(sizes)
             due_s = self._time_s[at - 1] + needed_s[at - 1]
             moving = (self._time_s[at:end] > due_s) & (speed[at:end] > rest)
+            moving &= ~np.logical_or.accumulate(self._retreats[at:end])
             sizes[at:end] = np.where(moving, speed[at:end], 0.0)
         self._tell("still moves after a stop", sizes, 0.0, "m/s or rad/s")
 
@@ -324,7 +326,8 @@ class Judge:
         fresh = np.append(True, np.abs(np.diff(goal_m, axis=0)).max(axis=1) > 1e-10)
         turned = log_of(np.einsum("nji,njk->nik", self._rotation[:-1], goal_rotation[1:]))
         fresh |= np.append(True, norms(np.diff(goal_rotation.reshape(-1, 9), axis=0))[:, 0] > 1e-10)
-        fresh |= np.append(True, ~usable[:-1])
+        percent = np.array([tick.percent for tick in self._told])
+        fresh |= np.append(True, ~usable[:-1]) | np.append(True, np.diff(percent) != 0)
         fresh &= usable
         begins = np.flatnonzero(fresh)
         if not len(begins):
@@ -337,7 +340,15 @@ class Judge:
             for part in (twist, acceleration)
         ]
         ahead = np.hstack([goal_m[begins] - place, turned[before]])
-        low, high = ends_of(*motion, ahead, axis_limits(self._limits))
+        limits = axis_limits(self._limits)
+        low, high = ends_of(*motion, ahead, limits)
+        # At a lower speed the same path takes longer: braking takes the way it takes at full speed.
+        shares = percent[begins] / 100.0
+        for share in set(shares.tolist()) - {0.0, 1.0}:
+            its = shares == share
+            slow = limits * share ** np.array([[1.0], [2.0], [3.0]])
+            down, up = ends_of(*(part[its] for part in (*motion, ahead)), slow)
+            low[its], high[its] = np.minimum(low[its], down), np.maximum(high[its], up)
         # An axis whose own goal stays keeps the ends it had.
         stays = np.abs(goal_m[begins[1:]] - goal_m[begins[1:] - 1]) <= 1e-10
         stays &= usable[begins[1:] - 1, None]

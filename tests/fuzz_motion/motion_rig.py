@@ -67,6 +67,7 @@ class Tick(NamedTuple):
         record: the command, None: nothing was streamed.
         goal: the goal in force, None: none is.
         percent: of the speed, in force.
+        retreats: the arm is led back from what blocked it.
     """
 
     time_ns: int
@@ -76,6 +77,7 @@ class Tick(NamedTuple):
     record: Any
     goal: Pose | None
     percent: float
+    retreats: bool
 
 
 @dataclass
@@ -202,6 +204,7 @@ class Rig:
                 record,
                 goal.pose if goal is not None else None,
                 float(getattr(self.commander.task, "speed_percent", 100.0)),
+                self.commander.retreating,
             )
         )
         if record is not None:

@@ -51,9 +51,9 @@ from vla_zenoh.types import (
     Task,
 )
 
-STARVED_STOP_S, STARVED_WAY_M = 0.30, 0.040
+STARVED_STOP_S, STARVED_WAY_M = 0.30, 0.045
 """From the last good chunk: a period, the watchdog (less the period begun) and the brake."""
-BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.020
+BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.021
 OWN_STOP_S, OWN_WAY_M = 0.15, 0.015
 LOST_STOP_S, LOST_WAY_M = 0.40, 0.060
 SILENT_STOP_S, SILENT_WAY_M = 0.25, 0.035

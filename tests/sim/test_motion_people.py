@@ -33,7 +33,7 @@ from vla_zenoh.lockstep import Lockstep, Message
 from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand, PoseState
 
 EXACT_M = 1e-3
-BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.020
+BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.021
 SLIP_M = 1e-3
 TOGGLES_S = 10.0
 MOVES_M_S, TOGGLED_WAY_M = 0.02, 0.3

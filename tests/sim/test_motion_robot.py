@@ -33,7 +33,7 @@ from vla_zenoh.control.so3 import norm3
 from vla_zenoh.lockstep import SIM, Lockstep, Message
 from vla_zenoh.types import GripperCommand, GripperState, JointState, PoseCommand, PoseState
 
-BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.020
+BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.021
 LOST_STOP_S, LOST_WAY_M = 0.40, 0.060
 FROZEN_STOP_S, FROZEN_WAY_M = 0.50, 0.085
 """The command runs `tracking_m` ahead of a measured pose that stands still, then the brake."""

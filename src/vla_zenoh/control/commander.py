@@ -146,6 +146,11 @@ class Commander:
         return self._mover.streaming
 
     @property
+    def retreating(self) -> bool:
+        """The arm is led back from what blocked it."""
+        return self._retreat.busy
+
+    @property
     def speed(self) -> float:
         """Share of the speed limits that the arm has now; less than 1 near a bound."""
         return self._mover.speed
@@ -253,6 +258,7 @@ class Commander:
             return
         lease, reasons = self._preflight(self.task.worker, now_ns)
         reasons += self.holding.refused(holder, self._around.holders)
+        reasons += self._mover.unsettled(now_ns)
         if lease is None or self.pose is None or self.gripper_state is None or reasons:
             self._refuse_setting("activate", reasons)
             return
@@ -424,6 +430,7 @@ class Commander:
     def _look_around(self, now_ns: int) -> None:
         if self.pose is not None:
             self._watch.measure(self._mover.commanded, pose_of(self.pose.record))
+            self._mover.look_at(self.pose.record, now_ns)
         if self._retreat.busy and not self._may_retreat(now_ns):
             self._retreat.end()
         if self.state not in OBEYING:

@@ -40,6 +40,8 @@ SAME_WIDTH_M = 0.005
 """A gripper this near to the width last sent has reached it."""
 HELD_M, HELD_RAD = 0.002, 0.01
 """A robot that holds a pose this near to what is streamed to it obeys: no stream begins."""
+SETTLED, SETTLED_NS = 5e-4, 100_000_000
+"""One that moves by less, in m and rad, for so long stands."""
 LEAST_OVERRIDE = 0.01
 """A speed override below this is none: the arm stands."""
 
@@ -82,6 +84,7 @@ class Mover:
         self._back: Pose | None = None
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
+        self._stands: tuple[Pose, int] | None = None
         self._timing: StepTiming | None = None
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
@@ -148,8 +151,9 @@ class Mover:
             inside = workspace_corners(self._limits) if self._joints is None else None
             self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits), inside)
             self._timing = StepTiming(self._smoother.box)
-        elif standing and not self._held(self._smoother.motion.pose, start):
-            # Also at rest: a robot that braked by itself stands elsewhere than we command.
+        elif standing and not (
+            self.streaming and self._near(*distance(self._smoother.motion.pose, start))
+        ):
             self._smoother.reset(start)
         if self._joints is not None and joint is not None:
             if standing:
@@ -168,10 +172,35 @@ class Mover:
             self.timeline.restart(goal, now_ns)
         self.goal = None if blocked else goal
 
-    def _held(self, commanded: Pose, held: Pose) -> bool:
-        """The robot still holds what is streamed to it: a step in the stream would be one of it."""
-        apart_m, apart_rad = distance(commanded, held)
-        return self.streaming and apart_m <= HELD_M and apart_rad <= HELD_RAD
+    def look_at(self, measured: PoseState, now_ns: int) -> None:
+        """See whether the robot still moves where the stream stands already."""
+        if not self.streaming or not self.at_rest:
+            self._stands = None
+            return
+        held = held_pose(measured)
+        if self._stands is None or max(distance(held, self._stands[0])) > SETTLED:
+            self._stands = held, now_ns
+
+    def unsettled(self, now_ns: int) -> list[str]:
+        """Why no activation may begin yet: the robot is on its way to where the stream ended.
+
+        A robot that braked by itself stands elsewhere: a new stream begins there.
+        """
+        if self._stands is None or self._smoother is None:
+            return []
+        held, since_ns = self._stands
+        apart_m, apart_rad = distance(self._smoother.motion.pose, held)
+        if self._near(apart_m, apart_rad) or now_ns - since_ns > SETTLED_NS:
+            return []
+        return [
+            f"the robot is still {apart_m:.3f} m and {apart_rad:.3f} rad from where it was sent "
+            f"last; activate again in {LINGER_NS / 1e9:g} s"
+        ]
+
+    @staticmethod
+    def _near(apart_m: float, apart_rad: float) -> bool:
+        """The robot holds what is streamed to it: to begin anew would be a step in the stream."""
+        return apart_m <= HELD_M and apart_rad <= HELD_RAD
 
     def _held_joints(self, joint: JointState) -> FloatArray:
         """Joints the robot's controller holds, or where they are."""

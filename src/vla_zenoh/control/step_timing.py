@@ -37,8 +37,8 @@ SPARE = 3.0
 """Mean deviations for which the arm has a way to go when a chunk is late."""
 CHANGE = 0.4
 """Part of the way to the speed that is wanted which a moving arm takes at each goal."""
-MOVING = 0.3
-"""Part of that speed from which on the arm counts as moving."""
+MOVING = 0.85
+"""Part of that speed from which on it does so; a slower one takes all of it."""
 SLOWEST = 1e-3
 """Least share of the velocity limits."""
 SOON_NS = 1_000_000
