@@ -88,7 +88,9 @@ class Scripted:
         asked = parse_hard(observation.prompt)
         if self._delay_s:
             time.sleep(self._delay_s * (1 + self._jitter * self._random.uniform(-1, 1)))
-        begun, place = self._asked_by(observation.stamp_wall_ns)
+        begun, place = self._asked_by(
+            observation.stamp_wall_ns, observation.task.speed
+        )
         horizon, limit = self.spec.action.horizon, asked.steps or math.inf
         ends = [min(begun + index, limit) for index in range(1, horizon + 1)]
         # No step twice: the chunk ends with the one that completes the count.
@@ -105,7 +107,7 @@ class Scripted:
             self._last_stamp_ns, self._last = observation.stamp_wall_ns, reached
         return ActionSteps(steps, asked.motion is None or ends[-1] >= limit - ROUNDING)
 
-    def _asked_by(self, stamp_ns: int) -> tuple[float, float]:
+    def _asked_by(self, stamp_ns: int, speed: float) -> tuple[float, float]:
         """Steps, and the way, asked for when this observation was taken: the next stands on them.
 
         The command node reckons alike: the first step at once, a later one along its duration.
@@ -113,7 +115,7 @@ class Scripted:
         if self._last_stamp_ns < 0:
             return 0.0, 0.0
         dt_ns = int(self.spec.action.dt_s * 1e9)
-        done, part_ns = divmod(stamp_ns - self._last_stamp_ns, dt_ns)
+        done, part_ns = divmod(round(speed * (stamp_ns - self._last_stamp_ns)), dt_ns)
         if done < 1:
             return self._last[0]
         if done >= len(self._last):

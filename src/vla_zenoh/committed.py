@@ -104,11 +104,12 @@ class Continuation:
             return None
         _, stamp_ns, steps = self._last
         # The command node counts the first step as asked for at once; see control/compose.py.
-        had = max((observation.stamp_wall_ns - stamp_ns) / 1e9 / self._action.dt_s, 1.0)
+        passed_s = observation.task.speed * (observation.stamp_wall_ns - stamp_ns) / 1e9
+        had = max(passed_s / self._action.dt_s, 1.0)
         left = rest_of(self._action, steps, had)
         if not len(left):
             return None
-        late = max(self._latencies_s) / self._action.dt_s
+        late = observation.task.speed * max(self._latencies_s) / self._action.dt_s
         return Committed(left, min(math.ceil(late - ALIGNED), len(left)))
 
 

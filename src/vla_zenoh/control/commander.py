@@ -14,7 +14,7 @@ from collections import deque
 from dataclasses import replace
 
 from vla_zenoh.control.acceptance import Lease, Refusal, refuse
-from vla_zenoh.control.compose import Goal
+from vla_zenoh.control.compose import Goal, Plan
 from vla_zenoh.control.composer import ChunkPlan, Composer
 from vla_zenoh.control.gripper import GripperArbiter
 from vla_zenoh.control.holding import Holding
@@ -85,6 +85,7 @@ class Commander:
         self._feels = True
         self._watch = Watch(profile)
         self._joint_watch = None if reach is None else JointWatch(profile, reach)
+        self._speed_changed = False
         self._out = Outputs()
 
     # -- one tick -----------------------------------------------------------------------------
@@ -116,6 +117,9 @@ class Commander:
             self.state, self.task, self._watch.deadline_ns, now_ns, ticks, self._out
         ):
             self._change(Trigger.FAULT, "no trajectory could be computed; braked")
+        if self._speed_changed and self._mover.timeline is not None:
+            self._speed_changed = False
+            self._expect_next(self._mover.timeline.plan, now_ns)
         if self.state is State.ACTIVE and self._mover.timeline is not None:
             self.progress.look(self._mover.timeline, self.task.episode, now_ns)
         if not self.dry_run:
@@ -219,6 +223,7 @@ class Commander:
                 now = f"the {self.task.speed_percent:g} % in force"
                 raise RecordError(f"{value:g} % is more than {now}; put it on speed to go faster")
             self.task = replace(self.task, speed_percent=value)
+            self._speed_changed = True
         elif name == "active" and (value is True or isinstance(value, str)):
             self._activate(now_ns, "" if value is True else value)
         elif name == "active" and value is False:
@@ -236,7 +241,7 @@ class Commander:
         self.task = replace(self.task, episode=episode, **changes)  # pyright: ignore
         self.progress.begin()
         if self.state in OBEYING:
-            self._watch.expect_first(now_ns, self.task.rate_hz)
+            self._watch.expect_first(now_ns, self.task.rate_hz, self.task.speed)
 
     def _change_worker(self, worker: str, now_ns: int) -> None:
         if self.state in OBEYING:
@@ -376,6 +381,10 @@ class Commander:
         while self._coming is None and self._waiting:
             self._begin(self._waiting.pop(), now_ns)
 
+    def _expect_next(self, plan: Plan, now_ns: int) -> None:
+        rate_hz, speed = self.task.rate_hz, self.task.speed
+        self._watch.expect_next(max(plan.end_ns, now_ns), rate_hz, now_ns, speed)
+
     def _begin(self, chunk: Stamped[ActionChunk], now_ns: int) -> None:
         timeline, lease = self._mover.timeline, self.lease
         if timeline is None or lease is None or self._superseded(chunk):
@@ -407,7 +416,7 @@ class Commander:
         # heap after a pause replace each other.
         plan.effective_ns = max(plan.effective_ns, self._resumed_ns)
         timeline.add(plan, now_ns)
-        self._watch.expect_next(max(plan.end_ns, now_ns), self.task.rate_hz, now_ns)
+        self._expect_next(plan, now_ns)
         self._out.accepted = plan.cause
         self._out.shortened(plan.news())
         self._shadow[worker] = chunk

@@ -42,8 +42,6 @@ HELD_M, HELD_RAD = 0.002, 0.01
 """A robot that holds a pose this near to what is streamed to it obeys: no stream begins."""
 SETTLED, SETTLED_NS = 5e-4, 100_000_000
 """One that moves by less, in m and rad, for so long stands."""
-LEAST_OVERRIDE = 0.01
-"""A speed override below this is none: the arm stands."""
 
 
 class Mover:
@@ -240,7 +238,7 @@ class Mover:
         if self._smoother is None or self.timeline is None:
             return True
         self._cause = None
-        self._take_override(task.speed_percent / 100.0, self.timeline, now_ns)
+        self._take_override(task.speed, self.timeline, now_ns)
         if state is State.ACTIVE:
             self._cause = self._follow(
                 self._smoother, self.timeline, task, overdue_ns, now_ns, ticks, out
@@ -276,7 +274,6 @@ class Mover:
 
     def _take_override(self, override: float, timeline: GoalTimeline, now_ns: int) -> None:
         """Let plan time pass at the speed override, and plan the way to the goal anew."""
-        override = override if override >= LEAST_OVERRIDE else 0.0
         if override != self._override or override != timeline.clock.override:
             self._override = override
             timeline.clock.set(override, now_ns)

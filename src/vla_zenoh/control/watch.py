@@ -9,6 +9,7 @@ from vla_zenoh.control.so3 import Pose, distance
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import GripperState, PoseState, Stamped
 
+NEVER_NS = 1 << 62
 FIRST_CHUNK_PATIENCE_S = 1.0
 """After activation a new observation, an inference and a chunk have to happen first."""
 BACK_OFF_M, BACK_OFF_RAD = 0.005, 0.02
@@ -30,14 +31,21 @@ class Watch:
         """When the next chunk is overdue."""
 
     # -- chunks -------------------------------------------------------------------------------
-    def expect_first(self, now_ns: int, rate_hz: float) -> None:
+    def expect_first(self, now_ns: int, rate_hz: float, speed: float = 1.0) -> None:
         """An episode begins at `now_ns`; its first chunk takes longer than the others."""
-        self.deadline_ns = now_ns + self._patience_ns(rate_hz, FIRST_CHUNK_PATIENCE_S)
+        self._expect(now_ns, rate_hz, speed, FIRST_CHUNK_PATIENCE_S)
 
-    def expect_next(self, end_ns: int, rate_hz: float, now_ns: int) -> None:
+    def expect_next(self, end_ns: int, rate_hz: float, now_ns: int, speed: float = 1.0) -> None:
         """The newest chunk runs out at `end_ns`, or where it would be followed too long."""
-        last_ns = now_ns + int(self._timing.max_open_loop_s * 1e9)
-        self.deadline_ns = min(end_ns, last_ns) + self._patience_ns(rate_hz)
+        open_loop_ns = int(self._timing.max_open_loop_s * 1e9 / speed) if speed else 0
+        self._expect(min(end_ns, now_ns + open_loop_ns), rate_hz, speed)
+
+    def _expect(self, end_ns: int, rate_hz: float, speed: float, extra_s: float = 0.0) -> None:
+        """One period at the asked rate after that, and the watchdog; none of an arm that stands."""
+        period_s = 1.0 / rate_hz / speed if speed else 0.0
+        self.deadline_ns = end_ns + int((period_s + self._timing.watchdog_s + extra_s) * 1e9)
+        if not speed:
+            self.deadline_ns = NEVER_NS
 
     def starved(self, now_ns: int) -> bool:
         """The next chunk is overdue."""
@@ -46,10 +54,6 @@ class Watch:
     def forsaken(self, now_ns: int) -> bool:
         """It is overdue for so long that nobody may still expect the arm to go on by itself."""
         return now_ns > self.deadline_ns + int(self._timing.max_hold_s * 1e9)
-
-    def _patience_ns(self, rate_hz: float, extra_s: float = 0.0) -> int:
-        """How long to wait for the next chunk: one period at the asked rate, and the watchdog."""
-        return int((1.0 / rate_hz + self._timing.watchdog_s + extra_s) * 1e9)
 
     # -- tracking -----------------------------------------------------------------------------
     def begin(self, held: Pose, actual: Pose) -> bool:

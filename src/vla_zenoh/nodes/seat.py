@@ -159,7 +159,9 @@ class Seat:
                     self._states[part].add(state)
 
     def _take_task(self, task: Stamped[Task]) -> None:
-        self.task, self._task_heard_s = task.record, time.monotonic()
+        before, self.task, self._task_heard_s = self.task, task.record, time.monotonic()
+        if before is not None and before.asked_hz != self.task.asked_hz:
+            self.due_s = min(self.due_s, self._task_heard_s)
         if task.record.episode == self._episode:
             return
         self._episode = task.record.episode
@@ -200,6 +202,8 @@ class Seat:
         """
         self.listen()
         self.node.clock.follow()
+        if self.task is not None and self.task.asked_hz <= 0.0:
+            return None
         if self.task is None or time.monotonic() - self._task_heard_s > TASK_PATIENCE_S:
             self.complaint = "no command node is heard"
             return None

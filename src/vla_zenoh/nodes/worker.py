@@ -182,7 +182,7 @@ class WorkerNode:
         if self._delay_s:
             time.sleep(self._delay_s)
         for (seat, observation, observed_ns), answer in zip(ready, answers, strict=True):
-            seat.due_s = max(seat.due_s + 1.0 / observation.rate_hz, began_s)
+            seat.due_s = max(seat.due_s + 1.0 / observation.task.asked_hz, began_s)
             if isinstance(answer, Exception):
                 seat.failed(answer)
                 continue

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from vla_zenoh.types.checks import boolean, integer, number, set_field, text
 
+LEAST_PERCENT = 1.0
+
 
 @dataclass(frozen=True, slots=True)
 class Task:
@@ -35,3 +37,14 @@ class Task:
         text("worker", self.worker, 128)
         set_field(self, "rate_hz", number("rate_hz", self.rate_hz, 0.01, 1000.0))
         set_field(self, "speed_percent", number("speed_percent", self.speed_percent, 0.0, 100.0))
+
+    @property
+    def speed(self) -> float:
+        """Plan seconds per second, 0 to 1: a percent at least, or the arm stands."""
+        return self.speed_percent / 100.0 if self.speed_percent >= LEAST_PERCENT else 0.0
+
+    @property
+    def asked_hz(self) -> float:
+        """Chunks per second asked of the worker now: at half the speed half as many, 0 where the
+        arm stands. A worker that is not obeyed is asked at the full rate."""
+        return self.rate_hz * (self.speed if self.active else 1.0)
