@@ -27,6 +27,8 @@ WANDER_M, WANDER_RAD = 1e-5, 1e-5
 OUTSIDE_M = 1e-4
 """Beyond the workspace box, of command and goal."""
 LEAD_M, LEAD_RAD = 1e-4, 1e-3
+LAG_M, LAG_RAD = 0.002, 0.01
+"""Joints that are commanded follow the pose within this; the leash is on the pose."""
 """Beyond the leash."""
 SAME = 2e-7
 """m and rad: a goal that moves less is told to stay; float32 has 3e-8 of 0.5 m."""
@@ -238,9 +240,17 @@ class Judge:
         self._box("goal outside the box", whole_m)
         ahead_m = np.linalg.norm(goal_m - self._position_m[where], axis=1)
         turn = log_of(np.einsum("nij,nkj->nik", goal_rotation, self._rotation[where]))
+        lag = self._case.joint
         for name, values, limit, tolerance, unit, factor in (
-            ("lead_m", ahead_m, self._limits.lead_m, LEAD_M, "mm over", 1e3),
-            ("lead_rad", norms(turn)[:, 0], self._limits.lead_rad, LEAD_RAD, "mrad over", 1e3),
+            ("lead_m", ahead_m, self._limits.lead_m, LEAD_M + lag * LAG_M, "mm over", 1e3),
+            (
+                "lead_rad",
+                norms(turn)[:, 0],
+                self._limits.lead_rad,
+                LEAD_RAD + lag * LAG_RAD,
+                "mrad over",
+                1e3,
+            ),
         ):
             sizes = np.zeros(len(self._told))
             sizes[where] = np.maximum(values - limit, 0.0)

@@ -254,7 +254,7 @@ class Mover:
             if self._joints is None:
                 self._smoother.tick()
             else:
-                active = state is State.ACTIVE
+                active = state is State.ACTIVE and self._override > 0.0
                 braking = not active and self._back is None
                 self._joints.tick(self._smoother, braking=braking, elbow=active)
         return self._smoother.failures == failures
