@@ -38,7 +38,7 @@ from vla_zenoh.types import (
     PoseState,
 )
 
-TICK_S, RAMP_S = 0.004, 0.1
+TICK_S, RAMP_S = 0.004, 0.24
 TICK_NS = 4_000_000
 SPEED_M_S = 0.2
 TOPIC = "/panda/panda_cartesian_impedance_controller/desired_pose"
@@ -62,6 +62,8 @@ class Turns:
     wall_ns: int = 10**18
     seq: int = 0
     moved_s: float = 0.0
+    ramp_s: float = RAMP_S
+    """How long the motion takes to its full speed, within the profile's limits."""
     whole: Ros2Node | None = None
 
     def joint_states(self, velocity: float = 0.0) -> None:
@@ -94,12 +96,13 @@ class Turns:
     def up(self, *, moves: bool = True) -> None:
         """A command upwards from home, `moved_s` after it began at rest."""
         self.moved_s += TICK_S * moves
-        ramp_s = min(self.moved_s, RAMP_S)
-        way_m = SPEED_M_S * (ramp_s * ramp_s / (2 * RAMP_S) + self.moved_s - ramp_s)
-        speed = SPEED_M_S * ramp_s / RAMP_S
+        begun_s, turn_1_s = min(self.moved_s, self.ramp_s), np.pi / self.ramp_s
+        speed = SPEED_M_S * (1 - np.cos(turn_1_s * begun_s)) / 2
+        ramp_m = SPEED_M_S * (begun_s - np.sin(turn_1_s * begun_s) / turn_1_s) / 2
+        way_m = ramp_m + SPEED_M_S * (self.moved_s - begun_s)
         home = panda().forward(HOME_RAD)
         at_m, quat = home.position_m + (0.0, 0.0, way_m), quat_from_rotation(home.rotation)
-        change = SPEED_M_S / RAMP_S if self.moved_s < RAMP_S else 0.0
+        change = SPEED_M_S * turn_1_s * np.sin(turn_1_s * begun_s) / 2
         twist, acceleration = np.zeros(6), np.zeros(6)
         twist[2], acceleration[2] = speed, change
         self.put(PoseCommand(at_m, quat, twist, acceleration, at_m, quat, "active"))

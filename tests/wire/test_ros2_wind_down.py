@@ -25,6 +25,7 @@ SLOW_S = 0.2
 """Between two turns of a loop that is late: by less than that."""
 GENTLE = "limits: {translation: {jerk_m_s3: 0.3}}\n"
 """From 0.2 m/s the robot's own stop takes 1.15 s."""
+GENTLE_RAMP_S = 2.0
 
 
 class Loop:
@@ -135,10 +136,12 @@ def test_an_arm_that_stood_while_the_loop_did_is_not_moved_again_by_its_brake(
 
 @pytest.mark.parametrize("turns", [GENTLE], indirect=True)
 def test_a_brake_that_takes_long_is_brought_to_its_end(loop: Loop) -> None:
-    loop.script[MOVING] = loop.stop.set
+    loop.turns.ramp_s = GENTLE_RAMP_S
+    moving = round(GENTLE_RAMP_S / TICK_S)
+    loop.script[moving] = loop.stop.set
     loop.run()
     braked(loop.turns)
-    assert (loop.turn - MOVING) * TICK_S > LEAST_S
+    assert (loop.turn - moving) * TICK_S > LEAST_S
 
 
 def test_a_loop_that_is_too_slow_to_brake_ends_in_time_and_says_so(loop: Loop) -> None:
