@@ -21,14 +21,15 @@ Array = NDArray[np.float64]
 LIMIT_RTOL, JERK_RTOL = 1e-3, 1e-2
 """Of velocity and acceleration; of jerk."""
 JOINT_JERK = 1.2
-GUARD_RTOL = 1e-2
+GUARD_RTOL, GUARD_TURN = 1e-2, {"velocity": 0.04, "acceleration": 0.04, "jerk": 0.15}
+"""Of what the robot is sent; of rotations, whose axes turn meanwhile."""
 WANDER_M, WANDER_RAD = 1e-5, 1e-5
 """An axis at its goal, a path beyond its ends, a line."""
 OUTSIDE_M = 1e-4
 """Beyond the workspace box, of command and goal."""
 LEAD_M, LEAD_RAD = 1e-4, 1e-3
-LAG_M, LAG_RAD = 0.002, 0.01
-"""Joints that are commanded follow the pose within this; the leash is on the pose."""
+LAG_M, LAG_RAD = 0.01, 0.05
+"""A pose waits for joints that are this far from it; the leash is on the pose."""
 """Beyond the leash."""
 SAME = 2e-7
 """m and rad: a goal that moves less is told to stay; float32 has 3e-8 of 0.5 m."""
@@ -241,6 +242,9 @@ class Judge:
         ahead_m = np.linalg.norm(goal_m - self._position_m[where], axis=1)
         turn = log_of(np.einsum("nij,nkj->nik", goal_rotation, self._rotation[where]))
         lag = self._case.joint
+        # Where a late tick takes the arm is foreseen with the acceleration it had.
+        late_s = np.diff(self._time_s, prepend=self._time_s[:1])[where]
+        foreseen = motion_limits(self._limits).translation[2] * late_s**3 / 3
         for name, values, limit, tolerance, unit, factor in (
             ("lead_m", ahead_m, self._limits.lead_m, LEAD_M + lag * LAG_M, "mm over", 1e3),
             (
@@ -253,7 +257,7 @@ class Judge:
             ),
         ):
             sizes = np.zeros(len(self._told))
-            sizes[where] = np.maximum(values - limit, 0.0)
+            sizes[where] = np.maximum(values - limit - foreseen, 0.0)
             self._tell(f"goal leads: {name}", sizes, tolerance, unit, factor)
 
     # -- stops --------------------------------------------------------------------------------
@@ -434,7 +438,8 @@ class Judge:
         for order, word in enumerate(("velocity", "acceleration", "jerk")):
             values = np.diff(moved, order, axis=0) / dt_s ** (order + 1)
             share = (size(values) / np.asarray(limits[order])).max(axis=1)
-            many = int((share > 1 + GUARD_RTOL).sum())
+            more = GUARD_TURN[word] if name == "rotation" else GUARD_RTOL
+            many = int((share > 1 + more).sum())
             if many:
                 at = int(share.argmax())
                 tick = max(self._trace.guard_tick[at + order + 1], 0)
