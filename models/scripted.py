@@ -88,9 +88,7 @@ class Scripted:
         asked = parse_hard(observation.prompt)
         if self._delay_s:
             time.sleep(self._delay_s * (1 + self._jitter * self._random.uniform(-1, 1)))
-        begun, place = self._asked_by(
-            observation.stamp_wall_ns, observation.task.speed
-        )
+        begun, place = self._asked_by(observation.stamp_wall_ns, observation.task.speed)
         horizon, limit = self.spec.action.horizon, asked.steps or math.inf
         ends = [min(begun + index, limit) for index in range(1, horizon + 1)]
         # No step twice: the chunk ends with the one that completes the count.
