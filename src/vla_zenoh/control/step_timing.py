@@ -44,7 +44,7 @@ SLOWEST = 1e-3
 SOON_NS = 1_000_000
 MARGIN_NS = 10_000_000
 EASING = 0.1
-"""Part of the time by which what is kept in reserve may change."""
+"""Part of the time by which what is kept in reserve may change; half of it how late the arm is."""
 
 
 class Arrivals:
@@ -102,7 +102,8 @@ class StepTiming:
         """The arm stands, nothing was asked of it yet."""
         self._arrivals.restart()
         self._plan: Plan | None = None
-        self._begun_ns = 0
+        self._took_ns = 0
+        self._begun_ns = self._late_ns = 0.0
         self._gone = self._stretch = self._spare_ns = 0.0
 
     def share(
@@ -149,9 +150,16 @@ class StepTiming:
         self._stretch = max(1.0, wait_ns / lasts_ns)
         covered_ns = lasts_ns * self._stretch - wait_ns
         spare_ns = MARGIN_NS + max(0.0, self._arrivals.spare_ns - covered_ns)
-        most_ns = EASING * (plan_ns - self._begun_ns) if before is not None else math.inf
+        most_ns = EASING * (plan_ns - self._took_ns) if before is not None else math.inf
         self._spare_ns += min(max(spare_ns - self._spare_ns, -most_ns), most_ns)
-        self._plan, self._begun_ns = plan, plan_ns
+        # An arm that began late, by what the first inference took, does not make up for it at once.
+        late_ns = plan_ns - plan.clock.at(plan.start_ns) - self._gone * plan.dt_ns
+        kept_ns = late_ns
+        if before is not None and self._stretch == 1.0:
+            kept_ns = self._late_ns - 0.5 * most_ns
+        self._late_ns = max(late_ns, kept_ns)
+        self._plan, self._took_ns = plan, plan_ns
+        self._begun_ns = plan_ns + self._late_ns - late_ns
 
     def _paced(
         self,
