@@ -37,7 +37,7 @@ THERE, STILL, CALM = 1e-6, 1e-6, 1e-3
 """m or rad, m/s or rad/s, m/s^2 or rad/s^2: what stands at its goal."""
 REST, JOINT_REST = 1e-6, 1e-3
 """m/s or rad/s of a command that stands."""
-STOP_S, JOINT_STOP_S, JOINT_LONGER = 0.03, 0.12, 1.5
+STOP_S, JOINT_STOP_S, JOINT_LONGER = 0.03, 0.12, 2.0
 """A stop may take this much longer than the limits need; of joints, times that, and their elbow's
 pull has to fade."""
 PULL_1_S, PULL_JERK = 25.0, 0.28

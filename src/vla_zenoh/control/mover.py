@@ -40,6 +40,7 @@ SAME_WIDTH_M = 0.005
 """A gripper this near to the width last sent has reached it."""
 HELD_M, HELD_RAD = 0.002, 0.01
 """A robot that holds a pose this near to what is streamed to it obeys: no stream begins."""
+HELD_JOINT_RAD = 0.004
 SETTLED, SETTLED_NS = 5e-4, 100_000_000
 """One that moves by less, in m and rad, for so long stands."""
 
@@ -145,7 +146,7 @@ class Mover:
         actual, start = pose_of(measured), held_pose(measured)
         standing = not self.streaming or self.at_rest
         if self._smoother is None:
-            # Joints that are commanded are kept in the box by what bounds them.
+            # Joints that are commanded have walls of their own.
             inside = workspace_corners(self._limits) if self._joints is None else None
             self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits), inside)
             self._timing = StepTiming(self._smoother.box)
@@ -154,8 +155,10 @@ class Mover:
         ):
             self._smoother.reset(start)
         if self._joints is not None and joint is not None:
-            if standing:
-                self._joints.restart(self._held_joints(joint))
+            held_rad = self._held_joints(joint)
+            apart_rad = float(np.abs(held_rad - self._joints.position_rad).max())
+            if standing and not (self.streaming and apart_rad <= HELD_JOINT_RAD):
+                self._joints.restart(held_rad)
             self._joints.keep_elbow()
         width_m = self._width_to_keep(gripper)
         self.gripper.restart(width_m)
@@ -277,7 +280,7 @@ class Mover:
         if override != self._override or override != timeline.clock.override:
             self._override = override
             timeline.clock.set(override, now_ns)
-            self.goal = None
+            self.goal, self._slowing = None, override > 0.0
 
     def _follow(
         self,
@@ -310,7 +313,9 @@ class Mover:
                 goal = cut
             self._slow_down(slower, out)
             shares = self._shares(smoother, goal.pose, timeline.plan, task, overdue_ns, now_ns)
-            smoother.target(goal.pose, shares)
+            hard = self._slowing and self._joints is None
+            enough = smoother.target(goal.pose, shares, all_to_stop=hard)
+            self._slowing &= not (enough and _within(smoother, self._override))
             self.goal = goal
             self.gripper.want(goal.width_m)
         return timeline.plan.cause
@@ -347,8 +352,8 @@ class Mover:
             speed = min(speed, share)
         # The same motion in more time: its acceleration shrinks with the square of the override,
         # its jerk with the cube. Until a faster arm has slowed down it brakes as hard as it may.
-        self._slowing = not _within(smoother, override)
-        most = FULL if self._slowing else Shares(1.0, override**2, override**3)
+        slow = _within(smoother, override)
+        most = Shares(1.0, override**2, override**3) if slow else FULL
         return self._of_joints(smoother, goal, Shares(speed, most.acceleration, most.jerk))
 
     def _of_joints(self, smoother: Smoother, goal: Pose, shares: Shares) -> Shares:

@@ -187,13 +187,18 @@ class Smoother:
             np.zeros(6),
         )
 
-    def target(self, pose: Pose, shares: Shares = FULL) -> None:
+    def target(self, pose: Pose, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
         """Head for `pose` from the present state, without a step in velocity or acceleration.
 
         Args:
             pose: where to.
             shares: of the limits; a faster motion slows down within them. More of the jerk is used
                 where the arm would get too fast first, or turn round.
+            all_to_stop: where these do not let it stop at `pose`, though all of acceleration and
+                jerk would, those are taken. Not to leave the box they are taken in any case.
+
+        Returns:
+            whether the shares are enough.
         """
         self._anchor_here()
         self.braking = False
@@ -201,7 +206,9 @@ class Smoother:
         limits = self.box * np.array(shares._replace(jerk=self._enough_jerk(shares)))[:, None]
         way = self._target - self._state.position
         way[np.abs(way) < QUIET[0]] = 0.0
-        self._begin(self._towards(way, limits))
+        plan, enough = self._towards(way, limits, all_to_stop)
+        self._begin(plan)
+        return enough
 
     def brake(self, shares: Shares | None = None) -> None:
         """Come to rest as fast as the limits allow, each axis by itself.
@@ -233,15 +240,16 @@ class Smoother:
             return
         self._plan = plan
 
-    def _towards(self, way: FloatArray, limits: FloatArray) -> _Plan | None:
-        """The plan of a motion by `way` (6,): together where no coordinate goes astray."""
+    def _towards(
+        self, way: FloatArray, limits: FloatArray, all_to_stop: bool
+    ) -> tuple[_Plan | None, bool]:
+        """The plan of a motion by `way` (6,) without detours, and whether these limits do."""
         if not np.isfinite(way).all():
-            return None
+            return None, False
         basis, parts = self._coordinates(way, limits)
         plan: _Plan | None = None
-        # With less acceleration than it had an arm may not stop inside: then it takes all.
         hardest = np.concatenate([limits[:1], self.box[1:]])
-        for most in (limits, hardest) if (limits[1:] < self.box[1:]).any() else (limits,):
+        for most in (limits, hardest) if (limits < hardest).any() else (limits,):
             ask = self._ask(basis, most, parts)
             ask.target_position = (basis.T @ way).tolist()
             for synchronization in (Synchronization.Time, Synchronization.No):
@@ -253,13 +261,17 @@ class Smoother:
                 if path is None:
                     continue
                 plan = _Plan(self._state.position, basis, path)
-                if not self._leaves(plan) and not (
-                    synchronization is Synchronization.Time
-                    and len(parts) > 1
-                    and self._goes_astray(path, ask)
-                ):
-                    return plan
-        return plan
+                may_take = hardest if all_to_stop else most
+                # As fast as it can, and with all it may take: it goes no further than it has to.
+                shortest = most is may_take and (
+                    synchronization is Synchronization.No or len(parts) == 1
+                )
+                astray = not shortest and self._goes_astray(
+                    path, basis.T @ way, self._ask(basis, may_take, parts)
+                )
+                if not astray and not self._leaves(plan):
+                    return plan, most is limits
+        return plan, False
 
     def _leaves(self, plan: _Plan) -> bool:
         """Whether a planned motion leaves the box; from outside it may come in."""
@@ -321,19 +333,21 @@ class Smoother:
             return np.stack([along, *others], axis=1), [1.0 - 2 * BESIDE, BESIDE, BESIDE]
         return np.eye(3), [1.0] * 3
 
-    def _goes_astray(self, path: Trajectory, ask: InputParameter) -> bool:
-        """Whether a coordinate leaves the range between its start, target and where it can stop."""
-        target = np.array(ask.target_position)
+    def _goes_astray(self, path: Trajectory, target: FloatArray, ask: InputParameter) -> bool:
+        """Whether a coordinate leaves the range between its start, its target and where it stops.
+
+        Args:
+            path: planned.
+            target: (k,).
+            ask: for a brake, with the limits that it may take.
+        """
         least, most = np.minimum(target, 0.0) - ASTRAY, np.maximum(target, 0.0) + ASTRAY
         low, high = _extrema(path)
         if (low >= least).all() and (high <= most).all():
             return False
         ask.control_interface = ControlInterface.Velocity
-        together, ask.per_dof_synchronization = ask.per_dof_synchronization, None
         ask.synchronization = Synchronization.No
         stop = self._calculated(ask)
-        ask.control_interface = ControlInterface.Position
-        ask.per_dof_synchronization = together
         if stop is None:
             return True
         stop_low, stop_high = _extrema(stop)
