@@ -103,7 +103,7 @@ def test_a_dds_client_stops_and_resets(lab: Lab) -> None:
     request = node.client("/vla/set_request", ros.SetRequestRequest, ros.SetRequestResponse)
     lab.chain.wait_still()
 
-    said = request.call("HARD: go up", "scripted", 5.0, True, timeout_s=DDS_TIMEOUT_S)
+    said = request.call("HARD: go down", "scripted", 5.0, True, timeout_s=DDS_TIMEOUT_S)
     assert said.success, said.message
     lab.chain.until("it moves", lambda: lab.witness.speed_m_s() > 0.02)
     assert stop.call(timeout_s=DDS_TIMEOUT_S).success
