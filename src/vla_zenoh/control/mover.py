@@ -12,7 +12,7 @@ from vla_zenoh.control.composer import Composer
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper import GripperArbiter
 from vla_zenoh.control.joint_stage import JointStage
-from vla_zenoh.control.limits import leash, workspace_corners
+from vla_zenoh.control.limits import into_workspace, leash, workspace_corners
 from vla_zenoh.control.ports import Outputs
 from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.retreat import Retreat
@@ -398,7 +398,11 @@ class Mover:
             self._brake(smoother, timeline, now_ns)
         elif back is not self._back:
             # Whatever the speed override: an arm that presses has to come free.
-            smoother.target(back, self._of_joints(smoother, back, Shares(self.retreat.speed)))
+            inside_m, _ = into_workspace(
+                self._limits, back.position_m, smoother.motion.pose.position_m
+            )
+            inside = Pose(inside_m, back.rotation)
+            smoother.target(inside, self._of_joints(smoother, inside, Shares(self.retreat.speed)))
         self._back = back
 
     def _brake(self, smoother: Smoother, timeline: GoalTimeline, now_ns: int) -> None:
