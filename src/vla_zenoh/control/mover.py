@@ -365,8 +365,6 @@ class Mover:
 
     def _slow_down(self, slower: Slowdown | None, out: Outputs) -> None:
         """Take over the speed of a goal; tell each reason once in every activation."""
-        if self._held_back and (slower is None or self._held_back.share < slower.share):
-            slower = self._held_back
         if slower is not None and slower.name not in (APPROACH, *self._slowed_by):
             self._slowed_by.add(slower.name)
             where = f" at {slower.where}" if slower.where else ""
@@ -449,7 +447,9 @@ def _ahead(motion: Motion, dt_s: float) -> Pose:
 def _within(smoother: Smoother, override: float) -> bool:
     """Whether the arm moves as slowly as it would at this override, and will go on so."""
     most = smoother.box * override ** np.array([[1.0], [2.0], [3.0]])
-    speed, change = np.abs(smoother.motion.twist), np.abs(smoother.motion.acceleration)
+    (_, rotation), *motion = smoother.motion
+    # The limits of rotation are those of the axes that turn with the arm.
+    speed, change = (np.abs(np.append(part[:3], rotation.T @ part[3:])) for part in motion)
     return bool(
         (change <= most[1]).all() and (speed + change**2 / (2 * most[2]) <= most[0] * 1.001).all()
     )
