@@ -64,7 +64,7 @@ format: $(READY) ## Let ruff put files into shape
 	$(BIN)/ruff format .
 
 bench: $(READY) ## Measure camera to command on this machine
-	$(BIN)/vla-zenoh bench chain $(ARGS)
+	$(BIN)/python -m benchmarks chain $(ARGS)
 
 bench-faults: $(READY) ## Faults of a lab network on an arm in motion (root), table into docs/reliability.md
 	$(BIN)/python tests/netns/bench_faults.py $(ARGS)

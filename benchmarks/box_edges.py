@@ -1,6 +1,6 @@
 """How far an arm leaves its workspace box that slides along faces and edges of it.
 
-    python benchmarks/box_edges.py [-n 100] [--perfect]
+    python -m benchmarks.box_edges [-n 100] [--perfect]
 
 Random policies push against each of the six faces and twelve edges and wander along it, in
 lockstep. The lower face is the shipped profile's, over the table. The shipped box's other faces are
@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lockstep_arm import activated, in_processes
 
-from vla_zenoh.lockstep import Delays
+from benchmarks.lockstep_arm import activated, in_processes
+from vla_zenoh.lab.lockstep import Delays
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import load_profile, override
 

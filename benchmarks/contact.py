@@ -14,7 +14,7 @@ fingers 75 N/mm and 0.6 kg, abdomen 10 N/mm (of its 40 kg the pad has 1 kg: the 
 That standard's table A.2 allows 140 N of lasting and 280 N of short contact with the hand, 110 N
 and 220 N with the abdomen.
 
-    .venv/bin/python benchmarks/contact.py [--only TEXT] [--untold]
+    .venv/bin/python -m benchmarks.contact [--only TEXT] [--untold]
 """
 
 from __future__ import annotations
@@ -30,10 +30,9 @@ import numpy as np
 
 from vla_zenoh import resources
 from vla_zenoh.codec import message
-from vla_zenoh.control.arm import make_shadow
-from vla_zenoh.control.so3 import norm3
-from vla_zenoh.lockstep import Lockstep, Message
-from vla_zenoh.nodes.sim import build_world
+from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.kinematics.so3 import norm3
+from vla_zenoh.lab.lockstep import Lockstep, Message
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -43,6 +42,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.types import PoseState
 
 SPEEDS_M_S = (0.02, 0.1, 0.4)

@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.control.arm import make_kinematics, make_shadow
-from vla_zenoh.control.impedance import Reference
-from vla_zenoh.control.joint_impedance import JointReference
-from vla_zenoh.control.so3 import log3, quat_from_rotation
-from vla_zenoh.lockstep import Delays, Lockstep
-from vla_zenoh.nodes.sim import build_world
+from vla_zenoh.control.profile_arm import make_kinematics, make_shadow
+from vla_zenoh.kinematics.so3 import log3, quat_from_rotation
+from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy import Policy
 from vla_zenoh.profile import Profile
+from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
+from vla_zenoh.types.references import JointReference, PoseReference
 
 WARM_UP_S, LOOK_S = 1.2, 0.25
 DAMPING = 1e-6
@@ -44,7 +43,7 @@ class PerfectArm:
         """Least and greatest position of every arm joint, (n,) each."""
         return self._kinematics.lower_rad, self._kinematics.upper_rad
 
-    def tick(self, reference: Reference) -> None:
+    def tick(self, reference: PoseReference) -> None:
         """A millisecond: the TCP is there, and the joints follow without their elbow."""
         pose, jacobian = self._kinematics.pose_and_jacobian(self._joints)
         turn = log3(reference.rotation @ pose.rotation.T)
@@ -72,7 +71,7 @@ class PerfectArm:
         """Measured position (3,) in m, and rotation (3, 3)."""
         return self._pose.position_m, self._pose.rotation
 
-    def pose_state(self, _: Reference | JointReference) -> PoseState:
+    def pose_state(self, _: PoseReference | JointReference) -> PoseState:
         """Measured, which is what is held."""
         quat, place = quat_from_rotation(self._pose.rotation), self._pose.position_m
         return PoseState(place, quat, np.zeros(6), np.zeros(6), place, quat)

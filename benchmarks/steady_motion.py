@@ -1,6 +1,6 @@
 """How steadily an arm moves that is asked for the same step again and again.
 
-    python benchmarks/steady_motion.py [--perfect] [--plot FILE.png] [--json FILE]
+    python -m benchmarks.steady_motion [--perfect] [--plot FILE.png] [--json FILE]
 
 The scripted model asks for 50 steps of 0.01 m and of 0.05 rad, at several rates, in chunks of
 several lengths; an inference takes 140 ms, with and without jitter; a step lasts one period, or
@@ -23,12 +23,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from lockstep_arm import LOOK_S, activated, in_processes
 
-from vla_zenoh.control.so3 import log3, rotation_from_quat
-from vla_zenoh.demo.segments import make_segment
-from vla_zenoh.loader import find_model, make_policy
-from vla_zenoh.lockstep import Delays, Lockstep
+from benchmarks.lockstep_arm import LOOK_S, activated, in_processes
+from vla_zenoh.kinematics.so3 import log3, rotation_from_quat
+from vla_zenoh.lab.demo.segments import make_segment
+from vla_zenoh.lab.lockstep import Delays, Lockstep
+from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 
 STEPS = 50

@@ -20,10 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.arm import make_kinematics, make_shadow
 from vla_zenoh.control.commander import Commander, Inputs, Setting
-from vla_zenoh.control.preflight import Surroundings
-from vla_zenoh.control.so3 import quat_from_rotation
+from vla_zenoh.control.preflight import PeerSnapshot
+from vla_zenoh.control.profile_arm import make_kinematics, make_shadow
+from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import ActionChunk, GripperState, Header, JointState, PoseState, Stamped
@@ -75,7 +75,7 @@ class Player:
             action=ActionSpec(horizon=HORIZON, dt_s=DT_S, rotation="rotvec", gripper="none"),
         )
         nodes = frozenset({"sim", "camera", f"worker-{WORKER}"})
-        self.around = Surroundings(
+        self.around = PeerSnapshot(
             alive=nodes,
             robot_node="sim",
             specs={WORKER: self.spec},

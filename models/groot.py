@@ -19,7 +19,7 @@ from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop import groot
 from vla_zenoh.interop.adapter import Adapter
 from vla_zenoh.interop.presets import GROOT
-from vla_zenoh.model_options import address, one_of
+from vla_zenoh.policy.model_options import address, one_of
 
 
 class Groot(Adapter):

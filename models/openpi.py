@@ -23,7 +23,7 @@ from websockets.sync.client import ClientConnection, connect
 from vla_zenoh.interop import openpi
 from vla_zenoh.interop.adapter import Adapter
 from vla_zenoh.interop.presets import OPENPI
-from vla_zenoh.model_options import address, one_of
+from vla_zenoh.policy.model_options import address, one_of
 
 CLOSE_S = 0.1
 

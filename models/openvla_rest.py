@@ -20,7 +20,7 @@ from typing import Any
 from vla_zenoh.interop import openvla_rest
 from vla_zenoh.interop.adapter import Adapter
 from vla_zenoh.interop.presets import OPENVLA_REST
-from vla_zenoh.model_options import address, yes_no
+from vla_zenoh.policy.model_options import address, yes_no
 
 
 class OpenVlaRest(Adapter):

@@ -26,8 +26,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from vla_zenoh.model_options import number, whole_number
-from vla_zenoh.motions import parse_hard
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -36,6 +34,8 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
 )
+from vla_zenoh.policy.model_options import number, whole_number
+from vla_zenoh.policy.scripted_motions import parse_hard
 
 ROUNDING = 1e-6
 """Less than this of a step is none."""

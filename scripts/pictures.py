@@ -22,11 +22,11 @@ import numpy as np
 import rerun as rr
 from rerun.experimental import ViewerClient
 
-from vla_zenoh.nodes.viewer import open_headless
+from vla_zenoh.lab.recording.reader import open_recording
+from vla_zenoh.lab.view.paths import TIMELINE
+from vla_zenoh.lab.view.show import APPLICATION, Show
+from vla_zenoh.lab.view.viewer import open_headless
 from vla_zenoh.profile import read_profile
-from vla_zenoh.recording.reader import open_recording
-from vla_zenoh.view.paths import TIMELINE
-from vla_zenoh.view.show import APPLICATION, Show
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs" / "images"

@@ -21,8 +21,8 @@ from pathlib import Path
 
 from bootstrap import uv_environment
 
-from vla_zenoh.loader import find_model
-from vla_zenoh.nodes.environment import environment_command
+from vla_zenoh.policy.loader import find_model
+from vla_zenoh.runtime.environments import environment_command
 
 ROOT = Path(__file__).resolve().parent.parent
 TESTS = ROOT / "tests" / "models"

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 import zenoh
 
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
-from vla_zenoh.nodes.camera import CameraNode
-from vla_zenoh.nodes.session import open_session
+from vla_zenoh.nodes.camera.node import CameraNode
 from vla_zenoh.profile import Profile, SessionProfile, load_profile
 from vla_zenoh.profile.schema import CameraProfile, HostProfile
 from vla_zenoh.types import Event, Header, NodeStatus

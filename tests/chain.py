@@ -23,14 +23,14 @@ import zenoh
 from camera_rig import PATIENCE_S, free_endpoint, until
 from numpy.typing import NDArray
 
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import Keys
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.launch import Host
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.runtime.launch import Host
 from vla_zenoh.types import Event, PoseCommand, PoseState
 
 READY_PATIENCE_S = 40.0

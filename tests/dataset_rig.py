@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Keys
+from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, Sample
+from vla_zenoh.lab.recording.writer import RunWriter
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
-from vla_zenoh.recording.sample import JPEG, MSGPACK, Sample
-from vla_zenoh.recording.writer import RunWriter
 from vla_zenoh.types import (
     ActionChunk,
     Cause,

@@ -11,13 +11,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from ruckig import InputParameter, OutputParameter, Ruckig, Synchronization
 
-from vla_zenoh.control.joint_impedance import JointReference
-from vla_zenoh.control.joint_reference import JointGuard, joint_guard_limits, joint_motion_limits
-from vla_zenoh.control.reference import ReferenceGuard, guard_limits
 from vla_zenoh.control.smoothing import Motion, Smoother, motion_limits
-from vla_zenoh.control.so3 import Pose, exp3, log3, quat_from_rotation
+from vla_zenoh.guard.joint_guard import JointGuard, joint_guard_limits, joint_motion_limits
+from vla_zenoh.guard.pose_guard import PoseGuard, guard_limits
+from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import FloatArray, Header, JointCommand, PoseCommand, Stamped
+from vla_zenoh.types.references import JointReference
 
 PROFILE = load_profile("panda_sim")
 NAMES = PROFILE.robot.arm_joints
@@ -200,7 +200,7 @@ def drive(
     rng = random.Random(seed)
     guard: Any
     if mode == "pose":
-        guard = ReferenceGuard(HOME, tick_s, guard_limits(profile))
+        guard = PoseGuard(HOME, tick_s, guard_limits(profile))
     else:
         ends = HOME_RAD - 3, HOME_RAD + 3
         guard = JointGuard(NAMES, HOME_RAD, tick_s, joint_guard_limits(profile, *ends))

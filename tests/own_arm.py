@@ -10,14 +10,13 @@ import threading
 import time
 from pathlib import Path
 
-from vla_zenoh.control.impedance import Reference
-from vla_zenoh.control.joint_impedance import JointReference
-from vla_zenoh.control.so3 import rotation_from_quat
-from vla_zenoh.nodes.sim import build_world
+from vla_zenoh.kinematics.so3 import rotation_from_quat
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robot import Command, Reading
+from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.simulation.world import STEP_NS
 from vla_zenoh.types import GripperState, JointCommand, JointState
+from vla_zenoh.types.references import JointReference, PoseReference
 
 CONNECT_S = 12.0
 """Longer than a node may say nothing."""
@@ -35,7 +34,7 @@ class OwnArm:
         self._world = build_world(load_profile(profile))
         self._trouble = Path(trouble) if trouble else None
         self._lock, self._end = threading.Lock(), threading.Event()
-        self._target: Reference | JointReference | None = None
+        self._target: PoseReference | JointReference | None = None
         self._state: tuple[JointState, GripperState, int] | None = None
         self._reflex: tuple[JointState, GripperState, int] | None = None
         self._moves_to_fail = 1
@@ -84,7 +83,9 @@ class OwnArm:
             )
         else:
             rotation = rotation_from_quat(command.quat_xyzw)
-            target = Reference(command.position_m, rotation, command.twist, command.acceleration)
+            target = PoseReference(
+                command.position_m, rotation, command.twist, command.acceleration
+            )
         with self._lock:
             self._target = target
 
@@ -104,7 +105,7 @@ class OwnArm:
 
     def _control(self) -> None:
         world = self._world
-        target: Reference | JointReference = JointReference.at_rest(
+        target: PoseReference | JointReference = JointReference.at_rest(
             world.joint_state().position_rad
         )
         next_ns = time.monotonic_ns()

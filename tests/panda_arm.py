@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla_zenoh.control.ik import InverseKinematics
-from vla_zenoh.control.kinematics import Kinematics
-from vla_zenoh.control.so3 import Pose, exp3
+from vla_zenoh.kinematics.ik import InverseKinematics
+from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.so3 import Pose, exp3
 from vla_zenoh.resources import robot_urdf
 from vla_zenoh.types import FloatArray
 

@@ -20,9 +20,9 @@ from typing import Any
 import pytest
 from camera_rig import free_endpoint, until
 
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.interop import origami
 from vla_zenoh.keys import origami_key
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import SessionProfile
 
 PEERS = Path(__file__).parent / "peers"

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from chain import Chain
 
-from vla_zenoh.evaluation.result import Evaluation
-from vla_zenoh.nodes.recorder import Recorder
+from vla_zenoh.lab.evaluation.result import Evaluation
+from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.profile import Profile, override
 
 RELATIVE = 1e-6  # stamps are floats of seconds since another beginning

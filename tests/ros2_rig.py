@@ -13,14 +13,14 @@ import zenoh
 from camera_rig import PATIENCE_S, free_endpoint, until
 from ros2_peer import KinematicPanda, Ros2Peer
 
+from vla_zenoh.bus.clock import Clock
+from vla_zenoh.bus.node import Stream
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.clock import Clock
-from vla_zenoh.nodes.node import Stream
-from vla_zenoh.nodes.ros2.node import Ros2Node
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.robots.ros2.node import Ros2Node
 from vla_zenoh.types import Event, GripperState, Header, JointState, NodeStatus, PoseState
 
 CAMERA = "/camera/realsense2_camera/color/image_raw"

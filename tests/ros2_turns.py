@@ -16,17 +16,17 @@ from panda_arm import ARM_JOINTS, HOME_RAD, panda
 from ros2_peer import FINGERS, GOAL, Ros2Peer
 from ros2_rig import write_profile
 
+from vla_zenoh.bus import buffers as slots
+from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
-from vla_zenoh.control.so3 import quat_from_rotation
 from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.nodes import slots
-from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.ros2 import hearing
-from vla_zenoh.nodes.ros2.arm import Arm
-from vla_zenoh.nodes.ros2.link import Link
-from vla_zenoh.nodes.ros2.node import Ros2Node
+from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.ros2 import state_subscriber as hearing
+from vla_zenoh.robots.ros2.arm import Arm
+from vla_zenoh.robots.ros2.node import Ros2Node
+from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.types import (
     Event,
     FloatArray,
@@ -162,7 +162,7 @@ def ros2_turns(
             assert arm is not None
         else:
             node = Node("ros2", profile, session)
-            link = Link(session, profile.ros2, Messages("jazzy"), "vla_panda")
+            link = RosGraph(session, profile.ros2, Messages("jazzy"), "vla_panda")
             arm = Arm(node, link, Messages("jazzy"), profile.ros2, lambda: (False, None, False))
         states: dict[type, list[Any]] = {}
         keys, subscribers = node.keys, []

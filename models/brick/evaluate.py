@@ -7,8 +7,8 @@
     python evaluate.py --family put --episodes 50 --seed 10000 [--vary all] [--delay 0.14]
 
 The same commander, guard and controller as in the nodes, on a virtual clock, see
-`vla_zenoh.lockstep`. With ``--collect DIR`` every situation the policy got into is kept with what
-the teacher would have done, in the form generate.py writes (dataset aggregation: Ross et al.,
+`vla_zenoh.lab.lockstep`. With ``--collect DIR`` every situation the policy got into is kept with
+what the teacher would have done, in the form generate.py writes (dataset aggregation: Ross et al.,
 AISTATS 2011).
 """
 
@@ -29,27 +29,27 @@ from generate import labelled
 from model import HORIZON, Brick, Hand, Waypoints
 from states import Situation
 
-from vla_zenoh.bench.statistics import wilson_95
-from vla_zenoh.lockstep import Delays, Lockstep
-from vla_zenoh.nodes.sim import build_world
-from vla_zenoh.policy import Observation
-from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.simulation.look import VARIATIONS
-from vla_zenoh.simulation.render import Renderer
-from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.world import World
-from vla_zenoh.tasks import (
+from vla_zenoh.lab.bench.statistics import wilson_95
+from vla_zenoh.lab.lockstep import Delays, Lockstep
+from vla_zenoh.lab.tasks import (
     COLOURS,
     FAMILIES,
     LIMIT_S,
-    Episode,
     Judge,
     Order,
+    TaskEpisode,
     Verdict,
     brick,
     draw_episode,
     draw_stay,
 )
+from vla_zenoh.policy import Observation
+from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.robots.sim.node import build_world
+from vla_zenoh.simulation.appearance import VARIATIONS
+from vla_zenoh.simulation.render import Renderer
+from vla_zenoh.simulation.robot_model import RobotModel
+from vla_zenoh.simulation.world import World
 from vla_zenoh.types import Image, ObjectPoses
 
 PROFILE = "panda_bricks"
@@ -167,7 +167,7 @@ class Watched(Brick):
 class Outcome:
     """What became of an episode."""
 
-    episode: Episode
+    episode: TaskEpisode
     verdict: Verdict
     watched: Watched | None
 

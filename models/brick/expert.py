@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from vla_zenoh.tasks import DIRECTIONS
+from vla_zenoh.lab.tasks import DIRECTIONS
 
 HORIZON = 8
 DT_S = 0.1

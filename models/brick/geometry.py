@@ -10,7 +10,7 @@ from expert import foretell
 from model import Hand as Memory
 from states import Situation, draw, draw_order
 
-from vla_zenoh.tasks import COLOURS, DIRECTIONS, FAMILIES, Order
+from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, FAMILIES, Order
 
 ORDERS = 4
 """Orders per situation: what the teacher would do under each."""

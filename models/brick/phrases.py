@@ -6,8 +6,8 @@ import numpy as np
 from model import MAX_WORDS, UNKNOWN, words_of
 from states import draw_order
 
-from vla_zenoh.tasks import COLOURS, DIRECTIONS, TRAINING, Order, say
-from vla_zenoh.tasks.words import WAYS
+from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, TRAINING, Order, say
+from vla_zenoh.lab.tasks.words import WAYS
 
 KINDS = ("put", "stack", *DIRECTIONS)
 NO_TASK = len(KINDS)

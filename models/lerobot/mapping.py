@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.interop.layout import Source
+from vla_zenoh.interop.field_mapping import FieldSource
 from vla_zenoh.interop.options import read_map, read_size
-from vla_zenoh.model_options import read_json, whole_number
-from vla_zenoh.state_vector import read_state
+from vla_zenoh.policy.model_options import read_json, whole_number
+from vla_zenoh.policy.state_vector import read_state
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
@@ -90,7 +90,7 @@ def pictures(
         )
     out: dict[str, tuple[str, tuple[int, ...]]] = {}
     for feature, shape in wanted.items():
-        source = named.get(feature, Source(camera=feature.rpartition(".")[2]))
+        source = named.get(feature, FieldSource(camera=feature.rpartition(".")[2]))
         if source is None:
             if kind not in GO_WITHOUT:
                 raise WorkerError(f"map leaves out {feature}; a policy {kind!r} needs it")
@@ -126,7 +126,7 @@ def picture_size(told: str, shape: tuple[int, ...], kind: str) -> tuple[int, int
 def state_parts(
     folder: Path, kind: str, features: Mapping[str, tuple[int, ...]], told: str, joints: int
 ) -> tuple[str, ...]:
-    """Parts that make ``observation.state``, in order, see `vla_zenoh.state_vector`.
+    """Parts that make ``observation.state``, in order, see `vla_zenoh.policy.state_vector`.
 
     Args:
         folder: of the policy.

@@ -40,9 +40,8 @@ from vla_zenoh_model_lerobot.mapping import (
 )
 
 from vla_zenoh.errors import SpecError, WorkerError
+from vla_zenoh.interop.action_semantics import read_meaning
 from vla_zenoh.interop.joints import Forward, make_forward
-from vla_zenoh.interop.meaning import read_meaning
-from vla_zenoh.model_options import checkpoint_folder, one_of
 from vla_zenoh.policy import (
     ActionSteps,
     CameraSpec,
@@ -51,8 +50,9 @@ from vla_zenoh.policy import (
     ObservationSpec,
     Resize,
 )
+from vla_zenoh.policy.model_options import checkpoint_folder, one_of
+from vla_zenoh.policy.state_vector import parts_of, state_vector
 from vla_zenoh.profile import load_profile
-from vla_zenoh.state_vector import parts_of, state_vector
 
 
 class LeRobot:

@@ -8,7 +8,7 @@ import numpy as np
 from vla_zenoh_model_openvla.statistics import AXES, Range
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.interop.meaning import Meaning, read_meaning
+from vla_zenoh.interop.action_semantics import ActionSemantics, read_meaning
 from vla_zenoh.interop.presets import OSC
 
 USUAL: Mapping[str, str] = {
@@ -29,11 +29,11 @@ LONGEST_STEP_M = 0.5
 """No arm goes further in a step of its data: numbers that do are no metres."""
 
 
-def data_meaning(told: Mapping[str, str], key: str, trained: Range, chunk: int) -> Meaning:
+def data_meaning(told: Mapping[str, str], key: str, trained: Range, chunk: int) -> ActionSemantics:
     """What the numbers of the data set `key` mean, as told and as it is known.
 
     Args:
-        told: by a person, see `vla_zenoh.interop.meaning`.
+        told: by a person, see `vla_zenoh.interop.action_semantics`.
         key: of the data set.
         trained: range of its actions.
         chunk: steps in an answer of the model.

@@ -36,10 +36,10 @@ from vla_zenoh_model_openvla.statistics import AXES, Range, choose, read_range
 from vla_zenoh_model_openvla.tokens import PROMPTS, ActionBins, prompt_text, prompt_tokens
 
 from vla_zenoh.errors import SpecError, WorkerError
-from vla_zenoh.model_options import checkpoint_folder, one_of
 from vla_zenoh.policy import ActionSteps, CameraSpec, ModelSpec, Observation, ObservationSpec
+from vla_zenoh.policy.model_options import checkpoint_folder, one_of
+from vla_zenoh.policy.state_vector import parts_of, read_state, state_vector
 from vla_zenoh.profile import load_profile
-from vla_zenoh.state_vector import parts_of, read_state, state_vector
 
 Device = str
 Dtype = Literal["auto", "bfloat16", "float16", "float32"]
@@ -66,7 +66,7 @@ class OpenVLA:
         dtype: of weights; ``auto``: bfloat16 on a GPU, else float32.
         quantise: ``int8`` or ``nf4``: Llama's layers in less memory.
         chunk: OFT: steps of a chunk; known for LIBERO and Bridge.
-        state: OFT: what the numbers of the robot's state are, see `vla_zenoh.state_vector`.
+        state: OFT: what the numbers of the robot's state are, see `vla_zenoh.policy.state_vector`.
         profile: of the robot; OFT: its gripper and arm, for the state.
         meaning: of the numbers in the units of the data, see vla_zenoh/interop/meaning.py; known
             for some data sets. `horizon` is, unless told otherwise, the whole chunk.

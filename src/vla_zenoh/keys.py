@@ -25,7 +25,7 @@ _CHUNK = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
 
 class Kind(Enum):
-    """How samples on a key are to be carried (see nodes/session.py)."""
+    """How samples on a key are to be carried (see bus/session.py)."""
 
     FRAME = "frame"  # large, newest only, may be dropped
     STATE = "state"  # small, fast, newest only, may be dropped
@@ -79,7 +79,7 @@ class Keys:
         return self._at("camera", chunk(camera, "camera name"), "jpeg")
 
     def camera_fitted(self, camera: str, form: str) -> str:
-        """A JPEG as a model wants it, made where the camera is; see `vla_zenoh.observe.form_of`."""
+        """A JPEG as a model wants it, made where the camera is; see `form_of`."""
         return self._at("camera", chunk(camera, "camera name"), "fitted", chunk(form, "form"))
 
     @property
@@ -334,3 +334,12 @@ def _covers(wide: list[str], narrow: list[str]) -> bool:
     if not narrow or narrow[0] == "**":
         return False
     return wide[0] in ("*", narrow[0]) and _covers(wide[1:], narrow[1:])
+
+
+NOT_SEEN = "is not there (a liveliness token on the key holding/NAME)"
+"""Said of the one who is to hold the arm active."""
+
+
+def worker_node(worker: str) -> str:
+    """Node name of a worker."""
+    return f"worker-{worker}"

@@ -14,13 +14,13 @@ from chain import command_line
 from peer_rig import KINDS, free_port, reachable
 
 from vla_zenoh import resources
-from vla_zenoh.check import fit, plausible
-from vla_zenoh.check.examine import Examination
-from vla_zenoh.check.examples import chart, looks
-from vla_zenoh.check.finding import MEANINGS
-from vla_zenoh.check.report import Report
-from vla_zenoh.loader import find_model, make_policy
-from vla_zenoh.nodes.check_bench import CheckBench
+from vla_zenoh.control import chunk_plausibility as plausible
+from vla_zenoh.control import spec_fit as fit
+from vla_zenoh.control.finding import MEANINGS
+from vla_zenoh.lab.check.examine import Examination
+from vla_zenoh.lab.check.examples import chart, looks
+from vla_zenoh.lab.check.own_process import CheckBench
+from vla_zenoh.lab.check.report import Report
 from vla_zenoh.policy import (
     ActionSpec,
     CameraSpec,
@@ -29,6 +29,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
     check_steps,
 )
+from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import JointLimits, Limits, load_profile, override
 
 BROKEN = Path(__file__).with_name("broken_worker.py")

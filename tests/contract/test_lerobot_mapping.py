@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.loader import find_model, make_policy
 from vla_zenoh.policy import Policy
+from vla_zenoh.policy.loader import find_model, make_policy
 
 ATOL = 1e-12
 CONFIG: dict[str, Any] = {

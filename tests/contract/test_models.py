@@ -14,10 +14,9 @@ import pytest
 
 from vla_zenoh import resources
 from vla_zenoh.control.actions import step_pose
-from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
-from vla_zenoh.control.so3 import Pose
+from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.errors import SpecError, WorkerError
-from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -26,6 +25,7 @@ from vla_zenoh.policy import (
     check_steps,
     example_observation,
 )
+from vla_zenoh.policy.loader import find_model, make_policy
 
 MODELS = resources.names("models")
 ELSEWHERE = {"groot", "lerobot", "openpi", "openvla", "openvla_rest", "origami"}
@@ -79,7 +79,7 @@ def test_its_header_says_what_it_needs(name: str) -> None:
 @pytest.mark.parametrize("name", MODELS)
 def test_importing_it_loads_nothing_heavy(name: str) -> None:
     code = (
-        "import json, sys; from vla_zenoh.loader import find_model, import_model\n"
+        "import json, sys; from vla_zenoh.policy.loader import find_model, import_model\n"
         f"import_model(find_model({name!r}))\n"
         "print(json.dumps(sorted(sys.modules)))"
     )

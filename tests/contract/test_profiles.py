@@ -13,7 +13,7 @@ import zenoh
 from pydantic import BaseModel, ValidationError
 
 from vla_zenoh import resources
-from vla_zenoh.nodes.session import config
+from vla_zenoh.bus.session import config
 from vla_zenoh.profile import Profile, advice, load_profile, to_yaml
 
 SHIPPED = sorted(path.stem for path in resources.shipped("profiles").glob("*.y*ml"))

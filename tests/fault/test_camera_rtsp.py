@@ -13,9 +13,9 @@ from camera_rig import camera_rig, until, write_video
 from rtsp_server import RtspServer
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.camera_sources.opencv import prepare
-from vla_zenoh.nodes.camera_sources.rtsp import RtspSource
-from vla_zenoh.nodes.camera_sources.source import STALL_S
+from vla_zenoh.nodes.camera.opencv import prepare
+from vla_zenoh.nodes.camera.rtsp import RtspSource
+from vla_zenoh.nodes.camera.source import STALL_S
 from vla_zenoh.profile.schema import CameraProfile
 
 RATE_HZ, LENGTH_S = 25, 2.0

@@ -17,12 +17,12 @@ import pytest
 from camera_rig import until
 from chain import MOVING_M_S, READY_PATIENCE_S, Recorder, write_profile
 
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import SessionError
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.orphan import PARENT_VARIABLE
-from vla_zenoh.nodes.session import open_session
-from vla_zenoh.nodes.supervisor import GIVE_UP_AFTER, NodeCommand, Supervisor
 from vla_zenoh.profile import load_profile
+from vla_zenoh.runtime.parent_watch import PARENT_VARIABLE
+from vla_zenoh.runtime.supervisor import GIVE_UP_AFTER, NodeCommand, Supervisor
 
 END_S = 3.0
 BUSY_S = 1.0

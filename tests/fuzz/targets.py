@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import typer
 
+from vla_zenoh.bus.clock_sync import decode_stamps
 from vla_zenoh.cli import decode as cli_decode
 from vla_zenoh.cli import keys as cli_keys
 from vla_zenoh.cli import net as cli_net
@@ -29,22 +30,21 @@ from vla_zenoh.cli.options import model_options, number_list
 from vla_zenoh.cli.output import Screen, plain_types
 from vla_zenoh.codec import header, image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
-from vla_zenoh.evaluation.csv_file import evaluate_csv
-from vla_zenoh.evaluation.run_file import evaluate_run
 from vla_zenoh.interop import groot, npy, openpi, openvla_rest, origami
 from vla_zenoh.interop.ros2 import attachment, table
 from vla_zenoh.interop.ros2.definitions import parse
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Keys
-from vla_zenoh.loader import find_model, make_policy
-from vla_zenoh.motions import parse_hard
-from vla_zenoh.nodes.offsets import decode_stamps
-from vla_zenoh.nodes.seen import Sight
+from vla_zenoh.lab.evaluation.csv_file import evaluate_csv
+from vla_zenoh.lab.evaluation.run_file import evaluate_run
+from vla_zenoh.lab.recording import cdr
+from vla_zenoh.lab.recording.kinds import RECORDS
+from vla_zenoh.lab.tasks.understand import understand
+from vla_zenoh.nodes.worker.inference_debug import InferenceView
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
+from vla_zenoh.policy.loader import find_model, make_policy
+from vla_zenoh.policy.scripted_motions import parse_hard
 from vla_zenoh.profile import load_profile
-from vla_zenoh.recording import cdr
-from vla_zenoh.recording.kinds import RECORDS
-from vla_zenoh.tasks.understand import understand
 from vla_zenoh.types import Event, Header, NodeStatus, Seen
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -148,7 +148,7 @@ def _event_told(data: bytes) -> None:
 
 
 def _sight(data: bytes) -> None:
-    sight = Sight(records.decode(Seen, data), {"front": data})
+    sight = InferenceView(records.decode(Seen, data), {"front": data})
     assert _display(cli_seen.table({"w": sight})) < MAX_SHOWN
 
 
@@ -249,8 +249,8 @@ def _bag_seed(kind: type) -> list[bytes]:
 
 def _recording() -> list[bytes]:
     from vla_zenoh.keys import Keys
-    from vla_zenoh.recording.sample import MSGPACK, TEXT, Sample
-    from vla_zenoh.recording.writer import RunWriter
+    from vla_zenoh.lab.recording.sample import MSGPACK, TEXT, Sample
+    from vla_zenoh.lab.recording.writer import RunWriter
     from vla_zenoh.types import Header, PoseState
 
     keys, at_ns = Keys("panda"), 10**18

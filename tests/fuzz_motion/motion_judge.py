@@ -12,9 +12,9 @@ from motion_case import Case, kinematics
 from motion_rig import HAS_SPEED, Tick, Trace
 from numpy.typing import NDArray
 
-from vla_zenoh.control.joint_reference import joint_motion_limits
 from vla_zenoh.control.smoothing import ROTATION_BOX, motion_limits
-from vla_zenoh.control.stream import BRAKE_MARGIN
+from vla_zenoh.guard.command_stream import BRAKE_MARGIN
+from vla_zenoh.guard.joint_guard import joint_motion_limits
 
 Array = NDArray[np.float64]
 

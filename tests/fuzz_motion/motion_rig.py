@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from motion_case import WORKER, Actions, Case, base_profile, kinematics
 
-from vla_zenoh.control.arm import make_shadow
-from vla_zenoh.control.arm_guard import Measured, make_arm_guard
 from vla_zenoh.control.commander import Commander, Inputs, Setting
-from vla_zenoh.control.preflight import Surroundings
-from vla_zenoh.control.so3 import Pose, exp3, log3, quat_from_rotation
+from vla_zenoh.control.preflight import PeerSnapshot
+from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.guard.arm_guard import Measured, make_arm_guard
+from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation
 from vla_zenoh.types import (
     ActionChunk,
     GripperState,
@@ -128,7 +128,7 @@ class Rig:
         self._wire: list[tuple[int, int, Stamped[Any]]] = []
         self._sent = self._held_until_ns = 0
         beside = frozenset({"sim", "camera", f"worker-{WORKER}"})
-        self._around: Surroundings | None = Surroundings(
+        self._around: PeerSnapshot | None = PeerSnapshot(
             alive=beside,
             robot_node="sim",
             specs={WORKER: case.spec},

@@ -24,7 +24,7 @@ from motion_judge import (
 )
 
 from vla_zenoh.control.smoothing import ROTATION_BOX, Motion, MotionLimits, Shares, Smoother
-from vla_zenoh.control.so3 import Pose, exp3
+from vla_zenoh.kinematics.so3 import Pose, exp3
 
 SHIPPED = MotionLimits((0.5, 2.0, 20.0), (1.5, 6.0, 60.0))
 LIMITS = (

@@ -22,7 +22,7 @@ from motion_judge import (
 from motion_rig import Rig, Trace
 from ruckig import ControlInterface, InputParameter, Ruckig, Trajectory
 
-from vla_zenoh.control.so3 import exp3, quat_from_rotation
+from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
 
 STATES, PLACES = 300, 400
 LIMITS = np.array([0.5, 2.0, 20.0])

@@ -8,8 +8,8 @@ import subprocess
 import pytest
 from peer_rig import free_port
 
-from vla_zenoh.loader import find_model
-from vla_zenoh.nodes.environment import environment_command
+from vla_zenoh.policy.loader import find_model
+from vla_zenoh.runtime.environments import environment_command
 
 pytestmark = [pytest.mark.models, pytest.mark.timeout(300)]
 
@@ -18,7 +18,7 @@ MADE_S = 280.0
 CODE = """
 import importlib.util, json, sys
 from vla_zenoh.errors import PeerError
-from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.policy import example_observation
 
 policy = make_policy(find_model(sys.argv[1]), json.loads(sys.argv[2]))

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from chain import Chain, command_line, running_chain
 
-from vla_zenoh.control.names import worker_node
-from vla_zenoh.loader import find_model
-from vla_zenoh.nodes.environment import environment_command
+from vla_zenoh.keys import worker_node
+from vla_zenoh.policy.loader import find_model
+from vla_zenoh.runtime.environments import environment_command
 
 pytestmark = [pytest.mark.models, pytest.mark.timeout(300)]
 

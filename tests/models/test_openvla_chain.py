@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,9 +12,9 @@ import numpy as np
 import pytest
 from chain import Chain, command_line, running_chain
 
-from vla_zenoh.control.names import worker_node
-from vla_zenoh.loader import find_model
-from vla_zenoh.nodes.environment import environment_command
+from vla_zenoh.keys import worker_node
+from vla_zenoh.policy.loader import find_model
+from vla_zenoh.runtime.environments import environment_command
 
 pytestmark = [pytest.mark.models, pytest.mark.timeout(300)]
 
@@ -78,8 +79,9 @@ def test_it_keeps_its_contract(checkpoint: Path) -> None:
 def test_the_stages_of_an_action_are_measured(checkpoint: Path, tmp_path: Path) -> None:
     file = tmp_path / "stages.json"
     options = [f"--set=checkpoint={checkpoint}", *(f"--set={option}" for option in OPTIONS)]
-    done = command_line(
-        "bench", "openvla", *options, "--rounds", "3", "--json", str(file), timeout_s=START_S
+    words = ["-m", "benchmarks", "openvla", *options, "--rounds", "3", "--json", str(file)]
+    done = subprocess.run(
+        [sys.executable, *words], capture_output=True, text=True, check=False, timeout=START_S
     )
     assert done.returncode == 0, done.stderr
     report = json.loads(file.read_text())

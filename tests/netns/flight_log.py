@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.control.smoothing import Smoother, motion_limits
-from vla_zenoh.control.so3 import Pose
+from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 
 FloatArray = NDArray[np.float64]

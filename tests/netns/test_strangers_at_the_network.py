@@ -19,7 +19,7 @@ from netns.attack import MARK, MOTION, RATE
 from netns.lab import needs_namespaces
 from netns.site import HERE, Site, secured_site
 
-from vla_zenoh.nodes.session import config
+from vla_zenoh.bus.session import config
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.security.identity import Identity, Role
 from vla_zenoh.security.store import Store

@@ -11,11 +11,11 @@ import threading
 
 from chain import READY_PATIENCE_S
 
-from vla_zenoh.demo.segments import tour
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.demo import DemoRun
-from vla_zenoh.nodes.listener import Listener
-from vla_zenoh.nodes.session import open_session
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.lab.demo.runner import DemoRun
+from vla_zenoh.lab.demo.segments import tour
+from vla_zenoh.lab.recording.stream_listener import StreamListener
 from vla_zenoh.profile import load_profile
 
 RATE_HZ = 10.0
@@ -25,7 +25,7 @@ def main(name: str) -> None:
     profile = load_profile(name)
     with open_session(profile.session, wait_s=READY_PATIENCE_S) as session:
         client = Client(profile, session).follow()
-        listener = Listener(session, profile.keys, profile.task.worker, keep=4096)
+        listener = StreamListener(session, profile.keys, profile.task.worker, keep=4096)
         run = DemoRun(client, listener, threading.Event(), lambda: None, lambda *_: None)
         try:
             result = run.run(tour(), RATE_HZ, None)

@@ -17,11 +17,10 @@ import zenoh
 from camera_rig import until
 from chain import READY_PATIENCE_S, Recorder
 
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
-from vla_zenoh.control.names import worker_node
-from vla_zenoh.keys import last
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.session import open_session
+from vla_zenoh.keys import last, worker_node
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Task
 

@@ -22,12 +22,10 @@ from typer.main import get_command
 
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import PeerError
-from vla_zenoh.interop.meaning import MEANING, read_meaning
+from vla_zenoh.interop.action_semantics import MEANING, read_meaning
 from vla_zenoh.interop.options import DEFAULTS, read_map
 from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, ORIGAMI
-from vla_zenoh.loader import find_model, make_policy
-from vla_zenoh.lockstep import Lockstep
-from vla_zenoh.nodes.sim import build_world
+from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.policy import (
     ActionSpec,
     CameraSpec,
@@ -35,9 +33,11 @@ from vla_zenoh.policy import (
     ObservationSpec,
     example_observation,
 )
+from vla_zenoh.policy.loader import find_model, make_policy
+from vla_zenoh.policy.state_vector import COORDINATES, PARTS, read_parts
 from vla_zenoh.profile import load_profile
 from vla_zenoh.profile.fit import workers_of
-from vla_zenoh.state_vector import COORDINATES, PARTS, read_parts
+from vla_zenoh.robots.sim.node import build_world
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "models.md").read_text("utf-8")

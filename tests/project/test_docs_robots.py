@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from vla_zenoh.cli.profile import profile_app
-from vla_zenoh.control.arm import make_kinematics, make_shadow
+from vla_zenoh.control.profile_arm import make_kinematics, make_shadow
 from vla_zenoh.interop.ros2.gripper_actions import position
-from vla_zenoh.loader import make_robot
+from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import load_profile
 from vla_zenoh.resources import robot_urdf
 from vla_zenoh.types import JointCommand

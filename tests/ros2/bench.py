@@ -39,10 +39,10 @@ from rig import Robot
 from ros_messages import CartesianImpedanceGoal, Header, Image, Pose, PoseStamped, Time
 from ros_node import Listener, RosNode, free_domain
 
-from vla_zenoh.bench.picture import noisy_picture
+from benchmarks.picture import noisy_picture
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
-from vla_zenoh.nodes.bench.process import cpu_s
+from vla_zenoh.lab.bench.cpu_time import cpu_s
 from vla_zenoh.types import PoseCommand
 
 FRONT = CAMERAS["front"]

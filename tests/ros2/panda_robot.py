@@ -48,11 +48,12 @@ from ros_messages import (
 )
 from ros_node import RosNode
 
-from vla_zenoh.control.impedance import ImpedanceGains, Reference
 from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.world import STEP_NS, World
+from vla_zenoh.types.references import PoseReference
 
 JOINT_STATES = "/joint_states"
 CURRENT_POSE = "/franka_robot_state_broadcaster/current_pose"
@@ -87,7 +88,7 @@ class Follower:
         quat = np.array([q.x, q.y, q.z, q.w])
         self._goal_rotation = pin.Quaternion(quat / np.linalg.norm(quat)).toRotationMatrix()
 
-    def tick(self, dt_s: float) -> Reference:
+    def tick(self, dt_s: float) -> PoseReference:
         """One step on."""
         w = FOLLOW_1_S
         away = np.concatenate(
@@ -98,7 +99,7 @@ class Follower:
         self._twist = self._twist + acceleration * dt_s
         self._position_m = self._position_m + self._twist[:3] * dt_s
         self._rotation = pin.exp3(self._twist[3:] * dt_s) @ self._rotation
-        return Reference(self._position_m, self._rotation, self._twist, acceleration)
+        return PoseReference(self._position_m, self._rotation, self._twist, acceleration)
 
 
 class PandaRobot:

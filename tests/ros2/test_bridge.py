@@ -13,11 +13,11 @@ import pytest
 import zenoh
 from camera_rig import free_endpoint, until
 
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.interop.ros2 import table
-from vla_zenoh.interop.ros2.keys import Endpoint, Role, Ros2Dds
+from vla_zenoh.interop.ros2.keys import Endpoint, EntityRole, Ros2Dds
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.qos import SENSOR
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import SessionProfile
 from vla_zenoh.types import PoseCommand
 
@@ -86,7 +86,7 @@ def test_pictures_of_a_dds_camera_are_read_to_the_pixel(border: Border) -> None:
     # The bridge reads DDS as the first subscriber that is announced wants it: a reliable one would
     # get nothing from a camera that is not.
     kind = "sensor_msgs/msg/Image"
-    endpoint = Endpoint(Role.SUBSCRIBER, "/camera/color/image_raw", kind, SENSOR)
+    endpoint = Endpoint(EntityRole.SUBSCRIBER, "/camera/color/image_raw", kind, SENSOR)
     heard, subscriber = border.hear(endpoint)
     tokens = border.announce(endpoint)
     writer = border.node.publisher(endpoint.name, ros.Image, reliable=False, depth=1)
@@ -101,7 +101,7 @@ def test_pictures_of_a_dds_camera_are_read_to_the_pixel(border: Border) -> None:
 
 
 def test_joint_states_of_a_dds_robot_are_read_to_the_bit(border: Border) -> None:
-    endpoint = Endpoint(Role.SUBSCRIBER, "/joint_states", "sensor_msgs/msg/JointState")
+    endpoint = Endpoint(EntityRole.SUBSCRIBER, "/joint_states", "sensor_msgs/msg/JointState")
     heard, subscriber = border.hear(endpoint)
     writer = border.node.publisher(endpoint.name, ros.JointState)
     position = [0.1 * k for k in range(7)]
@@ -119,7 +119,7 @@ def test_joint_states_of_a_dds_robot_are_read_to_the_bit(border: Border) -> None
 @pytest.mark.parametrize("kind", ["CartesianImpedanceGoal", "PoseStamped"])
 def test_a_pose_command_arrives_in_dds_to_the_bit(border: Border, kind: str) -> None:
     package = "multi_mode_control_msgs" if kind == "CartesianImpedanceGoal" else "geometry_msgs"
-    endpoint = Endpoint(Role.PUBLISHER, f"/desired/{kind.lower()}", f"{package}/msg/{kind}")
+    endpoint = Endpoint(EntityRole.PUBLISHER, f"/desired/{kind.lower()}", f"{package}/msg/{kind}")
     tokens = border.announce(endpoint)
     reader = border.node.subscription(endpoint.name, getattr(ros, kind))
     position, quat = np.array([0.4, -0.1, 1 / 3]), np.array([1.0, 0.0, 0.0, 0.0])
@@ -152,7 +152,7 @@ def test_a_pose_command_arrives_in_dds_to_the_bit(border: Border, kind: str) -> 
 
 
 def test_a_dds_client_finds_and_calls_a_service_that_we_announce(border: Border) -> None:
-    endpoint = Endpoint(Role.SERVER, "/vla_test/set_active", "std_srvs/srv/SetBool")
+    endpoint = Endpoint(EntityRole.SERVER, "/vla_test/set_active", "std_srvs/srv/SetBool")
     asked: list[bool] = []
 
     def answer(query: zenoh.Query) -> None:

@@ -25,16 +25,16 @@ from camera_rig import until
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 from ros2_rig import write_profile
 
+from vla_zenoh.bus.buffers import CallbackRing
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.interop.ros2 import table
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.topics import image, joint_state
-from vla_zenoh.nodes.ros2.link import Link, Request
-from vla_zenoh.nodes.ros2.node import Ros2Node
-from vla_zenoh.nodes.session import open_session
-from vla_zenoh.nodes.slots import Inbox
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.ros2 import Ros2Profile
+from vla_zenoh.robots.ros2.node import Ros2Node
+from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
 from vla_zenoh.types import PoseState
 
 pytestmark = [pytest.mark.ros2, pytest.mark.slow]
@@ -163,11 +163,11 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Profile, Sdk
 
 
 @pytest.fixture
-def link(lab: tuple[Profile, Sdk]) -> Iterator[Link]:
+def link(lab: tuple[Profile, Sdk]) -> Iterator[RosGraph]:
     profile, sdk = lab
     sdk.forget()
     with open_session(profile.session) as session:
-        link = Link(session, Ros2Profile(bridge="rmw_zenoh"), Messages("jazzy"), "vla_panda")
+        link = RosGraph(session, Ros2Profile(bridge="rmw_zenoh"), Messages("jazzy"), "vla_panda")
         yield link
         link.close()
 
@@ -198,7 +198,7 @@ def holds(found: Any, fields: dict[str, Any]) -> bool:
 
 @pytest.mark.parametrize("kind", FIELDS)
 def test_what_we_write_is_read_by_the_other_side(
-    lab: tuple[Profile, Sdk], link: Link, kind: str
+    lab: tuple[Profile, Sdk], link: RosGraph, kind: str
 ) -> None:
     _, sdk = lab
     topic = f"/ours/{kind.rsplit('/', 1)[1].lower()}"
@@ -226,11 +226,11 @@ def test_what_we_write_is_read_by_the_other_side(
 
 @pytest.mark.parametrize("kind", FIELDS)
 def test_what_the_other_side_writes_is_read_by_us(
-    lab: tuple[Profile, Sdk], link: Link, kind: str
+    lab: tuple[Profile, Sdk], link: RosGraph, kind: str
 ) -> None:
     _, sdk = lab
     topic = f"/theirs/{kind.rsplit('/', 1)[1].lower()}"
-    inbox = link.read(topic, kind, Inbox(8))
+    inbox = link.read(topic, kind, CallbackRing(8))
     sdk.do("advertise", name=topic, kind=kind)
     announced = sdk.wait("hash")
     assert announced is not None, sdk.errors[-5:]
@@ -249,7 +249,7 @@ def test_what_the_other_side_writes_is_read_by_us(
         table.read(JAZZY, kind, sample.payload.to_bytes())
 
 
-def test_our_service_answers_the_other_side(lab: tuple[Profile, Sdk], link: Link) -> None:
+def test_our_service_answers_the_other_side(lab: tuple[Profile, Sdk], link: RosGraph) -> None:
     _, sdk = lab
     asked: list[Any] = []
 
@@ -268,7 +268,7 @@ def test_our_service_answers_the_other_side(lab: tuple[Profile, Sdk], link: Link
     assert asked == [True]
 
 
-def test_the_other_sides_service_answers_us(lab: tuple[Profile, Sdk], link: Link) -> None:
+def test_the_other_sides_service_answers_us(lab: tuple[Profile, Sdk], link: RosGraph) -> None:
     _, sdk = lab
     sdk.do("serve", name="/theirs/set_active", kind=SET_BOOL)
     announced = sdk.wait("hash")

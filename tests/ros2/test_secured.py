@@ -23,7 +23,7 @@ import zenoh
 from camera_rig import free_endpoint
 from chain import running_chain
 
-from vla_zenoh.interop.ros2.keys import Endpoint, Role, Ros2Dds
+from vla_zenoh.interop.ros2.keys import Endpoint, EntityRole, Ros2Dds
 
 if TYPE_CHECKING:
     from rig import Lab
@@ -193,7 +193,7 @@ def heard_by(secured: SecuredLab, host: str, node: str) -> tuple[bool, bool]:
     with zenoh.open(settings(secured, host, node)) as session:
         wire = Ros2Dds(str(session.zid()), None)
         mine = session.liveliness().declare_token(wire.node_token())
-        end = Endpoint(Role.SUBSCRIBER, "/joint_states", "sensor_msgs/msg/JointState")
+        end = Endpoint(EntityRole.SUBSCRIBER, "/joint_states", "sensor_msgs/msg/JointState")
         handler = zenoh.handlers.Callback(states.append, indirect=False)
         subscriber = session.declare_subscriber(wire.key(end), handler)
         give_up = time.monotonic() + LOOK_S

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.codec import message
-from vla_zenoh.control.arm import make_shadow
-from vla_zenoh.control.reach import Shadow
-from vla_zenoh.control.stream import BRAKE_MARGIN
-from vla_zenoh.lockstep import Lockstep, Message, Tamper
-from vla_zenoh.nodes.sim import build_world
+from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.guard.command_stream import BRAKE_MARGIN
+from vla_zenoh.lab.lockstep import Lockstep, Message, Tamper
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -28,6 +27,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.simulation.world import World
 from vla_zenoh.types import ActionChunk, FloatArray, PoseCommand
 
@@ -84,7 +84,7 @@ def _world() -> World:
 
 
 @cache
-def _shadow() -> Shadow:
+def _shadow() -> ReachabilityFilter:
     return make_shadow(shipped())
 
 

@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pinocchio as pin
 
-from vla_zenoh.control.impedance import ImpedanceGains, Reference
+from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.world import STEP_S, World
+from vla_zenoh.types.references import PoseReference
 
 SCENE = "table"
 # TCP at x 0.43, y 0, z 0.16 m, tool straight down; see test_world_home.py.
@@ -30,12 +31,12 @@ def make_world(
     )
 
 
-def still(reference: Reference) -> Reference:
+def still(reference: PoseReference) -> PoseReference:
     """The same pose, at rest."""
     return reference._replace(twist=np.zeros(6), acceleration=np.zeros(6))
 
 
-def line(start: Reference, by_m: Sequence[float], duration_s: float) -> Iterator[Reference]:
+def line(start: PoseReference, by_m: Sequence[float], duration_s: float) -> Iterator[PoseReference]:
     """A straight move with a minimum-jerk profile, one reference a tick; ends at rest."""
     way, ticks = np.array(by_m, float), round(duration_s / STEP_S)
     for tick in range(1, ticks + 1):
@@ -44,7 +45,7 @@ def line(start: Reference, by_m: Sequence[float], duration_s: float) -> Iterator
         speed = (30 * s**2 - 60 * s**3 + 30 * s**4) / duration_s
         acceleration = (60 * s - 180 * s**2 + 120 * s**3) / duration_s**2
         still_turning = np.zeros(3)
-        yield Reference(
+        yield PoseReference(
             start.position_m + along * way,
             start.rotation,
             np.concatenate([speed * way, still_turning]),
@@ -53,8 +54,8 @@ def line(start: Reference, by_m: Sequence[float], duration_s: float) -> Iterator
 
 
 def circle(
-    start: Reference, radius_m: float, swing_rad: float, period_s: float, rounds: float
-) -> Iterator[Reference]:
+    start: PoseReference, radius_m: float, swing_rad: float, period_s: float, rounds: float
+) -> Iterator[PoseReference]:
     """Rounds in a tilted plane while the tool swings about a slanted axis, from rest to rest.
 
     The phase follows a minimum-jerk profile, so nothing jumps at either end.
@@ -72,7 +73,7 @@ def circle(
         first = radius_m * np.array([-n, c, 0.5 * n])
         second = radius_m * np.array([-c, -n, 0.5 * c])
         turn, turn_first, turn_second = swing_rad * (1 - c), swing_rad * n, swing_rad * c
-        yield Reference(
+        yield PoseReference(
             start.position_m + at,
             pin.exp3(axis * turn) @ start.rotation,
             np.concatenate([first * rate, axis * turn_first * rate]),
@@ -85,7 +86,7 @@ def circle(
         )
 
 
-def follow(world: World, references: Iterator[Reference]) -> tuple[Reference, float, float]:
+def follow(world: World, references: Iterator[PoseReference]) -> tuple[PoseReference, float, float]:
     """Run; give the last reference and the largest errors in metres and radians."""
     reference, worst_m, worst_rad = world.hold_reference(), 0.0, 0.0
     for reference in references:
@@ -97,7 +98,7 @@ def follow(world: World, references: Iterator[Reference]) -> tuple[Reference, fl
     return still(reference), worst_m, worst_rad
 
 
-def wait(world: World, reference: Reference, duration_s: float) -> None:
+def wait(world: World, reference: PoseReference, duration_s: float) -> None:
     """Hold `reference`."""
     for _ in range(round(duration_s / STEP_S)):
         world.tick(reference)

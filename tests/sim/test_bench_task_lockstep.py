@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from vla_zenoh.bench.task import BASELINES, Ended, Plan
-from vla_zenoh.cli.bench_task import _with_bricks
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.bench import task_lockstep
-from vla_zenoh.nodes.bench.task_lockstep import run_in_lockstep
+from vla_zenoh.lab.bench import task_lockstep
+from vla_zenoh.lab.bench.task import BASELINES, Ended, TaskPlan
+from vla_zenoh.lab.bench.task_lockstep import run_in_lockstep
+from vla_zenoh.lab.cli.bench_task import _with_bricks
 from vla_zenoh.profile import load_profile, override
 
 SEED = 1_000_000
@@ -37,7 +37,7 @@ class Nod:
 
 
 def outcomes(
-    plan: Plan, path: str = "", options: dict[str, str] | None = None, processes: int = 1
+    plan: TaskPlan, path: str = "", options: dict[str, str] | None = None, processes: int = 1
 ) -> list[Ended]:
     profile = _with_bricks(load_profile("panda_sim"), plan.worker, [], path)
     small = {
@@ -53,7 +53,7 @@ def outcomes(
 @pytest.mark.slow
 def test_a_model_of_ones_own_is_run_with_its_options(tmp_path: Path) -> None:
     (tmp_path / "nod.py").write_text(MODEL)
-    plan = Plan("nod", 1, SEED, family="stay", limit_s=LIMIT_S)
+    plan = TaskPlan("nod", 1, SEED, family="stay", limit_s=LIMIT_S)
     (still,) = outcomes(plan, str(tmp_path / "nod.py"))
     (moved,) = outcomes(plan, str(tmp_path / "nod.py"), {"step_m": "0.02"})
     assert (still.success, moved.failure) == (True, "moved")
@@ -71,7 +71,7 @@ def test_why_a_model_cannot_be_made_is_told_by_the_first_that_asks(
     tmp_path: Path, text: str, options: dict[str, str], told: str
 ) -> None:
     (tmp_path / "nod.py").write_text(text)
-    plan = Plan("nod", 1, SEED)
+    plan = TaskPlan("nod", 1, SEED)
     profile = _with_bricks(load_profile("panda_sim"), "nod", [], str(tmp_path / "nod.py"))
     task_lockstep._begin(profile, plan, options, None, None)
     with pytest.raises(NodeError, match=told):
@@ -82,7 +82,7 @@ def test_why_a_model_cannot_be_made_is_told_by_the_first_that_asks(
 def test_a_model_that_cannot_be_made_ends_the_bench_with_its_reason(tmp_path: Path) -> None:
     (tmp_path / "nod.py").write_text(MODEL)
     with pytest.raises(NodeError, match="options it takes: step_m"):
-        outcomes(Plan("nod", 40, SEED), str(tmp_path / "nod.py"), {"colour": "red"}, 2)
+        outcomes(TaskPlan("nod", 40, SEED), str(tmp_path / "nod.py"), {"colour": "red"}, 2)
 
 
 @pytest.mark.slow
@@ -91,34 +91,34 @@ def test_a_model_that_raises_fails_its_episode_and_its_words_are_told(tmp_path: 
         "return ActionSteps", "raise KeyError('front')\n        return ActionSteps"
     )
     (tmp_path / "nod.py").write_text(text)
-    ends = outcomes(Plan("nod", 2, SEED, limit_s=LIMIT_S), str(tmp_path / "nod.py"))
+    ends = outcomes(TaskPlan("nod", 2, SEED, limit_s=LIMIT_S), str(tmp_path / "nod.py"))
     assert [end.failure for end in ends] == ["not_obeyed"] * 2
     assert ends[0].why == "the model failed: KeyError: 'front'"
 
 
 @pytest.mark.slow
 def test_who_stands_still_does_no_task() -> None:
-    (end,) = outcomes(Plan("hold", 1, SEED, family="put", limit_s=LIMIT_S))
+    (end,) = outcomes(TaskPlan("hold", 1, SEED, family="put", limit_s=LIMIT_S))
     assert (end.success, end.failure) == (False, "not_moved")
     assert end.pictures is not None
 
 
 @pytest.mark.slow
 def test_who_moves_when_nothing_is_asked_fails() -> None:
-    (end,) = outcomes(Plan("scripted", 1, SEED, family="stay", limit_s=LIMIT_S))
+    (end,) = outcomes(TaskPlan("scripted", 1, SEED, family="stay", limit_s=LIMIT_S))
     assert (end.success, end.failure) == (False, "moved")
 
 
 @pytest.mark.slow
 def test_who_stands_still_when_nothing_is_asked_succeeds() -> None:
-    (end,) = outcomes(Plan("hold", 1, SEED, family="stay", limit_s=LIMIT_S))
+    (end,) = outcomes(TaskPlan("hold", 1, SEED, family="stay", limit_s=LIMIT_S))
     assert end.success
     assert end.pictures is None
 
 
 @pytest.mark.slow
 def test_a_worker_that_refuses_the_prompt_is_not_obeyed_and_its_reason_is_told() -> None:
-    (end,) = outcomes(Plan("scripted", 1, SEED, prompt="fetch", limit_s=LIMIT_S))
+    (end,) = outcomes(TaskPlan("scripted", 1, SEED, prompt="fetch", limit_s=LIMIT_S))
     assert end.failure == "not_obeyed"
     assert "does not know the prompt 'fetch'" in end.why
 
@@ -126,4 +126,4 @@ def test_a_worker_that_refuses_the_prompt_is_not_obeyed_and_its_reason_is_told()
 @pytest.mark.slow
 @pytest.mark.parametrize("model", BASELINES)
 def test_baselines_reach_nothing(model: str) -> None:
-    assert not any(end.success for end in outcomes(Plan(model, 12, SEED)))
+    assert not any(end.success for end in outcomes(TaskPlan(model, 12, SEED)))

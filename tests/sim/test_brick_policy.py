@@ -15,25 +15,25 @@ import pytest
 
 from vla_zenoh import resources
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.loader import find_model, make_policy
-from vla_zenoh.lockstep import Lockstep
-from vla_zenoh.nodes.sim import build_world
-from vla_zenoh.policy import ActionSteps, Policy, check_steps, example_observation
-from vla_zenoh.profile import load_profile
-from vla_zenoh.simulation.render import Renderer
-from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.world import World
-from vla_zenoh.tasks import (
+from vla_zenoh.lab.lockstep import Lockstep
+from vla_zenoh.lab.tasks import (
     HELD_OUT,
     NONSENSE,
     TRAINING,
-    Episode,
     Judge,
     Order,
+    TaskEpisode,
     Verdict,
     draw_episode,
     say,
 )
+from vla_zenoh.policy import ActionSteps, Policy, check_steps, example_observation
+from vla_zenoh.policy.loader import find_model, make_policy
+from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.sim.node import build_world
+from vla_zenoh.simulation.render import Renderer
+from vla_zenoh.simulation.robot_model import RobotModel
+from vla_zenoh.simulation.world import World
 from vla_zenoh.types import Image, ObjectPoses
 
 FOLDER = resources.find("models", "brick")
@@ -77,7 +77,7 @@ def policy() -> Policy:
     return made
 
 
-def carry_out(stage: Stage, episode: Episode, limit_s: float = LIMIT_S) -> Verdict:
+def carry_out(stage: Stage, episode: TaskEpisode, limit_s: float = LIMIT_S) -> Verdict:
     """Reset, ask, and look on until it is decided."""
     stage.world.reset(episode.seed)
     loop = Lockstep(
@@ -100,7 +100,7 @@ def carry_out(stage: Stage, episode: Episode, limit_s: float = LIMIT_S) -> Verdi
     return judge.end()
 
 
-def drawn(stage: Stage, seed: int, family: str, target: str | None = None) -> Episode:
+def drawn(stage: Stage, seed: int, family: str, target: str | None = None) -> TaskEpisode:
     stage.world.reset(seed)
     return draw_episode(seed, stage.objects(), family=family, target=target)
 
@@ -122,7 +122,7 @@ def test_another_prompt_in_the_same_scene_fetches_another_brick(stage: Stage) ->
 def test_a_prompt_without_sense_makes_it_stay(stage: Stage) -> None:
     stage.world.reset(SEED)
     before = stage.objects().position_m
-    verdict = carry_out(stage, Episode(SEED, Order("stay"), NONSENSE[6]), STAY_S)
+    verdict = carry_out(stage, TaskEpisode(SEED, Order("stay"), NONSENSE[6]), STAY_S)
     assert verdict.success
     np.testing.assert_allclose(stage.objects().position_m, before, atol=STILL_M)
 

@@ -12,10 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from motions import HOME_RAD
 
-from vla_zenoh.control.impedance import ImpedanceGains
 from vla_zenoh.errors import ResourceError
-from vla_zenoh.simulation.backend import Backend, why_not
-from vla_zenoh.simulation.look import (
+from vla_zenoh.lab.tasks import COLOURS, brick
+from vla_zenoh.simulation.appearance import (
     CAMERA,
     DISTRACTORS,
     LIGHTS,
@@ -23,16 +22,17 @@ from vla_zenoh.simulation.look import (
     MAX_TURN_RAD,
     TABLE,
     VARIATIONS,
+    Appearance,
     Dresser,
-    Look,
     draw_look,
 )
+from vla_zenoh.simulation.backend import Backend, why_not
+from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
 from vla_zenoh.simulation.placement import draw_places, footprint_m, objects_of
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import build_model
 from vla_zenoh.simulation.world import World
-from vla_zenoh.tasks import COLOURS, brick
 
 SCENE = "bricks"
 GAP_M = 0.045
@@ -87,7 +87,7 @@ def test_each_part_of_a_look_is_the_same_whatever_else_is_varied(seed: int) -> N
         alone = draw_look(seed, [part])
         for name in names:
             np.testing.assert_array_equal(getattr(alone, name), getattr(every, name))
-    assert draw_look(seed, [DISTRACTORS]) == Look()
+    assert draw_look(seed, [DISTRACTORS]) == Appearance()
 
 
 def test_an_unknown_variation_is_refused_by_name() -> None:

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 from motions import make_world
 
-from vla_zenoh.control.impedance import ImpedanceGains, Reference
-from vla_zenoh.control.so3 import Pose, log3, norm3
-from vla_zenoh.loader import find_model, make_policy
-from vla_zenoh.lockstep import Delays, Lockstep
+from vla_zenoh.kinematics.so3 import Pose, log3, norm3
+from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -22,8 +20,11 @@ from vla_zenoh.policy import (
     ObservationSpec,
     Policy,
 )
+from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
+from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
 from vla_zenoh.simulation.world import World
+from vla_zenoh.types.references import PoseReference
 
 REACHED_M, OFF_AXIS_M, DRIFT_RAD = 1e-3, 1e-3, 2e-3
 TURNED_RAD = 2e-3
@@ -273,7 +274,7 @@ def way_without_a_command_node(rate_hz: float, *, on_measured: bool) -> np.ndarr
         before = Pose(*world.tcp()) if on_measured else goal
         goal = Pose(before.position_m + [0.0, 0.0, 0.01], before.rotation)
         for _ in range(round(1000 / rate_hz)):
-            world.tick(Reference(goal.position_m, goal.rotation, np.zeros(6), np.zeros(6)))
+            world.tick(PoseReference(goal.position_m, goal.rotation, np.zeros(6), np.zeros(6)))
     return world.tcp()[0] - start_m
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from motions import make_world
 
-from vla_zenoh.control.arm import make_shadow
-from vla_zenoh.control.so3 import log3
-from vla_zenoh.loader import find_model, make_policy
-from vla_zenoh.lockstep import Delays, Lockstep
+from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.kinematics.so3 import log3
+from vla_zenoh.lab.lockstep import Delays, Lockstep
+from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import Composition, Profile, load_profile
 from vla_zenoh.types import FloatArray
 

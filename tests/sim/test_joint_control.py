@@ -9,12 +9,12 @@ import pinocchio as pin
 import pytest
 from motions import HOME_RAD, SCENE, line, make_world, still
 
-from vla_zenoh.control.impedance import ImpedanceGains, Reference
-from vla_zenoh.control.joint_impedance import JointReference
+from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import PREFIX, STEP_S
 from vla_zenoh.simulation.world import World
 from vla_zenoh.types import FloatArray
+from vla_zenoh.types.references import JointReference, PoseReference
 
 FOLLOW_LIMIT_M, FOLLOW_LIMIT_RAD = 1e-3, 2e-3
 FRICTION_NM = 0.5
@@ -52,7 +52,7 @@ def follow_joints(
     return JointReference.at_rest(reference.position_rad), worst_rad
 
 
-def hold(world: World, reference: Reference | JointReference, duration_s: float) -> None:
+def hold(world: World, reference: PoseReference | JointReference, duration_s: float) -> None:
     for _ in range(round(duration_s / STEP_S)):
         if isinstance(reference, JointReference):
             world.tick_joint(reference)
@@ -61,7 +61,7 @@ def hold(world: World, reference: Reference | JointReference, duration_s: float)
 
 
 def moved_while(
-    world: World, reference: Reference | JointReference, duration_s: float
+    world: World, reference: PoseReference | JointReference, duration_s: float
 ) -> tuple[float, float]:
     """Farthest the TCP (m) and any joint (rad) get from where they are."""
     at_m, at_rad = world.tcp()[0], world.joint_state().position_rad

@@ -9,10 +9,10 @@ import pytest
 from arm_rig import Asked, activate, mark, speed_m_s, stop_time_s, way_m, with_fields
 
 from vla_zenoh.codec import message
-from vla_zenoh.control.arm import make_shadow
-from vla_zenoh.lockstep import Lockstep, Message
-from vla_zenoh.nodes.sim import build_world
+from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.lab.lockstep import Lockstep, Message
 from vla_zenoh.profile import load_profile, override
+from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.types import JointState
 
 PROFILE = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})

@@ -39,7 +39,7 @@ from arm_rig import (
 
 from vla_zenoh.codec import message, records
 from vla_zenoh.errors import CodecError
-from vla_zenoh.lockstep import CAMERA, COMMAND, SIM, Lockstep, Message
+from vla_zenoh.lab.lockstep import CAMERA, COMMAND, SIM, Lockstep, Message
 from vla_zenoh.types import (
     ActionChunk,
     FloatArray,

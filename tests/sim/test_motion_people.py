@@ -28,9 +28,9 @@ from arm_rig import (
     way_m,
 )
 
-from vla_zenoh.control.impedance import Reference
-from vla_zenoh.lockstep import Lockstep, Message
+from vla_zenoh.lab.lockstep import Lockstep, Message
 from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand, PoseState
+from vla_zenoh.types.references import PoseReference
 
 EXACT_M = 1e-3
 BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.021
@@ -44,7 +44,7 @@ STALL_S = 1.0
 def held_m(loop: Lockstep) -> FloatArray:
     """Where the robot's controller holds the arm."""
     held = loop.guard.reference
-    assert isinstance(held, Reference)
+    assert isinstance(held, PoseReference)
     return held.position_m
 
 

@@ -13,9 +13,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from vla_zenoh.control.so3 import norm3
-from vla_zenoh.nodes.sim import build_world
+from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.simulation.world import WRENCH_FILTER_S, World
 
 LASTING_N = 5.0

@@ -16,9 +16,9 @@ import zenoh
 from camera_rig import until
 from chain import READY_PATIENCE_S, write_profile
 
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import message, records
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import Header, PoseCommand, PoseState
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from motions import HOME_RAD, circle, follow, line, make_world, wait
 
-from vla_zenoh.control.impedance import ImpedanceGains, Reference
 from vla_zenoh.errors import NodeError, RecordError, ResourceError
+from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
 from vla_zenoh.simulation.placement import draw_places, footprint_m, objects_of, regions_of
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.world import World
+from vla_zenoh.types.references import PoseReference
 
 TABLE_CLEARANCE_M = 2e-4  # how deep a resting brick sinks into the table at most
 SEEDS = range(40)
@@ -153,7 +154,7 @@ def test_poses_of_another_scene_are_refused() -> None:
 def test_a_reference_that_is_not_finite_stops_the_world_with_a_clear_error() -> None:
     world = make_world()
     reference = world.hold_reference()
-    broken = Reference(np.full(3, np.nan), *reference[1:])
+    broken = PoseReference(np.full(3, np.nan), *reference[1:])
     with pytest.raises(NodeError, match="bad reference"):
         world.tick(broken)
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from motions import follow, line, make_world, wait
 
-from vla_zenoh.control.impedance import Reference
 from vla_zenoh.errors import RecordError
 from vla_zenoh.simulation.world import World
+from vla_zenoh.types.references import PoseReference
 
 BRICK_WIDTH_M = 0.0318
 WIDTH_ATOL_M = 3e-4
@@ -23,7 +23,7 @@ BRICK_WEIGHT_N = 0.012 * 9.81
 FORCE_RTOL = 0.05
 
 
-def grasp(world: World, yaw_rad: float = 0.0, force_n: float = 20.0) -> Reference:
+def grasp(world: World, yaw_rad: float = 0.0, force_n: float = 20.0) -> PoseReference:
     turn = (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
     world.place("brick", (0.43, 0.0, 0.0096), turn)
     reference, _, _ = follow(world, line(world.hold_reference(), GRASP_M, 1.0))

@@ -43,7 +43,7 @@ from rich.console import Console  # noqa: E402
 from test_strangers import all_junk, all_keys, samples_of  # noqa: E402
 
 from vla_zenoh.errors import NodeError, SessionError  # noqa: E402
-from vla_zenoh.loader import find_model  # noqa: E402
+from vla_zenoh.policy.loader import find_model  # noqa: E402
 
 WORKERS = ("scripted", "twin")
 PROMPTS = (

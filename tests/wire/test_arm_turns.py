@@ -15,16 +15,17 @@ import pytest
 import zenoh
 from guard_rig import JointWriter
 
+from vla_zenoh.bus import buffers as slots
+from vla_zenoh.bus.clock import Tick
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
-from vla_zenoh.control.joint_reference import joint_motion_limits
-from vla_zenoh.control.stream import BRAKE_MARGIN
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes import arm_hearing, slots
-from vla_zenoh.nodes.arm import ArmNode
-from vla_zenoh.nodes.clock import Tick
-from vla_zenoh.nodes.last_brake import FAILURES, LEAST_S
+from vla_zenoh.guard.command_stream import BRAKE_MARGIN
+from vla_zenoh.guard.joint_guard import joint_motion_limits
 from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.python import state_reader as arm_hearing
+from vla_zenoh.robots.python.node import ArmNode
+from vla_zenoh.robots.shutdown_brake import FAILURES, LEAST_S
 from vla_zenoh.types import (
     Event,
     FloatArray,

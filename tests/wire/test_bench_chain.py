@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from vla_zenoh.bench.report import CHUNK, POSE, POSE_WITHOUT_WAIT, ROUND_TRIP, STAGES, TICK_WAIT
+from benchmarks.chain.report import CHUNK, POSE, POSE_WITHOUT_WAIT, ROUND_TRIP, STAGES, TICK_WAIT
 
 REQUESTS = 6
 SUM_TOLERANCE = 0.5  # of the whole: medians of stages need not add up to the median of the sum
@@ -27,7 +27,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict:
 def run_bench(file: Path, *ways: str) -> dict:
     arguments = [part for way in ways for part in ("--only", way)]
     done = subprocess.run(
-        [sys.executable, "-m", "vla_zenoh", "bench", "chain", "--rounds", "1"]
+        [sys.executable, "-m", "benchmarks", "chain", "--rounds", "1"]
         + ["--requests", str(REQUESTS), "--json", str(file), *arguments],
         capture_output=True,
         text=True,
@@ -67,7 +67,7 @@ def test_transport_alone_and_another_way_are_measured_beside_it(told: dict) -> N
 
 def test_an_unknown_way_is_refused_with_the_known_ones() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "vla_zenoh", "bench", "chain", "--only", "carrier-pigeon"],
+        [sys.executable, "-m", "benchmarks", "chain", "--only", "carrier-pigeon"],
         capture_output=True,
         text=True,
         check=False,

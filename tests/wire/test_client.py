@@ -9,14 +9,14 @@ import pytest
 import zenoh
 from camera_rig import free_endpoint, until
 
+from vla_zenoh.bus.client import MAX_WHY, Client
+from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.node_registry import MAX_OTHERS
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES
-from vla_zenoh.nodes.attendance import MAX_OTHERS
-from vla_zenoh.nodes.client import MAX_WHY, Client
-from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.seen import MAX_SAMPLES, SeenListener
-from vla_zenoh.nodes.session import open_session
+from vla_zenoh.nodes.worker.inference_debug import MAX_SAMPLES, InferenceDebugSubscriber
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import Event, Header, NodeStatus, Seen
@@ -90,7 +90,7 @@ def test_nobody_shows_what_another_worker_saw_nor_names_a_folder_elsewhere(
     who = header_codec.encode(Header(1, 2, "stranger#1"))
     key = profile.keys.seen_record("scripted")
     with open_session(profile.session) as here, open_session(profile.session) as there:
-        listener = SeenListener(here, profile.keys)
+        listener = InferenceDebugSubscriber(here, profile.keys)
         seen: list[str] = []
 
         def shown() -> bool:
@@ -110,7 +110,7 @@ def test_what_is_no_picture_does_not_wait_for_who_looks(profile: Profile) -> Non
     who = header_codec.encode(Header(1, 2, "stranger#1"))
     key = profile.keys.seen("scripted", "front")
     with open_session(profile.session) as here, open_session(profile.session) as there:
-        listener = SeenListener(here, profile.keys)
+        listener = InferenceDebugSubscriber(here, profile.keys)
 
         def deleted() -> bool:
             there.delete(key)

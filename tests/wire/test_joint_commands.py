@@ -17,9 +17,9 @@ import pytest
 import zenoh
 from camera_rig import await_match, free_endpoint, until
 
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import message, records
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import (
     FloatArray,

@@ -14,18 +14,18 @@ import pytest
 import zenoh
 from camera_rig import camera_rig, free_endpoint, grey, until
 
+from vla_zenoh.bus.buffers import LatestSample
+from vla_zenoh.bus.clock_sync import MAX_HEARD
+from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import decode_jpeg
-from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
+from vla_zenoh.control.preflight import PeerSnapshot, reasons_not_to_activate
 from vla_zenoh.keys import Kind
-from vla_zenoh.loader import find_model, make_policy
-from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.offsets import MAX_HEARD
-from vla_zenoh.nodes.rehearsal import rehearse
-from vla_zenoh.nodes.session import open_session
-from vla_zenoh.nodes.slots import Latest
-from vla_zenoh.nodes.worker import WorkerNode
-from vla_zenoh.observe import form_for, form_of, prepare
+from vla_zenoh.lab.doctor.rehearsal import rehearse
+from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
+from vla_zenoh.policy.loader import find_model, make_policy
+from vla_zenoh.policy.observation import form_for, form_of, prepare
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.profile.schema import CameraProfile, HostProfile, PicturesProfile
 from vla_zenoh.profile.session import second_link
@@ -84,7 +84,7 @@ def test_a_clock_that_is_ahead_is_measured_within_its_uncertainty() -> None:
 def test_stamps_of_another_host_are_read_on_the_own_clock() -> None:
     with two_nodes() as (near, far):
         set_ahead(far, AHEAD_NS)
-        slot = near.listen(near.keys.task, Latest())
+        slot = near.listen(near.keys.task, LatestSample())
         asked(near, "sim")
         out = far.stream(far.keys.task, Kind.ORDER)
         until("a listener", lambda: out.wanted)
@@ -107,7 +107,7 @@ def test_a_clock_beyond_the_bound_is_told_and_its_stamps_stay() -> None:
     with two_nodes() as (near, far):
         set_ahead(far, 2_000_000_000)
         found = asked(near, "sim")
-        around = Surroundings(frozenset({"sim"}), clocks=near.clocks.known())
+        around = PeerSnapshot(frozenset({"sim"}), clocks=near.clocks.known())
         reasons = reasons_not_to_activate(
             near.profile, "scripted", "hold", around, None, None, None, time.time_ns()
         )
@@ -142,8 +142,8 @@ def test_commands_and_pictures_travel_on_links_of_their_own() -> None:
         camera, worker = Node("camera", profile, there), Node("worker-far", profile, here)
         pictures = camera.stream(profile.keys.camera_jpeg("front"), Kind.FRAME)
         news = camera.stream(profile.keys.state_pose, Kind.STATE)
-        seen = worker.listen(pictures.key, Latest(), Kind.FRAME)
-        heard = worker.listen(news.key, Latest())
+        seen = worker.listen(pictures.key, LatestSample(), Kind.FRAME)
+        heard = worker.listen(news.key, LatestSample())
         until("a reader of both", lambda: pictures.wanted and news.wanted)
         for stream, slot in ((pictures, seen), (news, heard)):
             stream.put(b"something")

@@ -13,21 +13,21 @@ import pytest
 import zenoh
 from camera_rig import await_match, free_endpoint, until
 
+from vla_zenoh.bus.buffers import CallbackRing, LatestSample, ReceivedSample, ZenohRing
+from vla_zenoh.bus.clock import ADOPT_S, Clock
+from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.session import MAX_MESSAGE_BYTES, open_session
+from vla_zenoh.bus.writer_filter import SingleWriterFilter
 from vla_zenoh.errors import CodecError
-from vla_zenoh.nodes.clock import ADOPT_S, Clock
-from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.orphan import is_running
-from vla_zenoh.nodes.session import MAX_MESSAGE_BYTES, open_session
-from vla_zenoh.nodes.slots import Arrival, Inbox, Latest, Mailbox
-from vla_zenoh.nodes.speaker import Speaker
 from vla_zenoh.profile import SessionProfile, load_profile, override
+from vla_zenoh.runtime.parent_watch import is_running
 from vla_zenoh.types import Header
 
 SILENCE_NS = 500_000_000
 STEP_TOLERANCE_S = 0.002
 
 
-def refused(speaker: Speaker, header: Header, mono_ns: int) -> str | None:
+def refused(speaker: SingleWriterFilter, header: Header, mono_ns: int) -> str | None:
     try:
         speaker.check(header, mono_ns)
     except CodecError as error:
@@ -36,9 +36,9 @@ def refused(speaker: Speaker, header: Header, mono_ns: int) -> str | None:
 
 
 @pytest.fixture
-def spoken() -> Speaker:
+def spoken() -> SingleWriterFilter:
     """Number 7 of ``robot#1`` was heard at time 0."""
-    speaker = Speaker(SILENCE_NS / 1e9)
+    speaker = SingleWriterFilter(SILENCE_NS / 1e9)
     speaker.check(Header(0, 7, "robot#1"), 0)
     speaker.heard(Header(0, 7, "robot#1"), 0)
     return speaker
@@ -56,18 +56,18 @@ def spoken() -> Speaker:
     ],
 )
 def test_one_source_is_heard_until_it_falls_silent(
-    spoken: Speaker, source: str, seq: int, at_ns: int, reason: str | None
+    spoken: SingleWriterFilter, source: str, seq: int, at_ns: int, reason: str | None
 ) -> None:
     assert refused(spoken, Header(0, seq, source), at_ns) == reason
 
 
-def test_what_was_refused_does_not_keep_the_speaker_alive(spoken: Speaker) -> None:
+def test_what_was_refused_does_not_keep_the_speaker_alive(spoken: SingleWriterFilter) -> None:
     stranger = Header(0, 0, "robot#2")
     assert refused(spoken, stranger, SILENCE_NS - 1) == "foreign"
     assert refused(spoken, stranger, SILENCE_NS) is None
 
 
-def test_a_record_that_was_not_taken_does_not_use_up_its_number(spoken: Speaker) -> None:
+def test_a_record_that_was_not_taken_does_not_use_up_its_number(spoken: SingleWriterFilter) -> None:
     nonsense = Header(0, 8, "robot#1")
     assert refused(spoken, nonsense, 1) is None  # its payload turns out to be none
     assert refused(spoken, nonsense, 2) is None
@@ -81,11 +81,11 @@ def test_a_mailbox_keeps_the_newest_in_order_and_no_more_than_it_holds() -> None
         open_session(profile) as reader,
         open_session(profile) as writer,
     ):
-        box = Mailbox(3)
+        box = ZenohRing(3)
         subscriber = reader.declare_subscriber("test/box", box.channel())
         box.take_from(subscriber.try_recv)
         await_match(writer, "test/box")
-        last = reader.declare_subscriber("test/end", Mailbox(1).channel())
+        last = reader.declare_subscriber("test/end", ZenohRing(1).channel())
         await_match(writer, "test/end")
         for number in range(10):
             writer.put("test/box", str(number))
@@ -96,9 +96,9 @@ def test_a_mailbox_keeps_the_newest_in_order_and_no_more_than_it_holds() -> None
         assert box.take_all() == []
 
 
-@pytest.mark.parametrize("make", [Latest, partial(Inbox, 4), partial(Mailbox, 4)])
+@pytest.mark.parametrize("make", [LatestSample, partial(CallbackRing, 4), partial(ZenohRing, 4)])
 def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
-    make: Callable[[int], Latest | Inbox | Mailbox],
+    make: Callable[[int], LatestSample | CallbackRing | ZenohRing],
 ) -> None:
     endpoint = free_endpoint()
     profile = override(
@@ -113,7 +113,7 @@ def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
         node = Node("reader", profile, reader)
         key = node.keys.prompt
         slot = node.listen(key, make(limit))
-        events = Inbox(8)
+        events = CallbackRing(8)
         writer.declare_subscriber(
             node.keys.event("reader"), zenoh.handlers.Callback(events, indirect=False)
         )
@@ -123,8 +123,8 @@ def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
         writer.put(key, b"", attachment=bytes(limit + 1))
         writer.put(key, bytes(limit))
 
-        def take() -> list[Arrival]:
-            if isinstance(slot, Latest):
+        def take() -> list[ReceivedSample]:
+            if isinstance(slot, LatestSample):
                 arrival = slot.take()
                 return [] if arrival is None else [arrival]
             return slot.take_all()
@@ -139,9 +139,9 @@ def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
         node.close()
 
 
-@pytest.mark.parametrize("make", [Latest, partial(Inbox, 4), partial(Mailbox, 4)])
+@pytest.mark.parametrize("make", [LatestSample, partial(CallbackRing, 4), partial(ZenohRing, 4)])
 def test_what_deletes_is_not_taken_for_what_is_put(
-    make: Callable[[], Latest | Inbox | Mailbox],
+    make: Callable[[], LatestSample | CallbackRing | ZenohRing],
 ) -> None:
     endpoint = free_endpoint()
     profile = override(
@@ -160,8 +160,8 @@ def test_what_deletes_is_not_taken_for_what_is_put(
             writer.delete(key)
         writer.put(key, b"")
 
-        def take() -> list[Arrival]:
-            if isinstance(slot, Latest):
+        def take() -> list[ReceivedSample]:
+            if isinstance(slot, LatestSample):
                 arrival = slot.take()
                 return [] if arrival is None else [arrival]
             return slot.take_all()
@@ -181,7 +181,7 @@ def test_zenoh_itself_passes_over_what_nobody_could_read() -> None:
         open_session(profile) as reader,
         open_session(profile) as writer,
     ):
-        box = Mailbox(4, MAX_MESSAGE_BYTES)
+        box = ZenohRing(4, MAX_MESSAGE_BYTES)
         subscriber = reader.declare_subscriber("test/box", box.channel())
         box.take_from(subscriber.try_recv)
         await_match(writer, "test/box")

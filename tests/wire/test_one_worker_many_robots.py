@@ -18,16 +18,14 @@ import pytest
 import zenoh
 from camera_rig import await_match, free_endpoint, until
 
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.payload_limits import bytes_of, header_of
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.worker import robot_names
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, WorkerError
-from vla_zenoh.loader import find_model, make_policy
-from vla_zenoh.nodes.bounded import bytes_of, header_of
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.launch import Host
-from vla_zenoh.nodes.session import open_session
-from vla_zenoh.nodes.worker import WorkerNode
+from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -36,7 +34,9 @@ from vla_zenoh.policy import (
     ObservationSpec,
     Policy,
 )
+from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import Profile, as_robot, load_profile, override
+from vla_zenoh.runtime.launch import Host
 from vla_zenoh.types import ActionChunk, GripperState, Header, PoseState, Task
 
 ROBOTS = ("a", "b", "c")

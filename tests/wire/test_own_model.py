@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from chain import MOVING_M_S, command_line, running_chain
 
-from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.policy.loader import find_model, make_policy
 
 pytestmark = pytest.mark.slow
 

@@ -14,16 +14,16 @@ import pytest
 import zenoh
 from camera_rig import Rig, camera_rig, free_endpoint, grey, until
 
+from vla_zenoh.bus.node import Node, Stream
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes import camera as camera_node
-from vla_zenoh.nodes.camera_input import CameraInput, listen_to
-from vla_zenoh.nodes.camera_sources import asked
-from vla_zenoh.nodes.camera_sources.forms import MAX_SIZES
-from vla_zenoh.nodes.node import Node, Stream
-from vla_zenoh.nodes.session import open_session
-from vla_zenoh.observe import form_for, form_of
+from vla_zenoh.nodes.camera import node as camera_node
+from vla_zenoh.nodes.camera.fitted_streams import MAX_SIZES
+from vla_zenoh.nodes.camera import requested_sizes as asked
+from vla_zenoh.nodes.worker.camera_subscriber import CameraInput, listen_to
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
+from vla_zenoh.policy.observation import form_for, form_of
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Image

@@ -22,15 +22,15 @@ from chain import READY_PATIENCE_S, Chain, command_line
 from recording_rig import assert_same, ghost_of, recording
 from rosbags.rosbag2 import Reader
 
+from vla_zenoh.bus.node import Stream
 from vla_zenoh.codec import records
 from vla_zenoh.errors import NodeError
-from vla_zenoh.evaluation.run_file import evaluate_run
 from vla_zenoh.keys import Keys, Kind
-from vla_zenoh.nodes.node import Stream
-from vla_zenoh.nodes.recorder import Recorder
-from vla_zenoh.nodes.replay import CAMERAS, Replay
-from vla_zenoh.recording.reader import open_recording
-from vla_zenoh.recording.run import Run, load_run, pictures
+from vla_zenoh.lab.evaluation.run_file import evaluate_run
+from vla_zenoh.lab.recording.reader import open_recording
+from vla_zenoh.lab.recording.recorder import Recorder
+from vla_zenoh.lab.recording.replay import CAMERAS, Replay
+from vla_zenoh.lab.recording.run import Run, load_run, pictures
 from vla_zenoh.types import Event, NodeStatus
 
 STEPS, STEP_M = 5, 0.01

@@ -15,7 +15,7 @@ from chain import Chain, running_chain
 from ros2_peer import KinematicPanda, Ros2Peer
 from ros2_rig import CAMERA, HEIGHT, WIDTH, write_profile
 
-from vla_zenoh.nodes.session import open_session
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import load_profile
 
 pytestmark = pytest.mark.slow

@@ -8,10 +8,10 @@ import pytest
 from camera_rig import until
 from ros2_rig import write_profile
 
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.interop.ros2.graph import endpoints
-from vla_zenoh.nodes.ros2.node import Ros2Node
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.ros2.node import Ros2Node
 
 SLASH = "§"
 PLAIN = ""

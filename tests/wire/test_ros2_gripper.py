@@ -13,16 +13,16 @@ from camera_rig import until
 from ros2_peer import Ros2Peer
 from ros2_rig import write_profile
 
-from vla_zenoh.control.gripper_guard import OLDEST_NS
+from vla_zenoh.bus.clock import Clock
+from vla_zenoh.bus.node import Node, Stream
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.guard.gripper_guard import OLDEST_NS
 from vla_zenoh.interop.ros2.gripper_actions import SUCCEEDED
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.clock import Clock
-from vla_zenoh.nodes.node import Node, Stream
-from vla_zenoh.nodes.ros2.gripper import Gripper
-from vla_zenoh.nodes.ros2.link import Link
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.ros2.gripper import Gripper
+from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.types import GripperCommand
 
 HOUR_NS = 3_600_000_000_000
@@ -77,7 +77,7 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
     ):
         node = Node("ros2", profile, ours)
         messages = Messages(profile.ros2.distribution)
-        link = Link(ours, profile.ros2, messages, "vla_panda")
+        link = RosGraph(ours, profile.ros2, messages, "vla_panda")
         gripper = Gripper(node, link, messages, profile.ros2.gripper, lambda: rig.width_m)
         streams = [
             Stream(theirs, profile.keys.command_gripper, Kind.ORDER, source, Clock())

@@ -15,9 +15,9 @@ import zenoh
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 from ros2_rig import CAMERA, HEIGHT, WIDTH, Ros2Rig, ros2_rig
 
+from vla_zenoh.bus.node import Stream
 from vla_zenoh.codec.image import decode_raw
-from vla_zenoh.control.so3 import quat_from_rotation
-from vla_zenoh.nodes.node import Stream
+from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.types import (
     GripperCommand,
     GripperState,

@@ -16,15 +16,15 @@ from camera_rig import await_match, until
 from ros2_peer import Ros2Peer
 from ros2_rig import write_profile
 
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Keys
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.ros2.link import Link
-from vla_zenoh.nodes.ros2.people import People
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.ros2.ros_graph import RosGraph
+from vla_zenoh.robots.ros2.ros_services import RosServices
 from vla_zenoh.types import Header, Task
 
 PATIENCE_S = 30.0
@@ -36,7 +36,7 @@ TOO_LATE = "an emergency stop came after this was asked"
 class Rig:
     """Callers, services that do not answer before `agreed`, and what is put on our keys."""
 
-    people: People
+    people: RosServices
     peer: Ros2Peer
     callers: ThreadPoolExecutor
     operator: zenoh.Session
@@ -78,10 +78,10 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
         ThreadPoolExecutor(8) as callers,
     ):
         messages = Messages(profile.ros2.distribution)
-        link = Link(ours, profile.ros2, messages, "vla_panda")
+        link = RosGraph(ours, profile.ros2, messages, "vla_panda")
         # No command node is here: this is when it would have agreed.
         monkeypatch.setattr(Client, "wait_for", lambda *_: agreed.wait(PATIENCE_S))
-        people = People(profile, ours, link, messages, "/vla", lambda *_: None)
+        people = RosServices(profile, ours, link, messages, "/vla", lambda *_: None)
         peer = Ros2Peer(theirs)
         for key in (keys.active, keys.stop, keys.reset, keys.rate):
             theirs.declare_subscriber(key, zenoh.handlers.Callback(keep, indirect=False))

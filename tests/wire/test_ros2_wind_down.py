@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from ros2_turns import SPEED_M_S, TICK_S, Turns, ros2_turns
 
-from vla_zenoh.nodes.clock import Tick
-from vla_zenoh.nodes.last_brake import FAILURES, LEAST_S
+from vla_zenoh.bus.clock import Tick
+from vla_zenoh.robots.shutdown_brake import FAILURES, LEAST_S
 
 MOVING = 60
 """Turns after which the arm is in full motion."""

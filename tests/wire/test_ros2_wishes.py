@@ -13,21 +13,21 @@ from camera_rig import await_match, until
 from ros2_peer import Ros2Peer
 from ros2_rig import write_profile
 
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.switch import QUIET_S, Switch
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.ros2.link import Link
-from vla_zenoh.nodes.ros2.stops import Stops
-from vla_zenoh.nodes.ros2.wishes import PATIENCE_NS, Wishes
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.ros2.estop_order import EstopOrder
+from vla_zenoh.robots.ros2.ros_graph import RosGraph
+from vla_zenoh.robots.ros2.ros_topics import PATIENCE_NS, RosTopics
 
 
 class Rig(NamedTuple):
     """Somebody who publishes, what reads it, and what comes of it."""
 
     peer: Ros2Peer
-    wishes: Wishes
+    wishes: RosTopics
     heard: list[tuple[str, str]]
     refused: list[str]
     stop: Callable[[], None]
@@ -66,14 +66,14 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         open_session(profile.session) as theirs,
     ):
         messages = Messages(profile.ros2.distribution)
-        link = Link(ours, profile.ros2, messages, "vla_panda")
-        wishes = Wishes(
+        link = RosGraph(ours, profile.ros2, messages, "vla_panda")
+        wishes = RosTopics(
             Client(profile, ours),
             link,
             messages,
             "/vla",
             lambda reason, *_: refused.append(reason),
-            Stops(ours, profile.keys.stop),
+            EstopOrder(ours, profile.keys.stop),
         )
         peer = Ros2Peer(theirs)
         handler = zenoh.handlers.Callback(keep, indirect=False)

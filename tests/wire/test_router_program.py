@@ -16,16 +16,16 @@ import zenoh
 from camera_rig import free_endpoint, until
 from typer.testing import CliRunner
 
+from vla_zenoh.bus.buffers import CallbackRing
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import NodeError, SecurityError
-from vla_zenoh.nodes.router import router_config, run_router, run_zenohd
-from vla_zenoh.nodes.session import open_session
-from vla_zenoh.nodes.slots import Inbox
 from vla_zenoh.profile import load_profile
+from vla_zenoh.runtime.router import router_config, run_router, run_zenohd
 from vla_zenoh.security.identity import identities
 from vla_zenoh.security.rules import access_control
+from vla_zenoh.security.secure_profile import profile_text, serving_addresses
 from vla_zenoh.security.store import Store
-from vla_zenoh.security.written import profile_text, serving_addresses
 
 LIMIT_S = 20.0
 STAND_IN = """\
@@ -85,7 +85,7 @@ def test_a_real_zenohd_lets_each_do_its_part_and_no_more(tmp_path: Path) -> None
     profile = load_profile(str(file))
     words = [sys.executable, "-m", "vla_zenoh", "router", "--profile", str(file)]
     program = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    keys, heard = profile.keys, Inbox(16)
+    keys, heard = profile.keys, CallbackRing(16)
     try:
         with (
             open_session(profile.session, identity="command", wait_s=LIMIT_S) as command,

@@ -23,9 +23,9 @@ from websockets.sync.client import ClientConnection, connect
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop import openpi
-from vla_zenoh.interop.offer import make_offer
-from vla_zenoh.loader import find_model, make_policy
+from vla_zenoh.interop.served_policy import make_offer
 from vla_zenoh.policy import ModelSpec, example_observation
+from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 
 START_S, WAIT_S = 30.0, 10.0

@@ -15,11 +15,11 @@ import zenoh
 from camera_rig import until
 from chain import READY_PATIENCE_S, Chain, command_line, running_chain
 
+from vla_zenoh.bus.buffers import LatestSample
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.errors import SessionError
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.session import open_session
-from vla_zenoh.nodes.slots import Latest
 from vla_zenoh.types import ActionChunk, ObjectPoses
 
 SAME_M = 1e-3
@@ -225,8 +225,8 @@ def test_a_slow_reader_has_the_newest_and_holds_nobody_up(chain: Chain) -> None:
     """As a worker with a slow model is: its streams are never queued, nor is a stop behind them."""
     with open_session(chain.profile.session) as session:
         keys = chain.profile.keys
-        slots = {key: Latest() for key in (keys.camera_raw("front"), keys.state_pose)}
-        stop = Latest()
+        slots = {key: LatestSample() for key in (keys.camera_raw("front"), keys.state_pose)}
+        stop = LatestSample()
         subscribers = [
             session.declare_subscriber(key, zenoh.handlers.Callback(slot, indirect=False))
             for key, slot in {**slots, keys.stop: stop}.items()

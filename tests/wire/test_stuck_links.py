@@ -12,10 +12,10 @@ import pytest
 import zenoh
 from camera_rig import free_endpoint, until
 
+from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.session import config, open_session
+from vla_zenoh.bus.tcp_user_timeout import TcpUserTimeout
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.session import config, open_session
-from vla_zenoh.nodes.sockets import Impatience
 from vla_zenoh.profile import SessionProfile, load_profile, override
 
 LEASE_MS = 700
@@ -53,7 +53,7 @@ def test_a_client_does_not_close_a_stuck_link_before_its_router_does() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="TCP_USER_TIMEOUT is Linux's")
 def test_the_kernel_ends_connections_whose_data_nobody_acknowledges() -> None:
-    impatience = Impatience(0.7)
+    impatience = TcpUserTimeout(0.7)
     with socket.create_server(("127.0.0.1", 0)) as server:
         before = impatience.look()
         near = socket.create_connection(server.getsockname())

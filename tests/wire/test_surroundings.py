@@ -10,14 +10,14 @@ from typing import Any
 import pytest
 from camera_rig import await_match, free_endpoint, until
 
+from vla_zenoh.bus import clock_sync as offsets
+from vla_zenoh.bus.clock_sync import MAX_HEARD, MAX_PEERS
+from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
-from vla_zenoh.control.preflight import Surroundings
-from vla_zenoh.nodes import offsets
-from vla_zenoh.nodes.node import Node
-from vla_zenoh.nodes.offsets import MAX_HEARD, MAX_PEERS
-from vla_zenoh.nodes.session import open_session
-from vla_zenoh.nodes.surroundings import MAX_WORKERS, Neighbours
+from vla_zenoh.control.preflight import PeerSnapshot
+from vla_zenoh.nodes.command.peer_monitor import MAX_WORKERS, PeerMonitor
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import Header, NodeStatus
 
@@ -32,14 +32,14 @@ class Scene:
 
     def __init__(self, command: Node, camera: Node, thief: Node) -> None:
         self.command, self.camera, self.thief = command, camera, thief
-        self.ears = Neighbours(command)
-        self.around = Surroundings()
+        self.ears = PeerMonitor(command)
+        self.around = PeerSnapshot()
         self.nodes = (command, camera, thief)
         for node in (camera, thief):
             await_match(node.session, node.keys.status(node.name))
         until("both are alive", lambda: {camera.name, thief.name} <= self.look().alive)
 
-    def look(self) -> Surroundings:
+    def look(self) -> PeerSnapshot:
         self.command.clocks.tick()
         self.around = self.ears.look(self.command.clock.wall_ns()) or self.around
         return self.around

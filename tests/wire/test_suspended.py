@@ -10,8 +10,8 @@ import pytest
 import zenoh
 from camera_rig import until
 
-from vla_zenoh.nodes import clock
-from vla_zenoh.nodes.command import CommandNode
+from vla_zenoh.bus import clock
+from vla_zenoh.nodes.command.node import CommandNode
 from vla_zenoh.profile import load_profile
 
 ALONE = """{

@@ -20,10 +20,10 @@ import pytest
 from camera_rig import until
 from chain import READY_PATIENCE_S, Chain, running_chain
 
-from vla_zenoh.dataset.episodes import episodes_of
-from vla_zenoh.dataset.success import succeeded
-from vla_zenoh.evaluation.trial.folder import TrialFolder
-from vla_zenoh.recording.run import load_run
+from vla_zenoh.lab.dataset.episodes import episodes_of
+from vla_zenoh.lab.dataset.success import succeeded
+from vla_zenoh.lab.recording.run import load_run
+from vla_zenoh.lab.trial.folder import TrialFolder
 
 pytestmark = pytest.mark.slow
 

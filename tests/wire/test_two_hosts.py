@@ -13,9 +13,9 @@ import numpy as np
 from camera_rig import free_endpoint, until
 from chain import READY_PATIENCE_S, Recorder, write_profile
 
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import SessionError
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.session import open_session
 from vla_zenoh.profile import load_profile
 
 STEPS, STEP_M, TOLERANCE_M = 5, 0.01, 0.001

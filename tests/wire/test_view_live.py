@@ -19,8 +19,8 @@ from chain import READY_PATIENCE_S, Chain, command_line
 from view_rig import Shown
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.view import ViewListener
-from vla_zenoh.nodes.viewer import open_window
+from vla_zenoh.lab.view.listener import ViewListener
+from vla_zenoh.lab.view.viewer import open_window
 
 END_PATIENCE_S = 30.0
 STEPS, STEP_M = 5, 0.01

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from chain import MOVING_M_S, READY_PATIENCE_S, Chain, command_line
 
+from vla_zenoh.bus.host_id import own_boot
 from vla_zenoh.codec.image import decode_jpeg
-from vla_zenoh.nodes.launch import EXPENDABLE, Host
-from vla_zenoh.nodes.place import own_boot
-from vla_zenoh.nodes.seen import SeenListener, Sight
+from vla_zenoh.nodes.worker.inference_debug import InferenceDebugSubscriber, InferenceView
 from vla_zenoh.profile import override
+from vla_zenoh.runtime.launch import EXPENDABLE, Host
 
 COMMAND_TOLERANCE, ARM_TOLERANCE = 1.1, 2.7
 """As in tests/fault/test_dead_nodes.py."""
@@ -199,8 +199,8 @@ def test_what_a_model_sees_is_shown_with_its_prompt_raw_output_and_steps(
             lambda: chain.state("worker-looker") == "inferring",
             READY_PATIENCE_S,
         )
-        listener = SeenListener(chain.session, chain.profile.keys, "looker")
-        sights: list[Sight] = []
+        listener = InferenceDebugSubscriber(chain.session, chain.profile.keys, "looker")
+        sights: list[InferenceView] = []
 
         def shown() -> bool:
             sights.extend(listener.take())

@@ -8,12 +8,12 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
-from vla_zenoh.nodes.process import run_node
+from vla_zenoh.runtime.process import run_node
 
 
 def arm(profile: ProfileOption = DEFAULT_PROFILE, connect: ConnectOption = None) -> None:
     """Drive an arm by the Python file that the profile names in `arm.file`."""
-    from vla_zenoh.nodes.arm import ArmNode  # loads kinematics; other commands do not wait
+    from vla_zenoh.robots.python.node import ArmNode  # loads kinematics; other commands do not wait
 
     loaded = effective_profile(profile, connect)
     run_node(

@@ -12,7 +12,7 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
-from vla_zenoh.nodes.process import run_node
+from vla_zenoh.runtime.process import run_node
 
 
 def camera(
@@ -26,7 +26,7 @@ def camera(
     ] = "camera",
 ) -> None:
     """Run cameras: V4L2 devices, RTSP streams, files and the simulator's."""
-    from vla_zenoh.nodes.camera import CameraNode
+    from vla_zenoh.nodes.camera.node import CameraNode
 
     loaded = effective_profile(profile, connect)
     for wanted in cameras or ():

@@ -14,8 +14,8 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
-from vla_zenoh.nodes.orphan import RUN_FOLDER_VARIABLE
-from vla_zenoh.nodes.process import run_node
+from vla_zenoh.runtime.parent_watch import RUN_FOLDER_VARIABLE
+from vla_zenoh.runtime.process import run_node
 
 
 def command(
@@ -26,7 +26,7 @@ def command(
     ] = False,
 ) -> None:
     """Run the command node: turns chunks into a bounded, smooth pose stream."""
-    from vla_zenoh.nodes.command import CommandNode
+    from vla_zenoh.nodes.command.node import CommandNode
 
     loaded = effective_profile(profile, connect)
     folder = os.environ.get(RUN_FOLDER_VARIABLE)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from vla_zenoh.bus.payload_limits import bytes_of, header_of
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError
-from vla_zenoh.nodes.bounded import bytes_of, header_of
 
 MAX_TEXT = 400
 

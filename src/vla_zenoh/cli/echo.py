@@ -10,8 +10,9 @@ import typer
 import zenoh
 from rich.pretty import pretty_repr
 
+from vla_zenoh.bus.buffers import CallbackRing
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli import decode
-from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
@@ -20,9 +21,8 @@ from vla_zenoh.cli.options import (
     ProfileOption,
 )
 from vla_zenoh.cli.output import console, fail, styled
+from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.image import MAX_PICTURE_BYTES
-from vla_zenoh.nodes.session import open_session
-from vla_zenoh.nodes.slots import Inbox
 
 POLL_S = 0.02
 
@@ -42,9 +42,9 @@ def echo(
     as_json: JsonOption = False,
 ) -> None:
     """Print what is written on a key, decoded."""
-    loaded = Aim(profile, connect, host).load()
+    loaded = RobotTarget(profile, connect, host).load()
     whole = key if key.startswith(f"{loaded.root}/") else f"{loaded.root}/{loaded.robot.name}/{key}"
-    inbox, seen = Inbox(256, MAX_PICTURE_BYTES), 0
+    inbox, seen = CallbackRing(256, MAX_PICTURE_BYTES), 0
     with open_session(loaded.session) as session:
         try:
             subscriber = session.declare_subscriber(

@@ -12,8 +12,8 @@ import typer
 import zenoh
 from rich.table import Table
 
+from vla_zenoh.bus.client import Client
 from vla_zenoh.cli import decode
-from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
@@ -23,10 +23,10 @@ from vla_zenoh.cli.options import (
     RobotOption,
 )
 from vla_zenoh.cli.output import console, fail, print_json
+from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import Keys
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.printable import one_line
+from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import NodeStatus
 
 MAX_NUMBER = 40
@@ -34,7 +34,7 @@ SETTINGS = ("prompt", "active", "worker", "rate", "speed")
 
 
 @dataclass(slots=True)
-class Seen:
+class KeyTraffic:
     """A key and what is written on it."""
 
     key: str
@@ -61,7 +61,7 @@ def keys(
     as_json: JsonOption = False,
 ) -> None:
     """Show which keys exist, who writes them, their type and rate."""
-    aim = Aim(profile, connect, host, robot)
+    aim = RobotTarget(profile, connect, host, robot)
     with aim.client() as client:
         found = _listen(client, seconds, pictures)
         found += _settings(client)
@@ -77,7 +77,7 @@ def keys(
         fail(why)
 
 
-def table(found: Iterable[Seen]) -> Table:
+def table(found: Iterable[KeyTraffic]) -> Table:
     """What a person sees."""
     out = Table(header_style="bold")
     for column in ("key", "type", "writer", "rate", "bytes/s"):
@@ -93,8 +93,8 @@ def table(found: Iterable[Seen]) -> Table:
     return out
 
 
-def _listen(robot: Client, seconds: float, pictures: bool) -> list[Seen]:
-    seen: dict[str, Seen] = {}
+def _listen(robot: Client, seconds: float, pictures: bool) -> list[KeyTraffic]:
+    seen: dict[str, KeyTraffic] = {}
     lock = threading.Lock()
 
     def take(sample: zenoh.Sample) -> None:
@@ -103,7 +103,7 @@ def _listen(robot: Client, seconds: float, pictures: bool) -> list[Seen]:
             entry = seen.get(key)
             if entry is None:
                 header = decode.head(sample)
-                entry = seen[key] = Seen(
+                entry = seen[key] = KeyTraffic(
                     key, decode.encoding_of(sample), header["source"] if header else "?"
                 )
             entry.count += 1
@@ -132,20 +132,20 @@ def _expressions(robot: Client, pictures: bool) -> Iterable[str]:
     return [below + group for group in groups]
 
 
-def _settings(robot: Client) -> list[Seen]:
-    out: list[Seen] = []
+def _settings(robot: Client) -> list[KeyTraffic]:
+    out: list[KeyTraffic] = []
     for name in SETTINGS:
         key = getattr(robot.keys, name)
         for reply in robot.session.get(key, timeout=1.0):
             if reply.ok is not None:
                 value = decode.text(reply.ok.payload)
-                out.append(Seen(key, f"text, now {value!r}", "anyone; kept by command"))
+                out.append(KeyTraffic(key, f"text, now {value!r}", "anyone; kept by command"))
     return out
 
 
-def pictures_of(of: Keys, nodes: Mapping[str, tuple[NodeStatus, float, bool]]) -> list[Seen]:
+def pictures_of(of: Keys, nodes: Mapping[str, tuple[NodeStatus, float, bool]]) -> list[KeyTraffic]:
     """Keys of pictures, by the word of the nodes that make them."""
-    out: list[Seen] = []
+    out: list[KeyTraffic] = []
     for name, (found, _, _) in nodes.items():
         cameras = found.detail.get("cameras")
         for camera in cameras if isinstance(cameras, dict) else ():
@@ -154,6 +154,6 @@ def pictures_of(of: Keys, nodes: Mapping[str, tuple[NodeStatus, float, bool]]) -
                 raw, jpeg = of.camera_raw(camera), of.camera_jpeg(camera)
             except ProfileError:  # no camera of ours: anybody can write a status
                 continue
-            out.append(Seen(raw, "pixels, on demand", name, rate_hz=rate_hz))
-            out.append(Seen(jpeg, "image/jpeg, on demand", name))
+            out.append(KeyTraffic(raw, "pixels, on demand", name, rate_hz=rate_hz))
+            out.append(KeyTraffic(jpeg, "image/jpeg, on demand", name))
     return out

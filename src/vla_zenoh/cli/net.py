@@ -10,7 +10,8 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from vla_zenoh.cli.aim import Aim
+from vla_zenoh.bus.clock import Clock
+from vla_zenoh.bus.clock_sync import ClockSync
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
@@ -20,9 +21,8 @@ from vla_zenoh.cli.options import (
     RobotOption,
 )
 from vla_zenoh.cli.output import console, fail, print_json, styled
-from vla_zenoh.nodes.clock import Clock
-from vla_zenoh.nodes.offsets import Clocks
-from vla_zenoh.printable import one_line
+from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import NodeStatus
 
 HERE = "this computer"
@@ -35,7 +35,7 @@ MAX_NUMBER = 40
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class HostPair:
     """Two hosts, as the first one sees the second.
 
     Args:
@@ -91,9 +91,9 @@ def net(
     as_json: JsonOption = False,
 ) -> None:
     """Show every pair of hosts: link, round trip, clock offset; and what each key costs."""
-    aim = Aim(profile, connect, host, robot)
+    aim = RobotTarget(profile, connect, host, robot)
     with aim.client() as client:
-        clocks = Clocks(
+        clocks = ClockSync(
             client.session,
             client.keys,
             Clock(),
@@ -121,11 +121,13 @@ def net(
         fail(why)
 
 
-def _own(clocks: Clocks, statuses: Mapping[str, NodeStatus], links: tuple[str, ...]) -> list[Pair]:
+def _own(
+    clocks: ClockSync, statuses: Mapping[str, NodeStatus], links: tuple[str, ...]
+) -> list[HostPair]:
     """Each host as seen from here."""
     hosts = hosts_of(statuses)
     return [
-        Pair(
+        HostPair(
             HERE,
             hosts[node],
             "net",
@@ -157,9 +159,9 @@ def hosts_of(statuses: Mapping[str, NodeStatus]) -> dict[str, str]:
     }
 
 
-def pairs_of(statuses: Mapping[str, NodeStatus], own: list[Pair]) -> list[Pair]:
+def pairs_of(statuses: Mapping[str, NodeStatus], own: list[HostPair]) -> list[HostPair]:
     """The best measurement of each pair of hosts: `own`, and what nodes tell."""
-    best: dict[tuple[str, str], Pair] = {}
+    best: dict[tuple[str, str], HostPair] = {}
     for pair in [*own, *_told(statuses)]:
         hosts = (pair.seen_from, pair.host)
         if hosts not in best or pair.uncertainty_ms < best[hosts].uncertainty_ms:
@@ -167,9 +169,9 @@ def pairs_of(statuses: Mapping[str, NodeStatus], own: list[Pair]) -> list[Pair]:
     return [best[hosts] for hosts in sorted(best)]
 
 
-def _told(statuses: Mapping[str, NodeStatus]) -> list[Pair]:
+def _told(statuses: Mapping[str, NodeStatus]) -> list[HostPair]:
     """What nodes say of nodes on other hosts."""
-    out: list[Pair] = []
+    out: list[HostPair] = []
     hosts = hosts_of(statuses)
     for name, status in statuses.items():
         for other, found in _map(status.detail.get("clocks")).items():
@@ -181,7 +183,7 @@ def _told(statuses: Mapping[str, NodeStatus]) -> list[Pair]:
                 round_trip_ms, offset_ms, uncertainty_ms = (n or 0.0 for n in numbers)
                 links = _texts(_map(status.detail.get("net")).get("links"))
                 out.append(
-                    Pair(
+                    HostPair(
                         hosts[name],
                         hosts[other],
                         name,
@@ -227,7 +229,9 @@ def _texts(value: Any) -> tuple[str, ...]:
     return tuple(map(str, value)) if isinstance(value, (list, tuple)) else ()
 
 
-def tables(robot: str, pairs: list[Pair], lines: list[Line], bound_ms: float) -> tuple[Table, ...]:
+def tables(
+    robot: str, pairs: list[HostPair], lines: list[Line], bound_ms: float
+) -> tuple[Table, ...]:
     """What a person sees: the pairs of hosts, and the keys.
 
     Args:

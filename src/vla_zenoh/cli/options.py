@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vla_zenoh.nodes.place import HOST_VARIABLE
+from vla_zenoh.bus.host_id import HOST_VARIABLE
 from vla_zenoh.profile import Profile, load_profile, override
 
 DEFAULT_PROFILE = "panda_sim"

@@ -22,7 +22,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.text import Text
 
-from vla_zenoh.printable import printable
+from vla_zenoh.sanitize import printable
 
 
 class Screen(Console):

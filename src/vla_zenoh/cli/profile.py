@@ -27,7 +27,7 @@ profile_app = typer.Typer(
 
 LONG_BRAKE_S = 2.5
 """`up` ends a robot's node 2.8 s after Ctrl-C; a part of that goes by until this node hears of it.
-See `STOP_ORDER` in `vla_zenoh.nodes.supervisor`."""
+See `STOP_ORDER` in `vla_zenoh.runtime.supervisor`."""
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for a script.")]
 
@@ -110,7 +110,7 @@ def _arm(profile: Profile, name: str, host: str | None) -> list[str]:
     """
     commands = _runs_command(profile, name, host)
     try:
-        from vla_zenoh.control.arm import make_shadow
+        from vla_zenoh.control.profile_arm import make_shadow
 
         make_shadow(profile)
     except ResourceError as error:
@@ -134,7 +134,7 @@ def _brake(profile: Profile) -> list[str]:
     if profile.robot.driver == "sim":
         return []
     try:
-        from vla_zenoh.control.longest_brake import longest_brake_s
+        from vla_zenoh.guard.braking_time import longest_brake_s
     except ImportError:
         return []  # the arm was not looked at either, which is told
     brake_s = longest_brake_s(profile)

@@ -33,8 +33,8 @@ def ros2(
             if source is not None and source.name == "COMMANDLINE":
                 raise typer.BadParameter(f"give --{name} behind {context.invoked_subcommand}")
         return
-    from vla_zenoh.nodes.process import run_node
-    from vla_zenoh.nodes.ros2.node import Ros2Node  # loads kinematics; other commands do not wait
+    from vla_zenoh.robots.ros2.node import Ros2Node  # loads kinematics; other commands do not wait
+    from vla_zenoh.runtime.process import run_node
 
     loaded = effective_profile(profile, connect)
     run_node(

@@ -18,10 +18,10 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
-from vla_zenoh.nodes.orphan import RUN_FOLDER_VARIABLE
-from vla_zenoh.nodes.priority import prefer_this_process, realtime_links
-from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
-from vla_zenoh.nodes.router import router_config, run_router, run_zenohd
+from vla_zenoh.runtime.parent_watch import RUN_FOLDER_VARIABLE
+from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
+from vla_zenoh.runtime.router import router_config, run_router, run_zenohd
+from vla_zenoh.runtime.scheduling import prefer_this_process, realtime_links
 
 
 def router(

@@ -12,11 +12,11 @@ from typing import Annotated, Literal
 import typer
 from rich.table import Table
 
-from vla_zenoh.cli.aim import Aim
+from vla_zenoh.cli.free_endpoint import is_own
 from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, ProfileOption
 from vla_zenoh.cli.output import console, errors, fail, print_json, styled
-from vla_zenoh.cli.own_address import is_own
 from vla_zenoh.cli.secure_copying import copying
+from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
 from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.profile.session import DEFAULT_FOLDER
@@ -24,14 +24,14 @@ from vla_zenoh.resources import is_path
 from vla_zenoh.security.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
 from vla_zenoh.security.bridge import bridges
 from vla_zenoh.security.identity import PEOPLE, Role, identities, identities_of, people_at
-from vla_zenoh.security.stale import stale
-from vla_zenoh.security.store import Entry, Store
-from vla_zenoh.security.written import (
+from vla_zenoh.security.secure_profile import (
     moved,
     profile_text,
     serving_addresses,
     with_person,
 )
+from vla_zenoh.security.store import Entry, Store
+from vla_zenoh.security.unused_certificates import stale
 
 secure_app = typer.Typer(
     help="Certificates for a lab: nobody else is heard, and each role does only its part.",
@@ -107,7 +107,7 @@ def init(
         out.print(f"\nGive {which} its own folder, and all of them the profile:")
     for line in copying(written, file, store, others):
         out.print(line, soft_wrap=True)
-    _print_here(here, Aim(_typed(file)))
+    _print_here(here, RobotTarget(_typed(file)))
     kept = f"Keep {store.folder / 'ca.key'} here: who has it can make certificates."
     out.print(kept, soft_wrap=True)
     _complain_about_places(written)
@@ -239,7 +239,7 @@ def _typed(file: Path) -> str:
     return str(file) if "/" in str(file) else f"./{file}"
 
 
-def _print_here(host: str | None, aim: Aim) -> None:
+def _print_here(host: str | None, aim: RobotTarget) -> None:
     out = console()
     if host is not None:
         out.print(

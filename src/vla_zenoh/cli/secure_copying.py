@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.files import Needed, Part, needed_files
+from vla_zenoh.profile.files import FileUse, Needed, needed_files
 from vla_zenoh.security.store import Store
 
 SEARCHED = "vla-zenoh"
@@ -67,7 +67,7 @@ def _files(needed: Needed, file: Path, host: str) -> Iterator[str]:
         yield _packed(needed.whole, host, "/")
 
 
-def _packed(part: Part, host: str, there: str = "") -> str:
+def _packed(part: FileUse, host: str, there: str = "") -> str:
     """Files with their folders, below home or another folder there."""
     names = " ".join(map(shlex.quote, part.names))
     into = f"-C {there} " if there else ""

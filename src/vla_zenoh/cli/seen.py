@@ -13,7 +13,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from vla_zenoh.cli.aim import Aim
+from vla_zenoh.bus.client import Client
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
@@ -22,12 +22,12 @@ from vla_zenoh.cli.options import (
     RobotOption,
 )
 from vla_zenoh.cli.output import console, errors, fail
+from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.seen import SeenListener, Sight
+from vla_zenoh.nodes.worker.inference_debug import InferenceDebugSubscriber, InferenceView
 from vla_zenoh.policy import MAX_CAMERAS
-from vla_zenoh.printable import one_line
+from vla_zenoh.sanitize import one_line
 
 POLL_S = 0.05
 PATIENCE_S = 5.0
@@ -65,12 +65,12 @@ def seen(
     live = console().is_terminal and not as_json
     if not live and seconds is None and count is None:
         count = 1
-    aim = Aim(profile, connect, host, robot)
+    aim = RobotTarget(profile, connect, host, robot)
     with aim.client() as client:
-        listener = SeenListener(client.session, client.keys, worker)
+        listener = InferenceDebugSubscriber(client.session, client.keys, worker)
         began_s = time.monotonic()
         told = 0
-        newest: dict[str, Sight] = {}
+        newest: dict[str, InferenceView] = {}
         with Live(console=console(), auto_refresh=False) if live else nullcontext() as screen:
             while not (count is not None and told >= count):
                 waited_s = time.monotonic() - began_s
@@ -100,7 +100,7 @@ def seen(
         errors().print(f"left out: {why}", style="yellow")
 
 
-def _complain(aim: Aim, client: Client, worker: str | None) -> NoReturn:
+def _complain(aim: RobotTarget, client: Client, worker: str | None) -> NoReturn:
     """Ends the command: nobody showed anything."""
     words = ("seen",) if worker is None else ("seen", worker)
     if "command" not in client.alive:
@@ -113,7 +113,7 @@ def _complain(aim: Aim, client: Client, worker: str | None) -> NoReturn:
     )
 
 
-def _plain(sight: Sight) -> dict[str, Any]:
+def _plain(sight: InferenceView) -> dict[str, Any]:
     record = sight.record
     return {
         "worker": record.worker,
@@ -130,7 +130,7 @@ def _plain(sight: Sight) -> dict[str, Any]:
     }
 
 
-def _save(folder: Path, sight: Sight) -> None:
+def _save(folder: Path, sight: InferenceView) -> None:
     record = sight.record
     # Two runs of a worker may have the same numbers; no two observations the same stamp.
     stem = f"{record.observation_stamp_ns}-{record.chunk_seq}"
@@ -141,7 +141,7 @@ def _save(folder: Path, sight: Sight) -> None:
     (into / f"{stem}.json").write_text(json.dumps(_plain(sight), indent=2) + "\n", "utf-8")
 
 
-def table(newest: Mapping[str, Sight]) -> Table:
+def table(newest: Mapping[str, InferenceView]) -> Table:
     """What a person sees: worker -> its newest inference."""
     out = Table(header_style="bold")
     for column in ("worker", "sees", "prompt", "raw", "first step", "inference"):

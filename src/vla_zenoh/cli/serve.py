@@ -9,19 +9,19 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.chosen import chosen_worker
+from vla_zenoh.cli.bind_check import refuse_beyond_here
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ProfileOption,
     effective_profile,
 )
 from vla_zenoh.cli.output import console
-from vla_zenoh.cli.plain_door import refuse_beyond_here
-from vla_zenoh.interop.offer import make_offer
+from vla_zenoh.cli.worker_choice import chosen_worker
 from vla_zenoh.interop.openpi import PORT
-from vla_zenoh.loader import make_policy
-from vla_zenoh.nodes.environment import run_in_own_environment
-from vla_zenoh.nodes.process import stop_on_signals
+from vla_zenoh.interop.served_policy import make_offer
+from vla_zenoh.policy.loader import make_policy
+from vla_zenoh.runtime.environments import run_in_own_environment
+from vla_zenoh.runtime.process import stop_on_signals
 
 serve_app = typer.Typer(help="Serve a model to other systems.", no_args_is_help=True)
 

@@ -12,7 +12,7 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
-from vla_zenoh.nodes.process import run_node
+from vla_zenoh.runtime.process import run_node
 
 
 def sim(
@@ -26,7 +26,9 @@ def sim(
     ] = False,
 ) -> None:
     """Run the simulated robot: takes command keys, gives state keys."""
-    from vla_zenoh.nodes.sim import SimNode  # MuJoCo takes a while; other commands need not wait
+    from vla_zenoh.robots.sim.node import (
+        SimNode,  # MuJoCo takes a while; other commands need not wait
+    )
 
     loaded = effective_profile(profile, connect)
     run_node(

@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from vla_zenoh.cli.aim import Aim
+from vla_zenoh.bus.client import LEFT_OUT, Client
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
@@ -23,8 +23,8 @@ from vla_zenoh.cli.options import (
     RobotOption,
 )
 from vla_zenoh.cli.output import console, fail, print_json, styled
-from vla_zenoh.nodes.client import LEFT_OUT, Client
-from vla_zenoh.printable import one_line
+from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, Header, NodeStatus
 
 Heard = Mapping[str, tuple[NodeStatus, float, bool]]
@@ -67,7 +67,7 @@ def status(
     once: Annotated[bool, typer.Option("--once", help="Print the table once and end.")] = False,
 ) -> None:
     """Show every node: state, rates, ages, latencies, counters, and what happened last."""
-    aim = Aim(profile, connect, host, robot)
+    aim = RobotTarget(profile, connect, host, robot)
     with aim.client() as client:
         if as_json or once or not console().is_terminal:
             time.sleep(LISTEN_S)

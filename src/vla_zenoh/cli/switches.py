@@ -8,8 +8,9 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from vla_zenoh.cli.aim import Aim
-from vla_zenoh.cli.held import hold
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.liveliness import robots_alive
+from vla_zenoh.cli.deadman import hold
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
@@ -18,13 +19,12 @@ from vla_zenoh.cli.options import (
     RobotOption,
 )
 from vla_zenoh.cli.output import complain, console, errors, fail, styled
+from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.settings import decode_percent
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import Keys
-from vla_zenoh.nodes.alive import robots_alive
-from vla_zenoh.nodes.client import Client
-from vla_zenoh.nodes.process import stop_on_signals
 from vla_zenoh.profile import as_robot
+from vla_zenoh.runtime.process import stop_on_signals
 from vla_zenoh.types import Task
 
 STOP_PATIENCE_S = 3.0
@@ -45,7 +45,7 @@ def activate(
     ] = False,
 ) -> None:
     """Give the arm to the worker. Refused with every reason while something is not right."""
-    aim = Aim(profile, connect, host, robot)
+    aim = RobotTarget(profile, connect, host, robot)
     with aim.driver("activate") as client:
         stop = stop_on_signals() if while_here else None
         task = client.activate() if stop is None else client.activate_while_here("person")
@@ -65,7 +65,7 @@ def deactivate(
     robot: RobotOption = None,
 ) -> None:
     """Brake, and obey nobody."""
-    aim = Aim(profile, connect, host, robot)
+    aim = RobotTarget(profile, connect, host, robot)
     with aim.client(stop=True) as client:
         if not client.deactivate(STOP_PATIENCE_S):
             _complain(aim, client, "deactivate", "say that the arm stands")
@@ -80,7 +80,7 @@ def use(
     robot: RobotOption = None,
 ) -> None:
     """Choose the worker that is obeyed; the others go on beside it."""
-    aim = Aim(profile, connect, host, robot)
+    aim = RobotTarget(profile, connect, host, robot)
     with aim.driver("use", worker) as client:
         task = client.set_worker(worker)
         console().print(f"worker: {task.worker}, {aim.named(client)}", soft_wrap=True)
@@ -94,7 +94,7 @@ def rate(
     robot: RobotOption = None,
 ) -> None:
     """Choose how often the workers infer."""
-    aim = Aim(profile, connect, host, robot)
+    aim = RobotTarget(profile, connect, host, robot)
     with aim.driver("rate", f"{rate_hz:g}") as client:
         task = client.set_rate(rate_hz)
         console().print(f"rate: {task.rate_hz:g} Hz, {aim.named(client)}", soft_wrap=True)
@@ -111,7 +111,7 @@ def speed(
     robot: RobotOption = None,
 ) -> None:
     """Drive slower than planned, on the same path. Who may stop the arm may lower it."""
-    aim = Aim(profile, connect, host, robot)
+    aim = RobotTarget(profile, connect, host, robot)
     wanted = None if percent is None else decode_percent(percent.encode())
     # To lower it is like a stop: as whoever may, of those whose certificates lie here.
     with aim.client(stop=wanted is not None) as client:
@@ -128,7 +128,7 @@ def speed(
         _tell_speed(aim, client, client.set_speed(wanted))
 
 
-def _tell_speed(aim: Aim, client: Client, task: Task) -> None:
+def _tell_speed(aim: RobotTarget, client: Client, task: Task) -> None:
     console().print(
         f"speed: {task.speed_percent:g} % of what is planned, {aim.named(client)}", soft_wrap=True
     )
@@ -144,7 +144,7 @@ def stop(
     ] = False,
 ) -> None:
     """Emergency stop: brake now, and stay stopped until `vla-zenoh reset`."""
-    aim = Aim(profile, connect, host, robot)
+    aim = RobotTarget(profile, connect, host, robot)
     with aim.client(stop=True) as client:
         client.put(client.keys.stop, "stop")
         if every:
@@ -165,7 +165,7 @@ def reset(
     robot: RobotOption = None,
 ) -> None:
     """Clear an emergency stop or a fault. The arm stays inactive."""
-    aim = Aim(profile, connect, host, robot)
+    aim = RobotTarget(profile, connect, host, robot)
     with aim.driver("reset") as client:
         client.put(client.keys.reset, "reset")
         if not _heeded(client, lambda: _state(client) not in ("", "stopped", "fault")):
@@ -196,7 +196,7 @@ def _heeded(client: Client, done: Callable[[], bool]) -> bool:
     return done()
 
 
-def _complain(aim: Aim, client: Client, command: str, what: str) -> NoReturn:
+def _complain(aim: RobotTarget, client: Client, command: str, what: str) -> NoReturn:
     """Ends the command: the command node did not do `what`."""
     if why := aim.powerless(client.profile, command):
         fail(f"{aim.named(client)} does not {what}: {why}")
@@ -207,7 +207,7 @@ def _complain(aim: Aim, client: Client, command: str, what: str) -> NoReturn:
     )
 
 
-def _stop_all(aim: Aim, own: Client) -> None:
+def _stop_all(aim: RobotTarget, own: Client) -> None:
     robots: list[str] = []
     give_up = time.monotonic() + LOOK_S
     while time.monotonic() < give_up:
@@ -230,7 +230,7 @@ def _stop_all(aim: Aim, own: Client) -> None:
         fail(aim.powerless(own.profile, "stop", "--all") or "not every robot has stopped")
 
 
-def _tell_stopped(aim: Aim, client: Client, meant: str) -> None:
+def _tell_stopped(aim: RobotTarget, client: Client, meant: str) -> None:
     robot = client.keys.robot
     how = aim.typed("reset", robot=None if robot == meant else robot)
     console().print(

@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.aim import Aim
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     PROFILE_VARIABLE,
@@ -19,10 +18,11 @@ from vla_zenoh.cli.options import (
     effective_profile,
 )
 from vla_zenoh.cli.output import console, styled
-from vla_zenoh.nodes.launch import Host
-from vla_zenoh.nodes.process import die_with_parent, stop_on_signals
+from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.profile import load_profile, profile_file
 from vla_zenoh.resources import is_path
+from vla_zenoh.runtime.launch import Host
+from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
 
 COLOURS = ("cyan", "magenta", "green", "yellow", "blue", "bright_cyan", "bright_magenta")
 
@@ -68,8 +68,8 @@ def up(
     tell("up", "all nodes have ended")
 
 
-def aim_of(profile: str, running: Host) -> Aim:
+def aim_of(profile: str, running: Host) -> RobotTarget:
     """What leads other commands to this robot, from any folder and terminal of this computer."""
     there = running.profile.session.connect
     name = str(profile_file(profile)) if is_path(profile) else profile
-    return Aim(name, None if there == load_profile(profile).session.connect else there)
+    return RobotTarget(name, None if there == load_profile(profile).session.connect else there)

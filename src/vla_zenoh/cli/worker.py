@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 import typer
 
 from vla_zenoh import keys
-from vla_zenoh.cli.chosen import chosen_worker
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
@@ -16,13 +15,14 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     effective_profile,
 )
-from vla_zenoh.control.names import worker_node
+from vla_zenoh.cli.worker_choice import chosen_worker
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.loader import make_policy
-from vla_zenoh.nodes.environment import run_in_own_environment
-from vla_zenoh.nodes.process import run_node
-from vla_zenoh.nodes.worker import WorkerNode
+from vla_zenoh.keys import worker_node
+from vla_zenoh.nodes.worker.node import WorkerNode
+from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.profile import Profile
+from vla_zenoh.runtime.environments import run_in_own_environment
+from vla_zenoh.runtime.process import run_node
 
 
 def worker(

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla_zenoh.control.so3 import (
+from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.so3 import (
     Pose,
     exp3,
     orthonormal,
     rotation_from_quat,
     rotation_from_rpy,
 )
-from vla_zenoh.errors import RecordError
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec
 from vla_zenoh.types import FloatArray, unit_quaternion
 

@@ -1,6 +1,6 @@
 """Which goal is in force where chunks overlap: the newest plan's, a blend, or an ensemble.
 
-``P_i(t)`` is the waypoint of plan i at time t (see `vla_zenoh.control.compose`), i = 0 the oldest::
+``P_i(t)`` is the waypoint of plan i at time t, i = 0 the oldest::
 
     replace    F(t) = P_n(t), n the newest
     blend      F(t) = mix(F'(t), P_n(t), w(s)), F' the same over the plans before it,
@@ -29,9 +29,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vla_zenoh.control.compose import Goal, GoalTimeline, Plan
+from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.control.slowdown import Slowdown
-from vla_zenoh.control.so3 import Pose, between, exp3, log3, norm3, orthonormal
+from vla_zenoh.kinematics.so3 import Pose, between, exp3, log3, norm3, orthonormal
 from vla_zenoh.profile import Composition
 from vla_zenoh.types import FloatArray
 
@@ -40,7 +40,7 @@ MEAN_RAD = 1e-10
 """The mean of rotations is known well enough when it moves by less."""
 
 
-class Aggregator:
+class PlanAggregator:
     """See the module.
 
     Args:

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.collision import TABLE, CollisionModel
-from vla_zenoh.control.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.control.slowdown import Slowdown, slowdown
+from vla_zenoh.kinematics.collision import TABLE, CollisionModel
+from vla_zenoh.kinematics.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.profile import ReachLimits
 from vla_zenoh.types import FloatArray
 

@@ -13,22 +13,22 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 
-from vla_zenoh.control.acceptance import Lease, Refusal, refuse
-from vla_zenoh.control.compose import Goal, Plan
-from vla_zenoh.control.composer import ChunkPlan, Composer
-from vla_zenoh.control.gripper import GripperArbiter
-from vla_zenoh.control.holding import Holding
-from vla_zenoh.control.joint_fit import JOINT_PATIENCE_S, reasons_joints_do_not_fit
-from vla_zenoh.control.joint_watch import JointWatch
-from vla_zenoh.control.mover import Mover
-from vla_zenoh.control.ports import Inputs, Outputs, Setting
-from vla_zenoh.control.preflight import Surroundings, reasons_not_to_activate
-from vla_zenoh.control.progress import Progress
-from vla_zenoh.control.reach import Shadow
-from vla_zenoh.control.so3 import held_pose, pose_of
+from vla_zenoh.control.chunk_planner import ChunkPlan, ChunkPlanner
+from vla_zenoh.control.chunk_validation import Lease, Rejection, refuse
+from vla_zenoh.control.commander_io import Inputs, Outputs, Setting
+from vla_zenoh.control.deadman import Deadman
+from vla_zenoh.control.episode_progress import EpisodeProgress
+from vla_zenoh.control.gripper_arbiter import GripperArbiter
+from vla_zenoh.control.joint_monitor import JointMonitor
+from vla_zenoh.control.motion_pipeline import MotionPipeline
+from vla_zenoh.control.plan_timeline import Goal, Plan
+from vla_zenoh.control.preflight import PeerSnapshot, reasons_not_to_activate
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
-from vla_zenoh.control.watch import Watch
+from vla_zenoh.control.watchdog import Watchdog
 from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.joint_check import JOINT_PATIENCE_S, reasons_joints_do_not_fit
+from vla_zenoh.kinematics.so3 import held_pose, pose_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     MAX_TEXT,
@@ -60,7 +60,7 @@ class Commander:
     """
 
     def __init__(
-        self, profile: Profile, *, reach: Shadow | None = None, dry_run: bool = False
+        self, profile: Profile, *, reach: ReachabilityFilter | None = None, dry_run: bool = False
     ) -> None:
         self.profile = profile
         self.reach = reach
@@ -73,18 +73,18 @@ class Commander:
         self.joint: Stamped[JointState] | None = None
         self.gripper_state: Stamped[GripperState] | None = None
         self.lease: Lease | None = None
-        self.progress, self.holding = Progress(), Holding()
+        self.progress, self.holding = EpisodeProgress(), Deadman()
         self._resumed_ns = 0
-        self._around = Surroundings()
+        self._around = PeerSnapshot()
         self._shadow: dict[str, Stamped[ActionChunk]] = {}
-        self._composer = Composer(profile, reach)
+        self._composer = ChunkPlanner(profile, reach)
         self._waiting: deque[Stamped[ActionChunk]] = deque()
         self._coming: tuple[Stamped[ActionChunk], ChunkPlan] | None = None
-        self._mover = Mover(profile, reach, self._composer)
+        self._mover = MotionPipeline(profile, reach, self._composer)
         self.contact, self._retreat = self._mover.contact, self._mover.retreat
         self._feels = True
-        self._watch = Watch(profile)
-        self._joint_watch = None if reach is None else JointWatch(profile, reach)
+        self._watch = Watchdog(profile)
+        self._joint_watch = None if reach is None else JointMonitor(profile, reach)
         self._speed_changed = False
         self._out = Outputs()
 
@@ -319,7 +319,7 @@ class Commander:
             self.why = f"{what} refused: {'; '.join(reasons)}"[:MAX_TEXT]
         for reason in reasons:
             self._out.tell("warning", "refusal", f"{what}_refused", reason)
-            self._out.refusals.append(Refusal(f"{what}_refused", reason))
+            self._out.refusals.append(Rejection(f"{what}_refused", reason))
 
     def latch(self, why: str) -> None:
         """Begin stopped: an emergency stop outlives the process that heard it."""
@@ -351,12 +351,12 @@ class Commander:
         worker = chunk.record.worker
         owner = self._around.spec_sources.get(worker)
         if owner is None:
-            unknown = Refusal("unknown_worker", "its spec is not known yet", quiet=True)
+            unknown = Rejection("unknown_worker", "its spec is not known yet", quiet=True)
             self._out.refuse(unknown, worker)
             return
         if chunk.header.source != owner:
             why = f"a chunk by {chunk.header.source[:60]!r}, who did not publish this worker's spec"
-            self._out.refuse(Refusal("foreign", why), worker)
+            self._out.refuse(Rejection("foreign", why), worker)
             return
         if self.state not in OBEYING or worker != self.task.worker or self.lease is None:
             self._shadow[worker] = chunk
@@ -390,7 +390,7 @@ class Commander:
         if timeline is None or lease is None or self._superseded(chunk):
             return
         plan = self._composer.begin(chunk, lease.spec.action, timeline)
-        if isinstance(plan, Refusal):
+        if isinstance(plan, Rejection):
             self._out.refuse(plan, chunk.record.worker)
             return
         while self._waiting:
@@ -407,7 +407,7 @@ class Commander:
         if ready is False:
             return
         self._coming = None
-        if isinstance(ready, Refusal):
+        if isinstance(ready, Rejection):
             self._out.refuse(ready, worker)
             return
         if self.state is State.HOLDING:
@@ -428,12 +428,12 @@ class Commander:
         if self.state in OBEYING and chunk.record.episode == self.task.episode:
             return False
         why = "the arm was stopped or told something else meanwhile"
-        self._out.refuse(Refusal("superseded", why, quiet=True), chunk.record.worker)
+        self._out.refuse(Rejection("superseded", why, quiet=True), chunk.record.worker)
         return True
 
     def _overtaken(self, chunk: Stamped[ActionChunk]) -> None:
         why = "a newer one came before it was begun"
-        self._out.refuse(Refusal("overtaken", why, quiet=True), chunk.record.worker)
+        self._out.refuse(Rejection("overtaken", why, quiet=True), chunk.record.worker)
 
     # -- watching -----------------------------------------------------------------------------
     def _look_around(self, now_ns: int) -> None:

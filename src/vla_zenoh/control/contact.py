@@ -32,7 +32,7 @@ STEPS = 10
 """The speed has so many shares: each change of it plans the motion anew."""
 
 
-class Pressed(NamedTuple):
+class ExternalLoad(NamedTuple):
     """More than may press against the arm.
 
     Args:
@@ -170,12 +170,12 @@ class Contact:
         """Nothing presses, as far as the robot tells."""
         return all(kind.value <= QUIET * kind.slow for kind in self._kinds)
 
-    def pressed(self) -> Pressed | None:
+    def pressed(self) -> ExternalLoad | None:
         """What is above its limit, None: nothing."""
         for kind in self._kinds:
             value = kind.value
             if value > kind.stop:
-                return Pressed(kind.name, value, kind.stop, kind.unit)
+                return ExternalLoad(kind.name, value, kind.stop, kind.unit)
         return None
 
     def slowdown(self) -> Slowdown | None:

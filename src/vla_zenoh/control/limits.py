@@ -7,9 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.so3 import Pose, exp3, log3, norm3, orthonormal
+from vla_zenoh.kinematics.so3 import Pose, exp3, log3, norm3, orthonormal
 from vla_zenoh.profile import REFUSE_FACTOR, Limits
 from vla_zenoh.types import FloatArray
+
+
+class JointMotionLimits(NamedTuple):
+    """(n,) each: rad/s, rad/s^2, rad/s^3."""
+
+    velocity_rad_s: FloatArray
+    acceleration_rad_s2: FloatArray
+    jerk_rad_s3: FloatArray
 
 
 class LimitHit(NamedTuple):

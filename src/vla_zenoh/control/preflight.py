@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from vla_zenoh.check import fit, plausible
+from vla_zenoh.control import chunk_plausibility as plausible
+from vla_zenoh.control import spec_fit as fit
 from vla_zenoh.control.limits import into_workspace
-from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import SpecError
-from vla_zenoh.offset import Offset
+from vla_zenoh.keys import worker_node
+from vla_zenoh.ntp import Offset
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, GripperState, PoseState, Stamped
@@ -25,7 +26,7 @@ CAMERA_PATIENCE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class PeerSnapshot:
     """What the command node knows of the nodes around it.
 
     Args:
@@ -62,7 +63,7 @@ def reasons_not_to_activate(
     profile: Profile,
     worker: str,
     prompt: str,
-    around: Surroundings,
+    around: PeerSnapshot,
     pose: Stamped[PoseState] | None,
     gripper: Stamped[GripperState] | None,
     chunk: Stamped[ActionChunk] | None,
@@ -75,7 +76,7 @@ def reasons_not_to_activate(
         profile: the effective profile.
         worker: the worker that holds the lease.
         prompt: the prompt in force.
-        around: see `Surroundings`.
+        around: see `PeerSnapshot`.
         pose: newest TCP pose.
         gripper: newest gripper state.
         chunk: newest chunk of that worker, made while it was not obeyed.
@@ -95,7 +96,7 @@ def reasons_not_to_activate(
 
 def _robot(
     profile: Profile,
-    around: Surroundings,
+    around: PeerSnapshot,
     pose: Stamped[PoseState] | None,
     now_ns: int,
 ) -> list[str]:
@@ -140,7 +141,7 @@ def _too_old(what: str, state: Stamped[Any], profile: Profile, now_ns: int) -> l
     return [f"the {what} is {age_s:.2f} s old, at most {limit_s:g} s is allowed"]
 
 
-def _worker(worker: str, prompt: str, around: Surroundings) -> list[str]:
+def _worker(worker: str, prompt: str, around: PeerSnapshot) -> list[str]:
     node = worker_node(worker)
     if node not in around.alive:
         others = sorted(
@@ -159,7 +160,7 @@ def _worker(worker: str, prompt: str, around: Surroundings) -> list[str]:
     return reasons
 
 
-def _spec(profile: Profile, worker: str, around: Surroundings, rate_hz: float) -> list[str]:
+def _spec(profile: Profile, worker: str, around: PeerSnapshot, rate_hz: float) -> list[str]:
     """What its spec asks for and the profile does not give."""
     spec = around.specs.get(worker)
     if spec is None:
@@ -174,7 +175,7 @@ def _spec(profile: Profile, worker: str, around: Surroundings, rate_hz: float) -
 def _chunk(
     profile: Profile,
     worker: str,
-    around: Surroundings,
+    around: PeerSnapshot,
     chunk: Stamped[ActionChunk] | None,
     now_ns: int,
     rate_hz: float,
@@ -215,7 +216,7 @@ def _chunk(
     ]
 
 
-def _cameras(profile: Profile, worker: str, around: Surroundings) -> list[str]:
+def _cameras(profile: Profile, worker: str, around: PeerSnapshot) -> list[str]:
     spec = around.specs.get(worker)
     if spec is None:
         return []
@@ -235,7 +236,7 @@ def _cameras(profile: Profile, worker: str, around: Surroundings) -> list[str]:
     return reasons
 
 
-def _clocks(profile: Profile, worker: str, around: Surroundings) -> list[str]:
+def _clocks(profile: Profile, worker: str, around: PeerSnapshot) -> list[str]:
     """Clocks that are off by more than can be reckoned with, or not known and not our own."""
     spec = around.specs.get(worker)
     cameras = spec.observation.cameras if spec is not None else ()

@@ -18,9 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vla_zenoh.control.commander_io import Outputs
 from vla_zenoh.control.contact import Contact
-from vla_zenoh.control.ports import Outputs
-from vla_zenoh.control.so3 import Pose, distance, norm3
+from vla_zenoh.kinematics.so3 import Pose, distance, norm3
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
@@ -39,7 +39,7 @@ STRAY_M, STRAY_RAD = 0.01, 0.05
 """An arm that stands further than it was found blocked, and the brake, and this, is not there."""
 
 
-class Trail:
+class CommandTrail:
     """The way on which the arm came: measured poses, `SPACE_M` apart, newest last.
 
     What was gone there and back again is left out, so it never turns round.
@@ -105,7 +105,7 @@ class Retreat:
         self._limits, self._contact = limits, contact
         self.speed = min(1.0, limits.contact.retreat_m_s / limits.translation.velocity_m_s)
         """Share of the speed limits that it has."""
-        self._trail = Trail()
+        self._trail = CommandTrail()
         self._measured: Pose | None = None
         self._begun: _Begun | None = None
         self._target: Pose | None = None

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.smoothing import ROTATION_BOX
-from vla_zenoh.control.so3 import Pose, log3
+from vla_zenoh.kinematics.so3 import Pose, log3
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 

@@ -37,7 +37,7 @@ from ruckig import (
     Trajectory,
 )
 
-from vla_zenoh.control.so3 import Pose, body_rates, cross3, exp3, log3, norm3, orthonormal
+from vla_zenoh.kinematics.so3 import Pose, body_rates, cross3, exp3, log3, norm3, orthonormal
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 

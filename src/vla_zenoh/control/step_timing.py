@@ -17,7 +17,7 @@ last one, before the watchdog would brake it. ``x`` is a phase-locked clock of t
 alpha-beta filter), ``spare`` twice their mean deviation from it: what an inference takes varies.
 
 Only the speed is bounded by this. Which goal is in force when, and where the arm ends, are those of
-`vla_zenoh.control.compose`.
+`vla_zenoh.control.plan_timeline`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import math
 
 import numpy as np
 
-from vla_zenoh.control.compose import Plan
+from vla_zenoh.control.plan_timeline import Plan
 from vla_zenoh.types import FloatArray
 
 PHASE, PERIOD, DEVIATION = 0.3, 0.1, 0.2

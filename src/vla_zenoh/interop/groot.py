@@ -28,7 +28,7 @@ import numpy as np
 from vla_zenoh.codec.message import MAX_ITEMS, MAX_PAYLOAD_BYTES, count_containers
 from vla_zenoh.errors import PeerError
 from vla_zenoh.interop import npy
-from vla_zenoh.interop.layout import Layout
+from vla_zenoh.interop.field_mapping import FieldMapping
 from vla_zenoh.types import shown
 
 Version = Literal["n1.5", "n1.6"]
@@ -174,7 +174,7 @@ def read_actions(payload: bytes) -> dict[str, Any]:
     return {str(name).removeprefix(ACTION): value for name, value in answer.items()}
 
 
-def mismatches(modalities: Any, layout: Layout) -> list[str]:
+def mismatches(modalities: Any, layout: FieldMapping) -> list[str]:
     """What the server's modalities and the layout differ in: one sentence each."""
     if not isinstance(modalities, dict):
         return []

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.control.so3 import quat_from_rotation
 from vla_zenoh.errors import MissingExtraError
+from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import JointState
 
@@ -25,7 +25,7 @@ def make_forward(profile: Profile) -> Forward:
         ProfileError: frames or joints that the description does not have.
     """
     try:
-        from vla_zenoh.control.arm import make_kinematics
+        from vla_zenoh.control.profile_arm import make_kinematics
     except ImportError as error:
         raise MissingExtraError(error.name or "pinocchio", "control") from error
     kinematics = make_kinematics(profile)

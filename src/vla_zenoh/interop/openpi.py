@@ -15,7 +15,7 @@ from typing import Any
 
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError
-from vla_zenoh.interop.layout import Layout
+from vla_zenoh.interop.field_mapping import FieldMapping
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import shown
 
@@ -90,7 +90,7 @@ def _read(frame: bytes | str) -> Any:
     return found
 
 
-def mismatches(metadata: Mapping[str, Any], layout: Layout) -> list[str]:
+def mismatches(metadata: Mapping[str, Any], layout: FieldMapping) -> list[str]:
     """What the server says of itself and the layout does not: one sentence each.
 
     openpi's own server says nothing of its actions; vllm-omni's and ours do.

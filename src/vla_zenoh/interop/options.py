@@ -1,4 +1,4 @@
-"""The options that make a `Layout`.
+"""The options that make a `FieldMapping`.
 
 Everything is given as text options (``--set name=value``), and a preset is no more than such
 options for a known robot, each of which can be overridden; the preset ``none`` has none::
@@ -11,7 +11,7 @@ options for a known robot, each of which can be overridden; the preset ``none`` 
     keys       names in the answer, stood side by side (groot: x,y,z,...)
     columns    which of its columns, as 0:7 or 0,1,2,6
 
-and what the numbers of an answer mean, see `vla_zenoh.interop.meaning`.
+and what the numbers of an answer mean, see `vla_zenoh.interop.action_semantics`.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from collections.abc import Mapping
 from typing import Literal, cast
 
 from vla_zenoh.errors import SpecError
-from vla_zenoh.interop.layout import Layout, Source
-from vla_zenoh.interop.meaning import MEANING, as_spec_error, read_meaning
-from vla_zenoh.model_options import number
+from vla_zenoh.interop.action_semantics import MEANING, as_spec_error, read_meaning
+from vla_zenoh.interop.field_mapping import FieldMapping, FieldSource
 from vla_zenoh.policy import CameraSpec, ModelSpec, ObservationSpec, Resize, StatePart
-from vla_zenoh.state_vector import parts_of, read_parts
+from vla_zenoh.policy.model_options import number
+from vla_zenoh.policy.state_vector import parts_of, read_parts
 
 DEFAULTS: Mapping[str, str] = {
     "map": "",
@@ -51,7 +51,7 @@ def read_layout(
     *,
     max_width_m: float,
     normalisation: str | None = None,
-) -> Layout:
+) -> FieldMapping:
     """A layout of a preset and the options that override it.
 
     Args:
@@ -84,7 +84,7 @@ def read_layout(
     meaning = read_meaning(told, presets[preset], whose, normalisation=normalisation)
     with as_spec_error():
         observation = _observation(fields, chosen, meaning.needs_joints)
-    return Layout(
+    return FieldMapping(
         fields=fields,
         spec=ModelSpec(name=name, observation=observation, action=meaning.spec),
         keys=_keys(chosen["keys"]),
@@ -95,7 +95,7 @@ def read_layout(
 
 
 def _observation(
-    fields: Mapping[str, Source], chosen: Mapping[str, str], joints: bool
+    fields: Mapping[str, FieldSource], chosen: Mapping[str, str], joints: bool
 ) -> ObservationSpec:
     size = read_size(chosen["size"])
     parts = {part for source in fields.values() for part in parts_of(source.parts)}
@@ -165,13 +165,13 @@ def read_columns(text: str) -> tuple[int, ...] | None:
     raise SpecError(f"columns is {text!r}, wanted 0:7 or 0,1,2,6")
 
 
-def read_map(text: str) -> dict[str, Source | None]:
+def read_map(text: str) -> dict[str, FieldSource | None]:
     """The option `map`; None: this name is left out.
 
     Raises:
         SpecError: it cannot be read; says what is allowed.
     """
-    out: dict[str, Source | None] = {}
+    out: dict[str, FieldSource | None] = {}
     for entry in filter(None, (part.strip() for part in text.split(","))):
         theirs, equals, ours = (part.strip() for part in entry.partition("="))
         if not equals or not theirs:
@@ -182,14 +182,14 @@ def read_map(text: str) -> dict[str, Source | None]:
     return out
 
 
-def _source(text: str) -> Source:
+def _source(text: str) -> FieldSource:
     kind, colon, rest = text.partition(":")
     if kind == "camera" and rest:
-        return Source(camera=rest)
+        return FieldSource(camera=rest)
     if kind == "blank" and (size := _SIZE.fullmatch(rest)):
-        return Source(blank=(int(size[1]), int(size[2])))
+        return FieldSource(blank=(int(size[1]), int(size[2])))
     if text == "prompt":
-        return Source(prompt=True)
+        return FieldSource(prompt=True)
     if colon:
         raise SpecError(f"a source is camera:NAME, blank:HxW, prompt or parts, not {text!r}")
-    return Source(parts=read_parts(text))
+    return FieldSource(parts=read_parts(text))

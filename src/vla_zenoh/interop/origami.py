@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError
-from vla_zenoh.interop.layout import Layout
+from vla_zenoh.interop.field_mapping import FieldMapping
 from vla_zenoh.types import shown
 
 PROTOCOL = "origami-zenoh-v1"
@@ -70,7 +70,7 @@ def read_answer(payload: bytes, operation: Operation, request_id: str) -> Any:
     return answer[part]
 
 
-def mismatches(metadata: Any, layout: Layout) -> list[str]:
+def mismatches(metadata: Any, layout: FieldMapping) -> list[str]:
     """What the server says of itself and the layout does not: one sentence each."""
     if not isinstance(metadata, dict):
         return [f"its metadata is no map: {shown(metadata)}"]

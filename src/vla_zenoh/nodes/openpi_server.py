@@ -15,7 +15,7 @@ from typing import Any
 
 from vla_zenoh.errors import MissingExtraError, PeerError, SpecError
 from vla_zenoh.interop import openpi
-from vla_zenoh.interop.offer import Offer
+from vla_zenoh.interop.served_policy import ServedPolicy
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
 
 try:
@@ -42,7 +42,7 @@ class OpenPiServer:
     """
 
     def __init__(
-        self, policy: Policy, offer: Offer, host: str, port: int, *, api_key: str = ""
+        self, policy: Policy, offer: ServedPolicy, host: str, port: int, *, api_key: str = ""
     ) -> None:
         self._policy, self._offer, self._key = policy, offer, api_key
         self._busy = threading.Lock()

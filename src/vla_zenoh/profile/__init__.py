@@ -12,8 +12,9 @@ from vla_zenoh.profile.load import (
     read_profile,
     to_yaml,
 )
+from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.robot import POSE_JOINTS, GripperProfile, JointEnds, RobotProfile
-from vla_zenoh.profile.schema import CameraProfile, Composition, HostProfile, Profile, Timing
+from vla_zenoh.profile.schema import CameraProfile, Composition, HostProfile, Timing
 from vla_zenoh.profile.session import SessionProfile
 
 __all__ = [

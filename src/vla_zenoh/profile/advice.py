@@ -7,10 +7,10 @@ from pathlib import Path
 
 from vla_zenoh import resources
 from vla_zenoh.errors import MissingExtraError, ResourceError, WorkerError
-from vla_zenoh.loader import find_worker
+from vla_zenoh.policy.loader import find_worker
 from vla_zenoh.profile.fit import cameras_of, workers_of
+from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.robot import POSE_JOINTS
-from vla_zenoh.profile.schema import Profile
 from vla_zenoh.profile.session import ANYWHERE, address_of, is_loopback
 
 

@@ -8,10 +8,10 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from vla_zenoh.faults import in_words, nearest
-from vla_zenoh.profile.schema import Profile
+from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.section import Misfit, Place
 from vla_zenoh.profile.yaml_text import Lines
+from vla_zenoh.pydantic_errors import in_words, nearest
 from vla_zenoh.types import shown
 
 _NO_VALUE_SHOWN = {"missing", "extra_forbidden", "too_long", "too_short", "value_error"}

@@ -17,7 +17,7 @@ from vla_zenoh.errors import ResourceError
 from vla_zenoh.profile.fit import workers_of
 from vla_zenoh.profile.load import SUFFIXES, followed, load_profile
 from vla_zenoh.profile.paths import below, paths_in
-from vla_zenoh.profile.schema import Profile
+from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.yaml_text import read
 
 MESH = re.compile(rb"""<mesh\b[^>]*?\bfilename\s*=\s*["']([^"']+)["']""")
@@ -26,7 +26,7 @@ BESIDE, HOME, WHOLE = "beside the profile", "~", "/"
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class FileUse:
     """Files and folders that belong together.
 
     Args:
@@ -52,10 +52,10 @@ class Needed:
     """
 
     profile: str
-    beside: Part
-    searched: tuple[Part, ...]
-    home: Part
-    whole: Part
+    beside: FileUse
+    searched: tuple[FileUse, ...]
+    home: FileUse
+    whole: FileUse
     missing: tuple[str, ...]
 
 
@@ -167,11 +167,11 @@ class _Found:
             tuple(self.missing),
         )
 
-    def _part(self, base: Path, files: list[Path]) -> Part:
+    def _part(self, base: Path, files: list[Path]) -> FileUse:
         outside = [file for file in files if not file.is_relative_to(base)]
         self.missing.update({f"{file}, which is not below {base}": None for file in outside})
         names = [str(file.relative_to(base)) for file in files if file not in outside]
-        return Part(base, tuple(names))
+        return FileUse(base, tuple(names))
 
 
 def _place(before: Path, path: Path, named: str, where: str) -> str:

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
 
-from vla_zenoh.faults import nearest
 from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Gripper
+from vla_zenoh.profile.schema import HostProfile, ProfileFields
 from vla_zenoh.profile.section import Place
 from vla_zenoh.profile.session import TRUSTED_PROTOCOLS, endpoint_faults, is_loopback
-
-if TYPE_CHECKING:
-    from vla_zenoh.profile.schema import HostProfile, Profile
+from vla_zenoh.pydantic_errors import nearest
 
 Fault = tuple[Place, str]
 
@@ -24,7 +21,7 @@ ONLY_ONE = {
 }
 
 
-def faults(profile: Profile) -> list[Fault]:
+def faults(profile: ProfileFields) -> list[Fault]:
     """(place, sentence) of everything that does not fit."""
     return [
         *_robot(profile),
@@ -38,27 +35,27 @@ def faults(profile: Profile) -> list[Fault]:
     ]
 
 
-def cameras_of(profile: Profile, host: HostProfile) -> tuple[str, ...]:
+def cameras_of(profile: ProfileFields, host: HostProfile) -> tuple[str, ...]:
     """Names of the cameras that `host` runs."""
     if "camera" not in host.nodes:
         return ()
     return tuple(profile.cameras) if host.cameras is None else host.cameras
 
 
-def workers_of(profile: Profile, host: HostProfile) -> tuple[str, ...]:
+def workers_of(profile: ProfileFields, host: HostProfile) -> tuple[str, ...]:
     """Names of the workers that `host` runs."""
     if "worker" not in host.nodes:
         return ()
     return profile.workers if host.workers is None else host.workers
 
 
-def node_name(profile: Profile, host: str, kind: str) -> str:
+def node_name(profile: ProfileFields, host: str, kind: str) -> str:
     """What a node of this kind is called on the bus: two hosts may each have one."""
     hosts = [name for name, part in profile.hosts.items() if kind in part.nodes]
     return kind if len(hosts) < 2 else f"{kind}-{host}"
 
 
-def _robot(profile: Profile) -> Iterator[Fault]:
+def _robot(profile: ProfileFields) -> Iterator[Fault]:
     if profile.robot.driver == "ros2" and profile.ros2 is None:
         yield ("ros2",), "is missing: robot.driver is ros2"
     if profile.robot.driver == "arm" and profile.arm is None:
@@ -72,7 +69,7 @@ def _robot(profile: Profile) -> Iterator[Fault]:
             )
 
 
-def _cameras(profile: Profile) -> Iterator[Fault]:
+def _cameras(profile: ProfileFields) -> Iterator[Fault]:
     for name, camera in profile.cameras.items():
         place = ("cameras", name, "source")
         if camera.source.startswith("ros2:") and profile.ros2 is None:
@@ -89,7 +86,7 @@ def _cameras(profile: Profile) -> Iterator[Fault]:
         yield from _unknown(("ros2", "cameras"), profile.ros2.cameras, "cameras", profile.cameras)
 
 
-def _ros2(profile: Profile) -> Iterator[Fault]:
+def _ros2(profile: ProfileFields) -> Iterator[Fault]:
     ros2, robot = profile.ros2, profile.robot
     if ros2 is None:
         return
@@ -128,7 +125,7 @@ def _gripper_position(gripper: Ros2Gripper, has_ends: bool) -> Iterator[Fault]:
         )
 
 
-def _way_to_ros2(profile: Profile) -> Iterator[Fault]:
+def _way_to_ros2(profile: ProfileFields) -> Iterator[Fault]:
     """Whoever speaks to the bridge moves the robot past our command node."""
     assert profile.ros2 is not None
     places, secured = profile.ros2.connect, profile.session.security is not None
@@ -151,7 +148,7 @@ def _way_to_ros2(profile: Profile) -> Iterator[Fault]:
             yield ("ros2", "connect", str(index)), why
 
 
-def _task(profile: Profile) -> Iterator[Fault]:
+def _task(profile: ProfileFields) -> Iterator[Fault]:
     if profile.task.worker not in profile.workers:
         yield (
             ("task", "worker"),
@@ -161,7 +158,7 @@ def _task(profile: Profile) -> Iterator[Fault]:
         )
 
 
-def _serves(profile: Profile) -> Iterator[Fault]:
+def _serves(profile: ProfileFields) -> Iterator[Fault]:
     yield from _unknown(("serves",), profile.serves, "workers", profile.workers)
     for worker, robots in profile.serves.items():
         if profile.robot.name not in robots:
@@ -172,7 +169,7 @@ def _serves(profile: Profile) -> Iterator[Fault]:
             )
 
 
-def _hosts(profile: Profile) -> Iterator[Fault]:
+def _hosts(profile: ProfileFields) -> Iterator[Fault]:
     if not profile.hosts:
         yield ("hosts",), "is empty: name at least one host and its nodes"
     runs: dict[tuple[str, str], list[str]] = defaultdict(list)
@@ -208,7 +205,7 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
             )
 
 
-def _endpoints(profile: Profile, name: str, host: HostProfile) -> Iterator[Fault]:
+def _endpoints(profile: ProfileFields, name: str, host: HostProfile) -> Iterator[Fault]:
     for what in ("connect", "listen", "link"):
         endpoints = getattr(host, what)
         for index, why in endpoint_faults(
@@ -219,7 +216,7 @@ def _endpoints(profile: Profile, name: str, host: HostProfile) -> Iterator[Fault
             yield ("hosts", name, what), "is for a router, and this host runs none"
 
 
-def _routers(profile: Profile) -> Iterator[Fault]:
+def _routers(profile: ProfileFields) -> Iterator[Fault]:
     """Every router but one has to be told of another: they do not find each other."""
     alone = [n for n, host in profile.hosts.items() if "router" in host.nodes and not host.link]
     for name in alone[1:]:

@@ -49,7 +49,7 @@ class RotationLimits(Section):
 
 
 class ReachLimits(Section):
-    """What the arm's kinematics allow a goal to be; see `vla_zenoh.control.reach`.
+    """What the arm's kinematics allow a goal to be; see `vla_zenoh.control.reachability`.
 
     Args:
         joint_margin_rad: kept from both ends of every joint's range.

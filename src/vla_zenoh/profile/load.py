@@ -13,7 +13,7 @@ from vla_zenoh.errors import ProfileError, ResourceError
 from vla_zenoh.profile import yaml_text
 from vla_zenoh.profile.explain import explain
 from vla_zenoh.profile.paths import anchor
-from vla_zenoh.profile.schema import Profile
+from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.section import Place
 from vla_zenoh.profile.yaml_text import Lines
 

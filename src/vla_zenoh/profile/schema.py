@@ -13,7 +13,6 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import Keys
-from vla_zenoh.profile import fit
 from vla_zenoh.profile.arm import ArmProfile, Options
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import RobotProfile
@@ -140,7 +139,7 @@ class Composition(Section):
 
 
 class CameraCheck(Section):
-    """When a camera's own pictures say that it must not be believed; `vla_zenoh.picture_check`.
+    """When a camera's own pictures say that it must not be believed; `nodes.camera.image_check`.
 
     A limit of 0, of a share 1, switches that check off.
 
@@ -274,8 +273,8 @@ class HostProfile(Section):
     pictures: PicturesProfile | None = None
 
 
-class Profile(Section):
-    """Everything about one robot and its lab.
+class ProfileFields(Section):
+    """Everything about one robot and its lab; not yet checked as a whole, see `Profile`.
 
     Args:
         workers: their names; each is that of a model, unless `models` says which one it runs.
@@ -312,8 +311,3 @@ class Profile(Section):
     def keys(self) -> Keys:
         """The keys of this profile's robot."""
         return Keys(self.robot.name, self.root)
-
-    @model_validator(mode="after")
-    def _parts_fit(self) -> Profile:
-        refuse(fit.faults(self))
-        return self

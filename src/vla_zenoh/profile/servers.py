@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vla_zenoh.profile.fit import cameras_of, node_name
-from vla_zenoh.profile.schema import Profile
+from vla_zenoh.profile.profile import Profile
 
 
 def camera_servers(profile: Profile) -> dict[str, str]:

@@ -31,7 +31,7 @@ MAX_COMMON_NAME = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class KeyPair:
     """A certificate and its private key, as PEM text."""
 
     certificate: bytes
@@ -78,7 +78,7 @@ class Certificate:
         return f"ends in {left} day{'s' if left != 1 else ''}; renew it"
 
 
-def make_authority(name: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> Pair:
+def make_authority(name: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> KeyPair:
     """A new authority: a key, and a certificate that it signed itself.
 
     Args:
@@ -103,13 +103,13 @@ def make_authority(name: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> P
 
 
 def issue(
-    authority: Pair,
+    authority: KeyPair,
     common_name: str,
     now: dt.datetime,
     *,
     days: int = CERTIFICATE_DAYS,
     addresses: Iterable[str] | None = None,
-) -> Pair:
+) -> KeyPair:
     """A certificate for `common_name`, signed by `authority`.
 
     Args:
@@ -198,7 +198,7 @@ def signed_by(pem: bytes, authority: bytes) -> bool:
     return True
 
 
-def key_fits(pair: Pair) -> bool:
+def key_fits(pair: KeyPair) -> bool:
     """Whether the private key is the certificate's.
 
     Raises:
@@ -284,11 +284,11 @@ def _signed(
     builder: x509.CertificateBuilder,
     key: ec.EllipticCurvePrivateKey,
     signer: ec.EllipticCurvePrivateKey,
-) -> Pair:
+) -> KeyPair:
     from cryptography.hazmat.primitives import hashes, serialization
 
     certificate = builder.sign(signer, hashes.SHA256())
-    return Pair(
+    return KeyPair(
         certificate.public_bytes(serialization.Encoding.PEM),
         key.private_bytes(
             serialization.Encoding.PEM,
@@ -298,7 +298,7 @@ def _signed(
     )
 
 
-def _load(pair: Pair) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+def _load(pair: KeyPair) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
     x509, _ = _library()
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric import ec

@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from vla_zenoh.control.names import worker_node
 from vla_zenoh.errors import ProfileError, SecurityError
+from vla_zenoh.keys import worker_node
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.fit import cameras_of, node_name, workers_of
 

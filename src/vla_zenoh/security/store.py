@@ -21,7 +21,7 @@ from pathlib import Path
 
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.security import authority as ca
-from vla_zenoh.security.authority import Certificate, Pair
+from vla_zenoh.security.authority import Certificate, KeyPair
 from vla_zenoh.security.identity import PEOPLE, Identity, Role
 
 AUTHORITY = "ca"
@@ -131,7 +131,7 @@ class Store:
             _put(folder / f"{AUTHORITY}.pem", authority.certificate, 0o644)
         return made
 
-    def _authority(self) -> Pair:
+    def _authority(self) -> KeyPair:
         certificate, key = (self.folder / f"{AUTHORITY}.{end}" for end in ("pem", "key"))
         if not certificate.exists():
             raise SecurityError(f"{certificate} is not there: begin with `vla-zenoh secure init`")
@@ -142,7 +142,7 @@ class Store:
             )
         if fault := open_to_others(key):
             raise SecurityError(f"{fault}. Whoever read it can make certificates of this lab")
-        return Pair(_get(certificate), _get(key))
+        return KeyPair(_get(certificate), _get(key))
 
     def _served(self, identity: Identity) -> tuple[str, ...]:
         """What the certificate that is there says it serves as: only there it was ever written."""
@@ -151,7 +151,7 @@ class Store:
         except SecurityError:
             return ()
 
-    def _write(self, folder: Path, name: str, pair: Pair, *, renew: bool) -> Path:
+    def _write(self, folder: Path, name: str, pair: KeyPair, *, renew: bool) -> Path:
         files = Files(folder, folder / f"{name}.pem", folder / f"{name}.key")
         if not renew:
             self._refuse_to_overwrite(files)
@@ -301,7 +301,7 @@ class Store:
             return
         if fault := open_to_others(key):
             yield fault
-        if not ca.key_fits(Pair(_get(path), _get(key))):
+        if not ca.key_fits(KeyPair(_get(path), _get(key))):
             yield f"{key.name} belongs to another certificate"
 
 

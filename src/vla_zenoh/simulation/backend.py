@@ -78,7 +78,7 @@ def why_not(name: str) -> str:
     missing = [part for part in _LIBRARIES[name] if ctypes.util.find_library(part) is None]
     if missing:
         return f"the library lib{missing[0]} is not installed"
-    command = [sys.executable, "-m", "vla_zenoh.simulation.probe", name]
+    command = [sys.executable, "-m", "vla_zenoh.simulation.opengl_probe", name]
     # Whatever the caller's environment says must not decide what the probe tries.
     environment = {key: value for key, value in os.environ.items() if key not in _GL_VARIABLES}
     environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)

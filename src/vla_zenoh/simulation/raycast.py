@@ -49,7 +49,7 @@ class Background(NamedTuple):
     distance: FloatArray
 
 
-class View(NamedTuple):
+class Viewpoint(NamedTuple):
     """A camera now: where it is, its axes (3, 3), focal length in pixels, size in pixels."""
 
     position_m: FloatArray
@@ -86,7 +86,7 @@ class RaycastCanvas:
         index = self._model.camera(camera).id
         focal = height / 2.0 / math.tan(math.radians(self._model.cam_fovy[index]) / 2.0)
         axes = data.cam_xmat[index].reshape(3, 3)
-        view = View(data.cam_xpos[index].copy(), axes.copy(), focal, width, height)
+        view = Viewpoint(data.cam_xpos[index].copy(), axes.copy(), focal, width, height)
         body = self._model.cam_bodyid[index]
         if self._model.body_weldid[body] == 0 and self._model.body_mocapid[body] < 0:
             return self._over_background(data, view, (index, width, height))
@@ -96,7 +96,7 @@ class RaycastCanvas:
         """Nothing to give back."""
 
     def _over_background(
-        self, data: mujoco.MjData, view: View, key: tuple[int, int, int]
+        self, data: mujoco.MjData, view: Viewpoint, key: tuple[int, int, int]
     ) -> Pixels:
         if key not in self._backgrounds:
             rays = self._directions(view).reshape(-1, 3)
@@ -114,7 +114,7 @@ class RaycastCanvas:
         picture[rows[seen], columns[seen]] = self._shade(data, view, rays[seen], front)
         return picture
 
-    def _coarse_to_fine(self, data: mujoco.MjData, view: View) -> Pixels:
+    def _coarse_to_fine(self, data: mujoco.MjData, view: Viewpoint) -> Pixels:
         groups = {STATIC_GROUP, MOVING_GROUP}
         coarse = self._directions(view, GRID_PX)
         grid = coarse.shape[:2]
@@ -136,7 +136,7 @@ class RaycastCanvas:
         picture[rows, columns] = self._shade(data, view, rays, fine)
         return np.asarray(picture, np.uint8)
 
-    def _directions(self, view: View, step_px: int = 1) -> FloatArray:
+    def _directions(self, view: Viewpoint, step_px: int = 1) -> FloatArray:
         """Rays through every `step_px`-th pixel, in the camera's own axes, one unit deep.
 
         (height, width, 3) for a step of 1; else the grid reaches over the picture's edge, so that
@@ -154,7 +154,9 @@ class RaycastCanvas:
             self._rays[key] = rays
         return self._rays[key]
 
-    def _cast(self, data: mujoco.MjData, view: View, rays: FloatArray, groups: set[int]) -> Hits:
+    def _cast(
+        self, data: mujoco.MjData, view: Viewpoint, rays: FloatArray, groups: set[int]
+    ) -> Hits:
         count = len(rays)
         geom = np.full(count, -1, np.int32)
         distance, normal = np.zeros(count), np.zeros((count, 3))
@@ -177,7 +179,7 @@ class RaycastCanvas:
             )
         return Hits(geom, distance, normal)
 
-    def _shade(self, data: mujoco.MjData, view: View, rays: FloatArray, hits: Hits) -> Pixels:
+    def _shade(self, data: mujoco.MjData, view: Viewpoint, rays: FloatArray, hits: Hits) -> Pixels:
         """(n, 3) colours; black where a ray met nothing, as in OpenGL."""
         model, head = self._model, self._model.vis.headlight
         normal = hits.normal
@@ -199,7 +201,7 @@ class RaycastCanvas:
         colour = np.minimum(self._rgb[hits.geom] * light, 1.0) * 255.0 + 0.5
         return np.where(hits.geom[:, None] < 0, 0, colour).astype(np.uint8)
 
-    def _covered(self, data: mujoco.MjData, view: View) -> NDArray[np.bool_]:
+    def _covered(self, data: mujoco.MjData, view: Viewpoint) -> NDArray[np.bool_]:
         """Pixels (height, width) that moving geoms may cover."""
         mask = np.zeros((view.height, view.width), np.uint8)
         centre = np.array([view.width / 2.0, view.height / 2.0])

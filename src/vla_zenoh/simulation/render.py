@@ -55,7 +55,7 @@ class Renderer:
         # Not before the choice: with a bad MUJOCO_GL in the environment the import itself fails.
         import mujoco
 
-        from vla_zenoh.simulation.look import Dresser
+        from vla_zenoh.simulation.appearance import Dresser
         from vla_zenoh.simulation.scene import build_model
 
         self.backend = chosen
@@ -87,9 +87,9 @@ class Renderer:
         Raises:
             ResourceError: an unknown name in `vary`, or the scene has nothing to vary so.
         """
-        from vla_zenoh.simulation.look import Look, draw_look
+        from vla_zenoh.simulation.appearance import Appearance, draw_look
 
-        self._dresser.wear(Look() if seed is None else draw_look(seed, vary))
+        self._dresser.wear(Appearance() if seed is None else draw_look(seed, vary))
         self._canvas.refresh()
         self._update()
 

@@ -9,28 +9,27 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vla_zenoh.control.impedance import (
+from vla_zenoh.errors import NodeError
+from vla_zenoh.simulation.appearance import DISTRACTORS, draw_look
+from vla_zenoh.simulation.cartesian_impedance import (
     ArmState,
-    ImpedanceController,
+    CartesianImpedance,
     ImpedanceGains,
     ImpedanceOutput,
-    Reference,
 )
-from vla_zenoh.control.joint_impedance import (
+from vla_zenoh.simulation.joint_impedance import (
     JointGains,
     JointImpedanceController,
     JointImpedanceOutput,
-    JointReference,
 )
-from vla_zenoh.errors import NodeError
-from vla_zenoh.simulation.arm import SimulatedArm
-from vla_zenoh.simulation.hand import SimulatedHand
-from vla_zenoh.simulation.look import DISTRACTORS, draw_look
-from vla_zenoh.simulation.objects import SimulatedObjects
 from vla_zenoh.simulation.pose_vector import read_pose_vector, write_pose_vector
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import STEP_S, build_model
+from vla_zenoh.simulation.simulated_arm import SimulatedArm
+from vla_zenoh.simulation.simulated_hand import SimulatedHand
+from vla_zenoh.simulation.simulated_objects import SimulatedObjects
 from vla_zenoh.types import GripperState, JointState, PoseState, vector
+from vla_zenoh.types.references import JointReference, PoseReference
 
 FloatArray = NDArray[np.float64]
 
@@ -85,7 +84,7 @@ class World:
         self._arm = SimulatedArm(self.model, self._data, robot)
         self._hand = SimulatedHand(self.model, self._data, robot)
         self._objects = SimulatedObjects(self.model, self._data)
-        self._controller = ImpedanceController(
+        self._controller = CartesianImpedance(
             gains,
             lower_rad=self._arm.lower_rad,
             upper_rad=self._arm.upper_rad,
@@ -98,7 +97,7 @@ class World:
             effort_nm=self._arm.effort_limit_nm,
             period_s=STEP_S,
         )
-        self._in_charge: ImpedanceController | JointImpedanceController | None = None
+        self._in_charge: CartesianImpedance | JointImpedanceController | None = None
         self._held_rad: FloatArray | None = None
         self._felt = np.zeros(6)
         self.saturated = 0
@@ -128,7 +127,7 @@ class World:
         mujoco.mj_forward(model, data)
         self._fresh = True
 
-    def tick(self, reference: Reference) -> None:
+    def tick(self, reference: PoseReference) -> None:
         """Go on by exactly one millisecond towards `reference`.
 
         Raises:
@@ -154,10 +153,10 @@ class World:
         """The reference that keeps the joints where they are now."""
         return JointReference.at_rest(self._arm.position_rad)
 
-    def hold_reference(self) -> Reference:
+    def hold_reference(self) -> PoseReference:
         """The reference that keeps the TCP where it is now."""
         position, rotation = self.tcp()
-        return Reference(position, rotation, np.zeros(6), np.zeros(6))
+        return PoseReference(position, rotation, np.zeros(6), np.zeros(6))
 
     def set_gripper(self, width_m: float, speed_m_s: float, force_n: float) -> None:
         """Open or close to `width_m` at `speed_m_s`, pressing with at most `force_n`.
@@ -208,7 +207,7 @@ class World:
         self._refresh()
         return self._arm.tcp_position_m.copy(), self._arm.tcp_rotation.copy()
 
-    def pose_state(self, reference: Reference | JointReference) -> PoseState:
+    def pose_state(self, reference: PoseReference | JointReference) -> PoseState:
         """Measured TCP pose, twist and wrench beside the reference held now.
 
         The wrench is `wrench` after a low-pass of the first order with `WRENCH_FILTER_S`.
@@ -269,7 +268,7 @@ class World:
 
     # -- inside --------------------------------------------------------------------------------
 
-    def _put_in_charge(self, law: ImpedanceController | JointImpedanceController) -> ArmState:
+    def _put_in_charge(self, law: CartesianImpedance | JointImpedanceController) -> ArmState:
         state = self._arm.state()
         if self._in_charge is not law:
             if self._in_charge is not None:
@@ -285,7 +284,7 @@ class World:
     def _apply(
         self,
         output: ImpedanceOutput | JointImpedanceOutput,
-        reference: Reference | JointReference,
+        reference: PoseReference | JointReference,
     ) -> None:
         data = self._data
         if not math.isfinite(output.torque_nm.sum()):

@@ -15,10 +15,10 @@ import torch
 from dataset_rig import CHUNK_MS, CHUNKS, DT_S, HEIGHT, PROMPTS, WIDTH, steps_of, write_run
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from vla_zenoh.dataset.episodes import episodes_of
-from vla_zenoh.dataset.lerobot import export
-from vla_zenoh.recording.run import load_run
-from vla_zenoh.state_vector import read_parts
+from vla_zenoh.lab.dataset.episodes import episodes_of
+from vla_zenoh.lab.dataset.lerobot import export
+from vla_zenoh.lab.recording.run import load_run
+from vla_zenoh.policy.state_vector import read_parts
 
 pytestmark = pytest.mark.models
 

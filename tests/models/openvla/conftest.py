@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from vla_zenoh.loader import find_model, import_model
+from vla_zenoh.policy.loader import find_model, import_model
 
 import_model(find_model("openvla"))

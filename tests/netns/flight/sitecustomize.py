@@ -19,7 +19,7 @@ RECORDED = {"sim": "state/pose", "command": "command/pose"}
 
 def _note_commands(heard_s: list[float]) -> None:
     """Of the simulator: whenever its guard takes a command."""
-    from vla_zenoh.control.stream import CommandStream
+    from vla_zenoh.guard.command_stream import CommandStream
 
     take = CommandStream.take
 
@@ -32,7 +32,7 @@ def _note_commands(heard_s: list[float]) -> None:
 
 def _note_states(heard_s: list[float]) -> None:
     """Of the command node: whenever the arm's pose has come."""
-    from vla_zenoh.nodes.command_inputs import CommandInputs
+    from vla_zenoh.nodes.command.inputs import CommandInputs
 
     take = CommandInputs.take
 
@@ -48,7 +48,7 @@ def _note_states(heard_s: list[float]) -> None:
 def _install(node: str, path: str) -> None:
     import numpy as np
 
-    from vla_zenoh.nodes.node import Stream
+    from vla_zenoh.bus.node import Stream
 
     key_end, heard_s = RECORDED[node], [float("nan")]
     (_note_commands if node == "sim" else _note_states)(heard_s)

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from vla_zenoh.bus.buffers import LatestSample
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
-from vla_zenoh.nodes.session import open_session
-from vla_zenoh.nodes.slots import Latest
+from vla_zenoh.lab.tasks import COLOURS, brick
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -28,7 +29,6 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 from vla_zenoh.profile import load_profile
-from vla_zenoh.tasks import COLOURS, brick
 from vla_zenoh.types import ObjectPoses
 
 STEP_M, STEP_RAD = 0.04, 0.18
@@ -55,7 +55,7 @@ class Oracle:
             action=ActionSpec(horizon=1, dt_s=0.1, kind="absolute", gripper="absolute_m"),
         )
         self._profile = load_profile(profile)
-        self._truth = Latest()
+        self._truth = LatestSample()
         self._objects: ObjectPoses | None = None
         self._session: Any = None
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.interop.ros2.graph import endpoints
-from vla_zenoh.interop.ros2.keys import Role
+from vla_zenoh.interop.ros2.keys import EntityRole
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.ros2 import Ros2Profile
 from vla_zenoh.profile.session import (
@@ -22,11 +22,11 @@ from vla_zenoh.profile.session import (
 
 PROGRAM = "zenoh-bridge-ros2dds"
 ALLOWED_AS = {
-    Role.SUBSCRIBER: "publishers",
-    Role.PUBLISHER: "subscribers",
-    Role.CLIENT: "service_servers",
-    Role.SERVER: "service_clients",
-    Role.ACTION_CLIENT: "action_servers",
+    EntityRole.SUBSCRIBER: "publishers",
+    EntityRole.PUBLISHER: "subscribers",
+    EntityRole.CLIENT: "service_servers",
+    EntityRole.SERVER: "service_clients",
+    EntityRole.ACTION_CLIENT: "action_servers",
 }
 """Our end -> what the robot's side of it is called in the bridge's list."""
 KINDS = (*ALLOWED_AS.values(), "action_clients")

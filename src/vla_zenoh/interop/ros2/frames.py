@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from vla_zenoh.control.so3 import Pose, norm3, rotation_from_quat
 from vla_zenoh.errors import CodecError, RecordError
-from vla_zenoh.interop.arm_state import RESTARTED_NS
+from vla_zenoh.interop.joint_reading import RESTARTED_NS
 from vla_zenoh.interop.ros2.samples import Transform
+from vla_zenoh.kinematics.so3 import Pose, norm3, rotation_from_quat
 from vla_zenoh.types import unit_quaternion, vector
 
 MAX_FRAMES = 1000

@@ -20,7 +20,7 @@ class Step(Enum):
     CANCEL = "cancel"
 
 
-class Goal(NamedTuple):
+class ActionGoal(NamedTuple):
     """A goal in flight, told apart by its number."""
 
     number: int
@@ -42,7 +42,7 @@ class GoalKeeper:
         self._accepted = self._cancelling = False
         self._since_ns = 0
         self._number = 0
-        self.goal: Goal | None = None
+        self.goal: ActionGoal | None = None
         self.timeouts = 0
 
     def want(self, command: GripperCommand) -> None:
@@ -75,7 +75,7 @@ class GoalKeeper:
             return None
         if self.goal is None:
             self._number += 1
-            self.goal, self._wish = Goal(self._number, self._wish), None
+            self.goal, self._wish = ActionGoal(self._number, self._wish), None
             self._accepted = self._cancelling = False
             self._since_ns = now_ns
             return Step.SEND
@@ -84,10 +84,10 @@ class GoalKeeper:
             return Step.CANCEL
         return None
 
-    def travel_s(self, goal: Goal) -> float:
+    def travel_s(self, goal: ActionGoal) -> float:
         """How long the fingers may need for it."""
         return self._stroke_m / goal.command.speed_m_s
 
-    def _patience_ns(self, goal: Goal) -> int:
+    def _patience_ns(self, goal: ActionGoal) -> int:
         moves = self._accepted and not self._cancelling
         return self._timeout_ns + (int(self.travel_s(goal) * 1e9) if moves else 0)

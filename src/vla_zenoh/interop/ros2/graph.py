@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from vla_zenoh.interop.ros2 import diagnostics
 from vla_zenoh.interop.ros2.gripper_actions import GRASP
-from vla_zenoh.interop.ros2.keys import Endpoint, Role
+from vla_zenoh.interop.ros2.keys import Endpoint, EntityRole
 from vla_zenoh.interop.ros2.services import ACTIVE_TOPIC, PROMPT_TOPIC, SERVICES, STATUS_TOPIC
 from vla_zenoh.interop.ros2.topics import joint_state, plain, transforms, wrench
 from vla_zenoh.profile import Profile
@@ -35,7 +35,9 @@ def endpoints(profile: Profile) -> tuple[Endpoint, ...]:
     ros2 = profile.ros2
     if ros2 is None:
         return ()
-    found = [Endpoint(Role.SUBSCRIBER, c.topic, c.type) for c in camera_topics(profile).values()]
+    found = [
+        Endpoint(EntityRole.SUBSCRIBER, c.topic, c.type) for c in camera_topics(profile).values()
+    ]
     if profile.robot.driver == "ros2":
         found += _arm(ros2, profile.robot.command)
         found += [] if ros2.gripper is None else _gripper(ros2.gripper)
@@ -46,29 +48,29 @@ def endpoints(profile: Profile) -> tuple[Endpoint, ...]:
 
 def _arm(ros2: Ros2Profile, command: str) -> Iterator[Endpoint]:
     for topic in (ros2.joint_states, ros2.finger_states or ros2.joint_states):
-        yield Endpoint(Role.SUBSCRIBER, topic, joint_state.TYPE)
+        yield Endpoint(EntityRole.SUBSCRIBER, topic, joint_state.TYPE)
     if ros2.tcp == "tf":
         for topic in (TF, TF_STATIC):
-            yield Endpoint(Role.SUBSCRIBER, topic, transforms.TYPE)
+            yield Endpoint(EntityRole.SUBSCRIBER, topic, transforms.TYPE)
     if ros2.wrench is not None:
-        yield Endpoint(Role.SUBSCRIBER, ros2.wrench.topic, wrench.TYPE)
+        yield Endpoint(EntityRole.SUBSCRIBER, ros2.wrench.topic, wrench.TYPE)
     output = ros2.joint_command if command == "joint" else ros2.pose_command
     if output is not None:
-        yield Endpoint(Role.PUBLISHER, output.topic, output.type)
+        yield Endpoint(EntityRole.PUBLISHER, output.topic, output.type)
 
 
 def _gripper(gripper: Ros2Gripper) -> Iterator[Endpoint]:
     if gripper.type not in GRIPPER_ACTIONS:
-        yield Endpoint(Role.PUBLISHER, gripper.topic, gripper.type)
+        yield Endpoint(EntityRole.PUBLISHER, gripper.topic, gripper.type)
         return
-    yield Endpoint(Role.ACTION_CLIENT, gripper.topic, gripper.type)
+    yield Endpoint(EntityRole.ACTION_CLIENT, gripper.topic, gripper.type)
     if gripper.grasp is not None:
-        yield Endpoint(Role.ACTION_CLIENT, gripper.grasp, GRASP)
+        yield Endpoint(EntityRole.ACTION_CLIENT, gripper.grasp, GRASP)
 
 
 def _people(prefix: str) -> Iterator[Endpoint]:
     for service in SERVICES:
-        yield Endpoint(Role.SERVER, f"{prefix}/{service.name}", service.type)
-    yield Endpoint(Role.SUBSCRIBER, f"{prefix}/{PROMPT_TOPIC}", plain.TEXT)
-    yield Endpoint(Role.SUBSCRIBER, f"{prefix}/{ACTIVE_TOPIC}", plain.TRUTH)
-    yield Endpoint(Role.PUBLISHER, f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)
+        yield Endpoint(EntityRole.SERVER, f"{prefix}/{service.name}", service.type)
+    yield Endpoint(EntityRole.SUBSCRIBER, f"{prefix}/{PROMPT_TOPIC}", plain.TEXT)
+    yield Endpoint(EntityRole.SUBSCRIBER, f"{prefix}/{ACTIVE_TOPIC}", plain.TRUTH)
+    yield Endpoint(EntityRole.PUBLISHER, f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.fingers import Fingers
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.names import request_of, send_goal_of
+from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.profile.ros2 import Ros2Gripper
 from vla_zenoh.types import GripperCommand
@@ -20,7 +20,7 @@ SUCCEEDED = 4
 """action_msgs/GoalStatus.STATUS_SUCCEEDED."""
 
 
-class Outcome(NamedTuple):
+class GripperOutcome(NamedTuple):
     """How a goal ended: as asked, with something between the fingers, and what was said."""
 
     reached: bool
@@ -97,11 +97,11 @@ def cancel(messages: Messages, goal_id: bytes) -> Any:
     return messages.new("action_msgs/srv/CancelGoal_Request", goal_info=info)
 
 
-def outcome(action: str, response: Any) -> Outcome:
+def outcome(action: str, response: Any) -> GripperOutcome:
     """What the answer of get_result means."""
     result = response.result
     reached = response.status == SUCCEEDED
     if action in (GRIPPER_COMMAND, PARALLEL_COMMAND):
-        return Outcome(reached and bool(result.reached_goal), bool(result.stalled), "")
+        return GripperOutcome(reached and bool(result.reached_goal), bool(result.stalled), "")
     success = reached and bool(result.success)
-    return Outcome(success, success and action == GRASP, str(result.error)[:300])
+    return GripperOutcome(success, success and action == GRASP, str(result.error)[:300])

@@ -19,7 +19,7 @@ _SLASH_OF_BRIDGES = "§"
 _SLASH_OF_RMW = "%"
 
 
-class Role(Enum):
+class EntityRole(Enum):
     """What we are on a topic, service or action; the value is its name in tokens."""
 
     PUBLISHER = "MP"
@@ -40,7 +40,7 @@ class Endpoint:
         qos: of a topic.
     """
 
-    role: Role
+    role: EntityRole
     name: str
     type: str
     qos: Qos = DEFAULT
@@ -70,9 +70,9 @@ def parts_of(action: Endpoint) -> dict[str, Endpoint]:
     """The services an action client uses: send_goal, get_result and cancel_goal."""
     at = f"{action.name}/_action"
     return {
-        "send_goal": Endpoint(Role.CLIENT, f"{at}/send_goal", send_goal_of(action.type)),
-        "get_result": Endpoint(Role.CLIENT, f"{at}/get_result", get_result_of(action.type)),
-        "cancel_goal": Endpoint(Role.CLIENT, f"{at}/cancel_goal", CANCEL_GOAL),
+        "send_goal": Endpoint(EntityRole.CLIENT, f"{at}/send_goal", send_goal_of(action.type)),
+        "get_result": Endpoint(EntityRole.CLIENT, f"{at}/get_result", get_result_of(action.type)),
+        "cancel_goal": Endpoint(EntityRole.CLIENT, f"{at}/cancel_goal", CANCEL_GOAL),
     }
 
 
@@ -97,7 +97,7 @@ class Ros2Dds:
         kind, key = endpoint.type, self.key(endpoint)
         chunks = ["@", self.session_id, "@ros2_lv", endpoint.role.value]
         chunks += [text.replace("/", _SLASH_OF_BRIDGES) for text in (key, kind)]
-        if endpoint.role in (Role.PUBLISHER, Role.SUBSCRIBER):
+        if endpoint.role in (EntityRole.PUBLISHER, EntityRole.SUBSCRIBER):
             known = None if self.type_hash is None else self.type_hash(kind)
             chunks.append(endpoint.qos.as_ros2dds(known))
         return "/".join(chunks)

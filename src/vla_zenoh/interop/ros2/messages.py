@@ -16,9 +16,9 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.faults import nearest
 from vla_zenoh.interop.ros2.definitions import parse, shipped
 from vla_zenoh.interop.ros2.names import request_of, response_of, split_type
+from vla_zenoh.pydantic_errors import nearest
 
 STORES = {
     "humble": Stores.ROS2_HUMBLE,

@@ -31,7 +31,7 @@ class Joints(NamedTuple):
     effort: FloatArray | None
 
 
-class Picture(NamedTuple):
+class RosImage(NamedTuple):
     """An image of a camera.
 
     Args:

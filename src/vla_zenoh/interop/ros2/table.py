@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, Messages
-from vla_zenoh.interop.ros2.samples import Joints, Picture, Stamp, Transform, Wrench
+from vla_zenoh.interop.ros2.samples import Joints, RosImage, Stamp, Transform, Wrench
 from vla_zenoh.interop.ros2.topics import (
     compressed_image,
     float_array,
@@ -24,7 +24,7 @@ from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
 Write = Callable[[Messages, str, Any, Stamp], Any]
 
 
-class Reading(NamedTuple):
+class RosReading(NamedTuple):
     """A type we listen to.
 
     Args:
@@ -62,13 +62,13 @@ _STATE = ("state_joint", "state_pose", "state_gripper")
 _CAMERA = ("camera_raw", "camera_jpeg")
 
 READINGS = (
-    Reading(joint_state.TYPE, _STATE, Joints, joint_state.read),
-    Reading(transforms.TYPE, ("state_pose",), Transform, transforms.read),
-    Reading(wrench.TYPE, ("state_pose",), Wrench, wrench.read),
-    Reading(image.TYPE, _CAMERA, Picture, image.read, MAX_PICTURE_BYTES),
-    Reading(compressed_image.TYPE, _CAMERA, Picture, compressed_image.read, MAX_PICTURE_BYTES),
-    Reading(plain.TEXT, ("prompt",), str, plain.read),
-    Reading(plain.TRUTH, ("active",), bool, plain.read),
+    RosReading(joint_state.TYPE, _STATE, Joints, joint_state.read),
+    RosReading(transforms.TYPE, ("state_pose",), Transform, transforms.read),
+    RosReading(wrench.TYPE, ("state_pose",), Wrench, wrench.read),
+    RosReading(image.TYPE, _CAMERA, RosImage, image.read, MAX_PICTURE_BYTES),
+    RosReading(compressed_image.TYPE, _CAMERA, RosImage, compressed_image.read, MAX_PICTURE_BYTES),
+    RosReading(plain.TEXT, ("prompt",), str, plain.read),
+    RosReading(plain.TRUTH, ("active",), bool, plain.read),
 )
 
 

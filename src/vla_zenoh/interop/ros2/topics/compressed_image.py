@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import MAX_JPEG_BYTES, MAX_PIXELS, MAX_SIDE, decode_jpeg
 from vla_zenoh.errors import CodecError
-from vla_zenoh.interop.ros2.samples import Picture
+from vla_zenoh.interop.ros2.samples import RosImage
 from vla_zenoh.interop.ros2.stamps import to_ns
 
 TYPE = "sensor_msgs/msg/CompressedImage"
@@ -18,7 +18,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 
 
-def read(message: Any) -> Picture:
+def read(message: Any) -> RosImage:
     """The picture. What it is, is seen in its bytes: drivers write many things into ``format``.
 
     Raises:
@@ -30,7 +30,7 @@ def read(message: Any) -> Picture:
             "encoding", f"a compressed image {message.format[:40]!r}; read are: jpeg, png"
         )
     rgb = decode_jpeg(payload).rgb if payload.startswith(_JPEG) else _png(payload)
-    return Picture(to_ns(message.header.stamp), message.header.frame_id, rgb)
+    return RosImage(to_ns(message.header.stamp), message.header.frame_id, rgb)
 
 
 def _png(payload: bytes) -> NDArray[np.uint8]:

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import MAX_PIXELS, MAX_SIDE
 from vla_zenoh.errors import CodecError
-from vla_zenoh.interop.ros2.samples import Picture
+from vla_zenoh.interop.ros2.samples import RosImage
 from vla_zenoh.interop.ros2.stamps import to_ns
 
 TYPE = "sensor_msgs/msg/Image"
 CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
 
 
-def read(message: Any) -> Picture:
+def read(message: Any) -> RosImage:
     """The picture; of ``rgb8`` a view into the message.
 
     Raises:
@@ -45,7 +45,7 @@ def read(message: Any) -> Picture:
         data, (height, width, channels), (step, channels, 1), writeable=False
     )
     rgb = rows if message.encoding == "rgb8" else _to_rgb(rows, message.encoding)
-    return Picture(to_ns(message.header.stamp), message.header.frame_id, rgb)
+    return RosImage(to_ns(message.header.stamp), message.header.frame_id, rgb)
 
 
 def _to_rgb(rows: NDArray[np.uint8], encoding: str) -> NDArray[np.uint8]:

@@ -1,0 +1,30 @@
+"""``python -m benchmarks``, in a checkout: compares vla-zenoh with other policy servers."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from benchmarks.chain.cli import chain
+from benchmarks.codec.cli import codec
+from benchmarks.load.cli import load
+from benchmarks.openvla import openvla
+from vla_zenoh.cli.output import complain
+from vla_zenoh.errors import VlaZenohError
+
+app = typer.Typer(
+    help="Compare vla-zenoh with other ways of serving a policy.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+for command in (chain, codec, load, openvla):
+    app.command()(command)
+
+if __name__ == "__main__":
+    try:
+        app()
+    except VlaZenohError as error:
+        complain(str(error))
+        sys.exit(1)

@@ -1,0 +1,231 @@
+"""Our own chain under measurement: router, worker and command node as in a lab, each its process.
+
+This process plays the camera and hears what the picture led to; another one plays the robot.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.chain import report
+from benchmarks.chain.process import Server, free_port
+from vla_zenoh.bus.buffers import CallbackRing, LatestSample
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.node import Node
+from vla_zenoh.errors import NodeError, SessionError
+from vla_zenoh.lab.bench.cpu_time import cpu_s
+from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
+from vla_zenoh.profile import HostProfile, Profile, load_profile
+from vla_zenoh.runtime.launch import Host
+from vla_zenoh.types import ActionChunk, PoseCommand, Stamped
+
+PROFILE, CAMERA, WORKER, PROMPT = "panda_sim", "front", "scripted", "hold"
+RATE_HZ = 100.0
+"""Asked of the worker: the highest there is, so that it waits for the picture and nothing else."""
+READY_PATIENCE_S = 20.0
+ANSWER_PATIENCE_S = 0.5
+POSE_PATIENCE_S = 0.3
+TICK_MARGIN_S = 0.002
+POLL_S = 0.001
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What one picture led to; `figures_ms` as in `benchmarks.chain.report`."""
+
+    figures_ms: dict[str, float]
+
+
+def bench_profile(command_hz: float) -> Profile:
+    """The shipped profile at an address of its own, with the nodes that are measured."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    data = load_profile(PROFILE).model_dump()
+    data["session"].update(connect=(endpoint,), listen=(endpoint,))
+    data["timing"]["command_hz"] = command_hz
+    data["task"].update(prompt=PROMPT, worker=WORKER, rate_hz=RATE_HZ)
+    data["workers"] = (WORKER,)
+    # A worker takes raw pictures where the host has the cameras, as here.
+    here = HostProfile(nodes=("router", "camera", "command", "worker"))
+    data["hosts"] = {"here": here.model_dump()}
+    return Profile.model_validate(data)
+
+
+class Chain:
+    """The chain, up and obeying while the context lasts.
+
+    Args:
+        command_hz: rate of the command node.
+
+    Raises:
+        NodeError: it does not come up.
+    """
+
+    def __init__(self, command_hz: float) -> None:
+        self.profile = bench_profile(command_hz)
+        self._lines: list[str] = []
+        self._up = ExitStack()
+        self._host = Host(
+            self.profile,
+            None,
+            log=lambda node, line: self._lines.append(f"{node}: {line}"),
+            tell=lambda node, what: None,
+            own_router=True,
+        )
+        supervisor = self._host.supervisor
+        supervisor.children = [c for c in supervisor.children if c.command.kind != "camera"]
+        self._period_s = 1.0 / command_hz
+
+    def __enter__(self) -> Chain:
+        try:
+            self._start()
+        except BaseException:
+            self._up.close()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._up.close()
+
+    def _start(self) -> None:
+        self._up.enter_context(self._host)
+        session, client = self._host.session, self._host.client
+        assert session is not None
+        assert client is not None
+        self._robot = self._up.enter_context(Server("robot", str(self._host.profile_file)))
+        self._node = Node("camera", self.profile, session)
+        self._up.callback(self._node.close)
+        camera = self.profile.cameras[CAMERA]
+        self._outlet = CameraPublisher(CAMERA, camera, "benchmark", self._node, self._node.tell)
+        self._outlet.change(OK)
+        keys = self._node.keys
+        self._chunks = self._node.listen(keys.delta(WORKER), LatestSample())
+        self._poses = self._node.listen(keys.command_pose, CallbackRing(4096))
+        self._activate(client)
+
+    def _activate(self, client: Client) -> None:
+        """Show pictures until the worker answers and the command node finds nothing to refuse."""
+        blank = np.zeros((480, 640, 3), np.uint8)
+        give_up = time.monotonic() + READY_PATIENCE_S
+        why = "the worker does not answer"
+        while time.monotonic() < give_up:
+            self._robot.check()
+            self._publish(blank)
+            self._report()
+            if not self._chunks.wait(0.1):
+                continue
+            self._chunks.take()
+            if client.status("command") is None:
+                continue
+            try:
+                client.activate(timeout_s=0.5)
+                return
+            except SessionError as error:
+                why = str(error)
+        said = "\n".join(self._lines[-20:])
+        raise NodeError(f"the chain does not come up: {why}\n{said}".rstrip())
+
+    # -- CPU ----------------------------------------------------------------------------------
+    def cpu_s(self) -> dict[str, float]:
+        """Process -> CPU time so far; this one is ``camera``."""
+        spent = {name: cpu_s(pid) for name, pid in self._host.supervisor.pids().items()}
+        return spent | {"robot": cpu_s(self._robot.pid), "camera": time.process_time()}
+
+    # -- one request --------------------------------------------------------------------------
+    def _report(self) -> None:
+        self._node.report(OK, detail={"cameras": {CAMERA: {"state": OK, "age_s": 0.0}}})
+
+    def _publish(self, rgb: NDArray[np.uint8]) -> tuple[int, int]:
+        """Returns when, on the monotonic and on the wall clock."""
+        mono_ns, wall_ns = time.monotonic_ns(), self._node.clock.wall_ns()
+        self._outlet.seen(mono_ns)
+        self._outlet.put_rgb(rgb, mono_ns, wall_ns)
+        return mono_ns, wall_ns
+
+    def request(self, rgb: NDArray[np.uint8]) -> Answer:
+        """Show a picture and follow it.
+
+        Raises:
+            TimeoutError: no chunk or no pose command came of it.
+        """
+        self._poses.take_all()
+        self._chunks.take()
+        began_ns, stamp_ns = self._publish(rgb)
+        self._await_chunk(stamp_ns, began_ns)
+        chunk_ns = time.monotonic_ns()
+        time.sleep(self._period_s + TICK_MARGIN_S)
+        pose, heard_ns = self._await_pose(stamp_ns)
+        # Between requests: what is sent while one is under way would be measured with it.
+        self._report()
+        return Answer(
+            {report.CHUNK: (chunk_ns - began_ns) / 1e6}
+            | _pose_figures(pose, stamp_ns, (heard_ns - began_ns) / 1e6)
+        )
+
+    def _await_chunk(self, stamp_ns: int, began_ns: int) -> None:
+        give_up_ns = began_ns + int(ANSWER_PATIENCE_S * 1e9)
+        while (left_ns := give_up_ns - time.monotonic_ns()) > 0:
+            if not self._chunks.wait(left_ns / 1e9):
+                break
+            arrival = self._chunks.take()
+            chunk = self._node.read(ActionChunk, arrival) if arrival else None
+            if chunk is not None and chunk.record.observation_stamp_ns == stamp_ns:
+                return
+        raise TimeoutError
+
+    def _await_pose(self, stamp_ns: int) -> tuple[Stamped[PoseCommand], int]:
+        """The first pose command of the picture, and when it was heard on the monotonic clock."""
+        give_up = time.monotonic() + POSE_PATIENCE_S
+        while time.monotonic() < give_up:
+            for arrival in self._poses.take_all():
+                pose = self._node.read(PoseCommand, arrival)
+                cause = pose.record.cause if pose else None
+                if pose is not None and cause and cause.observation_stamp_ns == stamp_ns:
+                    return pose, arrival.mono_ns
+            time.sleep(POLL_S)
+        raise TimeoutError
+
+    def rest(self) -> None:
+        """Between requests: a node that died is not restarted, it ends the measurement.
+
+        Raises:
+            NodeError: one died.
+        """
+        self._robot.check()
+        running = self._host.supervisor.pids()
+        for child in self._host.supervisor.children:
+            if child.command.name not in running:
+                said = "\n".join(self._lines[-20:])
+                raise NodeError(f"the {child.command.name} under measurement died\n{said}".rstrip())
+
+
+def _pose_figures(pose: Stamped[PoseCommand], stamp_ns: int, total_ms: float) -> dict[str, float]:
+    """The way of a picture to its first pose command, cut where each node put its stamp.
+
+    The stages are of the wall clocks of processes of one computer. The last one is what is left of
+    the total, so that they add up to it.
+    """
+    cause = pose.record.cause
+    assert cause is not None
+    wait_ns = max(pose.header.stamp_wall_ns - cause.received_ns, 0)
+    stages = {
+        "picture_to_worker": (cause.observed_ns - stamp_ns) / 1e6,
+        "worker": (cause.published_ns - cause.observed_ns) / 1e6,
+        "chunk_to_command": (cause.received_ns - cause.published_ns) / 1e6,
+        report.TICK_WAIT: wait_ns / 1e6,
+    }
+    return stages | {
+        "tick_to_pose": total_ms - sum(stages.values()),
+        report.POSE: total_ms,
+        report.POSE_WITHOUT_WAIT: total_ms - wait_ns / 1e6,
+    }

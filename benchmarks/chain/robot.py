@@ -1,0 +1,61 @@
+"""A robot that is all traffic and no simulator: it stands, or is always where it was told to be."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+
+from vla_zenoh.bus.buffers import LatestSample
+from vla_zenoh.bus.clock import FixedRate
+from vla_zenoh.bus.metrics import RateMeter
+from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.codec.records import SMALL_BYTES
+from vla_zenoh.control.profile_arm import make_kinematics
+from vla_zenoh.keys import Kind
+from vla_zenoh.kinematics.so3 import quat_from_rotation
+from vla_zenoh.profile import load_profile
+from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
+from vla_zenoh.types import GripperState, JointState, PoseCommand, PoseState
+
+
+def play_robot(profile_file: str, stop: threading.Event, *, follows: bool) -> None:
+    """Publish the state of an arm at the profile's rate.
+
+    Args:
+        profile_file: whose robot it plays.
+        stop: ends it.
+        follows: the newest commanded pose is the measured one; otherwise the arm stands at home,
+            and hears nothing.
+    """
+    profile = load_profile(profile_file)
+    robot = profile.robot
+    kinematics = make_kinematics(profile)
+    home = kinematics.forward(kinematics.ordered(robot.arm_joints, robot.home_rad))
+    still = np.zeros(len(robot.arm_joints))
+    joints = JointState(robot.arm_joints, np.array(robot.home_rad), still, still)
+    pose = PoseState(home.position_m, quat_from_rotation(home.rotation), np.zeros(6))
+    gripper = GripperState(robot.gripper.max_width_m, moving=False, holding=False)
+    with open_session(profile.session, wait_s=ROUTER_PATIENCE_S) as session:
+        node = Node(robot.driver, profile, session)
+        orders = LatestSample(SMALL_BYTES)
+        if follows:
+            node.listen(node.keys.command_pose, orders)
+        poses = node.stream(node.keys.state_pose, Kind.STATE)
+        arms = node.stream(node.keys.state_joint, Kind.STATE)
+        grippers = node.stream(node.keys.state_gripper, Kind.STATE)
+        pace, rate = FixedRate(profile.timing.state_hz), RateMeter()
+        while not stop.is_set():
+            pace.wait()
+            arrival = orders.take()
+            order = node.read(PoseCommand, arrival) if arrival is not None else None
+            if order is not None:
+                told = order.record
+                pose = PoseState(told.position_m, told.quat_xyzw, told.twist)
+            header = poses.put(pose)
+            arms.put(joints, stamp_wall_ns=header.stamp_wall_ns, seq=header.seq)
+            grippers.put(gripper, stamp_wall_ns=header.stamp_wall_ns, seq=header.seq)
+            rate.tick()
+            node.report("following" if follows else "standing", rates_hz={"state": rate.rate_hz})
+        node.close()

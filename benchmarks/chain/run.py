@@ -1,0 +1,223 @@
+"""Measures all ways in turns: round after round, so that a busy moment meets all of them."""
+
+from __future__ import annotations
+
+import gc
+import os
+import platform
+import random
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks import peers
+from benchmarks.chain import report
+from benchmarks.chain.echo import EchoClient
+from benchmarks.chain.our_chain import WORKER, Chain
+from benchmarks.chain.process import START_PATIENCE_S, Server, free_port
+from benchmarks.chain.report import Result
+from benchmarks.chain.ways import ServingWay
+from benchmarks.picture import noisy_picture
+from vla_zenoh import __version__
+from vla_zenoh.errors import NodeError
+from vla_zenoh.keys import worker_node
+from vla_zenoh.lab.bench.cpu_time import cpu_s
+from vla_zenoh.lab.bench.statistics import Interval
+
+PERIOD_S = (0.012, 0.020)
+"""From one request to the next, evenly drawn: two ticks of 250 Hz wide, so that every phase of the
+tick is met equally often, and slower than the worker's highest rate."""
+WARM_UP = 20
+QUIET_S = 1.0
+MAX_LOST = 10
+
+Ask = Callable[[NDArray[np.uint8]], Mapping[str, float]]
+
+
+class Running(NamedTuple):
+    """A way that is up.
+
+    Args:
+        ask: one request; gives its figures in ms.
+        cpu_s: process -> CPU time so far.
+        parts: figure -> the processes whose CPU time it takes.
+        check: raises when a process has died.
+    """
+
+    ask: Ask
+    cpu_s: Callable[[], dict[str, float]]
+    parts: Mapping[str, Sequence[str]]
+    check: Callable[[], None]
+
+
+@contextmanager
+def _chain(way: ServingWay) -> Iterator[Running]:
+    with Chain(way.command_hz) as chain:
+        to_chunk = ("camera", "router", worker_node(WORKER))
+        everybody = (*to_chunk, "command")
+        parts = {
+            report.CHUNK: to_chunk,
+            report.POSE: everybody,
+        }
+        yield Running(lambda rgb: chain.request(rgb).figures_ms, chain.cpu_s, parts, chain.rest)
+
+
+@contextmanager
+def _echo(way: ServingWay) -> Iterator[Running]:
+    port = free_port()
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with ExitStack() as up:
+        servers: dict[str, Server] = {}
+        if way.routed:
+            servers["router"] = up.enter_context(Server("router", endpoint))
+            servers["router"].await_port(port)
+            servers["echo"] = up.enter_context(Server("echo", endpoint, "connect"))
+        else:
+            servers["echo"] = up.enter_context(Server("echo", endpoint, "listen"))
+            servers["echo"].await_port(port)
+        client = EchoClient(endpoint)
+        up.callback(client.close)
+        client.await_server(START_PATIENCE_S)
+        yield _round_trips(client.request, servers)
+
+
+@contextmanager
+def _peer(way: ServingWay) -> Iterator[Running]:
+    port = free_port()
+    with Server("peer", way.name, str(port)) as server:
+        server.await_port(port)
+        client = peers.load(way.name).Client(port)
+        try:
+            yield _round_trips(client.request, {"server": server})
+        finally:
+            client.close()
+
+
+def _round_trips(
+    request: Callable[[NDArray[np.uint8]], NDArray[Any]], servers: Mapping[str, Server]
+) -> Running:
+    def ask(rgb: NDArray[np.uint8]) -> dict[str, float]:
+        began_ns = time.monotonic_ns()
+        answer = request(rgb)
+        took_ms = (time.monotonic_ns() - began_ns) / 1e6
+        if len(answer) != len(peers.ACTION):
+            raise NodeError(f"a server of the benchmark answers {answer!r}")
+        return {report.ROUND_TRIP: took_ms}
+
+    def spent() -> dict[str, float]:
+        return {name: cpu_s(server.pid) for name, server in servers.items()} | {
+            "client": time.process_time()
+        }
+
+    def check() -> None:
+        for server in servers.values():
+            server.check()
+
+    return Running(ask, spent, {report.ROUND_TRIP: (*servers, "client")}, check)
+
+
+_START = {"chain": _chain, "echo": _echo, "peer": _peer}
+
+
+def measure(way: ServingWay, requests: int, seed: int) -> Interval:
+    """Start one way, ask it `requests` times, end it.
+
+    Raises:
+        NodeError: it does not start, dies, or leaves too many requests unanswered.
+    """
+    rgb = noisy_picture()
+    draw = random.Random(seed)
+    figures: dict[str, list[float]] = defaultdict(list)
+    with _START[way.kind](way) as running:
+        for _ in range(WARM_UP):
+            _paced(running, rgb, draw)
+        gc.collect()
+        standing = _spent_in(running, lambda: time.sleep(QUIET_S))
+        _paced(running, rgb, draw)  # what waited in quiet is not the first to be measured
+        lost = 0
+
+        def ask_all() -> None:
+            nonlocal lost
+            for _ in range(requests):
+                got = _paced(running, rgb, draw)
+                if got is None:
+                    lost += 1
+                    if lost > MAX_LOST:
+                        raise NodeError(f"{way.title}: more than {MAX_LOST} requests were lost")
+                    continue
+                for figure, value_ms in got.items():
+                    figures[figure].append(value_ms)
+
+        began = time.monotonic()
+        busy = _spent_in(running, ask_all)
+        took_s = time.monotonic() - began
+    share = {name: spent_s / QUIET_S for name, spent_s in standing.items()}
+    cpu_ms = {
+        figure: max(sum(busy[p] - share[p] * took_s for p in parts), 0.0) / requests * 1e3
+        for figure, parts in running.parts.items()
+    }
+    return Interval(way.name, dict(figures), cpu_ms, sum(share.values()), lost)
+
+
+def _spent_in(running: Running, act: Callable[[], None]) -> dict[str, float]:
+    before = running.cpu_s()
+    act()
+    after = running.cpu_s()
+    return {name: after[name] - before[name] for name in before}
+
+
+def _paced(
+    running: Running, rgb: NDArray[np.uint8], draw: random.Random
+) -> Mapping[str, float] | None:
+    """One request and the rest of its period; None when it was lost."""
+    next_s = time.monotonic() + draw.uniform(*PERIOD_S)
+    try:
+        got = running.ask(rgb)
+    except TimeoutError:
+        running.check()
+        return None
+    time.sleep(max(next_s - time.monotonic(), 0.0))
+    return got
+
+
+def run(
+    ways: Sequence[ServingWay], rounds: int, requests: int, progress: Callable[[ServingWay], None]
+) -> Result:
+    """Measure all of `ways` that are installed, in turns.
+
+    Args:
+        ways: what to measure.
+        rounds: how often each has its turn; the first one changes from round to round.
+        requests: in each turn.
+        progress: called before each turn.
+
+    Raises:
+        NodeError: a way does not work on this computer.
+    """
+    installed = [way for way in ways if not way.missing()]
+    machine = _machine()
+    done: list[dict[str, Interval]] = []
+    for number in range(rounds):
+        first = number % max(len(installed), 1)
+        slots: dict[str, Interval] = {}
+        for way in installed[first:] + installed[:first]:
+            progress(way)
+            slots[way.name] = measure(way, requests, seed=number)
+        done.append(slots)
+    return Result(ways, done, machine, requests)
+
+
+def _machine() -> dict[str, Any]:
+    return {
+        "cores": os.cpu_count(),
+        "load": round(os.getloadavg()[0], 2),
+        "architecture": platform.machine(),
+        "kernel": platform.release(),
+        "python": platform.python_version(),
+        "vla_zenoh": __version__,
+    }

@@ -1,0 +1,1 @@
+"""Encoding and decoding, ours and ROS 2's."""

@@ -1,0 +1,1 @@
+"""Robots and cameras that one router carries."""

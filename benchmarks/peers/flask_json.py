@@ -1,0 +1,57 @@
+"""Flask's own server and requests: a PNG as base64 in JSON there, a list of floats back."""
+
+from __future__ import annotations
+
+import base64
+import logging
+from typing import Any
+
+import cv2
+import flask
+import numpy as np
+import requests
+from numpy.typing import NDArray
+from werkzeug.serving import make_server
+
+from benchmarks.peers import ACTION, ADDRESS, PROMPT
+
+TIMEOUT_S = 10.0
+
+
+def serve(port: int) -> None:
+    """Answer until the process ends."""
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    app = flask.Flask(__name__)
+
+    @app.post("/act")
+    def act() -> Any:
+        asked = flask.request.get_json()
+        file = np.frombuffer(base64.b64decode(asked["image"]), np.uint8)
+        bgr = cv2.imdecode(file, cv2.IMREAD_COLOR)
+        if bgr is None:
+            return {"error": "not a picture"}, 400
+        cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+        return {"action": list(ACTION)}
+
+    make_server(ADDRESS, port, app, threaded=True).serve_forever()  # what app.run() does
+
+
+class Client:
+    """The asking end."""
+
+    def __init__(self, port: int) -> None:
+        self._url = f"http://{ADDRESS}:{port}/act"
+
+    def request(self, rgb: NDArray[np.uint8]) -> NDArray[Any]:
+        """A picture there, seven floats back."""
+        _, file = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+        image = base64.b64encode(file.tobytes()).decode()
+        body = {"image": image, "instruction": PROMPT}
+        # A proxy that the environment names is not meant for this computer.
+        proxies: Any = {"http": None}
+        answer = requests.post(self._url, json=body, timeout=TIMEOUT_S, proxies=proxies)
+        answer.raise_for_status()
+        return np.array(answer.json()["action"])
+
+    def close(self) -> None:
+        """Nothing is kept open between requests."""

@@ -1,0 +1,60 @@
+"""openpi's way: an asyncio WebSocket server and a synchronous client, arrays in msgpack."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from websockets.asyncio.server import ServerConnection
+from websockets.asyncio.server import serve as listen
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from benchmarks.peers import ACTION, ADDRESS, PROMPT, arrays
+
+
+async def _answer(connection: ServerConnection) -> None:
+    await connection.send(arrays.pack({}))  # the server's description of itself comes first
+    actions = np.array([ACTION], np.float32)
+    try:
+        while True:
+            asked = arrays.unpack(await connection.recv())  # pyright: ignore[reportArgumentType]
+            assert asked["observation/image"].ndim == 3
+            await connection.send(arrays.pack({"actions": actions, "server_timing": {}}))
+    except ConnectionClosed:
+        return
+
+
+async def _serve(port: int) -> None:
+    async with listen(_answer, ADDRESS, port, compression=None, max_size=None) as server:
+        await server.serve_forever()
+
+
+def serve(port: int) -> None:
+    """Answer until the process ends."""
+    asyncio.run(_serve(port))
+
+
+class Client:
+    """The asking end."""
+
+    def __init__(self, port: int) -> None:
+        self._up = ExitStack()
+        url = f"ws://{ADDRESS}:{port}"
+        self._socket = self._up.enter_context(
+            connect(url, compression=None, max_size=None, proxy=None)
+        )
+        self._socket.recv()
+
+    def request(self, rgb: NDArray[np.uint8]) -> NDArray[Any]:
+        """A picture there, seven floats back."""
+        self._socket.send(arrays.pack({"observation/image": rgb, "prompt": PROMPT}))
+        answer = arrays.unpack(self._socket.recv())  # pyright: ignore[reportArgumentType]
+        return answer["actions"][0]
+
+    def close(self) -> None:
+        """Say goodbye."""
+        self._up.close()

@@ -1,0 +1,43 @@
+"""ZeroMQ REQ/REP over TCP, arrays in msgpack."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+
+from benchmarks.peers import ACTION, ADDRESS, PROMPT, arrays
+
+TIMEOUT_MS = 10_000
+
+
+def serve(port: int) -> None:
+    """Answer until the process ends."""
+    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
+    socket.bind(f"tcp://{ADDRESS}:{port}")
+    actions = np.array([ACTION], np.float32)
+    while True:
+        asked = arrays.unpack(socket.recv())
+        assert asked["image"].ndim == 3
+        socket.send(arrays.pack({"actions": actions}))
+
+
+class Client:
+    """The asking end."""
+
+    def __init__(self, port: int) -> None:
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REQ)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.RCVTIMEO, TIMEOUT_MS)
+        self._socket.connect(f"tcp://{ADDRESS}:{port}")
+
+    def request(self, rgb: NDArray[np.uint8]) -> NDArray[Any]:
+        """A picture there, seven floats back."""
+        self._socket.send(arrays.pack({"image": rgb, "prompt": PROMPT}))
+        return arrays.unpack(self._socket.recv())["actions"][0]
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        self._socket.close()

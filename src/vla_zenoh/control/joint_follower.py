@@ -1,0 +1,457 @@
+"""Joint positions that follow a stream of TCP poses, for arms that take joints.
+
+Each tick takes one damped Newton step to the pose and turns it into joint velocities that the
+joints can have. With ``e`` the error from joints to target, ``v`` the target's twist and J# the
+inverse damped near a singularity::
+
+    feed      = J# v
+    back      = J# e / dt - feed      bounded to what can be stopped within J# e - feed dt
+    qd_wanted = (feed + back) + (1 - J# J) kp (q_posture - q)
+
+    J#        = J^T (J J^T + W)^-1,   W = wmax (1 - (s / s0)^2)^2 1 where s < s0, else 0
+
+`feed` makes a smooth stream exact; the bound on `back` makes a far target one that is reached
+without overshoot. All joints are slowed by one factor to the velocity limits and by one to the
+acceleration limits. Each follows what is wanted of it within its jerk limit ``j``: with ``r`` the
+wanted velocity's own rate and ``d`` what is left to it beyond that, the acceleration is
+
+    r + sign(d) a,   a dt + (a - j dt) dt + (a - 2 j dt) dt + ... = |d|
+
+which comes back to ``r`` as ``d`` comes to nothing. No joint gets faster than it may be, or than it
+can stop before the end of its range, in ticks and within both limits; a joint held back at its end
+is taken out and the others carry on without it.
+Towards a singularity all joints are slowed so that its singular value s falls no faster than
+``ka (s - s_stop)``: an arm that has slipped through one would come back in another branch.
+
+Damping: Nakamura, Hanafusa, "Inverse kinematic solutions with singularity robustness", J. Dyn.
+Sys. Meas. Control 108, 1986.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.walls import Walls
+from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.ik import pose_error
+from vla_zenoh.kinematics.kinematics import Kinematics, smallest_singular_value
+from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.types import FloatArray
+
+_IDENTITY_6 = np.eye(6)
+WATCHED = 4.0
+"""Times `damped_below` under which it is looked where the singular value goes."""
+BACK_SHARE = 0.7
+"""Part of the acceleration planned with on the way to a far target, whose path is curved."""
+NEAR_END_RAD = 0.1
+"""A joint that is further from the end of its range is not held back by that."""
+HALVINGS = 8
+WALL_SHARE, FAR_SHARE = 0.7, 0.1
+"""Part of the joints' acceleration and jerk that is reckoned with before a wall: they have their
+work besides. And before one that is far."""
+ELBOW_COST = 1e-2
+"""Cost of a joint's motion beside that of the TCP's."""
+BACK_JERK = 0.4
+"""Way is made up for at a rate of so many times jerk over acceleration, at most one tick's."""
+ROUNDING_RAD_S = 1e-9
+PEEK_RAD = 1e-3
+"""How far the joints are moved to see that."""
+
+
+@dataclass(frozen=True, slots=True)
+class FollowSettings:
+    """How the joints follow.
+
+    Args:
+        acceleration_rad_s2: of every joint, one number or one per joint.
+        jerk_rad_s3: likewise; the default is none that could be noticed.
+        velocity_share: part of the URDF's joint velocities that is used.
+        joint_margin_rad: kept from both ends of every joint's range.
+        posture_1_s: rate at which a redundant arm goes to its posture.
+        posture_rad_s: and its greatest speed.
+        damped_below: singular value s0 below which the inverse is damped.
+        damping: wmax, of a singular arm.
+        singularity_stop: singular value s_stop the arm does not go below by itself.
+        singularity_1_s: ka, how fast it may come near.
+    """
+
+    acceleration_rad_s2: float | tuple[float, ...] = 10.0
+    jerk_rad_s3: float | tuple[float, ...] = 1e6
+    velocity_share: float = 1.0
+    joint_margin_rad: float = 0.05
+    posture_1_s: float = 1.0
+    posture_rad_s: float = 0.2
+    damped_below: float = 0.03
+    damping: float = 4e-4
+    singularity_stop: float = 0.015
+    singularity_1_s: float = 5.0
+
+
+class JointMotion(NamedTuple):
+    """Where the joints are to be, (n,) each.
+
+    Args:
+        position_rad: where.
+        velocity_rad_s: how fast.
+        acceleration_rad_s2: of the tick before; None: they stood.
+        wanted_rad_s: the velocity that was wanted of them; None: the one they have.
+    """
+
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+    acceleration_rad_s2: FloatArray | None = None
+    wanted_rad_s: FloatArray | None = None
+
+
+class JointFollower:
+    """See the module.
+
+    Args:
+        kinematics: of the arm.
+        posture_rad: (n,) where a redundant arm prefers to be.
+        settings: see `FollowSettings`.
+        walls: what the arm is held before; None: nothing.
+
+    Raises:
+        RecordError: settings that do not fit the arm.
+    """
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        posture_rad: ArrayLike,
+        settings: FollowSettings | None = None,
+        walls: Walls | None = None,
+    ) -> None:
+        self.kinematics, self.walls = kinematics, walls
+        self.settings = settings = settings or FollowSettings()
+        self.posture_rad = np.array(posture_rad, dtype=np.float64)
+        self.acceleration_rad_s2, self.jerk_rad_s3 = (
+            np.full(kinematics.size, given) if np.ndim(given) == 0 else np.array(given, dtype=float)
+            for given in (settings.acceleration_rad_s2, settings.jerk_rad_s3)
+        )
+        for name in ("posture_rad", "acceleration_rad_s2", "jerk_rad_s3"):
+            values = getattr(self, name)
+            if values.shape != (kinematics.size,) or not np.isfinite(values).all():
+                raise RecordError(
+                    f"{name} must be {kinematics.size} finite numbers, got shape {values.shape}"
+                )
+        bounds = np.concatenate([self.acceleration_rad_s2, self.jerk_rad_s3])
+        if not (bounds > 0).all() or not 0 < settings.velocity_share <= 1:
+            raise RecordError(
+                "acceleration_rad_s2 and jerk_rad_s3 must be positive, velocity_share in (0, 1]"
+            )
+        self._back_1_s = BACK_JERK * float(np.min(self.jerk_rad_s3 / self.acceleration_rad_s2))
+        self.velocity_rad_s = settings.velocity_share * kinematics.velocity_rad_s
+        self.lower_rad = kinematics.lower_rad + settings.joint_margin_rad
+        self.upper_rad = kinematics.upper_rad - settings.joint_margin_rad
+
+    def step(
+        self, now: JointMotion, target: Pose, twist: FloatArray, dt_s: float
+    ) -> tuple[JointMotion, list[LimitHit]]:
+        """The joints one tick later.
+
+        Args:
+            now: what the last call returned; at first the measured joints at rest.
+            target: pose the TCP is to have then.
+            twist: (6,) velocity it is to have then, m/s and rad/s in base axes.
+            dt_s: of the tick.
+
+        Returns:
+            joints within their ranges, velocities and accelerations, whatever the target; and
+            what kept them from it: ``joint_velocity``, ``joint_limit``, ``singularity``.
+        """
+        joints, velocity = now.position_rad, now.velocity_rad_s
+        here, jacobian = self.kinematics.pose_and_jacobian(joints)
+        error = pose_error(target, here)
+        singular_value = smallest_singular_value(jacobian)
+        hits: list[LimitHit] = []
+        if singular_value < self.settings.damped_below:
+            hits.append(LimitHit("singularity", singular_value, self.settings.damped_below))
+        low, high = self._allowed(now, dt_s)
+        held = np.zeros(len(joints), dtype=bool)
+        onto = np.zeros(len(joints))
+        while True:
+            wanted = self._wanted(joints, jacobian, error, twist, singular_value, held, onto, dt_s)
+            wanted *= self._share_near_singularity(joints, wanted, singular_value)
+            ratio = float(np.max(np.abs(wanted) / self.velocity_rad_s))
+            wanted /= max(ratio, 1.0)
+            reached = self._reachable(wanted, now, dt_s)
+            excess = np.where(held, 0.0, np.maximum(reached - high, low - reached))
+            joint = int(np.argmax(excess))
+            if excess[joint] <= ROUNDING_RAD_S or held.sum() >= len(joints) - 1:
+                break
+            held[joint] = True
+            onto[joint] = min(max(reached[joint], low[joint]), high[joint])
+            bound = self.upper_rad if reached[joint] > high[joint] else self.lower_rad
+            place, name = float(joints[joint]), self.kinematics.arm_joints[joint]
+            if abs(float(bound[joint]) - place) < NEAR_END_RAD:
+                hits.append(LimitHit("joint_limit", place, float(bound[joint]), where=name))
+        if ratio > 1.0 + 1e-9:
+            joint = int(np.argmax(np.abs(wanted) / self.velocity_rad_s))
+            asked, limit = ratio * abs(float(wanted[joint])), float(self.velocity_rad_s[joint])
+            name = self.kinematics.arm_joints[joint]
+            hits.append(LimitHit("joint_velocity", asked, limit, where=name))
+        reached = self._before_walls(reached, low, high, now, here, jacobian, dt_s, hits)
+        acceleration = (reached - velocity) / dt_s
+        return JointMotion(joints + reached * dt_s, reached, acceleration, wanted), hits
+
+    def brake(self, now: JointMotion, dt_s: float) -> JointMotion:
+        """The joints one tick later when they are to stop as soon as they can, all at once.
+
+        So the TCP keeps its direction. Held before a wall a joint brakes less, and never speeds up.
+        """
+        joints, velocity = now.position_rad, now.velocity_rad_s
+        speed = np.maximum(np.abs(velocity), ROUNDING_RAD_S)
+        slower = np.minimum(self._rampable(speed, dt_s), self.acceleration_rad_s2) * dt_s
+        reached = velocity * (1.0 - min(float(np.min(slower / speed)), 1.0))
+        here, jacobian = self.kinematics.pose_and_jacobian(joints)
+        low, high = self._allowed(now, dt_s)
+        least = np.minimum(high, np.maximum(low, np.minimum(velocity, 0.0)))
+        most = np.maximum(low, np.minimum(high, np.maximum(velocity, 0.0)))
+        reached = self._before_walls(reached, least, most, now, here, jacobian, dt_s, [])
+        acceleration = (reached - velocity) / dt_s
+        return JointMotion(joints + reached * dt_s, reached, acceleration, np.zeros(len(joints)))
+
+    def _before_walls(
+        self,
+        reached: FloatArray,
+        low: FloatArray,
+        high: FloatArray,
+        now: JointMotion,
+        here: Pose,
+        jacobian: FloatArray,
+        dt_s: float,
+        hits: list[LimitHit],
+    ) -> FloatArray:
+        """`reached`, within `low` and `high`, changed so that the arm can stop before each wall.
+
+        With as little change to the motion of the TCP as can be: another elbow costs least. What
+        it is held before is added to `hits`.
+        """
+        reached = np.minimum(np.maximum(reached, low), high)
+        if self.walls is None:
+            return reached
+        rows, left_m = self.walls.at(now.position_rad, here.position_m, jacobian)
+        most, jerk = (
+            FAR_SHARE * (np.abs(rows) @ limit)
+            for limit in (self.acceleration_rad_s2, self.jerk_rad_s3)
+        )
+        # At first what is certainly far enough.
+        fastest = np.maximum(rows @ reached, 0.0) + most * most / jerk
+        far = left_m > fastest * (dt_s + 2 * most / jerk + fastest / (2 * most))
+        before = rows @ now.velocity_rad_s
+        metric = jacobian.T @ jacobian + ELBOW_COST * np.eye(jacobian.shape[1])
+        for wall in np.flatnonzero(~far).tolist():
+            row, nearer = rows[wall], float(rows[wall] @ reached)
+            if nearer <= 0:
+                continue
+            way = np.linalg.solve(metric, row)
+            way /= float(row @ way)
+            least = float(np.minimum(row * low, row * high).sum())
+            effort = np.maximum(np.abs(way), ROUNDING_RAD_S)
+            change = _towards_end(
+                float(left_m[wall]),
+                float(before[wall]),
+                (least - float(before[wall])) / dt_s,
+                (nearer - float(before[wall])) / dt_s,
+                WALL_SHARE * float(np.min(self.acceleration_rad_s2 / effort)),
+                WALL_SHARE * float(np.min(self.jerk_rad_s3 / effort)),
+                dt_s,
+            )
+            allowed = float(before[wall]) + change * dt_s
+            if nearer > allowed:
+                hits.append(self.walls.hit(wall, float(left_m[wall])))
+                reached = self._slower_along(row, way, allowed, reached, low, high)
+        return reached
+
+    @staticmethod
+    def _slower_along(
+        row: FloatArray,
+        first: FloatArray,
+        allowed: float,
+        reached: FloatArray,
+        low: FloatArray,
+        high: FloatArray,
+    ) -> FloatArray:
+        """`reached`, within its bounds, such that it is no faster along `row` than `allowed`."""
+        for way in (first, row, row):
+            excess = float(row @ reached) - allowed
+            # Joints that are on their bound already cannot help.
+            free = np.where(np.where(way > 0, reached > low, reached < high), way, 0.0)
+            gain = float(row @ free)
+            if excess <= 0 or gain <= 0:
+                break
+            reached = np.minimum(np.maximum(reached - excess / gain * free, low), high)
+        return reached
+
+    def _wanted(
+        self,
+        joints: FloatArray,
+        jacobian: FloatArray,
+        error: FloatArray,
+        twist: FloatArray,
+        singular_value: float,
+        held: FloatArray,
+        onto: FloatArray,
+        dt_s: float,
+    ) -> FloatArray:
+        settings = self.settings
+        posture = settings.posture_1_s * (self.posture_rad - joints)
+        fastest = float(np.abs(posture).max())
+        if fastest > settings.posture_rad_s:
+            posture *= settings.posture_rad_s / fastest
+        free = jacobian
+        if held.any():
+            posture = np.where(held, 0.0, posture)
+            free = np.where(held, 0.0, jacobian)
+            singular_value = smallest_singular_value(free)
+        taken = jacobian @ onto
+        damping = 1e-12
+        if singular_value < settings.damped_below:
+            share = 1.0 - (singular_value / settings.damped_below) ** 2
+            damping += settings.damping * share * share
+        right = np.stack([error / dt_s - taken, twist - taken, free @ posture], axis=1)
+        solved = free.T @ np.linalg.solve(free @ free.T + damping * _IDENTITY_6, right)
+        whole, feed = solved[:, 0], solved[:, 1]
+        back = min(1.0, self._back_1_s * dt_s) * (whole - feed)
+        most = _stoppable(np.abs(back) * dt_s, BACK_SHARE * self.acceleration_rad_s2, dt_s)
+        excess = float(np.max(np.abs(back) / np.maximum(most, 1e-12)))
+        if excess > 1.0:
+            back = back / excess
+        return np.where(held, onto, feed + back + posture - solved[:, 2])
+
+    def _share_near_singularity(
+        self, joints: FloatArray, wanted: FloatArray, singular_value: float
+    ) -> float:
+        """Part of the velocities `wanted` at which a singularity comes near slowly enough."""
+        settings = self.settings
+        fastest = float(np.abs(wanted).max())
+        if singular_value > WATCHED * settings.damped_below or fastest == 0.0:
+            return 1.0
+        ahead = joints + wanted * (PEEK_RAD / fastest)
+        after = smallest_singular_value(self.kinematics.jacobian(ahead))
+        # At the speed it can really have, or the rate would be that of a wish.
+        share = 1.0 / max(1.0, float(np.max(np.abs(wanted) / self.velocity_rad_s)))
+        fall_1_s = (singular_value - after) / PEEK_RAD * fastest * share
+        allowed = settings.singularity_1_s * max(singular_value - settings.singularity_stop, 0.0)
+        return share * allowed / fall_1_s if fall_1_s > allowed else 1.0
+
+    def _reachable(self, wanted: FloatArray, now: JointMotion, dt_s: float) -> FloatArray:
+        """As near to `wanted` as one tick can get, on the way to having it without overshoot."""
+        velocity, before = now.velocity_rad_s, now.wanted_rad_s
+        most = self.acceleration_rad_s2
+        rate = (wanted - (velocity if before is None else before)) / dt_s
+        rate = np.minimum(np.maximum(rate, -most), most)
+        left = wanted - velocity - rate * dt_s
+        acceleration = rate + np.copysign(self._rampable(np.abs(left), dt_s), left)
+        excess = float(np.max(np.abs(acceleration) / most))
+        return velocity + acceleration * (dt_s / max(excess, 1.0))
+
+    def _rampable(self, change: FloatArray, dt_s: float) -> FloatArray:
+        """Acceleration (n,) that comes down to nothing again within a change of velocity (n,)."""
+        return _stoppable(change, self.jerk_rad_s3, dt_s)
+
+    def _allowed(self, now: JointMotion, dt_s: float) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest velocities (n,) that every joint can have one tick later.
+
+        Within jerk and acceleration, and such that it can stay within its velocity and range. Where
+        these disagree (put outside its range, or found too fast) the former win.
+        """
+        joints, velocity = now.position_rad, now.velocity_rad_s
+        before = now.acceleration_rad_s2
+        before = np.zeros(len(joints)) if before is None else before
+        tick, most = self.jerk_rad_s3 * dt_s, self.acceleration_rad_s2
+        least = np.maximum(np.minimum(before - tick, most), -most)
+        greatest = np.minimum(np.maximum(before + tick, -most), most)
+        top, limit = [], self.velocity_rad_s
+        for sign, bound in ((1.0, self.upper_rad), (-1.0, self.lower_rad)):
+            room = limit - sign * velocity
+            high = np.where(room >= 0, self._rampable(np.maximum(room, 0.0), dt_s), room / dt_s)
+            left = sign * (bound - joints)
+            fastest = np.maximum(sign * velocity, 0.0) + most * dt_s
+            near = left < fastest * (dt_s + most / self.jerk_rad_s3 + fastest / (2 * most))
+            for joint in np.flatnonzero(near):
+                end = _towards_end(
+                    float(left[joint]),
+                    sign * float(velocity[joint]),
+                    float(least[joint] if sign > 0 else -greatest[joint]),
+                    float(greatest[joint] if sign > 0 else -least[joint]),
+                    float(most[joint]),
+                    float(self.jerk_rad_s3[joint]),
+                    dt_s,
+                )
+                high[joint] = min(high[joint], end)
+            top.append(high)
+        high = np.maximum(np.minimum(greatest, top[0]), least)
+        low = np.minimum(np.maximum(least, -top[1]), greatest)
+        return velocity + np.minimum(low, high) * dt_s, velocity + high * dt_s
+
+
+def _towards_end(
+    left: float,
+    velocity: float,
+    least: float,
+    greatest: float,
+    most: float,
+    jerk: float,
+    dt_s: float,
+) -> float:
+    """Greatest acceleration after which what moves can still stop within `left`, by halving.
+
+    Args:
+        left: of its way.
+        velocity: towards its end.
+        least: acceleration that it can have.
+        greatest: likewise.
+        most: acceleration it can stop with.
+        jerk: likewise.
+        dt_s: of the tick.
+    """
+
+    def fits(acceleration: float) -> bool:
+        after = velocity + acceleration * dt_s
+        return after * dt_s + _stop_way(after, acceleration, most, jerk) <= max(left, 0.0)
+
+    if fits(greatest):
+        return greatest
+    low, high = least, greatest
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
+
+
+def _stop_way(velocity: float, acceleration: float, most: float, jerk: float) -> float:
+    """How far a joint gets until it stops, as soon as acceleration and jerk allow."""
+    if velocity <= 0 and acceleration <= 0:
+        return 0.0
+    # Reckoned from where its acceleration will be nothing, or was.
+    ramp_s = abs(acceleration) / jerk
+    fastest = velocity + 0.5 * abs(acceleration) * ramp_s
+    if fastest <= 0:
+        return 0.0
+    if acceleration > 0:
+        before = velocity * ramp_s + acceleration * ramp_s**2 / 3
+    else:
+        before = acceleration * ramp_s**2 / -6 - fastest * ramp_s
+    if fastest < most * most / jerk:
+        return max(before + fastest * math.sqrt(fastest / jerk), 0.0)
+    return max(before + fastest * (fastest / most + most / jerk) / 2, 0.0)
+
+
+def _stoppable(distance: FloatArray, acceleration: FloatArray, dt_s: float) -> FloatArray:
+    """Greatest velocity from which joints that change it once a tick stop within `distance`.
+
+    After ``v dt`` come ``(v - a dt) dt``, ``(v - 2 a dt) dt``, ...: with k whole ticks of braking
+    ``distance = (k + 1) v dt - k (k + 1) / 2 a dt^2``.
+    """
+    unit = acceleration * (dt_s * dt_s)
+    ticks = np.floor(np.sqrt(0.25 + 2.0 * distance / unit) - 0.5)
+    return (distance / (ticks + 1.0) + 0.5 * ticks * unit) / dt_s

@@ -1,0 +1,260 @@
+"""Joint commands out of the smoothed pose stream, for arms that take joint positions.
+
+The pose stream has limits of its own, and joints have theirs. What joints cannot do is met in three
+places: the way to a goal is planned with the shares of the pose's limits that the joints can take
+(`PoseToJoint.shares`); where they lag behind all the same the pose waits for them (`pace`), for a
+while; and a brake that finds them lagging is theirs: they stop within their limits, and the pose is
+then where they have brought it. An arm that is told to stop does not make up for what it lagged.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vla_zenoh.control.barriers import Barriers
+from vla_zenoh.control.joint_follower import FollowSettings, JointFollower, JointMotion
+from vla_zenoh.control.limits import JointMotionLimits, into_workspace
+from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother
+from vla_zenoh.control.walls import Walls
+from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.so3 import Pose, distance, exp3, log3
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import Cause, FloatArray, JointCommand
+
+REST_RAD_S = 1e-5
+PULL_1_S = 25.0
+"""How fast the pull to the posture comes and goes, as a critically damped spring does."""
+PULL_JERK = 1.4
+"""Greatest jerk of that, whenever it turns round, in speeds times `PULL_1_S` squared."""
+NEAR_M, NEAR_RAD = 0.002, 0.01
+"""Joints that are nearer to the pose than this follow it."""
+FAR = 5.0
+"""So many times as far from it, and it waits for them."""
+SLOWEST = 1e-3
+"""Part of its pace that is always left: to stand is no motion to plan with."""
+ROOM = (0.95, 0.9, 0.9)
+"""Parts of the joints' velocity, acceleration and jerk that are planned with: the way is curved,
+and the elbow moves besides."""
+BEND = 0.5
+"""Part of the acceleration that the way's bend may take, in the joints' space."""
+PLACES = 3
+"""Places of a way at which it is looked."""
+BRAKE_BEND = 0.15
+"""Likewise of a brake, which takes what it can get: it bends less and less as it gets slower."""
+LOOK_TICKS = 4
+"""Ticks from one look at what the arm is near to until the next."""
+BRAKE_S = 0.1
+"""A brake leads about as far as the arm goes in this time."""
+CREEPING, STUCK_S = 0.05, 0.5
+"""A pose that goes on at less than this part of its pace for so long will not be reached."""
+OUTSIDE_M = 1e-3
+"""An arm that is further outside of the box began there, and is led in."""
+LEAST_SHARE = 0.02
+NOTHING = 1e-9
+DAMPING = 1e-5
+
+
+class PoseToJoint:
+    """Joints that follow the pose stream by differential inverse kinematics.
+
+    Args:
+        profile: joint limits, home as posture, rate.
+        kinematics: of the arm.
+        barriers: of the arm; None: only its TCP's box bounds the joints.
+    """
+
+    def __init__(
+        self, profile: Profile, kinematics: Kinematics, barriers: Barriers | None = None
+    ) -> None:
+        robot, limits = profile.robot, profile.limits
+        size = len(robot.arm_joints)
+        # The follower's joints are in chain order, the profile's in its own.
+        velocity, acceleration, jerk = (
+            kinematics.ordered(robot.arm_joints, limits.joint.of(name, size))
+            for name in ("velocity_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
+        )
+        self._kinematics = kinematics
+        share = float(np.min(velocity / kinematics.velocity_rad_s))
+        velocity = np.minimum(velocity, share * kinematics.velocity_rad_s)
+        self._limits = JointMotionLimits(velocity, acceleration, jerk)
+        home_rad = kinematics.ordered(robot.arm_joints, robot.home_rad)
+        self._home_rad = home_rad if robot.posture == "home" else None
+        settings = FollowSettings(
+            acceleration_rad_s2=tuple(acceleration.tolist()),
+            jerk_rad_s3=tuple(jerk.tolist()),
+            velocity_share=min(share, 1.0),
+            joint_margin_rad=limits.reach.joint_margin_rad,
+            singularity_stop=limits.reach.singularity_stop,
+        )
+        self._bounds = limits
+        self._walls = Walls(limits, barriers)
+        self._follower = JointFollower(kinematics, home_rad, settings, self._walls)
+        most = float(jerk.min()) / PULL_JERK / settings.posture_rad_s
+        self._pull_1_s = min(PULL_1_S, most**0.5)
+        self._longest_rad = settings.posture_rad_s / settings.posture_1_s
+        self._dt_s = 1.0 / profile.timing.command_hz
+        self._names = kinematics.arm_joints
+        self._held: set[str] = set()
+        self.restart(home_rad)
+
+    def restart(self, joints_rad: FloatArray) -> None:
+        """Stand at these joints (chain order); only for an arm that is not streamed to."""
+        still = np.zeros(len(joints_rad))
+        self._now = JointMotion(np.array(joints_rad, dtype=np.float64), still)
+        self._pull = self._pull_rate_1_s = 0.0
+        self._stopping, self._ticks = False, 0
+        self.keep_elbow()
+        self.pace = 1.0
+        """Part of its own pace at which the pose goes on."""
+
+    def keep_elbow(self) -> None:
+        """An activation begins: the posture is that of these joints, or home."""
+        here_rad = self._now.position_rad
+        self._posture_rad = here_rad if self._home_rad is None else self._home_rad
+        self._waited_s = 0.0
+
+    def shares(self, motion: Motion, goal: Pose, box: FloatArray, *, bend: float = BEND) -> Shares:
+        """Of the limits of a straight motion to a pose, what the joints can follow.
+
+        Args:
+            motion: where it begins, near to the joints, and how fast.
+            goal: where it ends.
+            box: (3, 6) velocity, acceleration and jerk of every axis, see `Smoother.box`.
+            bend: see `BEND`.
+        """
+        (position_m, rotation), twist, _ = motion
+        turn = log3(rotation.T @ goal.rotation)
+        ways = np.concatenate([goal.position_m - position_m, turn])
+        length = float(np.linalg.norm(ways))
+        if length < NOTHING:
+            return FULL
+        # All axes go together: the slowest one of the pose says how fast the way is taken.
+        rates = (box / np.maximum(np.abs(ways), NOTHING)).min(axis=1)
+        now = float(np.linalg.norm(twist)) / length
+        joint_ways, bends = self._ways(np.concatenate([ways[:3], rotation @ turn]))
+        limits = np.array(ROOM)[:, None] * np.array(self._limits)
+        needed = np.maximum(rates[:, None] * joint_ways, NOTHING)
+        velocity, _, jerk = (limits / needed).min(axis=1)
+        fastest = min(rates[0] * velocity, float(np.min(np.sqrt(bend * limits[1] / bends))))
+        reached = min(fastest, (now * now + rates[1]) ** 0.5)
+        left = np.maximum(limits[1] - bends * reached * reached, (1 - bend) * limits[1])
+        parts = np.clip([fastest / rates[0], (left / needed[1]).min(), jerk], LEAST_SHARE, 1.0)
+        return Shares(*(float(part) for part in parts))
+
+    def _ways(self, way: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How far (n,) each joint goes on a way (6,) of the TCP, and how much (n,) that changes.
+
+        Both of the whole way taken in one unit of time.
+        """
+        found: list[FloatArray] = []
+        joints = self._now.position_rad
+        for _ in range(PLACES):
+            jacobian = self._kinematics.jacobian(joints)
+            square = jacobian @ jacobian.T + DAMPING * np.eye(6)
+            found.append(jacobian.T @ np.linalg.solve(square, way))
+            joints = joints + found[-1] / (PLACES - 1)
+        bends = np.abs(np.diff(found, axis=0)).max(axis=0) * (PLACES - 1)
+        return np.abs(found).max(axis=0), np.maximum(bends, NOTHING)
+
+    def brake(self, smoother: Smoother) -> None:
+        """Let the pose come to rest as fast as the joints can."""
+        if smoother.braking:
+            return
+        (position_m, rotation), twist, _ = smoother.motion
+        way = BRAKE_S * twist
+        ahead = Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
+        smoother.brake(self.shares(smoother.motion, ahead, smoother.box, bend=BRAKE_BEND))
+
+    def tick(self, smoother: Smoother, *, braking: bool = False, elbow: bool = True) -> None:
+        """Follow the pose for one tick, or stop; `smoother` is moved on.
+
+        Args:
+            smoother: the pose.
+            braking: it comes to rest. An arm that brakes leaves its elbow where it is.
+            elbow: it may go to its posture.
+        """
+        here = self._kinematics.forward(self._now.position_rad)
+        lag = self._lag(here, smoother.motion.pose)
+        self._look()
+        self._stopping = braking and (self._stopping or lag > 1.0)
+        if self._stopping:
+            self._stop(smoother)
+            return
+        self.pace = min(max((FAR - lag) / (FAR - 1.0), SLOWEST), 1.0)
+        waits = self.pace < CREEPING
+        self._waited_s = self._waited_s + self._dt_s if waits else 0.0
+        motion = smoother.tick(self.pace)
+        self._follower.posture_rad = self._pulled_to(1.0 if elbow and not braking else 0.0)
+        twist = self.pace * motion.twist
+        pose = self._inside(here, motion.pose)
+        self._now, hits = self._follower.step(self._now, pose, twist, self._dt_s)
+        found = {f"{hit.name} {hit.where}".strip() for hit in hits}
+        self._held = found | (self._held if waits else set())
+
+    @property
+    def stuck(self) -> str:
+        """Why the pose waits for the joints for good, empty while it does not."""
+        if self._waited_s < STUCK_S:
+            return ""
+        held = sorted(self._held)
+        return (
+            f"the joints cannot follow the pose: it has waited for them for {STUCK_S:g} s; "
+            f"they are held by {', '.join(held) or 'nothing, so the arm cannot have this pose'}"
+        )
+
+    def _inside(self, here: Pose, pose: Pose) -> Pose:
+        """A pose in the box, of an arm that is in it."""
+        inside_m, outside_m = into_workspace(self._bounds, pose.position_m)
+        if not outside_m or into_workspace(self._bounds, here.position_m)[1] > OUTSIDE_M:
+            return pose
+        return Pose(inside_m, pose.rotation)
+
+    def _lag(self, here: Pose, pose: Pose) -> float:
+        """How far the joints, whose TCP is here, are from a pose, in times of what is near."""
+        apart_m, apart_rad = distance(here, self._inside(here, pose))
+        return max(apart_m / NEAR_M, apart_rad / NEAR_RAD)
+
+    def _look(self) -> None:
+        """See now and then what the arm is near to."""
+        if self._ticks % LOOK_TICKS == 0:
+            self._walls.look(self._now.position_rad)
+        self._ticks += 1
+
+    def _stop(self, smoother: Smoother) -> None:
+        """The joints stop by themselves, and the pose is where that brings the TCP."""
+        self._now = self._follower.brake(self._now, self._dt_s)
+        position, velocity = self._now[:2]
+        self._pull = self._pull_rate_1_s = 0.0
+        pose, jacobian = self._kinematics.pose_and_jacobian(position)
+        # Whoever takes this stop back plans from here: with no more than a plan may have.
+        change = np.clip(jacobian @ self._acceleration, -smoother.box[1], smoother.box[1])
+        smoother.brake_from(Motion(pose, jacobian @ velocity, change))
+
+    def _pulled_to(self, share: float) -> FloatArray:
+        """The posture (n,) of this tick: its pull comes and goes without a jerk of the elbow."""
+        w, dt_s = self._pull_1_s, self._dt_s
+        self._pull_rate_1_s += (w * w * (share - self._pull) - 2 * w * self._pull_rate_1_s) * dt_s
+        self._pull += self._pull_rate_1_s * dt_s
+        way_rad = self._posture_rad - self._now.position_rad
+        shortened = min(1.0, self._longest_rad / max(float(np.abs(way_rad).max()), 1e-9))
+        return self._now.position_rad + self._pull * shortened * way_rad
+
+    @property
+    def position_rad(self) -> FloatArray:
+        """(n,) where the joints are to be now."""
+        return self._now.position_rad
+
+    @property
+    def at_rest(self) -> bool:
+        """No joint moves."""
+        return float(np.abs(self._now.velocity_rad_s).max()) < REST_RAD_S
+
+    def command(self, state: str, cause: Cause | None) -> JointCommand:
+        """Where the joints have to be now."""
+        motion = self._now
+        return JointCommand(self._names, *motion[:2], self._acceleration, state=state, cause=cause)
+
+    @property
+    def _acceleration(self) -> FloatArray:
+        told = self._now.acceleration_rad_s2
+        return np.zeros(len(self._now.position_rad)) if told is None else told

@@ -1,0 +1,132 @@
+"""Reasons to stop obeying: what fell silent, what came late, an arm that does not follow."""
+
+from __future__ import annotations
+
+from vla_zenoh.control.chunk_validation import Lease
+from vla_zenoh.control.preflight import CLOCK_TOLERANCE_S, PeerSnapshot
+from vla_zenoh.keys import worker_node
+from vla_zenoh.kinematics.so3 import Pose, distance
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import GripperState, PoseState, Stamped
+
+NEVER_NS = 1 << 62
+FIRST_CHUNK_PATIENCE_S = 1.0
+"""After activation a new observation, an inference and a chunk have to happen first."""
+BACK_OFF_M, BACK_OFF_RAD = 0.005, 0.02
+"""A blocked arm that is led back may stray by this much more before it counts as blocked again."""
+
+
+class Watchdog:
+    """See the module.
+
+    Args:
+        profile: how far and how long.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        self._limits, self._timing = profile.limits, profile.timing
+        self.tracking_m = self.tracking_rad = 0.0
+        self._excused = (0.0, 0.0)
+        self.deadline_ns = 0
+        """When the next chunk is overdue."""
+
+    # -- chunks -------------------------------------------------------------------------------
+    def expect_first(self, now_ns: int, rate_hz: float, speed: float = 1.0) -> None:
+        """An episode begins at `now_ns`; its first chunk takes longer than the others."""
+        self._expect(now_ns, rate_hz, speed, FIRST_CHUNK_PATIENCE_S)
+
+    def expect_next(self, end_ns: int, rate_hz: float, now_ns: int, speed: float = 1.0) -> None:
+        """The newest chunk runs out at `end_ns`, or where it would be followed too long."""
+        open_loop_ns = int(self._timing.max_open_loop_s * 1e9 / speed) if speed else 0
+        self._expect(min(end_ns, now_ns + open_loop_ns), rate_hz, speed)
+
+    def _expect(self, end_ns: int, rate_hz: float, speed: float, extra_s: float = 0.0) -> None:
+        """One period at the asked rate after that, and the watchdog; none of an arm that stands."""
+        period_s = 1.0 / rate_hz / speed if speed else 0.0
+        self.deadline_ns = end_ns + int((period_s + self._timing.watchdog_s + extra_s) * 1e9)
+        if not speed:
+            self.deadline_ns = NEVER_NS
+
+    def starved(self, now_ns: int) -> bool:
+        """The next chunk is overdue."""
+        return now_ns > self.deadline_ns
+
+    def forsaken(self, now_ns: int) -> bool:
+        """It is overdue for so long that nobody may still expect the arm to go on by itself."""
+        return now_ns > self.deadline_ns + int(self._timing.max_hold_s * 1e9)
+
+    # -- tracking -----------------------------------------------------------------------------
+    def begin(self, held: Pose, actual: Pose) -> bool:
+        """The activation begins; says whether the arm is far from where it is held.
+
+        Such an arm is given the way back: it is not blocked as long as it comes nearer.
+        """
+        apart_m, apart_rad = distance(held, actual)
+        blocked = apart_m > self._limits.tracking_m or apart_rad > self._limits.tracking_rad
+        self._excused = (apart_m, apart_rad) if blocked else (0.0, 0.0)
+        return blocked
+
+    def measure(self, commanded: Pose | None, actual: Pose) -> None:
+        """How far the arm is from its command; `commanded` is None while nothing is streamed."""
+        self.tracking_m, self.tracking_rad = (
+            (0.0, 0.0) if commanded is None else distance(commanded, actual)
+        )
+
+    def blocked(self) -> str:
+        """Why the arm counts as blocked, empty when it follows."""
+        limits = self._limits
+        for apart, limit, excused, back_off, unit in (
+            (self.tracking_m, limits.tracking_m, self._excused[0], BACK_OFF_M, "m"),
+            (self.tracking_rad, limits.tracking_rad, self._excused[1], BACK_OFF_RAD, "rad"),
+        ):
+            allowed = max(limit, excused + back_off if excused else 0.0)
+            if apart > allowed:
+                return (
+                    f"the arm does not follow: {apart:.3f} {unit} from its command, "
+                    f"at most {allowed:.3g} {unit} (is it blocked?)"
+                )
+        # What was won back on the way out of a blockade is not given away again.
+        self._excused = (
+            min(self._excused[0], self.tracking_m),
+            min(self._excused[1], self.tracking_rad),
+        )
+        return ""
+
+    # -- everything around --------------------------------------------------------------------
+    def unheard(self, pose: Stamped[PoseState], gripper: Stamped[GripperState], now_ns: int) -> str:
+        """What the robot does not say any more, empty when it says all."""
+        patience_s = self._timing.state_timeout_s
+        for what, state in (("pose", pose), ("gripper", gripper)):
+            silent_s = (now_ns - state.received_ns) / 1e9
+            if silent_s > patience_s:
+                return f"robot state lost: {what} {silent_s:.3f} s old, at most {patience_s:g} s"
+            late_s = (now_ns - state.header.stamp_wall_ns) / 1e9 - CLOCK_TOLERANCE_S
+            if late_s > patience_s:
+                return f"robot state comes late: {what} by {late_s:.3f} s, at most {patience_s:g} s"
+        return ""
+
+    def lost(
+        self,
+        pose: Stamped[PoseState],
+        gripper: Stamped[GripperState],
+        around: PeerSnapshot,
+        worker: str,
+        lease: Lease,
+        now_ns: int,
+    ) -> str:
+        """What is not there any more, empty when all is."""
+        silent = self.unheard(pose, gripper, now_ns)
+        if silent:
+            return silent
+        needed = [around.robot_node, worker_node(worker)]
+        cameras = [camera.camera for camera in lease.spec.observation.cameras]
+        needed += [around.camera_nodes.get(camera, "camera") for camera in cameras]
+        for node in needed:
+            if node not in around.alive:
+                return f"node {node!r} is gone"
+        for camera in cameras:
+            if camera in around.camera_faults:
+                return f"camera {camera!r} {around.camera_faults[camera]}"
+        if around.spec_sources.get(worker) != lease.source:
+            return f"worker {worker!r} was started anew"
+        return ""

@@ -1,0 +1,1 @@
+"""The robot's side of a command stream: who is followed, and how fast. Pure."""

@@ -1,0 +1,232 @@
+"""One arm, two streams: poses of the TCP or joint positions. Whoever is followed owns the arm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from vla_zenoh.control.states import OBEYING
+from vla_zenoh.guard.joint_guard import JointGuard, joint_guard_limits
+from vla_zenoh.guard.pose_guard import PoseGuard, guard_limits
+from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import FloatArray, JointCommand, PoseCommand, Stamped
+from vla_zenoh.types.references import JointReference, PoseReference
+
+STANDING_RAD_S = 0.02
+"""An arm of which no joint is faster stands: its law may be exchanged."""
+
+UNHEEDED = frozenset({"jump", "too_fast", "out_of_range", "names", "moving", "other_mode"})
+"""Why a stream is not followed although nobody else's is: who writes it has to hear of it."""
+UNHEEDED_NS = 200_000_000
+"""For so long it is said after the last such refusal."""
+LEADING = frozenset(state.value for state in OBEYING)
+"""Who commands in another state brakes or stands already, and waits for nothing."""
+
+Mode = Literal["pose", "joint"]
+
+
+class Measured(NamedTuple):
+    """Where the arm is.
+
+    Args:
+        pose: of the TCP.
+        position_rad: (n,).
+        velocity_rad_s: (n,).
+    """
+
+    pose: Pose
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+
+
+class ArmGuard:
+    """Follows one stream; the other may begin when nobody is followed and the arm stands.
+
+    It begins where the arm was measured, not where the last reference was: the change itself moves
+    nothing.
+
+    Args:
+        poses: guard of the pose stream.
+        joints: guard of the joint stream.
+        measure: where the arm is now.
+        mode: which of them holds the arm at first.
+    """
+
+    def __init__(
+        self,
+        poses: PoseGuard,
+        joints: JointGuard,
+        measure: Callable[[], Measured],
+        mode: Mode = "pose",
+    ) -> None:
+        self._poses, self._joints = poses, joints
+        self._measure = measure
+        self._writer = self._state = ""
+        self._unheeded_until_ns = 0
+        self._now_ns = 0
+        self.mode: Mode = mode
+
+    @property
+    def _in_charge(self) -> PoseGuard | JointGuard:
+        return self._poses if self.mode == "pose" else self._joints
+
+    @property
+    def following(self) -> bool:
+        """A command stream is being followed."""
+        return self._in_charge.following
+
+    @property
+    def moving(self) -> bool:
+        """A stream is being followed, or what was followed last is still brought to rest."""
+        return self._in_charge.moving
+
+    @property
+    def writer(self) -> str:
+        """Source of the stream that is being followed, empty where none is."""
+        return self._writer if self.following else ""
+
+    @property
+    def leads(self) -> bool:
+        """Who is followed carries out what it is told; after a stop, for one, it only brakes."""
+        return self.following and self._state in LEADING
+
+    @property
+    def braking(self) -> bool:
+        """The stream fell silent in motion."""
+        return self._in_charge.braking
+
+    @property
+    def unheeded(self) -> bool:
+        """Somebody leads an arm that follows nobody, and is not obeyed.
+
+        Who writes that stream cannot see it by the arm, which may stand when a motion begins.
+        """
+        if self.following or self.braking:
+            return False
+        return 0 < self._unheeded_until_ns - self._now_ns <= UNHEEDED_NS
+
+    @property
+    def silences(self) -> int:
+        """How often a stream fell silent in motion."""
+        return self._poses.silences + self._joints.silences
+
+    @property
+    def reference(self) -> PoseReference | JointReference:
+        """What the arm holds now."""
+        if self.mode == "joint":
+            return self._joints.motion
+        motion = self._poses.motion
+        return PoseReference(
+            motion.pose.position_m, motion.pose.rotation, motion.twist, motion.acceleration
+        )
+
+    def offer_pose(self, command: Stamped[PoseCommand], now_ns: int) -> str | None:
+        """Take a pose, or say in one word why not.
+
+        Returns:
+            None, ``other_mode`` (joints are followed), ``moving`` (the arm does, so that its law
+            cannot be exchanged), or what `PoseGuard.offer` says.
+        """
+        reason = self._offer_pose(command, now_ns)
+        self._note(reason, command.record.state, now_ns)
+        return reason
+
+    def _offer_pose(self, command: Stamped[PoseCommand], now_ns: int) -> str | None:
+        if self.mode != "pose":
+            if self.following or self.braking:
+                return "other_mode"
+            measured = self._measure()
+            if _moves(measured):
+                return "moving"
+            self._poses.anchor(measured.pose)
+        reason = self._poses.offer(command, now_ns)
+        if reason is None:
+            self.mode, self._writer = "pose", command.header.source
+            self._state = command.record.state
+        return reason
+
+    def offer_joint(self, command: Stamped[JointCommand], now_ns: int) -> str | None:
+        """Take joint positions, or say in one word why not.
+
+        Returns:
+            None, ``other_mode`` (poses are followed), ``moving``, or what `JointGuard.offer` says.
+        """
+        reason = self._offer_joint(command, now_ns)
+        self._note(reason, command.record.state, now_ns)
+        return reason
+
+    def _offer_joint(self, command: Stamped[JointCommand], now_ns: int) -> str | None:
+        if self.mode != "joint":
+            if self.following or self.braking:
+                return "other_mode"
+            measured = self._measure()
+            if _moves(measured):
+                return "moving"
+            self._joints.anchor(measured.position_rad)
+        reason = self._joints.offer(command, now_ns)
+        if reason is None:
+            self.mode, self._writer = "joint", command.header.source
+            self._state = command.record.state
+        return reason
+
+    def _note(self, reason: str | None, state: str, now_ns: int) -> None:
+        # While somebody is followed a stranger's word changes nothing.
+        if reason in UNHEEDED and state in LEADING and not (self.following or self.braking):
+            self._unheeded_until_ns = now_ns + UNHEEDED_NS
+
+    def tick(self, now_ns: int) -> PoseReference | JointReference:
+        """What the arm has to hold at `now_ns`."""
+        self._now_ns = now_ns
+        self._in_charge.tick(now_ns)
+        return self.reference
+
+    def anchor(self) -> None:
+        """Somebody else moved the arm; follow nobody and stand. Commands heard stay heard."""
+        measured = self._measure()
+        self._poses.anchor(measured.pose)
+        self._joints.anchor(measured.position_rad)
+
+    def stand(self) -> None:
+        """Follow nobody and stand where the reference is: the arm stopped there by itself."""
+        self._in_charge.stand()
+
+    def restart(self) -> None:
+        """The robot was put elsewhere; follow nobody and stand there."""
+        measured = self._measure()
+        self._poses.restart(measured.pose)
+        self._joints.restart(measured.position_rad)
+
+
+def make_arm_guard(
+    profile: Profile,
+    measure: Callable[[], Measured],
+    joint_range_rad: tuple[FloatArray, FloatArray],
+    dt_s: float,
+) -> ArmGuard:
+    """The guard of a profile's robot, standing where the arm stands.
+
+    Args:
+        profile: limits, timing, and which stream holds the arm at first.
+        measure: where the arm is now.
+        joint_range_rad: lower and upper ends of the joints, (n,) each.
+        dt_s: time between two ticks.
+    """
+    here = measure()
+    return ArmGuard(
+        PoseGuard(here.pose, dt_s, guard_limits(profile)),
+        JointGuard(
+            profile.robot.arm_joints,
+            here.position_rad,
+            dt_s,
+            joint_guard_limits(profile, *joint_range_rad),
+        ),
+        measure,
+        profile.robot.command,
+    )
+
+
+def _moves(measured: Measured) -> bool:
+    return float(np.abs(measured.velocity_rad_s).max()) > STANDING_RAD_S

@@ -1,0 +1,247 @@
+"""What the numbers of a policy mean that was not made for this package, as a person says it.
+
+One set of options for policy servers, LeRobot's directories and OpenVLA's::
+
+    action     delta, absolute (of the TCP); joint_delta, joint_position (become absolute poses
+               by the arm's forward kinematics)
+    frame      base, tcp: axes of a delta
+    rotation   rpy, rotvec, quat_xyzw, quat_wxyz
+    clip       numbers of the arm are clipped to [-clip, clip] first; empty: not
+    position_scale_m, rotation_scale_rad, joint_scale_rad   one unit of the numbers
+    gripper    none, delta_m, absolute_m, open_fraction, binary
+    gripper_open       high, low: which end of binary and open_fraction is open
+    gripper_threshold  of binary
+    dt_s       duration of a step
+    horizon    steps taken from an answer, at most
+
+A meaning that nobody said is asked for: a wrong guess moves a robot.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Literal, cast, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from vla_zenoh.errors import SpecError
+from vla_zenoh.interop.joints import Forward, poses_of
+from vla_zenoh.policy import ActionSpec, Frame, GripperMeaning, Rotation
+from vla_zenoh.policy.model_options import number, one_of, whole_number
+from vla_zenoh.pydantic_errors import in_words
+from vla_zenoh.types import JointState
+
+Action = Literal["delta", "absolute", "joint_delta", "joint_position"]
+TheirRotation = Literal["rpy", "rotvec", "quat_xyzw", "quat_wxyz"]
+
+MEANING: Mapping[str, str] = {
+    "action": "",
+    "frame": "base",
+    "rotation": "",
+    "clip": "",
+    "position_scale_m": "1",
+    "rotation_scale_rad": "1",
+    "joint_scale_rad": "1",
+    "gripper": "",
+    "gripper_open": "",
+    "gripper_threshold": "0.5",
+    "dt_s": "",
+    "horizon": "",
+}
+"""Every option with its default; empty: none, but for `clip`."""
+OPEN = ("high", "low")
+QUATERNION_SLACK = 0.1
+"""A network's quaternion this far from unit length is brought to it; further is something else."""
+_ASKED: Mapping[str, str] = {
+    "action": " or ".join(get_args(Action)),
+    "rotation": " or ".join(get_args(TheirRotation)),
+    "gripper": " or ".join(get_args(GripperMeaning)),
+    "gripper_open": "high or low: is the gripper open where its number is large?",
+    "dt_s": "seconds of a step, 1 / fps of the data",
+    "horizon": "how many steps of an answer are taken",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ActionSemantics:
+    """See the module. Made by `read_meaning`.
+
+    Args:
+        spec: what our side is told: metres and radians.
+        action: what the arm's numbers are.
+        rotation: in which form they have it, where they are poses.
+        clip: bound of the arm's raw numbers; 0: none.
+        scales: (position, rotation, joint) one unit in m, rad, rad.
+    """
+
+    spec: ActionSpec
+    action: Action
+    rotation: TheirRotation
+    clip: float
+    scales: tuple[float, float, float]
+
+    @property
+    def needs_joints(self) -> bool:
+        """Its numbers are joints, so forward kinematics are needed."""
+        return _of_joints(self.action)
+
+    def parts(self, joints: int) -> dict[str, int]:
+        """What a row holds, in order, and how many numbers that is, of an arm with `joints`."""
+        turns = 4 if self.rotation.startswith("quat") else 3
+        arm = {"joints": joints} if self.needs_joints else {"position": 3, self.rotation: turns}
+        return arm if self.spec.gripper == "none" else {**arm, "gripper": 1}
+
+    def steps(
+        self,
+        rows: NDArray[np.float64],
+        joint: JointState | None = None,
+        forward: Forward | None = None,
+    ) -> NDArray[np.float64]:
+        """(H, D) in the meaning of `spec`.
+
+        Args:
+            rows: (H, C) as `parts` says.
+            joint: where the arm was when it was looked at; for joints.
+            forward: kinematics of the arm; likewise.
+
+        Raises:
+            SpecError: another number of columns, or a quaternion that is none.
+        """
+        parts = self.parts(0 if joint is None else len(joint.names))
+        if rows.shape[1] != sum(parts.values()):
+            wanted = " + ".join(f"{name} {count}" for name, count in parts.items())
+            raise SpecError(
+                f"the answer has {rows.shape[1]} columns, wanted {sum(parts.values())}: {wanted}",
+                "shape",
+            )
+        arm, gripper = np.split(rows, [rows.shape[1] - ("gripper" in parts)], axis=1)
+        if self.clip:
+            arm = arm.clip(-self.clip, self.clip)
+        if not self.needs_joints:
+            return np.concatenate([arm[:, :3] * self.scales[0], self._turns(arm), gripper], axis=1)
+        assert joint is not None
+        assert forward is not None
+        deltas = self.action == "joint_delta"
+        poses = poses_of(arm * self.scales[2], joint, forward, deltas=deltas)
+        return np.concatenate([poses, gripper], axis=1)
+
+    def _turns(self, arm: NDArray[np.float64]) -> NDArray[np.float64]:
+        rotation = arm[:, 3:]
+        if not self.rotation.startswith("quat"):
+            return rotation * self.scales[1]
+        norm = np.linalg.norm(rotation, axis=1, keepdims=True)
+        if (abs(norm - 1.0) > QUATERNION_SLACK).any():
+            raise SpecError(f"a quaternion of norm {norm.min():.3g}; wanted 1", "quaternion")
+        return np.roll(rotation / norm, 0 if self.rotation == "quat_xyzw" else -1, axis=1)
+
+
+def _of_joints(action: str) -> bool:
+    return action in ("joint_delta", "joint_position")
+
+
+def read_meaning(
+    told: Mapping[str, str],
+    known: Mapping[str, str] | None = None,
+    whose: str = "",
+    *,
+    normalisation: str | None = None,
+) -> ActionSemantics:
+    """The meaning that options give.
+
+    Args:
+        told: by a person, any of `MEANING`.
+        known: options that a preset or the name of a data set stands for; `told` overrides them.
+            Another `action` is another meaning: then nothing but `horizon` is left of them.
+        whose: they are, for messages.
+        normalisation: for the spec.
+
+    Raises:
+        SpecError: an option is not known, cannot be, or is missing; names what is allowed.
+    """
+    unknown = [name for name in told if name not in MEANING]
+    if unknown:
+        raise SpecError(f"no option {', '.join(map(repr, unknown))}; known: {', '.join(MEANING)}")
+    known = {name: value for name, value in (known or {}).items() if name in MEANING}
+    action = told.get("action") or known.get("action", "")
+    other = bool(known.get("action")) and action != known["action"]
+    if other:
+        known = {name: value for name, value in known.items() if name == "horizon"}
+    chosen = {**MEANING, **known, **told, "action": action}
+    for name, allowed in (
+        ("action", get_args(Action)),
+        ("rotation", get_args(TheirRotation)),
+        ("frame", get_args(Frame)),
+        ("gripper", get_args(GripperMeaning)),
+        ("gripper_open", OPEN),
+    ):
+        if chosen[name]:
+            one_of(name, chosen[name], allowed)
+    _ask_for_missing(chosen, f"action={action} is not that of {whose}, so " if other else "")
+    joints = _of_joints(action)
+    rotation = "quat_xyzw" if joints else chosen["rotation"]
+    return ActionSemantics(
+        spec=_spec(chosen, rotation, normalisation),
+        action=cast(Action, action),
+        rotation=cast(TheirRotation, rotation),
+        clip=number("clip", chosen["clip"] or "0"),
+        scales=(
+            number("position_scale_m", chosen["position_scale_m"]),
+            number("rotation_scale_rad", chosen["rotation_scale_rad"]),
+            number("joint_scale_rad", chosen["joint_scale_rad"]),
+        ),
+    )
+
+
+def _ask_for_missing(chosen: Mapping[str, str], why: str) -> None:
+    wanted = set(_ASKED)
+    if _of_joints(chosen["action"]):
+        wanted -= {"rotation"}
+    if chosen["gripper"] not in ("", "open_fraction", "binary"):
+        wanted -= {"gripper_open"}
+    missing = [name for name in _ASKED if name in wanted and not chosen[name]]
+    if missing:
+        raise SpecError(
+            f"{why}nobody says what the numbers mean: "
+            + ", ".join(f"--set {name}=({_ASKED[name]})" for name in missing)
+        )
+
+
+def _spec(chosen: Mapping[str, str], rotation: str, normalisation: str | None) -> ActionSpec:
+    action = chosen["action"]
+    quaternion = rotation.startswith("quat")
+    with as_spec_error():
+        return ActionSpec(
+            horizon=whole_number("horizon", chosen["horizon"]),
+            dt_s=number("dt_s", chosen["dt_s"]),
+            kind="delta" if action == "delta" else "absolute",
+            frame=cast(Frame, "base" if _of_joints(action) else chosen["frame"]),
+            rotation="quaternion" if quaternion else cast(Rotation, rotation),
+            gripper=cast(GripperMeaning, chosen["gripper"]),
+            gripper_open_is_high=chosen["gripper_open"] != "low",
+            gripper_threshold=number(
+                "gripper_threshold", chosen["gripper_threshold"], least=-math.inf
+            ),
+            normalisation=normalisation,
+        )
+
+
+@contextmanager
+def as_spec_error() -> Iterator[None]:
+    """What a spec refuses, as a sentence that names each option.
+
+    Raises:
+        SpecError: a spec was not valid.
+    """
+    try:
+        yield
+    except ValidationError as error:
+        faults = "; ".join(
+            f"{'.'.join(map(str, fault['loc'])) or 'options'}: {in_words(fault)}"
+            for fault in error.errors(include_url=False)
+        )
+        raise SpecError(f"the options give no valid spec: {faults}") from error

@@ -1,0 +1,208 @@
+"""Of joint states as robots tell them: our joint, pose and gripper states.
+
+Positions have to be finite, new, and such as a joint of this arm can have. What an arm does not
+tell (velocities, efforts) is made up for: velocities by differences, efforts by zero.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vla_zenoh.errors import CodecError, RecordError
+from vla_zenoh.interop.ros2.samples import Joints
+from vla_zenoh.kinematics.fingers import Fingers
+from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
+
+MOVING_M_S = 0.002
+"""Fingers faster than this move."""
+BEYOND = 10.0
+"""A joint may be told to be, and to move, this many times as far as its description allows: zero
+points are set in many ways, garbage is further off."""
+FURTHEST = 10.0
+"""Finger joints told to be further, m or rad, or to move so far within a second, are garbage."""
+RESTARTED_NS = 1_000_000_000
+"""A stamp this much older than the last one is a robot that was started anew, or a clock that was
+set; a smaller step back is a message that was overtaken."""
+
+
+class Newness:
+    """Refuses what came before: a stamp that stands still is a robot, or camera, that does."""
+
+    def __init__(self) -> None:
+        self._stamp_ns = -1
+
+    def check(self, stamp_ns: int) -> None:
+        """Take a stamp.
+
+        Raises:
+            CodecError: ``frozen`` (the same again) or ``out_of_order``.
+        """
+        if stamp_ns == self._stamp_ns:
+            raise CodecError("frozen", f"the stamp {stamp_ns} came again")
+        if self._stamp_ns - RESTARTED_NS < stamp_ns < self._stamp_ns:
+            late_ms = (self._stamp_ns - stamp_ns) / 1e6
+            raise CodecError("out_of_order", f"{late_ms:.1f} ms older than the one before")
+        self._stamp_ns = stamp_ns
+
+
+class JointReading:
+    """The newest of one arm and its gripper.
+
+    Args:
+        profile: whose robot it is.
+        kinematics: of that robot.
+    """
+
+    def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
+        robot = profile.robot
+        self._arm, self._finger_names = robot.arm_joints, robot.finger_joints
+        self._fingers = Fingers(robot.gripper, len(robot.finger_joints))
+        self._max_width_m = robot.gripper.max_width_m
+        self._kinematics = kinematics
+        at = [kinematics.arm_joints.index(name) for name in robot.arm_joints]
+        lower_rad, upper_rad = kinematics.lower_rad[at], kinematics.upper_rad[at]
+        self._middle_rad = (lower_rad + upper_rad) / 2
+        self._furthest_rad = BEYOND * (upper_rad - lower_rad) / 2
+        self._fastest_rad_s = BEYOND * kinematics.velocity_rad_s[at]
+        self._arm_newness, self._finger_newness = Newness(), Newness()
+        self._joints: JointState | None = None
+        self.stamp_ns = 0
+        self.width_m: float | None = None
+        self.width_stamp_ns = 0
+        self._finger_speed_m_s = 0.0
+        self.efforts_missing = 0
+
+    # -- taking -------------------------------------------------------------------------------
+    def take(self, joints: Joints, stamp_ns: int) -> JointState | None:
+        """Take a message; the arm's joints of it, None where it says nothing of the arm.
+
+        Args:
+            joints: the message.
+            stamp_ns: its own, or when it arrived where it has none.
+
+        Raises:
+            CodecError: ``frozen``, ``out_of_order``, ``partial`` (some of the arm's joints), or
+                ``invalid`` (not finite, or nothing that this arm can do).
+        """
+        places = {name: index for index, name in enumerate(joints.names)}
+        self._take_fingers(joints, places, stamp_ns)
+        found = [name for name in self._arm if name in places]
+        if not found:
+            return None
+        if len(found) < len(self._arm):
+            missing = ", ".join(name for name in self._arm if name not in places)
+            raise CodecError("partial", f"joint states of this arm without {missing}")
+        at = [places[name] for name in self._arm]
+        position = _finite("position", joints.position[at])
+        self._check(position - self._middle_rad, self._furthest_rad, position, "rad")
+        velocity = None
+        if joints.velocity is not None:
+            velocity = _finite("velocity", joints.velocity[at])
+            self._check(velocity, self._fastest_rad_s, velocity, "rad/s")
+        self._arm_newness.check(stamp_ns)
+        if velocity is None:
+            velocity = self._velocity(position, stamp_ns)
+        try:
+            state = JointState(self._arm, position, velocity, self._effort(joints, at))
+        except RecordError as error:
+            raise CodecError("invalid", str(error)) from error
+        self._joints, self.stamp_ns = state, stamp_ns
+        return state
+
+    def _check(self, off: FloatArray, most: FloatArray, told: FloatArray, unit: str) -> None:
+        """That no joint is told to be `off` by more than `most`, both (n,)."""
+        wrong = np.flatnonzero(np.abs(off) > most)
+        if wrong.size:
+            joint = int(wrong[0])
+            raise CodecError(
+                "invalid",
+                f"{self._arm[joint]} at {told[joint]:.4g} {unit}: more than {BEYOND:g} times what "
+                "its description allows",
+            )
+
+    def _velocity(self, position: FloatArray, stamp_ns: int) -> FloatArray:
+        """By the difference to the message before; two that were stamped at nearly one time say
+        nothing of velocity, hence the bound."""
+        elapsed_s = (stamp_ns - self.stamp_ns) / 1e9
+        if self._joints is None or not 0 < elapsed_s < 1:
+            return np.zeros(len(position))
+        velocity = (position - self._joints.position_rad) / elapsed_s
+        return np.clip(velocity, -self._fastest_rad_s, self._fastest_rad_s)
+
+    def _effort(self, joints: Joints, at: list[int]) -> FloatArray:
+        """Nothing here is controlled by efforts, and ros2_control writes NaN where it has none."""
+        effort = None if joints.effort is None else joints.effort[at]
+        if effort is not None and np.isfinite(effort).all():
+            return effort
+        self.efforts_missing += 1
+        return np.zeros(len(at))
+
+    def _take_fingers(self, joints: Joints, places: dict[str, int], stamp_ns: int) -> None:
+        at = [places[name] for name in self._finger_names if name in places]
+        if not at:
+            return
+        positions = _finite("position", joints.position[at])
+        if float(np.abs(positions).max()) > FURTHEST:
+            raise CodecError("invalid", f"a finger joint beyond {FURTHEST:g} m or rad")
+        self._finger_newness.check(stamp_ns)
+        width_m = self._fingers.width_m(positions)
+        elapsed_s = (stamp_ns - self.width_stamp_ns) / 1e9
+        velocity = None if joints.velocity is None else joints.velocity[at]
+        if velocity is not None and bool((np.abs(velocity) <= FURTHEST).all()):
+            self._finger_speed_m_s = self._fingers.speed_m_s(velocity)
+        elif self.width_m is not None and 0 < elapsed_s < 1:
+            self._finger_speed_m_s = abs(width_m - self.width_m) / elapsed_s
+        self.width_m, self.width_stamp_ns = width_m, stamp_ns
+
+    # -- telling ------------------------------------------------------------------------------
+    @property
+    def joints(self) -> JointState | None:
+        """The newest, None before the first."""
+        return self._joints
+
+    def tcp(self) -> tuple[Pose, FloatArray]:
+        """Pose and twist (6,) of the TCP, by our kinematics; needs `joints`."""
+        assert self._joints is not None
+        ordered = self._kinematics.joints_of(self._joints)
+        pose, jacobian = self._kinematics.pose_and_jacobian(ordered)
+        velocity = self._kinematics.ordered(self._joints.names, self._joints.velocity_rad_s)
+        return pose, jacobian @ velocity
+
+    def gripper(self, *, busy: bool, wanted_m: float | None, held: bool) -> GripperState | None:
+        """State of the gripper, None where it is not known.
+
+        Args:
+            busy: a goal is in flight.
+            wanted_m: width asked for last; where no finger joints are described, it is believed.
+            held: the gripper said that it holds something.
+        """
+        if not self._finger_names:
+            width_m = self._max_width_m if wanted_m is None else wanted_m
+            return GripperState(width_m, busy, held)
+        if self.width_m is None:
+            return None
+        moving = busy or self._finger_speed_m_s > MOVING_M_S
+        return GripperState(min(max(self.width_m, 0.0), 1.0), moving, held and not moving)
+
+
+def pose_state(
+    pose: Pose, twist: FloatArray, wrench: FloatArray | None, reference: Pose | None
+) -> PoseState:
+    """A record of a TCP pose."""
+    return PoseState(
+        pose.position_m,
+        quat_from_rotation(pose.rotation),
+        twist,
+        wrench,
+        None if reference is None else reference.position_m,
+        None if reference is None else quat_from_rotation(reference.rotation),
+    )
+
+
+def _finite(what: str, values: FloatArray) -> FloatArray:
+    if not np.isfinite(values).all():
+        raise CodecError("invalid", f"a joint {what} that is NaN or infinite")
+    return values

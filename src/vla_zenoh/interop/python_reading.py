@@ -1,0 +1,104 @@
+"""Of what a robot in a Python file says: our records, checked before any of them is used."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from vla_zenoh.interop.joint_reading import JointReading, pose_state
+from vla_zenoh.interop.ros2.samples import Joints
+from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.profile import Profile
+from vla_zenoh.robot import Reading, numbers
+from vla_zenoh.sanitize import one_line
+from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
+
+MAX_WORDS = 300
+FAULT_NS = 200_000_000
+"""A fault counts for so long at least: of states the newest is looked at, and one of them alone
+could be passed over."""
+
+
+class Taken(NamedTuple):
+    """A reading that holds.
+
+    Args:
+        stamp_ns: when it was measured, wall clock.
+        joints: of the arm.
+        tcp: by our kinematics.
+        pose: the same with twist and wrench; without a reference.
+        gripper: ready and without faults.
+    """
+
+    stamp_ns: int
+    joints: JointState
+    tcp: Pose
+    pose: PoseState
+    gripper: GripperState
+
+
+class PythonReading:
+    """Takes readings of one arm.
+
+    Args:
+        profile: whose robot it is.
+        kinematics: of that robot.
+    """
+
+    def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
+        self._names = profile.robot.arm_joints
+        self._state = JointReading(profile, kinematics)
+
+    def take(self, reading: Reading, stamp_ns: int, asked_m: float) -> Taken:
+        """All of it, or nothing.
+
+        Args:
+            reading: as the robot gave it.
+            stamp_ns: when it was measured, wall clock.
+            asked_m: width asked for last, believed where the reading has none.
+
+        Raises:
+            ValueError: something of it is no number, or not what this arm can be and do.
+        """
+        count = len(self._names)
+
+        def maybe(name: str, size: int) -> FloatArray | None:
+            given = getattr(reading, name)
+            return None if given is None else numbers(name, given, size)
+
+        joints = Joints(
+            stamp_ns,
+            self._names,
+            numbers("position_rad", reading.position_rad, count),
+            maybe("velocity_rad_s", count),
+            maybe("effort_nm", count),
+        )
+        wrench = maybe("wrench", 6)
+        width_m = asked_m if reading.width_m is None else reading.width_m
+        gripper = GripperState(width_m, reading.moving, reading.holding)
+        taken = self._state.take(joints, stamp_ns)
+        assert taken is not None
+        tcp, twist = self._state.tcp()
+        return Taken(stamp_ns, taken, tcp, pose_state(tcp, twist, wrench, None), gripper)
+
+
+class Fault:
+    """Why the robot does not move: from when it says so until it says otherwise."""
+
+    def __init__(self) -> None:
+        self.words = ""
+        self._since_ns = 0
+
+    def say(self, words: object, now_ns: int) -> bool:
+        """Take what a reading says; whether `words` are others now.
+
+        Args:
+            words: empty or None: it is well.
+            now_ns: on the monotonic clock.
+        """
+        before = self.words
+        if words:
+            self.words, self._since_ns = one_line(words, MAX_WORDS)[:MAX_WORDS], now_ns
+        elif now_ns - self._since_ns >= FAULT_NS:
+            self.words = ""
+        return self.words != before

@@ -1,0 +1,132 @@
+"""A model of ours for those who ask by names: a map of arrays to an `Observation`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.errors import PeerError, RecordError, SpecError
+from vla_zenoh.interop.field_mapping import FieldSource
+from vla_zenoh.interop.options import read_map
+from vla_zenoh.policy import ModelSpec, Observation
+from vla_zenoh.policy.observation import prepare
+from vla_zenoh.policy.state_vector import ROTATIONS, parts_of, read_parts, state_of
+from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task, shown
+
+_OF_PART = {"pose": "position+quat_xyzw", "gripper": "gripper_m", "joint": "joint"}
+
+
+@dataclass(frozen=True, slots=True)
+class ServedPolicy:
+    """What a model can be asked, and under which names.
+
+    Args:
+        spec: of the model.
+        fields: name -> what it holds.
+        joints: names of the arm's joints, in the order in which they are given.
+        max_width_m: of the gripper.
+    """
+
+    spec: ModelSpec
+    fields: Mapping[str, FieldSource]
+    joints: tuple[str, ...]
+    max_width_m: float
+
+    def described(self) -> dict[str, str]:
+        """Name -> what it has to be, for people."""
+        out: dict[str, str] = {}
+        for name, source in self.fields.items():
+            if source.camera:
+                out[name] = f"picture of camera {source.camera}, (H, W, 3) RGB uint8"
+            else:
+                out[name] = "text" if source.prompt else "+".join(source.parts)
+        return out
+
+    def observe(self, given: Mapping[str, Any], stamp_wall_ns: int, seq: int) -> Observation:
+        """An observation of what was given; names that are not asked for are passed over.
+
+        Twists and joint velocities, which such a question does not hold, are zero.
+
+        Raises:
+            PeerError: a name is missing or holds something else; says what is wanted.
+        """
+        described = self.described()
+        missing = [f"{name} ({what})" for name, what in described.items() if name not in given]
+        if missing:
+            raise PeerError("peer_request", f"the observation lacks {', '.join(missing)}")
+        prompt, state, images = "", {}, {}
+        cameras = {camera.camera: camera for camera in self.spec.observation.cameras}
+        try:
+            for name, source in self.fields.items():
+                value = given[name]
+                if source.prompt:
+                    if not isinstance(value, str):
+                        raise PeerError("peer_request", f"{name} is not text: {shown(value)}")
+                    prompt = value
+                elif source.camera:
+                    if not isinstance(value, np.ndarray):
+                        raise PeerError("peer_request", f"{name} is no array: {shown(value)}")
+                    images[source.camera] = prepare(Image(value), cameras[source.camera])
+                else:
+                    numbers = np.asarray(value, np.float64)
+                    state |= state_of(source.parts, numbers, len(self.joints), self.max_width_m)
+            return Observation(
+                stamp_wall_ns=stamp_wall_ns,
+                seq=seq,
+                task=Task(0, True, prompt, self.spec.name, 1.0 / self.spec.action.dt_s),
+                images=images,
+                **self._state(state),
+            )
+        except (RecordError, SpecError, ValueError, TypeError) as error:
+            wanted = "; ".join(f"{name}: {what}" for name, what in described.items())
+            raise PeerError("peer_request", f"{error} (wanted: {wanted})") from error
+
+    def _state(self, state: Mapping[str, Any]) -> dict[str, Any]:
+        asked, none = self.spec.observation.state, np.zeros(len(self.joints))
+        out: dict[str, Any] = {}
+        if "pose" in asked:
+            out["pose"] = PoseState(state["position_m"], state["quat_xyzw"], np.zeros(6))
+        if "gripper" in asked:
+            out["gripper"] = GripperState(state["width_m"], moving=False, holding=False)
+        if "joint" in asked:
+            out["joint"] = JointState(self.joints, state["joint"], none, none)
+        return out
+
+
+def make_offer(
+    spec: ModelSpec, map_option: str, joints: tuple[str, ...], max_width_m: float
+) -> ServedPolicy:
+    """The offer of a model; `map_option` names things otherwise than ``observation/...``.
+
+    Raises:
+        SpecError: what the model needs is not named, or named twice.
+    """
+    fields = {name: source for name, source in read_map(map_option).items() if source is not None}
+    own = list(fields.values())
+    if any(source.blank for source in own):
+        raise SpecError("blank is for what is sent, not for what is asked for")
+    named = {source.camera for source in own if source.camera}
+    for camera in spec.observation.cameras:
+        if camera.camera not in named:
+            fields[f"observation/{camera.camera}"] = FieldSource(camera=camera.camera)
+    unknown = named - {camera.camera for camera in spec.observation.cameras}
+    if unknown:
+        raise SpecError(f"the model has no camera {', '.join(sorted(unknown))}")
+    covered = {part for source in own for part in parts_of(source.parts)}
+    for part in spec.observation.state:
+        if part not in covered:
+            parts = read_parts(_OF_PART[part])
+            fields[f"observation/{part}"] = FieldSource(parts=parts)
+    _check_whole(spec, fields)
+    if not any(source.prompt for source in own):
+        fields["prompt"] = FieldSource(prompt=True)
+    return ServedPolicy(spec, fields, joints, max_width_m)
+
+
+def _check_whole(spec: ModelSpec, fields: Mapping[str, FieldSource]) -> None:
+    parts = {part for source in fields.values() for part in source.parts}
+    if "pose" in spec.observation.state and not ("position" in parts and parts & set(ROTATIONS)):
+        raise SpecError(f"map must give the whole pose: position and one of {', '.join(ROTATIONS)}")

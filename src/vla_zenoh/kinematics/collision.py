@@ -1,0 +1,245 @@
+"""How far the arm is from itself and from the table.
+
+Every link is the convex hull of its collision shapes. Which pairs of links say something is found
+once, by sampling the joint space: pairs that are always near are neighbours by construction, pairs
+that never come near need no looking at, and pairs that are too near in a pose known to be good are
+a fault of the shapes. It is what MoveIt's setup assistant calls adjacent, never and default.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vla_zenoh.errors import ResourceError
+from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.types import FloatArray
+
+SAMPLES = 1000
+NEVER_SPARE_M = 0.03
+"""What a finite number of samples may have missed of a pair's smallest distance."""
+TABLE = "table"
+
+
+class CollisionPair(NamedTuple):
+    """Two things that must not touch.
+
+    Args:
+        first: a link.
+        second: another link, or ``table``.
+        is_hand: `first` moves with the last joint of the arm, so it is what reaches for things.
+    """
+
+    first: str
+    second: str
+    is_hand: bool
+
+    def __str__(self) -> str:
+        return f"{self.first} and {self.second}"
+
+
+class CollisionModel:
+    """See the module.
+
+    Args:
+        kinematics: of the arm; other joints are where it locked them.
+        near_m: distances above this are of no interest.
+        touching_m: distances below this are a collision.
+        table_z_m: height of the table in the base frame; None: no table.
+        known_good_rad: configurations (n,) that are known to be free.
+
+    Raises:
+        ResourceError: the URDF's collision shapes cannot be loaded, or there are none.
+    """
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        *,
+        near_m: float,
+        touching_m: float,
+        table_z_m: float | None = None,
+        known_good_rad: Sequence[FloatArray] = (),
+    ) -> None:
+        self._model, self._data = kinematics.model, kinematics.model.createData()
+        self._geometry: Any = _one_hull_a_link(kinematics)
+        if table_z_m is not None:
+            self._geometry.addGeometryObject(_table(kinematics, table_z_m))
+        pairs = _pairs_that_move(self._geometry)
+        distances = self._sample(kinematics, pairs)
+        good = self._at(known_good_rad, pairs)
+        wanted = (distances.max(axis=0) > near_m) & (distances.min(axis=0) < near_m + NEVER_SPARE_M)
+        if len(good):
+            wanted &= good.min(axis=0) > touching_m
+        self._use([pair for pair, keep in zip(pairs, wanted, strict=True) if keep])
+        last = kinematics.model.njoints - 1
+        self.pairs: tuple[CollisionPair, ...] = tuple(
+            CollisionPair(first.name, second.name, first.parentJoint == last)
+            for first, second in (
+                (self._geometry.geometryObjects[p.first], self._geometry.geometryObjects[p.second])
+                for p in self._geometry.collisionPairs
+            )
+        )
+
+    def distances(self, joints_rad: FloatArray) -> FloatArray:
+        """(len(pairs),) m, negative where two things are inside each other."""
+        pin.updateGeometryPlacements(
+            self._model, self._data, self._geometry, self._work, joints_rad
+        )
+        pin.computeDistances(self._geometry, self._work)
+        return np.array([result.min_distance for result in self._results])
+
+    def slopes(self, joints_rad: FloatArray, indices: Sequence[int]) -> FloatArray:
+        """(len(indices), n) m/rad: how these distances change with each joint.
+
+        Only after `distances` of the same joints. Nothing for two that are inside each other.
+        """
+        if not len(indices):
+            return np.zeros((0, len(joints_rad)))
+        pin.computeJointJacobians(self._model, self._data, joints_rad)
+        found = np.zeros((len(indices), len(joints_rad)))
+        for row, index in enumerate(indices):
+            result, pair = self._results[index], self._geometry.collisionPairs[int(index)]
+            normal = np.array(result.normal)
+            for sign, which, point in (
+                (-1.0, pair.first, result.getNearestPoint1()),
+                (1.0, pair.second, result.getNearestPoint2()),
+            ):
+                joint = self._geometry.geometryObjects[which].parentJoint
+                if joint == 0:
+                    continue
+                jacobian = pin.getJointJacobian(
+                    self._model, self._data, joint, pin.LOCAL_WORLD_ALIGNED
+                )
+                arm_m = np.array(point) - self._data.oMi[joint].translation
+                found[row] += sign * (normal @ (jacobian[:3] - pin.skew(arm_m) @ jacobian[3:]))
+        return found
+
+    def _use(self, pairs: Sequence[tuple[int, int]]) -> None:
+        self._geometry.removeAllCollisionPairs()
+        for first, second in pairs:
+            self._geometry.addCollisionPair(pin.CollisionPair(first, second))
+        self._work: Any = self._geometry.createData()
+        for request in self._work.distanceRequests:
+            # The last separating direction: the next configuration is a small step away.
+            request.gjk_initial_guess = coal.GJKInitialGuess.CachedGuess
+        self._results: list[Any] = list(self._work.distanceResults)
+
+    def _at(
+        self, configurations: Sequence[FloatArray], pairs: Sequence[tuple[int, int]]
+    ) -> FloatArray:
+        self._use(pairs)
+        return np.array([self.distances(np.asarray(joints)) for joints in configurations])
+
+    def _sample(self, kinematics: Kinematics, pairs: Sequence[tuple[int, int]]) -> FloatArray:
+        random = np.random.default_rng(0)  # the same pairs at every start
+        shape = (SAMPLES, kinematics.size)
+        span = kinematics.upper_rad - kinematics.lower_rad
+        return self._at(list(kinematics.lower_rad + span * random.random(shape)), pairs)
+
+
+def _load(kinematics: Kinematics) -> Any:
+    urdf: Path = kinematics.urdf
+    try:
+        geometry = pin.buildGeomFromUrdf(
+            kinematics.full_model,
+            str(urdf),
+            pin.GeometryType.COLLISION,
+            # package://name/... is looked for beside the URDF and in every folder above it.
+            package_dirs=[str(folder) for folder in urdf.resolve().parents],
+        )
+    except (ValueError, RuntimeError) as error:
+        raise ResourceError(
+            f"the collision shapes of {urdf.name} cannot be loaded: {_one_line(error)}. "
+            "package://NAME/... is looked for as NAME/... beside the URDF and in every folder "
+            "above it"
+        ) from error
+    if geometry.ngeoms == 0:
+        raise ResourceError(f"{urdf.name} has no collision shapes; give it some, or do without")
+    return geometry
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _one_hull_a_link(kinematics: Kinematics) -> Any:
+    full, geometry = kinematics.full_model, _load(kinematics)
+    by_link: dict[str, list[Any]] = {}
+    for shape in geometry.geometryObjects:
+        by_link.setdefault(full.frames[shape.parentFrame].name, []).append(shape)
+    hulls = pin.GeometryModel()
+    for link, shapes in by_link.items():
+        corners = np.concatenate([_corners(shape) for shape in shapes])
+        points = coal.StdVec_Vec3s()
+        points.extend([corner.copy() for corner in corners])
+        hull = coal.Convex.convexHull(points, True, "Qt")
+        frame = full.getFrameId(link)
+        parent = full.frames[frame].parentJoint
+        hulls.addGeometryObject(pin.GeometryObject(link, parent, frame, pin.SE3.Identity(), hull))
+    _, reduced = pin.buildReducedModel(
+        full, hulls, kinematics.locked_joints, kinematics.locked_position
+    )
+    return reduced
+
+
+def _corners(shape: Any) -> FloatArray:
+    """(m, 3) points whose hull holds the shape, in its joint's frame."""
+    geometry, placement = shape.geometry, shape.placement
+    if isinstance(geometry, coal.BVHModelBase):
+        points = np.array(geometry.vertices()) * shape.meshScale
+    else:
+        points = _primitive(geometry)
+    return points @ placement.rotation.T + placement.translation
+
+
+def _primitive(geometry: Any) -> FloatArray:
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    if isinstance(geometry, coal.Box):
+        return signs * geometry.halfSide
+    sides = 24
+    turn = np.arange(sides) * 2 * np.pi / sides
+    around = np.stack([np.cos(turn), np.sin(turn)], axis=1) / np.cos(np.pi / sides)
+    if isinstance(geometry, coal.Cylinder):
+        heights = np.array([-geometry.halfLength, geometry.halfLength])
+        return _prism(around * geometry.radius, heights)
+    if isinstance(geometry, (coal.Sphere, coal.Capsule)):
+        half = geometry.halfLength if isinstance(geometry, coal.Capsule) else 0.0
+        tilt = np.linspace(-0.5, 0.5, 9) * np.pi
+        rings = [
+            _prism(around * (geometry.radius * np.cos(t)), np.array([geometry.radius * np.sin(t)]))
+            for t in tilt
+        ]
+        ball = np.concatenate(rings) / np.cos(np.pi / 16)
+        return np.concatenate([ball + (0, 0, half), ball - (0, 0, half)])
+    raise ResourceError(
+        f"a collision shape of the kind {type(geometry).__name__} is not known; "
+        "known: mesh, box, cylinder, sphere, capsule"
+    )
+
+
+def _prism(ring: FloatArray, heights: FloatArray) -> FloatArray:
+    return np.concatenate(
+        [np.concatenate([ring, np.full((len(ring), 1), height)], axis=1) for height in heights]
+    )
+
+
+def _table(kinematics: Kinematics, table_z_m: float) -> Any:
+    placement = kinematics.base_placement * pin.SE3(np.eye(3), np.array([0.0, 0.0, table_z_m]))
+    half_space = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
+    return pin.GeometryObject(TABLE, 0, 0, placement, half_space)
+
+
+def _pairs_that_move(geometry: Any) -> list[tuple[int, int]]:
+    shapes = geometry.geometryObjects
+    return [
+        (first, second)
+        for first, second in itertools.combinations(range(len(shapes)), 2)
+        if shapes[first].parentJoint != shapes[second].parentJoint
+    ]

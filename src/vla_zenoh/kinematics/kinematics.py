@@ -1,0 +1,238 @@
+"""Where the TCP is and how it moves, from the URDF: forward kinematics and Jacobian of the arm.
+
+One object serves one thread: it keeps Pinocchio's work space. Joint vectors are in the order of
+`Kinematics.arm_joints`, which is the order along the chain, whatever order a profile or a
+`JointState` lists them in; `Kinematics.ordered` and `Kinematics.joints_of` sort them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from vla_zenoh.errors import ProfileError, RecordError
+from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.profile import JointEnds
+from vla_zenoh.types import FloatArray, JointState
+
+BEYOND_LIMITS = 0.1
+"""Of its range a finger joint may be told to end so far outside of it: drivers and descriptions of
+one gripper differ in the last digits."""
+
+
+class Kinematics:
+    """The arm alone: every joint that is not one of its own is locked, fingers wide open.
+
+    Args:
+        urdf: robot description.
+        tcp_frame: the link whose pose is meant.
+        arm_joints: in any order.
+        finger_joints: locked where the hand is widest.
+        base_frame: poses are given in this link, which must not move; None: the URDF's root.
+        finger_ends: where that is; None: at their upper limit, which needs joints that slide.
+
+    Raises:
+        ProfileError: a joint or link is not in the URDF, cannot be used, or lacks its limits; or
+            the ends of a finger joint are not such as it can have.
+    """
+
+    def __init__(
+        self,
+        urdf: Path,
+        tcp_frame: str,
+        arm_joints: Sequence[str],
+        finger_joints: Sequence[str] = (),
+        *,
+        base_frame: str | None = None,
+        finger_ends: JointEnds | None = None,
+    ) -> None:
+        self.urdf = urdf
+        self.full_model: Any = pin.buildModelFromUrdf(str(urdf))
+        self.locked_position = _locked(
+            self.full_model, urdf, arm_joints, finger_joints, finger_ends
+        )
+        self.locked_joints: list[int] = [
+            index for index in range(1, self.full_model.njoints)
+            if self.full_model.names[index] not in arm_joints
+        ]  # fmt: skip
+        self.model: Any = pin.buildReducedModel(
+            self.full_model, self.locked_joints, self.locked_position
+        )
+        self.data: Any = self.model.createData()
+        self.arm_joints: tuple[str, ...] = tuple(self.model.names)[1:]
+        self._tcp = _frame(self.model, urdf, tcp_frame)
+        self.base_placement = _base_placement(self.model, self.data, urdf, base_frame)
+        self._base_turn: FloatArray | None = None
+        if not np.allclose(self.base_placement.rotation, np.eye(3), atol=1e-12):
+            self._base_turn = np.kron(np.eye(2), self.base_placement.rotation.T)
+        self.lower_rad: FloatArray = np.array(self.model.lowerPositionLimit)
+        self.upper_rad: FloatArray = np.array(self.model.upperPositionLimit)
+        self.velocity_rad_s: FloatArray = np.array(self.model.upperVelocityLimit)
+        for index, name in enumerate(self.arm_joints):
+            if not (
+                self.lower_rad[index] < self.upper_rad[index] and self.velocity_rad_s[index] > 0
+            ):
+                raise ProfileError(
+                    f"joint {name!r} of {urdf.name} has no room to move: its <limit> needs "
+                    "lower < upper (rad) and velocity > 0 (rad/s)"
+                )
+
+    @property
+    def size(self) -> int:
+        """Number of arm joints, n."""
+        return len(self.arm_joints)
+
+    # -- joints -------------------------------------------------------------------------------
+    def ordered(self, names: Sequence[str], values: ArrayLike) -> FloatArray:
+        """`values` (n,) given for `names` in any order, in the order of `arm_joints`.
+
+        Raises:
+            RecordError: a joint is missing; what is not of the arm is passed over.
+        """
+        given = np.asarray(values, dtype=np.float64)
+        places = {name: index for index, name in enumerate(names)}
+        missing = [name for name in self.arm_joints if name not in places]
+        if missing or given.shape != (len(places),):
+            raise RecordError(
+                f"joints {', '.join(missing) or 'repeated'} of the arm; given: {', '.join(names)}; "
+                "wanted once each: " + ", ".join(self.arm_joints)
+            )
+        return given[[places[name] for name in self.arm_joints]]
+
+    def joints_of(self, state: JointState) -> FloatArray:
+        """Measured joint positions (n,) rad.
+
+        Raises:
+            RecordError: the state lacks a joint of the arm.
+        """
+        if state.names == self.arm_joints:
+            return state.position_rad
+        return self.ordered(state.names, state.position_rad)
+
+    # -- poses and velocities -----------------------------------------------------------------
+    def forward(self, joints_rad: FloatArray) -> Pose:
+        """Pose of the TCP in the base frame."""
+        pin.forwardKinematics(self.model, self.data, joints_rad)
+        return self._tcp_pose()
+
+    def jacobian(self, joints_rad: FloatArray) -> FloatArray:
+        """(6, n): twist of the TCP (linear first, base axes) per joint velocity."""
+        jacobian = pin.computeFrameJacobian(
+            self.model, self.data, joints_rad, self._tcp, pin.LOCAL_WORLD_ALIGNED
+        )
+        return jacobian if self._base_turn is None else self._base_turn @ jacobian
+
+    def pose_and_jacobian(self, joints_rad: FloatArray) -> tuple[Pose, FloatArray]:
+        """Both of the above for the price of one."""
+        jacobian = self.jacobian(joints_rad)  # leaves the joints' placements behind
+        return self._tcp_pose(), jacobian
+
+    def _tcp_pose(self) -> Pose:
+        placement = pin.updateFramePlacement(self.model, self.data, self._tcp)
+        if self._base_turn is not None:
+            placement = self.base_placement.actInv(placement)
+        # Copies: the placement is a view into the work space.
+        return Pose(placement.translation.copy(), placement.rotation.copy())
+
+
+def smallest_singular_value(jacobian: FloatArray) -> float:
+    """How slow the TCP's slowest direction is (m and rad alike) per rad/s; 0 when singular."""
+    squared = (
+        jacobian @ jacobian.T if jacobian.shape[0] <= jacobian.shape[1] else jacobian.T @ jacobian
+    )
+    return math.sqrt(max(float(np.linalg.eigvalsh(squared)[0]), 0.0))
+
+
+def manipulability(jacobian: FloatArray) -> float:
+    """``sqrt(det(J J^T))``: volume of the ellipsoid of TCP velocities; 0 when singular.
+
+    Source: Yoshikawa, "Manipulability of robotic mechanisms", Int. J. Robotics Research, 1985.
+    """
+    return math.sqrt(max(float(np.linalg.det(jacobian @ jacobian.T)), 0.0))
+
+
+def _near(name: str, known: Sequence[str]) -> str:
+    match = difflib.get_close_matches(name, known, 1)
+    return f"; did you mean {match[0]!r}?" if match else ""
+
+
+def _locked(
+    model: Any,
+    urdf: Path,
+    arm_joints: Sequence[str],
+    finger_joints: Sequence[str],
+    finger_ends: JointEnds | None,
+) -> FloatArray:
+    """Configuration of the whole robot at which all but the arm is locked."""
+    known = list(model.names)[1:]
+    for name in (*arm_joints, *finger_joints):
+        if name not in known:
+            raise ProfileError(
+                f"{urdf.name} has no joint {name!r}{_near(name, known)}; it has: {', '.join(known)}"
+            )
+    for name in arm_joints:
+        joint = model.joints[model.getJointId(name)]
+        if joint.nq != 1:
+            raise ProfileError(
+                f"joint {name!r} of {urdf.name} turns without end, which this arm model does not "
+                "know: make it revolute and give it limits"
+            )
+    position = pin.neutral(model)
+    for name in finger_joints:
+        joint = model.joints[model.getJointId(name)]
+        position[joint.idx_q] = _wide_open(model, joint, f"{name!r} of {urdf.name}", finger_ends)
+    return position
+
+
+def _wide_open(model: Any, joint: Any, called: str, ends: JointEnds | None) -> float:
+    """Position of a finger joint at which the hand is widest, m or rad."""
+    lower = float(model.lowerPositionLimit[joint.idx_q])
+    upper = float(model.upperPositionLimit[joint.idx_q])
+    if joint.nq != 1 or not (math.isfinite(lower) and math.isfinite(upper)):
+        raise ProfileError(f"finger joint {called} has no limits to open and to shut at")
+    unit = "m" if joint.shortname().startswith("JointModelP") else "rad"
+    if ends is None and unit == "m":
+        return upper
+    way = f"it goes from {lower:g} to {upper:g} {unit}"
+    wanted = f"gripper: {{joint_open_{unit}: ..., joint_shut_{unit}: ...}}"
+    if ends is None:
+        raise ProfileError(
+            f"finger joint {called} turns, and its angle is no width: say at which angle the "
+            f"gripper is open by max_width_m and at which it is shut, as {wanted}; {way}"
+        )
+    if ends.unit != unit:
+        does = "slides" if unit == "m" else "turns"
+        raise ProfileError(f"finger joint {called} {does}: write {wanted}; {way}")
+    margin = BEYOND_LIMITS * (upper - lower)
+    for what, value in (("open", ends.open), ("shut", ends.shut)):
+        if not lower - margin <= value <= upper + margin:
+            raise ProfileError(
+                f"finger joint {called} cannot be at gripper.joint_{what}_{unit} ({value:g}): {way}"
+            )
+    return ends.open
+
+
+def _frame(model: Any, urdf: Path, name: str) -> int:
+    if not model.existFrame(name):
+        known = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+        raise ProfileError(
+            f"{urdf.name} has no link {name!r}{_near(name, known)}; it has: {', '.join(known)}"
+        )
+    return model.getFrameId(name)
+
+
+def _base_placement(model: Any, data: Any, urdf: Path, name: str | None) -> Any:
+    if name is None:
+        return pin.SE3.Identity()
+    index = _frame(model, urdf, name)
+    if model.frames[index].parentJoint != 0:
+        raise ProfileError(f"base_frame {name!r} of {urdf.name} moves with the arm's joints")
+    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    return data.oMf[index].copy()

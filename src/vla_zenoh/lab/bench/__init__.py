@@ -1,0 +1,1 @@
+"""Measures the chain and judges models by task."""

@@ -1,0 +1,104 @@
+"""What a tick of the command node costs, in the real chain, at several rates."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from vla_zenoh.errors import NodeError
+from vla_zenoh.lab.bench.cpu_time import cpu_s
+from vla_zenoh.lab.demo.runner import DemoRun, Interrupted
+from vla_zenoh.lab.recording.stream_listener import StreamListener
+from vla_zenoh.nodes.command.status import SPREAD_S
+from vla_zenoh.profile import Profile, override
+from vla_zenoh.runtime.launch import Host
+
+PROMPT = "HARD: go up within 0.2"
+RATE_HZ = 10.0
+STATUS_S = 1.0
+COMPUTES = "while True: sum(range(100_000))"
+
+
+def measure_command(
+    profile: Profile,
+    command_hz: float,
+    seconds: float,
+    stop: threading.Event,
+    log: Callable[[str, str], None],
+    busy: int = 0,
+) -> dict[str, Any]:
+    """Cost and lateness of ticks while the arm goes up and down, at one rate.
+
+    Args:
+        profile: of a simulated robot, at an address of its own.
+        command_hz: ticks a second.
+        seconds: how long to measure.
+        stop: set by Ctrl-C.
+        log: (node, line) for what nodes write.
+        busy: programs that do nothing but compute meanwhile.
+
+    Raises:
+        NodeError: the chain does not come up, or the arm is not obeyed to the end.
+        Interrupted: Ctrl-C.
+    """
+    profile = override(profile, {"timing": {"command_hz": command_hz}})
+    with Host(profile, None, log=log, tell=log, own_router=True) as host:
+        assert host.session is not None and host.client is not None
+        client = host.client
+
+        def watch() -> None:
+            if not host.supervisor.watch():
+                raise NodeError("a node dies again and again")
+
+        listener = StreamListener(host.session, profile.keys, profile.task.worker)
+        run = DemoRun(client, listener, stop, watch, lambda *_: None)
+        run.wait_until_ready()
+        run.activate(RATE_HZ)
+        listener.close()  # what it hears costs time that is not the command node's
+        client.set_prompt(PROMPT)
+        if stop.wait(STATUS_S):
+            raise Interrupted
+        pid = host.supervisor.pids()["command"]
+        missed, spent_s, began_s = _missed(host), cpu_s(pid), time.monotonic()
+        with others_compute(busy):
+            if stop.wait(max(seconds, SPREAD_S)):
+                raise Interrupted
+            status = client.status("command")
+        spent_s, took_s = cpu_s(pid) - spent_s, time.monotonic() - began_s
+        if status is None or status.state != "active":
+            found = f"{status.state} ({status.detail.get('why')})" if status else "silent"
+            raise NodeError(f"the command node at {command_hz:g} Hz is {found}")
+        return {
+            "command_hz": command_hz,
+            "held_hz": round(status.rates_hz.get("loop", 0.0), 1),
+            "tick_us": status.detail["tick_us"],
+            "late_us": status.detail["late_us"],
+            "pose_age_ms": status.detail["pose_age_ms"],
+            "busy": busy,
+            "missed_ticks": _missed(host) - missed,
+            "core_share": round(spent_s / took_s, 3),
+            "realtime": status.detail["realtime"],
+            "seconds": round(took_s, 1),
+        }
+
+
+@contextmanager
+def others_compute(count: int) -> Iterator[None]:
+    """So many programs that do nothing but compute, at this one's own niceness."""
+    programs = [subprocess.Popen([sys.executable, "-c", COMPUTES]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+
+
+def _missed(host: Host) -> int:
+    status = host.client.status("command") if host.client else None
+    return int(status.counters.get("command.missed_ticks", 0)) if status else 0

@@ -1,0 +1,18 @@
+"""CPU time of a process."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+
+from vla_zenoh.errors import NodeError
+
+
+def cpu_s(pid: int) -> float:
+    """CPU time a process has taken so far, of threads that have ended too, s."""
+    clock = ctypes.c_int()
+    error = ctypes.CDLL(None).clock_getcpuclockid(pid, ctypes.byref(clock))
+    if error:
+        raise NodeError(f"process {pid} of the benchmark has ended: {os.strerror(error)}")
+    return time.clock_gettime(clock.value)

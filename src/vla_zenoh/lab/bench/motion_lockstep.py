@@ -1,0 +1,198 @@
+"""The motion protocol on a virtual clock: the same code, faster than real time, one row a process.
+
+What a computer's load does is not in it, so its latencies are those of `Delays` and of waiting for
+the next picture and tick; motion, limits and seams are what the nodes would do.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.errors import NodeError
+from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.lab.bench.motion import (
+    PREPARATION_HZ,
+    WAY_HZ,
+    Conditions,
+    MeasuredStream,
+    Trial,
+    failed_row,
+    make_row,
+    way_of,
+)
+from vla_zenoh.lab.demo.analysis import RestPose, judge
+from vla_zenoh.lab.demo.segments import DemoSegment, make_segment
+from vla_zenoh.lab.lockstep import Delays, Lockstep
+from vla_zenoh.policy.loader import find_model, make_policy
+from vla_zenoh.profile import Profile
+from vla_zenoh.robots.sim.node import build_world
+from vla_zenoh.runtime.process import die_with_parent
+from vla_zenoh.types import PoseCommand
+
+CAMERA_S, WIRE_S = 0.015, 0.0005
+"""Camera stamp to worker, and every other way, about as measured in real time."""
+WARM_UP_S, SETTLE_S, SLACK_S = 1.2, 1.0, 5.0
+LOOK_S = 0.25
+"""How often a waiting parent looks whether it shall stop."""
+
+Row = dict[str, Any]
+
+
+def run_in_lockstep(
+    profile: Profile,
+    trials: Sequence[Trial],
+    conditions: Sequence[Conditions],
+    stop: threading.Event,
+    done: Callable[[Row], None],
+    *,
+    processes: int | None = None,
+) -> Iterator[Row]:
+    """All rows, in the order of `conditions` and `trials`.
+
+    Args:
+        profile: of a robot that is commanded by poses.
+        trials: prompts.
+        conditions: each prompt under each of these.
+        stop: set by Ctrl-C; rows not ended are left out.
+        done: called with every row as it ends, in whatever order.
+        processes: at once; None: one a core.
+
+    Raises:
+        NodeError: one of them was killed.
+    """
+    jobs = [(profile, trial, each) for each in conditions for trial in trials]
+    context = multiprocessing.get_context("spawn")
+    many = processes or os.cpu_count() or 1
+    with ProcessPoolExecutor(many, mp_context=context, initializer=_begin) as pool:
+        futures = [pool.submit(lockstep_row, *job) for job in jobs]
+        left = set(futures)
+        while left and not stop.is_set():
+            ended, left = wait(left, LOOK_S, FIRST_COMPLETED)
+            for future in ended:
+                done(_result(future))
+        if left:  # not to the end of their rows
+            for process in multiprocessing.active_children():
+                process.terminate()
+        yield from (_result(future) for future in futures if future not in left)
+
+
+def _result(future: Future[Row]) -> Row:
+    try:
+        return future.result()
+    except BrokenProcessPool as error:
+        raise NodeError(
+            "a process of the bench was killed; is there enough memory for one on every core?"
+        ) from error
+
+
+def _begin() -> None:
+    die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends us
+
+
+def lockstep_row(profile: Profile, trial: Trial, conditions: Conditions) -> Row:
+    """Carry one prompt out; one that does not end is a row that says so."""
+    try:
+        return _row(profile, trial, conditions)
+    except NodeError as error:
+        return failed_row(trial, conditions, str(error))
+
+
+def _row(profile: Profile, trial: Trial, conditions: Conditions) -> Row:
+    dt_s = 0.1
+    options = {"horizon": str(conditions.horizon), "dt_s": str(dt_s)}
+    loop = Lockstep(
+        profile,
+        build_world(profile),
+        make_policy(find_model("scripted"), options),
+        delays=Delays(conditions.delay_ms / 1e3, conditions.jitter, CAMERA_S, wire_s=WIRE_S),
+        reach=make_shadow(profile),
+    )
+    loop.put("rate", PREPARATION_HZ)
+    loop.run(WARM_UP_S)
+    loop.put("active", True)
+    loop.run(LOOK_S)
+    if trial.preparation:
+        _carry_out(loop, make_segment(trial.preparation, 1), PREPARATION_HZ)
+    loop.put("rate", conditions.rate_hz)
+    loop.run(1.0 / PREPARATION_HZ)
+    before, since = _standing(loop), len(loop.trace.time_ns)
+    steps_done = _carry_out(loop, trial.segment, conditions.rate_hz)
+    outcome = judge(
+        trial.segment,
+        before,
+        _standing(loop),
+        max_width_m=profile.robot.gripper.max_width_m,
+        steps_done=steps_done,
+        duration_s=(loop.now_ns - loop.trace.time_ns[since]) / 1e9 - SETTLE_S,
+    )
+    return make_row(trial, conditions, profile, outcome, _stream(loop, since))
+
+
+def _carry_out(loop: Lockstep, segment: DemoSegment, rate_hz: float) -> int:
+    """Put the prompt, wait until the arm stands after its last step; steps carried out."""
+    commander, limit_s = loop.commander, segment.steps / rate_hz * 2 + SLACK_S
+    episode = commander.task.episode
+    loop.put("prompt", segment.prompt_with_count)
+    ended = loop.run_until(
+        lambda: commander.task.episode != episode and commander.progress.done and commander.at_rest,
+        limit_s,
+    )
+    if not ended or commander.state.value not in ("active", "holding"):
+        raise NodeError(
+            f"{segment.prompt_with_count!r} at {rate_hz:g} Hz did not end in {limit_s:.0f} s: the "
+            f"command node is {commander.state.value} ({commander.why}), refused: "
+            f"{dict(loop.refused) or 'nothing'}"
+        )
+    loop.run(SETTLE_S)
+    return commander.progress.steps
+
+
+def _standing(loop: Lockstep) -> RestPose:
+    return RestPose(Pose(*loop.world.tcp()), loop.world.gripper_state().width_m)
+
+
+def _stream(loop: Lockstep, since: int) -> MeasuredStream:
+    trace, period_s = loop.trace, 1.0 / loop.profile.timing.command_hz
+    sent: list[tuple[int, PoseCommand]] = []
+    tracking_m = 0.0
+    for index in range(since, len(trace.time_ns)):
+        command, before = trace.commands[index], trace.commands[index - 1]
+        if before is not None:
+            # The measured pose of this tick follows the command of the one before.
+            there_m = before.position_m + before.twist[:3] * period_s
+            away_m = float(np.linalg.norm(trace.position_m[index] - there_m))
+            tracking_m = max(tracking_m, away_m)
+        if command is not None:
+            sent.append((trace.time_ns[index], command))
+    first: dict[int, tuple[float, float]] = {}
+    for time_ns, command in sent:
+        cause = command.cause
+        if cause is not None and cause.observation_stamp_ns >= trace.time_ns[since]:
+            times = (
+                (time_ns - cause.observation_stamp_ns) / 1e6,
+                (cause.received_ns - cause.observation_stamp_ns) / 1e6,
+            )
+            first.setdefault(cause.chunk_seq, times)
+    every = round(loop.profile.timing.command_hz / WAY_HZ)
+    places = zip(trace.position_m[since::every], trace.rotation[since::every], strict=True)
+    return MeasuredStream(
+        np.array([time_ns - trace.time_ns[since] for time_ns, _ in sent]) / 1e9,
+        np.array([command.twist for _, command in sent]).reshape(-1, 6),
+        np.array([command.acceleration for _, command in sent]).reshape(-1, 6),
+        np.array([command.cause.chunk_seq if command.cause else -1 for _, command in sent]),
+        *way_of([Pose(*place) for place in places]),
+        tracking_m,
+        [end_to_end for end_to_end, _ in first.values()],
+        [outbound for _, outbound in first.values()],
+    )

@@ -1,0 +1,145 @@
+"""The motion protocol's rows as tables for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich.box import SIMPLE
+from rich.table import Table
+from rich.text import Text
+
+from vla_zenoh.lab.bench.thesis import THESIS
+
+Row = dict[str, Any]
+
+
+def motion_table(rows: Sequence[Row]) -> Table:
+    """What was asked and reached, and what the motion was like."""
+    chunked = any(row["horizon"] > 1 for row in rows)
+    delayed = any(row["delay_ms"] for row in rows)
+    table = _table(
+        "50 steps each, measured at rest",
+        "prompt",
+        "Hz",
+        *(["chunk"] if chunked else []),
+        *(["delay"] if delayed else []),
+        "asked",
+        "reached",
+        "off mm",
+        "mrad",
+        "track mm",
+        "v",
+        "a",
+        "jerk",
+        *(["at seams"] if chunked or delayed else []),
+        "",
+    )
+    table.caption = (
+        "off: beside the asked direction or axis. track: measured from commanded pose, at most. "
+        "v, a: peaks in m/s, m/s2, of rotations in rad. jerk: peak as a share of its limit"
+    )
+    for row in rows:
+        conditions = (
+            row["prompt"],
+            f"{row['rate_hz']:g}",
+            *([f"{row['horizon']}"] if chunked else []),
+            *([f"{row['delay_ms']:g}±{row['jitter']:.0%}"] if delayed else []),
+        )
+        verdict = Text("ok", "green") if row["ok"] else Text("; ".join(row["faults"]), "red")
+        if "asked_m" not in row:
+            missing = len(table.columns) - len(conditions) - 1
+            table.add_row(*conditions, *["-"] * missing, verdict)
+            continue
+        table.add_row(
+            *conditions,
+            *_amounts(row),
+            f"{row['off_axis_mm']:.2f}",
+            f"{row['off_axis_rad'] * 1e3:.2f}",
+            f"{row['tracking_mm']:.2f}",
+            _peak(row, "velocity", ""),
+            _peak(row, "acceleration", "2"),
+            f"{row['peak_jerk_over_limit']:.3f}",
+            *([f"{row['seam_jerk_over_limit']:.3f}"] if chunked or delayed else []),
+            verdict,
+        )
+    return table
+
+
+def thesis_table(rows: Sequence[Row], *, virtual: bool) -> Table:
+    """The thesis's Table 5.2 beside ours: one step a request, path lengths over 50 requests.
+
+    Args:
+        rows: of any conditions; those that the thesis ran too are shown.
+        virtual: latencies are those of lockstep, and left out.
+    """
+    table = _table("beside the thesis", "prompt", "Hz", "asked", "thesis", "ours")
+    for column in ("thesis e2e", "ours", "outbound", "ours"):
+        if not virtual:
+            table.add_column(column, justify="right", no_wrap=True)
+    for row in rows:
+        published = THESIS.get((row["prompt"], row["rate_hz"]))
+        if published is None or "asked_m" not in row or row["horizon"] > 1 or row["delay_ms"]:
+            continue
+        times = (
+            _mean_p95(published.e2e_ms),
+            _mean_p95((row["e2e_ms_mean"], row["e2e_ms_p95"])),
+            _mean_p95(published.outbound_ms),
+            _mean_p95((row["outbound_ms_mean"], row["outbound_ms_p95"])),
+        )
+        table.add_row(
+            row["prompt"],
+            f"{row['rate_hz']:g}",
+            _paths(row["asked_path_m"] or None, row["asked_path_rad"] or None),
+            _paths(published.path_m, published.path_rad),
+            _paths(row["path_m"], row["path_rad"]),
+            *(() if virtual else times),
+        )
+    table.caption = (
+        "way of the TCP over 50 requests in m and rad, the thesis's on a real arm, ours simulated"
+    )
+    if not virtual:
+        table.caption += (
+            "; mean / p95 in ms: e2e from the request (ours: the camera's stamp) to the command, "
+            "outbound to the model (ours: until its answer is with the command node)"
+        )
+    return table
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(
+        title=title,
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    for column in columns:
+        left = column in ("prompt", "")
+        table.add_column(column, justify="left" if left else "right", no_wrap=column != "")
+    return table
+
+
+def _amounts(row: Row) -> tuple[str, str]:
+    if row["asked_m"]:
+        return f"{row['asked_m']:.4f} m", f"{row['reached_m']:.4f} m"
+    if row["asked_rad"]:
+        return f"{row['asked_rad']:.4f} rad", f"{row['reached_rad']:.4f} rad"
+    return f"{row['asked_width_m'] * 1e3:.1f} mm", f"{row['reached_width_m'] * 1e3:.1f} mm"
+
+
+def _peak(row: Row, what: str, power: str) -> str:
+    unit = "rad" if row["asked_rad"] else "m"
+    return f"{row[f'peak_{what}_{unit}_s{power}']:.3f}"
+
+
+def _paths(way_m: float | None, way_rad: float | None) -> str:
+    parts = ((way_m, "m"), (way_rad, "rad"))
+    return ", ".join(f"{value:.3f} {unit}" for value, unit in parts if value is not None)
+
+
+def _mean_p95(pair: tuple[float | None, float | None] | None) -> str:
+    if pair is None or pair[0] is None or pair[1] is None:
+        return ""
+    return f"{pair[0]:.1f} / {pair[1]:.1f}"

@@ -1,0 +1,265 @@
+"""Two runs of `bench task` over the same layouts, pair by pair.
+
+Which layouts a policy met is most of the noise in its success rate. Where both runs asked the same
+task of the same layout the layout cancels, so that far fewer episodes tell two policies apart than
+two rates beside each other would.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from vla_zenoh.errors import RecordError
+from vla_zenoh.lab.evaluation.paired import Paired, paired
+from vla_zenoh.pydantic_errors import in_words
+
+ALPHA = 0.05
+"""A p below this counts as a difference, as in the intervals at 95 %."""
+CONDITIONS = (
+    "mode",
+    "profile",
+    "vary",
+    "held_out",
+    "prompt",
+    "delay_ms",
+    "rate_hz",
+    "limit_s",
+)
+"""Beside the model and its options, what changes how well it does."""
+
+Task = tuple[int, str, str, str, str, int]
+"""Seed, family, target, onto, direction, and how often that was asked before."""
+
+
+class _Read(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
+
+
+class PairedOutcome(_Read):
+    """How one episode of a run ended; as in its file."""
+
+    seed: int
+    family: str
+    target: str = ""
+    onto: str = ""
+    direction: str = ""
+    success: bool
+    failure: str
+
+    @property
+    def task(self) -> str:
+        """What was asked, without the layout."""
+        onto = f"on {self.onto}" if self.onto else ""
+        return " ".join(part for part in (self.family, self.target, onto, self.direction) if part)
+
+
+class TaskResultFile(_Read):
+    """What `vla-zenoh bench task` wrote; as in its file."""
+
+    model: str
+    options: dict[str, str]
+    scene: str
+    mode: str
+    profile: str
+    vary: tuple[str, ...]
+    held_out: bool
+    prompt: str | None
+    delay_ms: float
+    rate_hz: float | None
+    limit_s: float
+    all: tuple[PairedOutcome, ...]
+
+    def by_task(self) -> dict[Task, PairedOutcome]:
+        """Every episode, by what was asked in which layout."""
+        asked: Counter[Any] = Counter()
+        out: dict[Task, PairedOutcome] = {}
+        for each in self.all:
+            what = (each.seed, each.family, each.target, each.onto, each.direction)
+            out[*what, asked[what]] = each
+            asked[what] += 1
+        return out
+
+
+def read_run(content: bytes, where: str) -> TaskResultFile:
+    """A file of `bench task`.
+
+    Args:
+        content: of the file.
+        where: it is, for messages.
+
+    Raises:
+        RecordError: it is something else.
+    """
+    try:
+        return TaskResultFile.model_validate_json(content)
+    except ValidationError as error:
+        fault = error.errors(include_url=False)[0]
+        place = ".".join(map(str, fault["loc"]))
+        why = f"{place} {in_words(fault)}" if place else in_words(fault)
+        raise RecordError(f"{where} is no result of `vla-zenoh bench task`: {why}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Made by `compare`.
+
+    Args:
+        a: the first run.
+        b: the second one; differences are B's less A's.
+        pairs: what both were asked in the same layout, in A's order.
+    """
+
+    a: TaskResultFile
+    b: TaskResultFile
+    pairs: tuple[tuple[PairedOutcome, PairedOutcome], ...]
+
+    @property
+    def counts(self) -> Paired:
+        """Of all pairs; its first is B."""
+        return _counts(self.pairs)
+
+    @property
+    def b_is_worse(self) -> bool:
+        """B did fewer of the same tasks, and chance alone explains that with less than `ALPHA`."""
+        return self.counts.difference < 0 and self.counts.p < ALPHA
+
+    @property
+    def unpaired(self) -> tuple[int, int]:
+        """Episodes of A, and of B, that have no partner."""
+        return len(self.a.all) - len(self.pairs), len(self.b.all) - len(self.pairs)
+
+    def by(self, of: Callable[[PairedOutcome], str]) -> dict[str, Paired]:
+        """Counts of the pairs that are alike in something of their task."""
+        return {
+            name: _counts(pair for pair in self.pairs if of(pair[0]) == name)
+            for name in sorted({of(one) for one, _ in self.pairs})
+        }
+
+    def disagreements(self) -> Iterator[dict[str, Any]]:
+        """Every pair that one alone did: who, and how the other failed."""
+        for one, other in self.pairs:
+            if one.success != other.success:
+                failed = other if one.success else one
+                yield {
+                    "seed": one.seed,
+                    "task": one.task,
+                    "done_by": "a" if one.success else "b",
+                    "failure_of_the_other": failed.failure,
+                }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain types."""
+        only_a, only_b = self.unpaired
+        return {
+            "a": _shown(self.a),
+            "b": _shown(self.b),
+            "differ": differing(self.a, self.b),
+            "unpaired": {"a": only_a, "b": only_b},
+            **figures(self.counts),
+            "b_is_worse": self.b_is_worse,
+            "by_family": {k: figures(v) for k, v in self.by(lambda one: one.family).items()},
+            "by_task": {k: figures(v) for k, v in self.by(lambda one: one.task).items()},
+            "disagreements": list(self.disagreements()),
+        }
+
+
+def compare(a: TaskResultFile, b: TaskResultFile, differ: Collection[str] = ()) -> Comparison:
+    """Pair what both runs asked in the same layouts.
+
+    Args:
+        a: one run.
+        b: another one.
+        differ: which of `CONDITIONS` may differ, because they are what is compared.
+
+    Raises:
+        RecordError: they were made under other conditions than these, or share no task.
+    """
+    if a.scene != b.scene:
+        raise RecordError(
+            f"A was run in the scene {a.scene}, B in {b.scene}: a seed lays them out differently, "
+            "so no layout is in both"
+        )
+    others = {name: pair for name, pair in differing(a, b).items() if name not in differ}
+    if others:
+        told = ", ".join(
+            f"{name} is {_said(one)} in A and {_said(two)} in B"
+            for name, (one, two) in others.items()
+        )
+        named = " ".join(f"--differ {name}" for name in others)
+        raise RecordError(
+            f"the runs were not made alike: {told}. That would be taken for the models' doing; "
+            f"run one of them again, or, where it is what you want to compare: {named}"
+        )
+    first, second = a.by_task(), b.by_task()
+    pairs = tuple((one, second[task]) for task, one in first.items() if task in second)
+    if not pairs:
+        raise RecordError(_nothing_in_common(a, b))
+    return Comparison(a, b, pairs)
+
+
+def differing(a: TaskResultFile, b: TaskResultFile) -> dict[str, tuple[Any, Any]]:
+    """Those of `CONDITIONS` that are not the same -> what they are in A and in B."""
+    values = {name: (getattr(a, name), getattr(b, name)) for name in CONDITIONS}
+    return {name: pair for name, pair in values.items() if pair[0] != pair[1]}
+
+
+def figures(counts: Paired) -> dict[str, Any]:
+    """Plain types of some pairs, whose first is B."""
+    n = counts.setups
+    return {
+        "pairs": n,
+        "both": counts.both,
+        "only_a": counts.second,
+        "only_b": counts.first,
+        "neither": counts.neither,
+        "rate_a": (counts.both + counts.second) / n,
+        "rate_b": (counts.both + counts.first) / n,
+        "difference": counts.difference,
+        "difference_95": list(counts.difference_95),
+        "p": counts.p,
+    }
+
+
+def _counts(pairs: Iterable[tuple[PairedOutcome, PairedOutcome]]) -> Paired:
+    return paired((other.success, one.success) for one, other in pairs)
+
+
+def _shown(run: TaskResultFile) -> Mapping[str, Any]:
+    conditions = {name: getattr(run, name) for name in CONDITIONS}
+    return {
+        "model": run.model,
+        "options": run.options,
+        "scene": run.scene,
+        **conditions,
+        "vary": list(run.vary),
+        "episodes": len(run.all),
+    }
+
+
+def _said(value: Any) -> str:
+    if value is None or value == ():
+        return "not set"
+    if isinstance(value, tuple):
+        return "+".join(value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _nothing_in_common(a: TaskResultFile, b: TaskResultFile) -> str:
+    seeds = [{each.seed for each in run.all} for run in (a, b)]
+    if not all(seeds):
+        return f"{'A' if not seeds[0] else 'B'} has no episodes: it was ended before its first"
+    if seeds[0] & seeds[1]:
+        return (
+            "the layouts are the same, and other tasks were asked in them: run both with the same "
+            "--family and --pairs"
+        )
+    spans = [f"{min(each)} to {max(each)}" for each in seeds]
+    return (
+        f"no layout is in both: A has seeds {spans[0]}, B {spans[1]}; run one of them again with "
+        "the other's --seed"
+    )

@@ -1,0 +1,179 @@
+"""Observations made from a spec: a colour chart, other pictures, an arm in several states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.policy import CameraSpec, ModelSpec, Observation, example_observation
+from vla_zenoh.policy.observation import prepare
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import GripperState, Image, JointState, PoseState
+
+PROMPTS = (
+    "put the red brick in the box",
+    "push the blue brick to the left",
+    "hold",
+)
+"""Tried where a model does not name others. Two ask for different motions, one for none."""
+STRANGE_PROMPT = "legt den grünen Klotz in die Kiste \N{PACKAGE}, bitte! " * 8
+"""Long, in another language and beyond ASCII: a model may refuse it, and must not break."""
+DEFAULT_SIZE = (480, 640)
+PERIOD_NS = 200_000_000
+START_NS = 1_700_000_000_000_000_000
+MAX_WIDTH_M = 0.08
+HOME_M, DOWN_XYZW = (0.43, 0.0, 0.16), (1.0, 0.0, 0.0, 0.0)
+
+Picture = NDArray[np.uint8]
+
+
+def chart(height: int, width: int) -> Picture:
+    """RGB bars, a gray ramp below, a white square in the top left corner, and a round patch.
+
+    No two of its mirror images and channel orders are alike.
+    """
+    bars = np.array(
+        [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0], [0, 255, 255], [200, 90, 30]],
+        np.uint8,
+    )
+    columns = np.arange(width) * len(bars) // width
+    picture = np.repeat(bars[columns][None], height, axis=0)
+    ramp = (np.arange(width) * 255 // max(width - 1, 1)).astype(np.uint8)
+    picture[3 * height // 4 :] = ramp[None, :, None]
+    picture[: height // 8, : width // 8] = 255
+    centre, radius = (2 * width // 3, height // 3), max(2, height // 8)
+    return np.asarray(cv2.circle(picture, centre, radius, (180, 0, 90), -1), np.uint8)
+
+
+def noise(height: int, width: int) -> Picture:
+    """The same noise every time, coarse enough to outlive a resize."""
+    small = np.random.default_rng(7).integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    scaled = cv2.resize(small, (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(scaled, np.uint8)
+
+
+def plain(value: int) -> Callable[[int, int], Picture]:
+    """Nothing but one gray."""
+    return lambda height, width: np.full((height, width, 3), value, np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
+class ImageStyle:
+    """What one example shows.
+
+    Args:
+        name: for people.
+        picture: of every camera, from height and width, RGB.
+        prompt: plain text.
+        position_m: of the TCP.
+        width_m: of the gripper.
+        holding: an object is held.
+        swapped: red and blue are exchanged.
+        active: the arm is obeyed.
+        strange: the model may refuse it with a `SpecError`.
+    """
+
+    name: str
+    picture: Callable[[int, int], Picture] = chart
+    prompt: str = PROMPTS[0]
+    position_m: tuple[float, float, float] = HOME_M
+    width_m: float = MAX_WIDTH_M
+    holding: bool = False
+    swapped: bool = False
+    active: bool = True
+    strange: bool = False
+
+
+def looks(prompts: Sequence[str] = PROMPTS) -> list[ImageStyle]:
+    """Everything that is tried, the most telling first."""
+    first = prompts[0]
+    return [
+        ImageStyle("colour chart", prompt=first),
+        ImageStyle("noise", picture=noise, prompt=first),
+        ImageStyle("black pictures", picture=plain(0), prompt=first),
+        *(ImageStyle(f"prompt {prompt[:24]!r}", prompt=prompt) for prompt in prompts[1:]),
+        ImageStyle("a strange prompt", prompt=STRANGE_PROMPT, strange=True),
+        ImageStyle("something held", prompt=first, width_m=0.03, holding=True),
+        ImageStyle("gripper shut", prompt=first, width_m=0.0, position_m=(0.5, 0.2, 0.02)),
+        ImageStyle("far corner", prompt=first, position_m=(0.75, -0.45, 0.6)),
+        ImageStyle("white pictures", picture=plain(255), prompt=first),
+        ImageStyle("not obeyed", prompt=first, active=False),
+    ]
+
+
+@dataclass(slots=True)
+class Maker:
+    """Makes observations one after the other, each a period later than the last.
+
+    Args:
+        spec: what the model asks for.
+        profile: where the cameras' sizes and the joints are from; None: usual ones.
+        seq: of the next one.
+    """
+
+    spec: ModelSpec
+    profile: Profile | None = None
+    seq: int = 0
+
+    def make(self, look: ImageStyle, *, again: bool = False) -> Observation:
+        """An observation with this look.
+
+        Its arrays cannot be written to, as those a worker gives cannot.
+
+        Args:
+            look: what it shows.
+            again: with the time and number of the first one, as if everything began anew.
+
+        Raises:
+            SpecError: a picture of the profile's size does not fit the spec.
+        """
+        seq = 0 if again else self.seq
+        self.seq = max(self.seq, seq + 1)
+        seen = example_observation(self.spec, prompt=look.prompt)
+        return replace(
+            seen,
+            stamp_wall_ns=START_NS + seq * PERIOD_NS,
+            seq=seq,
+            task=replace(seen.task, active=look.active, episode=1),
+            images=self._images(look),
+            joint=self._joint() if seen.joint is not None else None,
+            pose=PoseState(np.array(look.position_m), np.array(DOWN_XYZW), np.zeros(6))
+            if seen.pose is not None
+            else None,
+            gripper=GripperState(look.width_m, moving=False, holding=look.holding)
+            if seen.gripper is not None
+            else None,
+        )
+
+    def _images(self, look: ImageStyle) -> Mapping[str, Picture]:
+        out: dict[str, Picture] = {}
+        for camera in self.spec.observation.cameras:
+            picture = look.picture(*self._size(camera))
+            if look.swapped:
+                picture = np.ascontiguousarray(picture[..., ::-1])
+            prepared = np.array(prepare(Image(picture), camera))
+            prepared.setflags(write=False)
+            out[camera.camera] = prepared
+        return out
+
+    def _size(self, camera: CameraSpec) -> tuple[int, int]:
+        """Height and width of what the camera sends."""
+        source = self.profile.cameras.get(camera.camera) if self.profile else None
+        if source is not None:
+            return source.height, source.width
+        if camera.resize == "none" and camera.height is not None and camera.width is not None:
+            return camera.height, camera.width
+        return DEFAULT_SIZE
+
+    def _joint(self) -> JointState:
+        names = tuple(f"joint{i}" for i in range(1, 8))
+        position = np.zeros(7)
+        if self.profile is not None:
+            names = self.profile.robot.arm_joints
+            position = np.array(self.profile.robot.home_rad)
+        zeros = np.zeros(len(names))
+        return JointState(names, position, zeros, zeros)

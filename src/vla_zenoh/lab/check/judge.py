@@ -1,0 +1,125 @@
+"""What the answers of an examination, and the time and memory they took, say of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.control import chunk_plausibility as plausible
+from vla_zenoh.control.finding import Finding, error, note, warning
+from vla_zenoh.lab.check.examples import MAX_WIDTH_M, ImageStyle
+from vla_zenoh.policy import ActionSpec
+
+GROWTH_KIB, GROWTH_TOTAL_KIB = 32.0, 4096.0
+"""Memory that every inference keeps, and in all, before it is taken for a leak."""
+ALIKE = 1e-7
+
+Steps = NDArray[np.float32]
+Answers = Sequence[tuple[ImageStyle, Steps]]
+
+
+def alike(a: Steps, b: Steps) -> bool:
+    """Whether two answers are the same."""
+    return a.shape == b.shape and bool(np.abs(a - b).max() <= ALIKE)
+
+
+def growth(kib: Sequence[float]) -> tuple[float, list[Finding]]:
+    """KiB that every inference adds, and whether that is a leak.
+
+    Args:
+        kib: resident memory after each.
+    """
+    third = len(kib) // 3
+    # The first third may still fill caches; from then on nothing should be kept.
+    rest = np.array(kib[third:])
+    each_kib = float(np.polyfit(np.arange(len(rest)), rest, 1)[0])
+    steady = rest[-third:].min() > rest[:third].max()
+    if steady and each_kib > GROWTH_KIB and each_kib * len(rest) > GROWTH_TOTAL_KIB:
+        return each_kib, [error("memory_growth", f"every inference keeps {each_kib:.0f} KiB")]
+    return each_kib, []
+
+
+def slowness(
+    action: ActionSpec, p50_s: float, p95_s: float, *, oldest_s: float, rate_hz: float | None
+) -> list[Finding]:
+    """What an inference that takes so long is too slow for.
+
+    Args:
+        action: of the spec.
+        p50_s: of one inference.
+        p95_s: likewise.
+        oldest_s: an observation may be at most so old.
+        rate_hz: chunks per second that are asked of it; None: not known.
+    """
+    found: list[Finding] = []
+    if p50_s > oldest_s:
+        found.append(
+            error(
+                "too_slow",
+                f"an inference takes {p50_s:.3g} s; the command node refuses chunks whose "
+                f"observation is older than {oldest_s:g} s (timing.max_observation_age_s)",
+            )
+        )
+    if p50_s > action.horizon * action.dt_s:
+        # One step late is still the goal; of many late ones all but the last are lost.
+        level = error if action.horizon > 1 else warning
+        found.append(
+            level(
+                "slower_than_chunk",
+                f"an inference takes {p50_s:.3g} s, its {action.horizon} steps of "
+                f"{action.dt_s:g} s are over by then",
+            )
+        )
+    if rate_hz is not None and p95_s > 1.0 / rate_hz:
+        found.append(
+            warning(
+                "slower_than_rate",
+                f"an inference takes up to {p95_s:.3g} s (p95), it is asked for "
+                f"{rate_hz:g} times a second",
+            )
+        )
+    return found
+
+
+def behaviour(
+    action: ActionSpec, answers: Answers, depends_on: Mapping[str, bool | None]
+) -> list[Finding]:
+    """What all answers have in common that they should not.
+
+    Args:
+        action: of the spec.
+        answers: at least one.
+        depends_on: pictures, colour order, prompt: whether they matter; None: not known.
+    """
+    found = _polarity(action, answers)
+    # The first three numbers of every rotation, x, y, z of a quaternion too, are zero for none.
+    moves = any(np.any(np.abs(steps[:, :6]) > ALIKE) for _, steps in answers)
+    if action.kind == "delta" and not moves:
+        found.append(
+            note("stands_still", "no example made it move; try --prompt with one it knows")
+        )
+    return found + [
+        warning(f"ignores_{what.replace(' ', '_')}", f"the answer does not depend on the {what}")
+        for what, matters in depends_on.items()
+        if matters is False
+    ]
+
+
+def _polarity(action: ActionSpec, answers: Answers) -> list[Finding]:
+    """An open, empty gripper that every answer shuts is a sign of the wrong polarity."""
+    shares = [
+        opening
+        for look, steps in answers
+        if look.width_m == MAX_WIDTH_M and (opening := plausible.opening(action, steps)) is not None
+    ]
+    if not shares or float(np.concatenate(shares).max()) > 0.5:
+        return []
+    return [
+        warning(
+            "gripper_polarity",
+            "every example with an open, empty gripper has it shut at once; is "
+            f"gripper_open_is_high: {action.gripper_open_is_high} right?",
+        )
+    ]

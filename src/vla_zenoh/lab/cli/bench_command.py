@@ -1,0 +1,70 @@
+"""vla-zenoh bench command."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich.box import SIMPLE
+from rich.progress import track
+from rich.table import Table
+
+from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
+from vla_zenoh.cli.output import console, errors
+from vla_zenoh.lab.cli.bench_file import JsonFileOption, kept_rows
+
+WIDTH = 160
+SHARES = ("p50", "p95", "p99", "max")
+
+
+def command(
+    rates: Annotated[
+        str, typer.Option("--rates", help="Ticks a second, separated by commas.")
+    ] = "250,500,1000",
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=8, max=600, help="How long at each rate.")
+    ] = 10.0,
+    busy: Annotated[
+        int,
+        typer.Option("--busy", min=0, max=64, help="Programs that only compute, beside it."),
+    ] = 0,
+    profile: Annotated[
+        str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
+    ] = DEFAULT_PROFILE,
+    json_file: JsonFileOption = None,
+) -> None:
+    """Measure what a tick of the command node costs while the simulated arm moves.
+
+    The real chain is started once for every rate.
+    """
+    from vla_zenoh.cli.free_endpoint import own_address
+    from vla_zenoh.lab.bench.command_runner import measure_command
+    from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
+
+    rates_hz = number_list("--rates", rates, 50, 1000)
+    stop = stop_on_signals()
+    die_with_parent()
+    loaded = own_address(effective_profile(profile))
+    with kept_rows(json_file) as rows:
+        for rate_hz in track(rates_hz, "command node", console=errors()):
+            rows.append(measure_command(loaded, rate_hz, seconds, stop, rows.log, busy))
+    table = Table(box=SIMPLE, pad_edge=False)
+    for column in ("asked Hz", "held Hz", "missed", "core share"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for name in ("tick us", "late us", "pose ms"):
+        for share in SHARES:
+            table.add_column(f"{name}\n{share}", justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(
+            f"{row['command_hz']:g}",
+            f"{row['held_hz']:g}",
+            f"{row['missed_ticks']}",
+            f"{row['core_share']:.2f}",
+            *(f"{row['tick_us'][share]:.0f}" for share in SHARES),
+            *(f"{row['late_us'][share]:.0f}" for share in SHARES),
+            *(f"{row['pose_age_ms'][share]:.0f}" for share in SHARES),
+        )
+    told = "tick: from waking until the command is out. late: waking behind its time. pose: its age"
+    realtime = all(row["realtime"] for row in rows)
+    table.caption = told if realtime else f"{told} (no real-time priority here)"
+    console(WIDTH).print(table)

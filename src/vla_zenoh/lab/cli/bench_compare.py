@@ -1,0 +1,117 @@
+"""vla-zenoh bench compare."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from vla_zenoh.cli.options import JsonOption
+from vla_zenoh.cli.output import console, print_json
+from vla_zenoh.errors import ResourceError
+from vla_zenoh.lab.bench.paired_tasks import ALPHA, CONDITIONS, Comparison, figures, read_run
+from vla_zenoh.lab.bench.paired_tasks import compare as compare_runs
+
+B_IS_WORSE = 3
+"""Exit code; 1 and 2 are those of every command for what it refuses."""
+LEAST_WIDTH = 120
+DISAGREEMENTS = 10
+
+
+def compare(
+    a: Annotated[Path, typer.Argument(help="Result of a run of `bench task`.", metavar="A.json")],
+    b: Annotated[Path, typer.Argument(help="Result of another one.", metavar="B.json")],
+    differ: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--differ",
+            help=f"What is compared, where it is not the model; may be repeated: "
+            f"{', '.join(CONDITIONS)}.",
+        ),
+    ] = None,
+    tasks: Annotated[bool, typer.Option("--tasks", help="A row for every task, too.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare two runs of `bench task` on the layouts that are in both.
+
+    Exits with 0 when B was not shown to be worse than A, 3 when it was (p below 0.05), 1 when the
+    runs cannot be compared.
+    """
+    unknown = [name for name in differ or () if name not in CONDITIONS]
+    if unknown:
+        raise typer.BadParameter(f"--differ {unknown[0]!r}: {', '.join(CONDITIONS)}")
+    first, second = (read_run(_bytes(path), str(path)) for path in (a, b))
+    found = compare_runs(first, second, differ or ())
+    if as_json:
+        print_json(found.to_dict())
+    else:
+        _print(found, tasks=tasks)
+    if found.b_is_worse:
+        raise typer.Exit(B_IS_WORSE)
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ResourceError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def _print(found: Comparison, *, tasks: bool) -> None:
+    result = found.to_dict()
+    out = console(LEAST_WIDTH)
+    for name, run in (("A", result["a"]), ("B", result["b"])):
+        options = ", ".join(f"{k}={v}" for k, v in run["options"].items())
+        told = f" ({options})" if options else ""
+        out.print(f"{name}: {run['model']}{told}, {run['episodes']} episodes", soft_wrap=True)
+    for name, (one, other) in result["differ"].items():
+        out.print(f"{name}: {one} in A, {other} in B", soft_wrap=True)
+    table = Table(header_style="bold")
+    for column in ("", "pairs", "A", "B", "both", "only A", "only B", "neither", "B - A"):
+        table.add_column(column, justify="right" if column else "left", no_wrap=True)
+    table.add_column("95 %", justify="right", no_wrap=True)
+    table.add_column("p", justify="right", no_wrap=True)
+    _row(table, "all", figures(found.counts))
+    for part in ("by_family", *(["by_task"] if tasks else [])):
+        table.add_section()
+        for name, row in result[part].items():
+            _row(table, name, row)
+    out.print(table)
+    said = list(found.disagreements())
+    for each in said[:DISAGREEMENTS]:
+        who, why = each["done_by"].upper(), each["failure_of_the_other"]
+        out.print(f"- {each['seed']}, {each['task']}: done by {who} alone, the other: {why}")
+    if len(said) > DISAGREEMENTS:
+        out.print(f"- and {len(said) - DISAGREEMENTS} more, with --json")
+    only_a, only_b = found.unpaired
+    if only_a or only_b:
+        out.print(f"left out, because only one of them did it: {only_a} of A, {only_b} of B")
+    out.print(_verdict(found), soft_wrap=True)
+
+
+def _row(table: Table, name: str, row: dict[str, Any]) -> None:
+    low, high = row["difference_95"]
+    table.add_row(
+        name,
+        str(row["pairs"]),
+        f"{row['rate_a']:.1%}",
+        f"{row['rate_b']:.1%}",
+        *(str(row[part]) for part in ("both", "only_a", "only_b", "neither")),
+        f"{row['difference']:+.1%}",
+        f"{low:+.1%}..{high:+.1%}",
+        f"{row['p']:.2g}",
+    )
+
+
+def _verdict(found: Comparison) -> str:
+    counts = found.counts
+    low, high = counts.difference_95
+    if counts.p >= ALPHA:
+        return (
+            f"No difference is shown: p = {counts.p:.2g}, and B's rate less A's is between "
+            f"{low:+.1%} and {high:+.1%}."
+        )
+    word = "fewer" if found.b_is_worse else "more"
+    return f"B does {word} of the same tasks than A: p = {counts.p:.2g}."

@@ -1,0 +1,104 @@
+"""vla-zenoh dataset export, dataset stats."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from vla_zenoh.cli.output import console, errors, fail, print_json
+from vla_zenoh.errors import RecordingError
+from vla_zenoh.lab.evaluation.files import MCAP
+
+dataset_app = typer.Typer(
+    name="dataset", help="Recorded runs as data to train on.", no_args_is_help=True
+)
+
+
+@dataset_app.command("export")
+def export(
+    runs: Annotated[list[Path], typer.Argument(help="Recordings (.mcap), or folders with such.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the dataset; a new one.")],
+    form: Annotated[
+        Literal["lerobot"], typer.Option("--format", help="LeRobotDataset v3.0.")
+    ] = "lerobot",
+    worker: Annotated[
+        str | None, typer.Option("--worker", help="Only what this worker did.")
+    ] = None,
+    cameras: Annotated[
+        list[str] | None,
+        typer.Option("--camera", help="Only this one; may be repeated. Else all recorded ones."),
+    ] = None,
+    state: Annotated[
+        str, typer.Option("--state", help="Parts of the state, as the worker lerobot has them.")
+    ] = "position+rpy+gripper_m",
+    successful: Annotated[
+        bool, typer.Option("--successful", help="Only episodes known to have done their task.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a script.")] = False,
+) -> None:
+    """Make a dataset of recorded runs: an episode for each time a worker was obeyed."""
+    from vla_zenoh.lab.dataset.episodes import episodes_of
+    from vla_zenoh.lab.dataset.lerobot import export as write
+    from vla_zenoh.lab.dataset.success import succeeded
+    from vla_zenoh.lab.recording.run import load_run
+    from vla_zenoh.policy.state_vector import read_parts
+
+    parts = read_parts(state)
+    episodes, seen = [], None
+    for path in _files(runs):
+        run = load_run(path)
+        for problem in run.problems:
+            errors().print(f"{path.name}: {problem}", style="yellow")
+        found = episodes_of(run, worker)
+        for episode in found:
+            episode.success = succeeded(episode)
+        episodes += [each for each in found if each.success or not successful]
+        if found:
+            seen = set(run.picture_counts) if seen is None else seen & set(run.picture_counts)
+    written = write(out, episodes, cameras or sorted(seen or ()), parts)
+    if as_json:
+        print_json(written._asdict())
+        return
+    known = "" if written.successes is None else f", {written.successes} known to be successful"
+    console().print(
+        f"{written.folder}: {written.episodes} episodes{known}, {written.frames} frames at "
+        f"{written.fps} Hz, cameras {', '.join(written.cameras) or 'none'}, "
+        f"{len(written.tasks)} prompts"
+    )
+
+
+@dataset_app.command("stats")
+def stats(
+    folder: Annotated[Path, typer.Argument(help="A LeRobot dataset v3.0.")],
+    name: Annotated[
+        str | None, typer.Option("--name", help="Key of the statistics; the folder's name else.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="File; dataset_statistics.json in the folder without it."),
+    ] = None,
+) -> None:
+    """Write OpenVLA's dataset_statistics.json of a dataset."""
+    from vla_zenoh.lab.dataset.openvla import openvla_statistics
+
+    content = openvla_statistics(folder, name or folder.resolve().name)
+    path = out or folder / "dataset_statistics.json"
+    try:
+        path.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+    except OSError as error:
+        fail(f"{path} cannot be written: {error}")
+    console().print(f"{path}: key {next(iter(content))!r}")
+
+
+def _files(given: list[Path]) -> list[Path]:
+    out = [
+        path
+        for each in given
+        for path in (sorted(each.rglob(f"*{MCAP}")) if each.is_dir() else [each])
+    ]
+    if not out:
+        raise RecordingError(f"no {MCAP} file in {', '.join(map(str, given))}")
+    return out

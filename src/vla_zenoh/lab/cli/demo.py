@@ -1,0 +1,88 @@
+"""vla-zenoh demo."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vla_zenoh.cli.options import DEFAULT_PROFILE
+
+DEFAULT_STEPS = 50
+
+
+TASK_PROFILE = "panda_bricks"
+
+
+def demo(
+    prompt: Annotated[
+        str | None,
+        typer.Option(
+            "--prompt",
+            help="One prompt: a task such as 'put the red brick in the box', or a fixed motion "
+            "such as 'HARD: go up'. Without it: one task of every kind.",
+        ),
+    ] = None,
+    tour: Annotated[
+        bool, typer.Option("--tour", help="A tour of all fixed motions in place of tasks.")
+    ] = False,
+    rate: Annotated[
+        float, typer.Option("--rate", help="Chunks per second.", min=0.2, max=50)
+    ] = 5.0,
+    steps: Annotated[
+        int, typer.Option("--steps", help="Steps of a fixed motion.", min=1, max=10_000)
+    ] = DEFAULT_STEPS,
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            "--seconds",
+            help="Let a fixed motion run this long; the most a task may take.",
+            min=0.5,
+            max=3600,
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", help="Of the layout of the tasks.", min=0)
+    ] = None,
+    profile: Annotated[
+        str | None, typer.Option("--profile", "-p", help="Name or path of a simulated profile.")
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the summary to this file.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Run folder; runs/demo-<time> without it.")
+    ] = None,
+) -> None:
+    """Bring a simulated robot up, let prompts move it, and show what was asked and done.
+
+    Exits with 0 only when the arm did what was asked.
+    """
+    # Simulation, kinematics and plots take a while to load, and a camera host has none of them.
+    if tour and prompt is not None:
+        raise typer.BadParameter("--tour is instead of a --prompt")
+    if tour or (prompt is not None and _is_fixed_motion(prompt)):
+        from vla_zenoh.lab.cli.demo_run import run_demo
+        from vla_zenoh.lab.demo.segments import make_segment
+        from vla_zenoh.lab.demo.segments import tour as all_motions
+
+        segments = all_motions() if prompt is None else [make_segment(prompt, steps)]
+        run_demo(segments, rate, seconds, profile or DEFAULT_PROFILE, json_file, out)
+        return
+    from vla_zenoh.lab.cli.demo_tasks import run_task_demo
+    from vla_zenoh.lab.demo.tasks import FIRST_SEED
+
+    run_task_demo(
+        [prompt] if prompt else [],
+        FIRST_SEED if seed is None else seed,
+        rate,
+        seconds,
+        profile or TASK_PROFILE,
+        json_file,
+        out,
+    )
+
+
+def _is_fixed_motion(prompt: str) -> bool:
+    return prompt.strip().lower().startswith(("hard", "hold"))

@@ -1,0 +1,165 @@
+"""What every demo has: an address of its own, a run folder, nodes, a recording and a film."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from vla_zenoh.cli.free_endpoint import own_address
+from vla_zenoh.cli.options import effective_profile
+from vla_zenoh.cli.output import Screen, errors
+from vla_zenoh.lab.demo.video import write_video
+from vla_zenoh.lab.recording.recorder import Recorder
+from vla_zenoh.lab.recording.run import Run, load_run, pictures
+from vla_zenoh.profile import Profile, to_yaml
+from vla_zenoh.runtime.launch import Host
+from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
+from vla_zenoh.types import NodeStatus
+
+MAX_LOG_LINES = 20
+PICTURE_NS = 60_000_000
+"""Pictures of the film lie at least this far apart: twice as many as it shows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """See the module. Made by `prepare`.
+
+    Args:
+        profile: in force, at an address of its own.
+        folder: of the run.
+        stop: set by Ctrl-C.
+        screen: for progress, which is no result: stdout stays for the summary.
+    """
+
+    profile: Profile
+    folder: Path
+    stop: threading.Event
+    screen: Screen
+
+    @property
+    def camera(self) -> str | None:
+        """Whose pictures are recorded and filmed; None: there is no camera."""
+        cameras = self.profile.cameras
+        return "front" if "front" in cameras else next(iter(cameras), None)
+
+    @property
+    def recording(self) -> Path:
+        """The file everything else is made of."""
+        return self.folder / "run.mcap"
+
+    @contextmanager
+    def nodes(self, described: str) -> Iterator[tuple[Host, Progress]]:
+        """All nodes at work and recorded, beside bars; where it fails, the end of their log.
+
+        Args:
+            described: format of the bars' first column.
+        """
+        profile, lines = self.profile, []
+        columns = (
+            TextColumn(described, markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+        )
+        with (
+            (self.folder / "nodes.log").open("w", encoding="utf-8") as log_file,
+            Progress(*columns, console=self.screen) as bars,
+        ):
+            coming_up = bars.add_task("starting the nodes", total=None)
+
+            def log(node: str, line: str) -> None:
+                log_file.write(f"{node:>16} | {line}\n")
+                lines.append(f"{node}: {line}")
+
+            # Pictures of one camera alone: each more takes its share of the processor.
+            pictures_of = [profile.keys.camera_jpeg(self.camera)] if self.camera else []
+            try:
+                with Host(profile, None, log=log, tell=log, own_router=True) as running:
+                    assert running.session is not None
+                    bars.update(coming_up, visible=False)
+                    recorder = Recorder(
+                        profile,
+                        running.session,
+                        self.recording,
+                        expressions=(*profile.keys.without_pictures, *pictures_of),
+                    ).start()
+                    try:
+                        yield running, bars
+                    finally:
+                        recorder.close()
+            except Exception:
+                last = "\n".join(lines[-MAX_LOG_LINES:])
+                self.screen.print(last, style="dim")
+                raise
+
+    def recorded(self) -> Run:
+        """What was recorded."""
+        return load_run(self.recording)
+
+    def write(self, summary: Mapping[str, Any], json_file: Path | None) -> None:
+        """profile.yaml and summary.json, the latter also where a person wants it."""
+        (self.folder / "profile.yaml").write_text(to_yaml(self.profile), "utf-8")
+        text = json.dumps(summary, indent=2) + "\n"
+        for path in (self.folder / "summary.json", json_file):
+            if path is not None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text, "utf-8")
+
+    def film(self, run: Run, marks: list[tuple[int, str]]) -> None:
+        """front.mp4, with `marks` (ns, text) in it."""
+        frames = self._frames(run)
+        columns = (
+            TextColumn("{task.description:<24}", markup=False),
+            BarColumn(),
+            TimeElapsedColumn(),
+        )
+        with Progress(*columns, console=self.screen) as bars:
+            filming = bars.add_task("writing front.mp4", total=max(1, len(frames)))
+            written = write_video(
+                self.folder / "front.mp4",
+                frames,
+                marks,
+                lambda done, total: bars.update(filming, completed=done, total=total),
+            )
+            if not written:
+                bars.update(filming, description="no pictures, no video", completed=1, total=1)
+
+    def _frames(self, run: Run) -> list[tuple[int, bytes]]:
+        frames: list[tuple[int, bytes]] = []
+        for picture in pictures(run.file, self.camera) if self.camera is not None else ():
+            if not frames or picture.heard_ns - frames[-1][0] >= PICTURE_NS:
+                frames.append((picture.heard_ns, picture.jpeg))
+        return frames
+
+
+def prepare(profile: str, out: Path | None) -> Stage:
+    """A stage for the profile, in the folder `out` or one named by the time of day."""
+    stop = stop_on_signals()
+    die_with_parent()
+    loaded = own_address(effective_profile(profile))
+    folder = out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
+    folder.mkdir(parents=True, exist_ok=True)
+    screen, here = errors(), loaded.session.connect[0]
+    screen.print(f"profile {loaded.name}, router at {here}, run folder {folder}")
+    screen.print(f"watch it from another terminal: vla-zenoh status --connect {here}", style="dim")
+    return Stage(loaded, folder, stop, screen)
+
+
+def refusals(statuses: Mapping[str, NodeStatus]) -> dict[str, int]:
+    """What all nodes refused, by reason."""
+    out: Counter[str] = Counter()
+    for status in statuses.values():
+        for name, count in status.counters.items():
+            if name.startswith("refused."):
+                out[name.removeprefix("refused.")] += count
+    return dict(sorted(out.items()))

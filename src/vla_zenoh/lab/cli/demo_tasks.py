@@ -1,0 +1,126 @@
+"""What ``vla-zenoh demo`` does with a policy that does tasks: nodes, run folder, verdicts."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from vla_zenoh.cli.output import console, styled
+from vla_zenoh.lab.bench.task import Ended
+from vla_zenoh.lab.bench.task_runner import TaskRun
+from vla_zenoh.lab.bench.task_sheet import sheet
+from vla_zenoh.lab.cli.demo_stage import Stage, prepare, refusals
+from vla_zenoh.lab.demo.analysis import latencies
+from vla_zenoh.lab.demo.runner import Interrupted
+from vla_zenoh.lab.demo.tasks import Tour, judged
+from vla_zenoh.lab.tasks import FAILURES, LIMIT_S
+from vla_zenoh.sanitize import one_line, printable
+
+ROUNDS = 3
+"""Tasks without a prompt given: one of every family."""
+
+
+def run_task_demo(
+    prompts: list[str],
+    seed: int,
+    rate: float,
+    seconds: float | None,
+    profile: str,
+    json_file: Path | None,
+    out: Path | None,
+) -> None:
+    """See ``vla-zenoh demo``."""
+    stage = prepare(profile, out)
+    loaded, folder = stage.profile, stage.folder
+    plan = Tour(
+        loaded.task.worker,
+        len(prompts) or ROUNDS,
+        seed,
+        rate_hz=rate,
+        prompts=tuple(prompts),
+        limit_s=seconds or LIMIT_S,
+    )
+    began_ns = time.time_ns()
+    ended, refused = _run(stage, plan)
+    run = stage.recorded()
+    summary = {
+        "ok": len(ended) == plan.episodes and all(_well(each) is not False for each in ended),
+        "profile": loaded.name,
+        "model": plan.model,
+        "rate_hz": rate,
+        "seed": seed,
+        "tasks": [each.to_dict() | {"judged": judged(each.prompt)} for each in ended],
+        "latency_ms": latencies(run.first_commands()),
+        "refusals": refused,
+    }
+    stage.write(summary, json_file)
+    picture = sheet(ended)
+    if picture is not None:
+        (folder / "tasks.jpg").write_bytes(picture)
+    marks = [(at_ns, prompt) for at_ns, prompt in run.prompts() if at_ns >= began_ns]
+    stage.film(run, marks)
+    _show(ended, summary, folder)
+    if stage.stop.is_set():
+        raise typer.Exit(130)
+    if not summary["ok"]:
+        raise typer.Exit(1)
+
+
+def _run(stage: Stage, plan: Tour) -> tuple[list[Ended], dict[str, int]]:
+    ended: list[Ended] = []
+    with stage.nodes("{task.description:<52}") as (running, bars):
+        assert running.client is not None
+        client = running.client
+        bar = bars.add_task("waiting for the first task", total=plan.episodes)
+        try:
+            for each in TaskRun(running, plan, stage.stop, stage.camera).run():
+                ended.append(each)
+                said = f"{one_line(each.prompt, 40)}: {_word(each)}"
+                bars.update(bar, completed=len(ended), description=said)
+        except Interrupted:
+            pass
+        finally:
+            counted = refusals({n: found[0] for n, found in client.snapshot().items()})
+            client.deactivate()
+    return ended, counted
+
+
+def _well(ended: Ended) -> bool | None:
+    """Whether it was done; None: nobody here knows what was asked, and the chain was well."""
+    if judged(ended.prompt):
+        return ended.success
+    return None if ended.success or ended.failure in FAILURES else False
+
+
+def _word(ended: Ended) -> str:
+    done = _well(ended)
+    if done is None:
+        return "not judged: a wording that only the policy may know"
+    return f"done in {ended.time_s:.1f} s" if done else ended.failure
+
+
+def _show(ended: list[Ended], summary: dict[str, Any], folder: Path) -> None:
+    table = Table(title="asked by prompt, judged by the true poses", title_justify="left")
+    table.add_column("prompt")
+    table.add_column("")
+    for each in ended:
+        colour = {True: "green", False: "red", None: "yellow"}[_well(each)]
+        known = judged(each.prompt) and each.failure in FAILURES
+        why = FAILURES[each.failure] if known else each.why
+        said = Text.assemble(styled(_word(each), colour), printable(f": {why}") if why else "")
+        table.add_row(each.prompt, said)
+    screen = console()
+    screen.print(table)
+    latency = summary["latency_ms"]
+    if latency.get("p50") is not None:
+        screen.print(
+            f"latency, camera stamp to pose command: p50 {latency['p50']:.1f} ms, "
+            f"p95 {latency['p95']:.1f} ms; inference p50 "
+            f"{latency['stages']['inference'].get('p50', 0.0):.1f} ms"
+        )
+    screen.print(f"run folder: {folder} (run.mcap, summary.json, tasks.jpg, front.mp4)")

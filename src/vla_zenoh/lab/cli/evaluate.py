@@ -1,0 +1,148 @@
+"""vla-zenoh eval."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.table import Table
+
+from vla_zenoh.cli.output import console, errors, fail, plain_types
+from vla_zenoh.lab.evaluation import tables
+from vla_zenoh.lab.evaluation.files import evaluate
+from vla_zenoh.lab.evaluation.overall import overall, to_mapping
+from vla_zenoh.lab.evaluation.result import STAGES, Evaluation
+
+PICTURES = 8
+WIDE = 110
+"""Columns of a terminal in which every column has room."""
+STDOUT = Path("-")
+
+
+def evaluation(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(help="Recordings (.mcap), the thesis's CSV, or folders that hold such."),
+    ],
+    first: Annotated[
+        int | None, typer.Option("--first", help="Only so many requests of each run.", min=1)
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write everything to this file; - is stdout.")
+    ] = None,
+    csv_file: Annotated[
+        Path | None, typer.Option("--csv", help="Write one row per run to this file; - is stdout.")
+    ] = None,
+    html_file: Annotated[
+        Path | None, typer.Option("--html", help="Write a page with plots to this file.")
+    ] = None,
+    pictures: Annotated[
+        int, typer.Option("--pictures", help="Moments shown of each camera.", min=0, max=50)
+    ] = PICTURES,
+) -> None:
+    """Evaluate recorded runs: latency, motion, drift, smoothness, refusals.
+
+    Exits with 0 when at least one file could be evaluated; what could not is said on stderr.
+    """
+    runs, faults = evaluate(paths, first, pictures=pictures if html_file else 0)
+    if STDOUT not in (json_file, csv_file):
+        _show(runs)
+    for run in runs:
+        for problem in run.problems:
+            errors().print(f"{run.name}: {problem}", style="yellow")
+    for why in faults.values():
+        errors().print(f"not evaluated: {why}", style="red")
+    if json_file is not None:
+        _write(json_file, json.dumps(plain_types(to_mapping(runs, faults)), indent=2) + "\n")
+    if csv_file is not None:
+        _write(csv_file, _rows(runs))
+    if html_file is not None:
+        from vla_zenoh.lab.evaluation.report import page
+
+        _write(html_file, page(runs, faults))
+    if not runs:
+        fail("nothing could be evaluated")
+
+
+def _write(path: Path, text: str) -> None:
+    if path == STDOUT:
+        sys.stdout.write(text)
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, "utf-8")
+    except OSError as error:
+        fail(f"{path} cannot be written: {error.strerror}")
+
+
+def _rows(runs: Sequence[Evaluation]) -> str:
+    rows = [run.row() for run in (*runs, *([overall(runs)] if len(runs) > 1 else ()))]
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    out = io.StringIO(newline="")
+    writer = csv.DictWriter(out, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return out.getvalue()
+
+
+def _show(runs: Sequence[Evaluation]) -> None:
+    if not runs:
+        return
+    screen = console()
+    table = Table(header_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    shown_columns = None if screen.width >= WIDE else tables.NARROW
+    for column in tables.SUMMARY_COLUMNS[:shown_columns]:
+        left = column == "run"
+        table.add_column(column, justify="left" if left else "right", overflow="fold")
+    for run in runs:
+        row = tables.summary_row(run)[:shown_columns]
+        table.add_row(*row)
+    if len(runs) > 1:
+        table.add_section()
+        table.add_row(*tables.summary_row(overall(runs))[:shown_columns], style="bold")
+    screen.print(table)
+    shown = runs[0] if len(runs) == 1 else overall(runs)
+    _show_latency([*runs, shown] if len(runs) > 1 else runs)
+    if len(runs) == 1:
+        _show_segments(shown)
+    for name, value in tables.figures(shown):
+        screen.print(f"{name}: {value}")
+
+
+def _show_latency(runs: Sequence[Evaluation]) -> None:
+    table = Table(title="latency in ms", title_justify="left", header_style="bold")
+    table.box, table.padding = box.SIMPLE_HEAD, (0, 1, 0, 0)
+    several = len(runs) > 1
+    if several:
+        table.add_column("run", overflow="fold")
+    table.add_column("stage")
+    for column in tables.LATENCY_COLUMNS:
+        table.add_column(column, justify="right")
+    wide = console().width >= WIDE
+    if wide:
+        table.add_column("")
+    for run in runs:
+        name = run.name
+        for index, row in enumerate(tables.latency_rows(run)):
+            first = [name if index == 0 else ""] if several else []
+            table.add_row(*first, *row, *([STAGES[row[0]]] if wide else []))
+        table.add_section()
+    if table.row_count:
+        console().print(table)
+
+
+def _show_segments(run: Evaluation) -> None:
+    table = Table(title="asked and reached", title_justify="left", header_style="bold")
+    table.box, table.padding = box.SIMPLE_HEAD, (0, 1, 0, 0)
+    for column in tables.SEGMENT_COLUMNS:
+        table.add_column(column, justify="left" if column == "prompt" else "right")
+    for row in tables.segment_rows(run):
+        table.add_row(*row)
+    console().print(table)

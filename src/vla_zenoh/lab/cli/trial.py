@@ -1,0 +1,241 @@
+"""vla-zenoh trial."""
+
+from __future__ import annotations
+
+import secrets
+import signal
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    ConnectOption,
+    HostOption,
+    JsonOption,
+    ProfileOption,
+    RobotOption,
+)
+from vla_zenoh.cli.output import console, errors, fail, print_json, printable
+from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.lab.trial.folder import TrialFolder
+from vla_zenoh.lab.trial.judged import EpisodeVerdict
+from vla_zenoh.lab.trial.plan import TrialPlan
+from vla_zenoh.lab.trial.score import TrialScore, score
+
+EPISODES, SECONDS = 20, 60.0
+
+
+def trial(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder; one that is there goes on.")],
+    workers: Annotated[
+        str | None, typer.Option("--workers", "-w", help="One or more, separated by commas.")
+    ] = None,
+    prompt: Annotated[str | None, typer.Option("--prompt", help="What they are to do.")] = None,
+    episodes: Annotated[
+        int | None, typer.Option("--episodes", "-n", min=1, help="Of every worker.")
+    ] = None,
+    setups: Annotated[
+        Path | None,
+        typer.Option("--setups", help="Text file with a setup a line; every worker does each."),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", "-s", min=0.1, help="An episode ends after these.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", help="Of the workers' order; drawn without it.")
+    ] = None,
+    is_open: Annotated[
+        bool, typer.Option("--open", help="Say which worker it is; else nobody is told.")
+    ] = False,
+    yes_setup: Annotated[
+        bool, typer.Option("--yes-setup", help="Every setup is laid already; do not ask.")
+    ] = False,
+    report: Annotated[
+        bool, typer.Option("--report", help="Only show what was judged so far.")
+    ] = False,
+    profile: ProfileOption = DEFAULT_PROFILE,
+    connect: ConnectOption = None,
+    host: HostOption = None,
+    robot: RobotOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Try models on a real arm, where you say whether each episode succeeded.
+
+    Every setup is done by every worker, in an order that you are not told. Enter ends an episode,
+    Ctrl-C ends the trial, the arm brakes first; the same command goes on with it.
+    """
+    folder, aim = TrialFolder(out), RobotTarget(profile, connect, host, robot)
+    if report:
+        plan = folder.plan()
+        if plan is None:
+            fail(f"{out} holds no trial")
+        found = folder.episodes()
+        _warn_of_peeking(plan, found)
+    else:
+        asked = {
+            "robot": aim.load().robot.name,
+            "workers": None if workers is None else _names(workers),
+            "prompt": None if prompt is None else prompt.strip(),
+            "setups": _setups(episodes, setups),
+            "seconds": seconds,
+            "seed": seed,
+            "blind": False if is_open else None,
+        }
+        with folder.alone():
+            plan = _begun(folder, asked)
+            found = folder.episodes()
+            if folder.torn:
+                said = "the last line of trials.jsonl was cut off; its episode is done again"
+                errors().print(said, style="yellow", markup=False)
+            if plan.next_due(found) is not None:
+                found = _run(folder, plan, found, aim, yes_setup)
+    result = score(plan, found)
+    if as_json:
+        print_json(_mapping(plan, result, found))
+    else:
+        _show(plan, result)
+
+
+def _names(workers: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in workers.split(","))
+
+
+def _setups(episodes: int | None, file: Path | None) -> tuple[str, ...] | None:
+    if file is None:
+        return None if episodes is None else ("",) * episodes
+    if episodes is not None:
+        raise typer.BadParameter("--setups says how many there are: leave --episodes out")
+    try:
+        lines = [line.strip() for line in file.read_text("utf-8").splitlines()]
+    except (OSError, UnicodeError) as error:
+        fail(f"{file} cannot be read: {error}")
+    return tuple(line for line in lines if line)
+
+
+def _begun(folder: TrialFolder, asked: dict[str, Any]) -> TrialPlan:
+    """The plan of the folder, or one of what was asked for."""
+    plan = folder.plan()
+    if plan is not None:
+        others = plan.other_than(asked)
+        if others:
+            fail(
+                f"{folder.path} was begun otherwise: {'; '.join(others)}. Leave that out to go on "
+                "with it, or give another --out"
+            )
+        return plan
+    for name in ("workers", "prompt"):
+        if asked[name] is None:
+            raise typer.BadParameter(f"--{name} is needed: {folder.path} holds no trial yet")
+    usual = {
+        "setups": ("",) * EPISODES,
+        "seconds": SECONDS,
+        "seed": secrets.randbelow(2**32),
+        "blind": True,
+    }
+    plan = TrialPlan(
+        **{**usual, **{name: value for name, value in asked.items() if value is not None}}
+    )
+    folder.begin(plan)
+    return plan
+
+
+def _run(
+    folder: TrialFolder,
+    plan: TrialPlan,
+    found: list[EpisodeVerdict],
+    aim: RobotTarget,
+    yes_setup: bool,
+) -> list[EpisodeVerdict]:
+    from vla_zenoh.lab.cli.trial_person import TrialPerson
+    from vla_zenoh.lab.demo.runner import Interrupted
+    from vla_zenoh.lab.trial.runner import TrialRun
+    from vla_zenoh.runtime.process import stop_on_signals
+
+    stop = stop_on_signals()
+    # Neither a terminal that is closed nor Ctrl-Z may leave a moving arm behind.
+    signal.signal(signal.SIGHUP, lambda *_: stop.set())
+    signal.signal(signal.SIGTSTP, signal.SIG_IGN)
+    done = score(plan, found).done
+    blind = "; the order is not told" if plan.blind else ""
+    said = f"{folder.path}: {plan.prompt!r}, {done} of {plan.episodes} episodes done{blind}"
+    errors().print(said, markup=False)
+    person = TrialPerson(plan, sys.stdin.fileno(), stop, lays=yes_setup)
+    try:
+        with aim.driver("trial", "--out", str(folder.path)) as client:
+            return TrialRun(client, plan, folder, person, stop).run()
+    except Interrupted:
+        done = score(plan, folder.episodes()).done
+        errors().print(f"{done} of {plan.episodes} done; the same command goes on", markup=False)
+        raise typer.Exit(130) from None
+
+
+def _warn_of_peeking(plan: TrialPlan, found: list[EpisodeVerdict]) -> None:
+    done = score(plan, found).done
+    if done < plan.episodes:
+        errors().print(
+            f"{done} of {plan.episodes} episodes done: p and intervals hold where the number of "
+            "episodes was fixed beforehand, not where a look at them decides when to stop",
+            style="yellow",
+            markup=False,
+        )
+
+
+def _mapping(plan: TrialPlan, result: TrialScore, found: list[EpisodeVerdict]) -> dict[str, Any]:
+    pair = result.paired
+    return {
+        "plan": asdict(plan),
+        "done": result.done,
+        "of": result.of,
+        "workers": {each.worker: {**asdict(each), "rate": each.rate} for each in result.workers},
+        "paired": None
+        if pair is None
+        else {
+            **asdict(pair),
+            "setups": pair.setups,
+            "difference": pair.difference,
+            "difference_95": pair.difference_95,
+            "p": pair.p,
+        },
+        "episodes": [asdict(each) for each in found],
+    }
+
+
+def _show(plan: TrialPlan, result: TrialScore) -> None:
+    title = f"{plan.prompt!r}: {result.done} of {result.of} episodes"
+    table = Table(header_style="bold", title=Text(printable(title)), title_justify="left")
+    columns = ("worker", "done", "of", "rate", "95 %", "time p50", "brakes", "taken", "void")
+    for column in columns:
+        table.add_column(column, justify="left" if column == "worker" else "right")
+    for each in result.workers:
+        low, high = each.wilson_95
+        time_s = each.time_to_success_s
+        table.add_row(
+            Text(printable(each.worker)),
+            str(each.successes),
+            str(each.episodes),
+            "" if each.rate is None else f"{each.rate:.1%}",
+            f"{low:.1%}..{high:.1%}",
+            "" if time_s is None else f"{time_s:.1f} s",
+            str(each.brakes),
+            str(each.interventions),
+            str(each.void),
+        )
+    screen = console()
+    screen.print(table)
+    pair = result.paired
+    if pair is not None:
+        one, other = plan.workers
+        low, high = pair.difference_95
+        screen.print(
+            f"{one} less {other} over {pair.setups} setups that both did: {pair.difference:+.1%} "
+            f"(95 %: {low:+.1%}..{high:+.1%}), exact McNemar p = {pair.p:.3g}; both {pair.both}, "
+            f"{one} alone {pair.first}, {other} alone {pair.second}, neither {pair.neither}",
+            markup=False,
+            soft_wrap=True,
+        )

@@ -1,0 +1,208 @@
+"""The person at a trial: somebody at a terminal, or a script that writes lines.
+
+To a terminal questions are put on stderr, and what is typed while the arm moves ends the episode.
+A script's lines may all be there from the beginning: while the arm moves an empty line alone is
+taken, and one that means nothing where it stands ends the trial, because all behind it would.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import termios
+import threading
+import time
+from contextlib import suppress
+
+from rich.live import Live
+from rich.text import Text
+
+from vla_zenoh.cli.output import errors, printable
+from vla_zenoh.errors import NodeError
+from vla_zenoh.lab.demo.runner import Interrupted
+from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, Phase
+from vla_zenoh.lab.trial.judged import END_WORDS
+from vla_zenoh.lab.trial.plan import TrialPlan
+
+WAIT_S = 0.1
+REFRESH_S = 0.2
+MAX_LINE_BYTES = 64 * 1024
+VERDICTS = "y / n / x (void, done again), and a note"
+EXPECTED = {
+    Phase.LAY: "an empty line when it is laid",
+    Phase.REPAIR: "an empty line to try again, or x and a note",
+    Phase.JUDGE: VERDICTS,
+}
+
+
+class Lines:
+    """Lines of a file descriptor, without waiting for one longer than asked.
+
+    Args:
+        fd: a terminal, a pipe or a file.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self._fd, self._buffer, self._eof = fd, b"", False
+
+    @property
+    def over(self) -> bool:
+        """There is no line, and none will come."""
+        return self._eof and not self._buffer
+
+    def peek(self, timeout_s: float) -> str | None:
+        """The next line, which stays; None: it is not there within that time."""
+        if not self._whole() and select.select([self._fd], [], [], timeout_s)[0]:
+            data = b""
+            with suppress(OSError):  # a terminal that is gone
+                data = os.read(self._fd, MAX_LINE_BYTES)
+            self._buffer += data
+            self._eof = not data
+        if not self._whole():
+            return None
+        return self._buffer.partition(b"\n")[0].decode("utf-8", "replace").rstrip("\r")
+
+    def take(self, timeout_s: float) -> str | None:
+        """Likewise, and it is gone then."""
+        line = self.peek(timeout_s)
+        if line is not None:
+            self._buffer = self._buffer.partition(b"\n")[2]
+        return line
+
+    def forget(self) -> None:
+        """What a person typed before now was not meant for what is asked now."""
+        termios.tcflush(self._fd, termios.TCIFLUSH)
+        self._buffer = b""
+
+    def _whole(self) -> bool:
+        # At the end of all what has no line feed is a line; more than this is none any more.
+        too_long = len(self._buffer) >= MAX_LINE_BYTES
+        return b"\n" in self._buffer or too_long or (self._eof and bool(self._buffer))
+
+
+class TrialPerson:
+    """See the module.
+
+    Args:
+        plan: of the trial.
+        fd: where lines come from.
+        stop: set by Ctrl-C.
+        lays: setups are laid by somebody else: nobody is asked whether they are, but after an
+            episode that somebody or something else has ended.
+    """
+
+    def __init__(self, plan: TrialPlan, fd: int, stop: threading.Event, *, lays: bool) -> None:
+        self._plan, self._stop, self._lays = plan, stop, lays
+        self._lines, self._terminal = Lines(fd), os.isatty(fd)
+        self._screen = errors()
+        self._live: Live | None = None
+        self._refreshed_s = 0.0
+
+    # -- questions ----------------------------------------------------------------------------
+    def ask(self, conduct: EpisodeFsm) -> str:
+        """See `vla_zenoh.lab.trial.person`."""
+        phase = conduct.phase
+        if phase is Phase.LAY:
+            self._say(self._setup(conduct), style="bold")
+            if self._lays and not conduct.needs_a_person:
+                return ""
+            question = "lay it, then press Enter:"
+            if conduct.needs_a_person:
+                question = (
+                    "the arm was taken away before: lay it, see that it may move, then Enter:"
+                )
+        elif phase is Phase.REPAIR:
+            self._say(self._plan.hide(conduct.reasons), style="yellow")
+            question = "repair it, then press Enter; or x (void, done again), and a note:"
+        else:
+            question = f"did it succeed? {VERDICTS}:"
+        if self._terminal and phase is not Phase.JUDGE:
+            self._lines.forget()  # an Enter too many is not to move an arm
+        self._say(question, end=" " if self._terminal else "\n")
+        return self._wait()
+
+    def _setup(self, conduct: EpisodeFsm) -> str:
+        plan, due = self._plan, conduct.due
+        at = (due.setup - 1) * len(plan.workers) + due.turn
+        said = f"episode {at} of {plan.episodes}: setup {due.setup}"
+        words = plan.words(due.setup)
+        said += f", {words}" if words else ""
+        return said if plan.blind else f"{said} (worker {due.worker})"
+
+    def _wait(self) -> str:
+        while (line := self._lines.take(WAIT_S)) is None:
+            if self._stop.is_set():
+                raise Interrupted
+            if self._lines.over:
+                raise NodeError(
+                    "standard input has ended before the trial; the same command goes on with it"
+                )
+        return line
+
+    def misunderstood(self, line: str, phase: Phase) -> None:
+        """See `vla_zenoh.lab.trial.person`.
+
+        Raises:
+            NodeError: it is a line of a script.
+        """
+        said = f"{line[:80]!r} means nothing here: {EXPECTED[phase]}"
+        if not self._terminal:
+            raise NodeError(f"{said}; the same command goes on with the trial")
+        self._say(said, style="yellow")
+
+    # -- while the arm moves ------------------------------------------------------------------
+    def typed(self) -> str | None:
+        """See `vla_zenoh.lab.trial.person`.
+
+        Raises:
+            NodeError: a script has ended, so nobody would judge.
+        """
+        if self._terminal:
+            line = self._lines.take(0.0)
+            return "" if line is None and self._lines.over else line
+        if self._lines.peek(0.0) == "":
+            return self._lines.take(0.0)
+        if self._lines.over:
+            raise NodeError(
+                "standard input has ended while an episode runs; the same command goes on with "
+                "the trial"
+            )
+        return None
+
+    def watch(self, conduct: EpisodeFsm) -> None:
+        """See `vla_zenoh.lab.trial.person`."""
+        if not (self._terminal and self._screen.is_terminal):
+            return
+        if self._live is None:
+            self._live = Live(console=self._screen, auto_refresh=False, transient=True)
+            self._live.start()
+        now_s = time.monotonic()
+        if now_s - self._refreshed_s >= REFRESH_S:
+            self._refreshed_s = now_s
+            seen = conduct.seen
+            said = f"{conduct.time_s:5.1f} of {conduct.seconds:g} s  {seen.state}  "
+            said += f"{seen.chunks} chunks  {self._plan.hide(seen.why)}  (Enter ends it)"
+            self._live.update(
+                Text(printable(said), no_wrap=True, overflow="ellipsis"), refresh=True
+            )
+
+    def ended(self, conduct: EpisodeFsm) -> None:
+        """See `vla_zenoh.lab.trial.person`."""
+        self._calm()
+        assert conduct.end is not None
+        why = self._plan.hide(conduct.why)
+        said = f"{END_WORDS[conduct.end]}{f': {why}' if why else ''}"
+        self._say(f"{said}; {conduct.time_s:.1f} s, {conduct.seen.chunks} chunks")
+
+    def tell(self, text: str) -> None:
+        """See `vla_zenoh.lab.trial.person`."""
+        self._calm()
+        self._say(text, style="yellow")
+
+    def _calm(self) -> None:
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    def _say(self, text: str, *, style: str = "", end: str = "\n") -> None:
+        self._screen.print(Text(printable(text), style=style), end=end, soft_wrap=True)

@@ -1,0 +1,1 @@
+"""How far the actions of two workers are apart."""

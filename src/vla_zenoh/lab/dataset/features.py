@@ -1,0 +1,100 @@
+"""What the columns of a dataset hold, and the state of the robot as one of them."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from vla_zenoh.errors import RecordingError
+from vla_zenoh.lab.dataset.episodes import RecordedEpisode
+from vla_zenoh.lab.recording.run import RecordedSample
+from vla_zenoh.policy import ActionSpec, Observation
+from vla_zenoh.policy.state_vector import parts_of, state_vector
+from vla_zenoh.types import Task
+
+DEFAULT_STATE = "position+rpy+gripper_m"
+STATE, ACTION, PICTURE = "observation.state", "action", "observation.images."
+NAMES = {
+    "position": ["x", "y", "z"],
+    "rpy": ["roll", "pitch", "yaw"],
+    "rotvec": ["rx", "ry", "rz"],
+    "quaternion": ["qx", "qy", "qz", "qw"],
+    "quat_xyzw": ["qx", "qy", "qz", "qw"],
+    "quat_wxyz": ["qw", "qx", "qy", "qz"],
+    "fingers_m": ["left_finger", "right_finger"],
+}
+NEAR_NS = 100_000_000
+"""A state belongs to a frame when it lies no further from it than this."""
+
+
+def state_names(parts: Sequence[str], joints: int) -> list[str]:
+    """A name for each number.
+
+    Args:
+        parts: of the state.
+        joints: how many the arm has.
+    """
+    of_arm = {
+        "joint": [f"joint{index}" for index in range(1, joints + 1)],
+        "joint_deg": [f"joint{index}_deg" for index in range(1, joints + 1)],
+    }
+    return [name for part in parts for name in {**NAMES, **of_arm}.get(part, [part])]
+
+
+def joints_of(episode: RecordedEpisode) -> int:
+    """How many joints the arm was recorded with; 0: none were."""
+    return len(episode.run.joints[0].record.names) if episode.run.joints else 0
+
+
+def action_names(spec: ActionSpec) -> list[str]:
+    """A name for each number of a step."""
+    gripper = [] if spec.gripper == "none" else [f"gripper_{spec.gripper}"]
+    return [*NAMES["position"], *NAMES[spec.rotation], *gripper]
+
+
+def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.float32]:
+    """(n, S) the robot's state at each frame.
+
+    Raises:
+        RecordingError: it is not in the recording.
+    """
+    run = episode.run
+    streams = {"joint": run.joints, "pose": run.poses, "gripper": run.grippers}
+    wanted = {part: streams[part] for part in parts_of(parts)}
+    most_m = _max_width_m(run.file.profile_yaml)
+    task = Task(0, True, "", episode.worker, 1.0)
+    rows = []
+    for frame in episode.frames:
+        found: dict[str, Any] = {}
+        for part, stream in wanted.items():
+            near = _nearest(stream, frame.stamp_ns)
+            if near is None:
+                raise RecordingError(
+                    f"{run.path}: no state/{part} within {NEAR_NS / 1e6:g} ms of a frame"
+                )
+            found[part] = near.record
+        observation = Observation(frame.stamp_ns, 0, task, **found)
+        rows.append(state_vector(parts, observation, most_m))
+    return np.array(rows, np.float32)
+
+
+def _nearest(stream: list[RecordedSample], at_ns: int) -> RecordedSample | None:
+    index = bisect_left(stream, at_ns, key=lambda entry: entry.header.stamp_wall_ns)
+    around = stream[max(index - 1, 0) : index + 1]
+    near = min(around, key=lambda each: abs(each.header.stamp_wall_ns - at_ns), default=None)
+    if near is None or abs(near.header.stamp_wall_ns - at_ns) > NEAR_NS:
+        return None
+    return near
+
+
+def _max_width_m(profile_yaml: str) -> float:
+    """Of the profile in force; 1 where the recording has none, so that a fraction is the width."""
+    try:
+        return float(yaml.safe_load(profile_yaml)["robot"]["gripper"]["max_width_m"])
+    except (TypeError, KeyError, ValueError, yaml.YAMLError):
+        return 1.0

@@ -1,0 +1,352 @@
+"""A LeRobotDataset in its format v3.0: parquet, MP4 and JSON, without LeRobot.
+
+    data/chunk-000/file-000.parquet                     frames, one row group an episode
+    videos/<camera key>/chunk-000/file-000.mp4          one file an episode
+    meta/info.json stats.json tasks.parquet episodes/chunk-000/file-000.parquet
+
+Beside it ``meta/vla_zenoh.json`` says for each episode from which run it is, and holds the spec.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.errors import MissingExtraError, RecordingError
+from vla_zenoh.lab.dataset import statistics
+from vla_zenoh.lab.dataset.episodes import RecordedEpisode, fps_of
+from vla_zenoh.lab.dataset.features import (
+    ACTION,
+    PICTURE,
+    STATE,
+    action_names,
+    joints_of,
+    state_names,
+    states_of,
+)
+from vla_zenoh.lab.dataset.pictures import (
+    CODEC,
+    PIXELS,
+    EpisodeVideo,
+    chosen,
+    stamps_of,
+    write_videos,
+)
+from vla_zenoh.lab.dataset.statistics import Colours
+
+VERSION = "v3.0"
+FILES_IN_A_CHUNK = 1000
+PART = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+DATA, EPISODES = f"data/{PART}.parquet", f"meta/episodes/{PART}.parquet"
+VIDEOS, TASKS = f"videos/{{video_key}}/{PART}.mp4", "meta/tasks.parquet"
+INFO, STATS, OURS = "meta/info.json", "meta/stats.json", "meta/vla_zenoh.json"
+DATA_MB, VIDEO_MB = 100, 200
+"""Sizes at which LeRobot begins another file when it adds to a dataset."""
+COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+
+
+class Written(NamedTuple):
+    """What became of it.
+
+    Args:
+        folder: of the dataset.
+        episodes: how many.
+        frames: of all.
+        fps: frames per second.
+        cameras: whose pictures are in it.
+        tasks: every prompt.
+        successes: episodes that did their task; None: of none it is known.
+    """
+
+    folder: Path
+    episodes: int
+    frames: int
+    fps: int
+    cameras: tuple[str, ...]
+    tasks: tuple[str, ...]
+    successes: int | None
+
+
+def export(
+    folder: Path, episodes: Sequence[RecordedEpisode], cameras: Sequence[str], parts: Sequence[str]
+) -> Written:
+    """Write a dataset; `folder` is there only when it is whole.
+
+    Args:
+        folder: must not exist, or be empty.
+        episodes: in the order they get.
+        cameras: whose pictures.
+        parts: of the state, see `vla_zenoh.policy.state_vector`.
+
+    Raises:
+        RecordingError: the folder is not empty; there are no episodes; their actions do not mean
+            the same; something of them was not recorded.
+        MissingExtraError: pyarrow or PyAV is not installed.
+    """
+    if not episodes:
+        raise RecordingError("the recordings hold no episode: no chunk was carried out in them")
+    if any(episode.spec.action != episodes[0].spec.action for episode in episodes):
+        whose = ", ".join(sorted({episode.worker for episode in episodes}))
+        raise RecordingError(
+            f"the actions of the workers {whose} do not mean the same; choose one with --worker"
+        )
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise RecordingError(f"{folder} is there already; give --out a new folder")
+    part = folder.with_name(f"{folder.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        written = _Dataset(part, episodes, cameras, parts).write()
+        if folder.exists():
+            folder.rmdir()
+        part.rename(folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return written._replace(folder=folder)
+
+
+class _Dataset:
+    def __init__(
+        self,
+        root: Path,
+        episodes: Sequence[RecordedEpisode],
+        cameras: Sequence[str],
+        parts: Sequence[str],
+    ) -> None:
+        try:
+            import pyarrow
+            import pyarrow.parquet
+        except ImportError as error:
+            raise MissingExtraError("pyarrow", "dataset") from error
+        self._pa, self._pq = pyarrow, pyarrow.parquet
+        self._root, self._episodes = root, list(episodes)
+        self._cameras, self._parts = tuple(cameras), parts
+        self._spec = episodes[0].spec
+        self._fps = fps_of(self._spec.action)
+        self._states = [states_of(episode, parts) for episode in self._episodes]
+        self._state_names = state_names(parts, joints_of(episodes[0]))
+        self._tasks = list(
+            dict.fromkeys(frame.prompt for episode in self._episodes for frame in episode.frames)
+        )
+
+    def write(self) -> Written:
+        (self._root / INFO).parent.mkdir(parents=True)
+        videos = {camera: self._write_videos(camera) for camera in self._cameras}
+        rows = self._write_data()
+        self._write_tasks()
+        self._write_episodes(rows, videos)
+        self._write_json(rows, videos)
+        known = [episode.success for episode in self._episodes if episode.success is not None]
+        return Written(
+            self._root,
+            len(self._episodes),
+            sum(len(each["index"]) for each in rows),
+            self._fps,
+            self._cameras,
+            tuple(self._tasks),
+            sum(known) if known else None,
+        )
+
+    def _place(self, pattern: str, number: int, **more: str) -> Path:
+        chunk_index, file_index = divmod(number, FILES_IN_A_CHUNK)
+        path = self._root / pattern.format(chunk_index=chunk_index, file_index=file_index, **more)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def _write_videos(self, camera: str) -> list[EpisodeVideo]:
+        """One of each episode, in their order; each run is read twice."""
+        out: dict[int, EpisodeVideo] = {}
+        runs = {id(episode.run): episode.run for episode in self._episodes}
+        for run in runs.values():
+            stamps = stamps_of(run, camera)
+            mine = [at for at, episode in enumerate(self._episodes) if episode.run is run]
+            wanted = [
+                (
+                    self._place(VIDEOS, at, video_key=PICTURE + camera),
+                    chosen(self._episodes[at], camera, stamps),
+                )
+                for at in mine
+            ]
+            out.update(zip(mine, write_videos(run, camera, wanted, self._fps), strict=True))
+        sizes = {video.size for video in out.values()}
+        if len(sizes) > 1:
+            raise RecordingError(f"camera {camera!r} has pictures of {len(sizes)} sizes: {sizes}")
+        return [out[at] for at in range(len(self._episodes))]
+
+    def _write_data(self) -> list[dict[str, NDArray[Any]]]:
+        """Rows of each episode, as they were written."""
+        pa = self._pa
+        numbers = {STATE: len(self._state_names), ACTION: self._spec.action.dimension}
+        schema = pa.schema(
+            [(name, pa.list_(pa.float32(), size)) for name, size in numbers.items()]
+            + [("timestamp", pa.float32())]
+            + [(name, pa.int64()) for name in COUNTERS[1:]]
+        )
+        out, first = [], 0
+        with self._pq.ParquetWriter(self._place(DATA, 0), schema) as writer:
+            for number, (episode, states) in enumerate(
+                zip(self._episodes, self._states, strict=True)
+            ):
+                count = len(episode.frames)
+                tasks = [self._tasks.index(frame.prompt) for frame in episode.frames]
+                rows: dict[str, NDArray[Any]] = {
+                    STATE: states,
+                    ACTION: np.array([frame.action for frame in episode.frames], np.float32),
+                    "timestamp": (np.arange(count) / self._fps).astype(np.float32),
+                    "frame_index": np.arange(count),
+                    "episode_index": np.full(count, number),
+                    "index": np.arange(first, first + count),
+                    "task_index": np.array(tasks),
+                }
+                columns = [
+                    pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
+                    if values.ndim == 2
+                    else pa.array(values, schema.field(name).type)
+                    for name, values in rows.items()
+                ]
+                table = pa.Table.from_arrays(columns, names=list(rows)).cast(schema)
+                writer.write_table(table)  # a row group of its own
+                out.append(rows)
+                first += count
+        return out
+
+    def _write_tasks(self) -> None:
+        pa = self._pa
+        table = pa.table({"task_index": range(len(self._tasks)), "task": self._tasks})
+        # LeRobot reads it with pandas and takes the words from the index.
+        kinds = (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+        columns = [
+            {
+                "name": name,
+                "field_name": name,
+                "pandas_type": kind,
+                "numpy_type": dtype,
+                "metadata": None,
+            }
+            for name, kind, dtype in kinds
+        ]
+        pandas = {
+            "index_columns": ["task"],
+            "column_indexes": [],
+            "columns": columns,
+            "pandas_version": "2.2.0",
+        }
+        table = table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+        self._pq.write_table(table, self._root / TASKS)
+
+    def _write_episodes(
+        self, rows: list[dict[str, NDArray[Any]]], videos: dict[str, list[EpisodeVideo]]
+    ) -> None:
+        table: dict[str, list[Any]] = {}
+        for number, (episode, mine) in enumerate(zip(self._episodes, rows, strict=True)):
+            count, first = len(mine["index"]), int(mine["index"][0])
+            entry: dict[str, Any] = {
+                "episode_index": number,
+                "tasks": list(dict.fromkeys(frame.prompt for frame in episode.frames)),
+                "length": count,
+                "data/chunk_index": 0,
+                "data/file_index": 0,
+                "dataset_from_index": first,
+                "dataset_to_index": first + count,
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+                "success": episode.success,
+                "worker": episode.worker,
+                "run": episode.run.path.name,
+            }
+            found = {name: statistics.of_numbers(values) for name, values in mine.items()}
+            chunk, file = divmod(number, FILES_IN_A_CHUNK)
+            for camera, of_episodes in videos.items():
+                name = PICTURE + camera
+                entry |= {
+                    f"videos/{name}/chunk_index": chunk,
+                    f"videos/{name}/file_index": file,
+                    f"videos/{name}/from_timestamp": 0.0,
+                    f"videos/{name}/to_timestamp": count / self._fps,
+                }
+                found[name] = of_episodes[number].colours.statistics()
+            for name, values in found.items():
+                entry |= {f"stats/{name}/{what}": value for what, value in values.items()}
+            for name, value in entry.items():
+                table.setdefault(name, []).append(value)
+        success = self._pa.array(table.pop("success"), self._pa.bool_())
+        made = self._pa.table(table).append_column("success", success)
+        self._pq.write_table(made, self._place(EPISODES, 0))
+
+    def _write_json(
+        self, rows: list[dict[str, NDArray[Any]]], videos: dict[str, list[EpisodeVideo]]
+    ) -> None:
+        stats = {
+            name: statistics.of_numbers(np.concatenate([each[name] for each in rows]))
+            for name in rows[0]
+        }
+        for camera, of_episodes in videos.items():
+            colours = Colours()
+            for video in of_episodes:
+                colours.join(video.colours)
+            stats[PICTURE + camera] = colours.statistics()
+        info = {
+            "codebase_version": VERSION,
+            "robot_type": self._episodes[0].run.keys.robot,
+            "total_episodes": len(rows),
+            "total_frames": sum(len(each["index"]) for each in rows),
+            "total_tasks": len(self._tasks),
+            "chunks_size": FILES_IN_A_CHUNK,
+            "data_files_size_in_mb": DATA_MB,
+            "video_files_size_in_mb": VIDEO_MB,
+            "fps": self._fps,
+            "splits": {"train": f"0:{len(rows)}"},
+            "data_path": DATA,
+            "video_path": VIDEOS if videos else None,
+            "features": self._features(videos),
+        }
+        ours = {
+            "spec": self._spec.to_dict(),
+            "state": "+".join(self._parts),
+            "episodes": [
+                {
+                    "run": episode.run.path.name,
+                    "worker": episode.worker,
+                    "since_ns": episode.since_ns,
+                    "until_ns": episode.until_ns,
+                    "success": episode.success,
+                }
+                for episode in self._episodes
+            ],
+        }
+        for path, content in ((INFO, info), (STATS, stats), (OURS, ours)):
+            (self._root / path).write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+
+    def _features(self, videos: dict[str, list[EpisodeVideo]]) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        for camera, of_episodes in videos.items():
+            height, width = of_episodes[0].size
+            out[PICTURE + camera] = {
+                "dtype": "video",
+                "shape": [height, width, 3],
+                "names": ["height", "width", "channels"],
+                "info": {
+                    "video.height": height,
+                    "video.width": width,
+                    "video.codec": CODEC.replace("libx264", "h264"),
+                    "video.pix_fmt": PIXELS,
+                    "video.fps": self._fps,
+                    "video.channels": 3,
+                    "is_depth_map": False,
+                    "has_audio": False,
+                },
+            }
+        for name, names in (
+            (STATE, self._state_names),
+            (ACTION, action_names(self._spec.action)),
+        ):
+            out[name] = {"dtype": "float32", "shape": [len(names)], "names": names}
+        for name in COUNTERS:
+            dtype = "float32" if name == "timestamp" else "int64"
+            out[name] = {"dtype": dtype, "shape": [1], "names": None}
+        return out

@@ -1,0 +1,55 @@
+"""Whether an episode did what it was told: a person said so, or the simulator's true poses tell."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+
+from vla_zenoh.errors import RecordError
+from vla_zenoh.lab.dataset.episodes import RecordedEpisode
+from vla_zenoh.lab.recording.run import RecordedSample
+from vla_zenoh.lab.tasks.judge import SETTLED_S, Judge
+from vla_zenoh.lab.tasks.understand import understand
+from vla_zenoh.lab.trial.judged import verdict_in
+
+AFTER_NS = int(1.2 * SETTLED_S * 1e9)
+"""A brick that was just let go is looked at for so long after the end."""
+
+
+def succeeded(episode: RecordedEpisode) -> bool | None:
+    """The verdict of a person, else that of the true poses; None: nobody knows.
+
+    That is: the person called the episode void; or nobody was asked, and its prompt is no known
+    task, or changed, or no true poses are recorded.
+    """
+    said = verdict_in(episode.run.file.ended, episode.worker)
+    if said is not None:
+        return None if said == "void" else said == "success"
+    prompts = {frame.prompt for frame in episode.frames}
+    order = understand(prompts.pop()) if len(prompts) == 1 else None
+    run = episode.run
+    before = _newest(run.objects, episode.since_ns)
+    pose = _newest(run.poses, episode.since_ns)
+    if order is None or before is None or pose is None:
+        return None
+    try:
+        judge = Judge(order, before.record, pose.record.position_m)
+    except RecordError:
+        return None
+    verdict = None
+    for entry in run.objects:
+        at_ns = entry.header.stamp_wall_ns
+        if not episode.since_ns <= at_ns < episode.until_ns + AFTER_NS:
+            continue
+        width, pose = _newest(run.grippers, at_ns), _newest(run.poses, at_ns)
+        if width is None or pose is None:
+            continue
+        time_s = (at_ns - episode.since_ns) / 1e9
+        verdict = judge.see(entry.record, width.record.width_m, time_s, pose.record.position_m)
+        if verdict is not None:
+            break
+    return (verdict or judge.end()).success
+
+
+def _newest(stream: list[RecordedSample], at_ns: int) -> RecordedSample | None:
+    index = bisect_right(stream, at_ns, key=lambda entry: entry.header.stamp_wall_ns) - 1
+    return stream[index] if index >= 0 else None

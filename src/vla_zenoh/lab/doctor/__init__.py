@@ -1,0 +1,48 @@
+"""Looks at a host: what is there, what is missing, and the package or setting that helps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from vla_zenoh.lab.doctor.finding import HostFinding, Level
+from vla_zenoh.lab.doctor.libraries import libraries, msgpack_in_c, python_version
+from vla_zenoh.lab.doctor.needs import Needs, Role, needs_of
+from vla_zenoh.lab.doctor.opengl import opengl
+from vla_zenoh.lab.doctor.realtime import governor, niceness, processors, real_time_priority
+from vla_zenoh.lab.doctor.router import router
+from vla_zenoh.lab.doctor.storage import disk, left_segments, shared_memory
+from vla_zenoh.lab.doctor.terminal import terminal
+from vla_zenoh.lab.doctor.video import video_devices
+from vla_zenoh.lab.doctor.wallclock import wall_clock
+
+__all__ = ["HostFinding", "Level", "Needs", "Role", "examine", "needs_of"]
+
+ROLES: tuple[Role, ...] = ("base", "control", "sim", "ros2")
+
+
+def examine(needs: Needs, try_zenoh: Callable[[str], str]) -> Iterator[HostFinding]:
+    """All checks, one after the other, each as soon as it is done; some take seconds.
+
+    Args:
+        needs: what this host is for.
+        try_zenoh: opens a session at an endpoint and closes it; returns the reason if it cannot.
+    """
+    yield python_version()
+    results = {role: libraries(role, required=role in needs.roles) for role in ROLES}
+    yield from results.values()
+    if results["base"].level == "ok":
+        yield msgpack_in_c()
+    if results["sim"].level == "ok":
+        yield opengl()
+    yield processors()
+    yield governor()
+    yield real_time_priority()
+    yield niceness()
+    yield shared_memory()
+    yield left_segments()
+    yield disk()
+    for endpoint in needs.endpoints:
+        yield router(endpoint, is_router=needs.is_router, try_zenoh=try_zenoh)
+    yield wall_clock()
+    yield video_devices(needs.devices)
+    yield terminal()

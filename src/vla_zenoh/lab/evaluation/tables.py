@@ -1,0 +1,141 @@
+"""Figures as words, for the screen and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from vla_zenoh.lab.evaluation.numbers import spread
+from vla_zenoh.lab.evaluation.result import Evaluation
+from vla_zenoh.types import FloatArray
+
+LATENCY_COLUMNS = ("min", "mean", "p50", "p95", "max")
+SUMMARY_COLUMNS = (
+    "run",
+    "n",
+    "ok",
+    "p50 ms",
+    "p95 ms",
+    "path m",
+    "turn rad",
+    "off mm",
+    "track mm",
+    "idle s",
+    "refused",
+)
+"""Requests, share that succeeded, end-to-end latency, way of the TCP, furthest off the asked axis,
+tracking error (p95), time it stood while active, refusals."""
+NARROW = 7
+"""So many of these columns fit on a terminal of 80."""
+NONE = "-"
+
+
+def number(value: float | None, unit: str, digits: int = 3, scale: float = 1.0) -> str:
+    """`value` with its unit, a dash for None."""
+    return NONE if value is None else f"{value * scale:.{digits}f} {unit}".rstrip()
+
+
+def summary_row(run: Evaluation) -> tuple[str, ...]:
+    """One line for one run, see `SUMMARY_COLUMNS`."""
+    latency = run.latency().get("end_to_end")
+    tracking = spread(run.tracking_mm)
+    drift_m = [found.drift_m for found in run.segments if found.drift_m is not None]
+    return (
+        run.name,
+        str(run.requests),
+        NONE if run.success_rate is None else f"{run.success_rate:.0%}",
+        number(latency.p50 if latency else None, "", 1),
+        number(latency.p95 if latency else None, "", 1),
+        number(run.path_m, ""),
+        number(run.path_rad, ""),
+        number(max(drift_m, default=None), "", 1, 1e3),
+        number(tracking.p95 if tracking else None, "", 2),
+        number(run.idle_s, "", 1),
+        str(run.refusals.total()),
+    )
+
+
+def latency_rows(run: Evaluation) -> list[tuple[str, ...]]:
+    """Stage, its five figures in ms."""
+    return [
+        (stage, *(f"{getattr(found, name):.3f}" for name in LATENCY_COLUMNS))
+        for stage, found in run.latency().items()
+    ]
+
+
+def segment_rows(run: Evaluation) -> list[tuple[str, ...]]:
+    """Prompt, steps, asked, reached along it, furthest off it, gripper."""
+    rows: list[tuple[str, ...]] = []
+    for found in run.segments:
+        turning = bool(found.asked_rad)
+        asked, along = (
+            (found.asked_rad, found.along_rad) if turning else (found.asked_m, found.along_m)
+        )
+        unit, digits = ("rad", 4) if turning else ("m", 4)
+        width = found.width_m
+        rows.append(
+            (
+                found.prompt,
+                str(found.requests),
+                number(asked, unit, digits),
+                number(along, unit, digits),
+                number(found.drift_m, "mm", 2, 1e3),
+                number(found.drift_rad, "mrad", 2, 1e3),
+                NONE if width is None else f"{width[0] * 1e3:.1f} to {width[1] * 1e3:.1f} mm",
+            )
+        )
+    return rows
+
+
+SEGMENT_COLUMNS = (
+    "prompt",
+    "steps",
+    "asked",
+    "reached",
+    "off axis",
+    "rotation off axis",
+    "gripper",
+)
+
+
+def figures(run: Evaluation) -> list[tuple[str, str]]:
+    """Name and value of everything that has one, see docs/recording.md for what they mean."""
+    jerk_unit = run.jerk_unit.replace("_s3", "/s³")
+    rows = [
+        ("requests", str(run.requests)),
+        ("succeeded", NONE if run.success_rate is None else f"{run.success_rate:.1%}"),
+        ("time", number(run.seconds, "s", 1)),
+        ("path", number(run.path_m, "m", 4)),
+        ("rotation path", number(run.path_rad, "rad", 4)),
+        ("commanded path", number(run.command_path_m, "m", 4)),
+        ("commanded rotation path", number(run.command_path_rad, "rad", 4)),
+        ("tracking error, mean / p95 / max", _three(run.tracking_mm, "mm")),
+        ("rotation tracking, mean / p95 / max", _three(run.tracking_mrad, "mrad")),
+        ("commanded jerk, mean / p95 / max", _three(run.jerk, jerk_unit, 1)),
+        ("idle while active", _share(run.idle_s, run.active_s)),
+        ("chunk seams", str(len(run.seam_goal_mm)) if len(run.seam_goal_mm) else NONE),
+        ("goal at seams moves, mean / p95 / max", _three(run.seam_goal_mm, "mm")),
+        ("velocity step at seams", _three(run.seam_velocity_mm_s, "mm/s")),
+        ("gripper orders", NONE if run.gripper_orders is None else str(run.gripper_orders)),
+        ("refused", _counts(run.refusals.most_common())),
+        ("skipped", _counts(run.skipped.most_common())),
+    ]
+    return [(name, value) for name, value in rows if value != NONE]
+
+
+def _three(values: FloatArray, unit: str, digits: int = 3) -> str:
+    found = spread(values)
+    if found is None:
+        return NONE
+    return " / ".join(f"{value:.{digits}f}" for value in (found.mean, found.p95, found.max)) + (
+        f" {unit}"
+    )
+
+
+def _share(part: float | None, whole: float | None) -> str:
+    if part is None or not whole:
+        return NONE
+    return f"{part:.1f} of {whole:.1f} s"
+
+
+def _counts(counts: Sequence[tuple[str, int]]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts) or NONE

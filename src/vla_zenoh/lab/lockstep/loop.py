@@ -1,0 +1,317 @@
+"""The loop itself: who hears what when."""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
+from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
+from vla_zenoh.control.preflight import PeerSnapshot
+from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.errors import CodecError
+from vla_zenoh.guard.arm_guard import Measured, make_arm_guard
+from vla_zenoh.guard.gripper_guard import GripperGuard
+from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.lab.lockstep.records import Delays, LockstepTrace, Message, Tamper
+from vla_zenoh.lab.lockstep.worker import LockstepWorker
+from vla_zenoh.policy import Policy
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import (
+    ActionChunk,
+    Event,
+    GripperCommand,
+    GripperState,
+    Header,
+    Image,
+    JointCommand,
+    JointState,
+    PoseCommand,
+    PoseState,
+    Stamped,
+    Task,
+)
+from vla_zenoh.types.references import JointReference
+
+if TYPE_CHECKING:
+    from vla_zenoh.simulation.world import World
+
+TICK_NS = 1_000_000
+"""One step of the world."""
+START_NS = 1_700_000_000_000_000_000
+"""The virtual wall clock begins here; any time that is not zero will do."""
+SIM, CAMERA, COMMAND = "sim", "camera", "command"
+
+
+class Lockstep:
+    """See the package. Settings are put with `put`; time goes on with `run` and `run_until`.
+
+    Args:
+        profile: limits, timing, cameras.
+        world: the simulated robot.
+        policy: the model; its ``load`` is called here if it has one.
+        delays: see `Delays`.
+        picture: what a camera sees, by name; None: small gray pictures.
+        reach: see `Commander`.
+        dry_run: likewise.
+        seed: of the jitter.
+        others: more workers, by name; they run in the shadow until one is chosen.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        world: World,
+        policy: Policy,
+        *,
+        delays: Delays | None = None,
+        picture: Callable[[str], Image] | None = None,
+        reach: ReachabilityFilter | None = None,
+        dry_run: bool = False,
+        seed: int = 0,
+        others: Mapping[str, Policy] | None = None,
+    ) -> None:
+        self.profile, self.world = profile, world
+        self.delays = delays or Delays()
+        self.now_ns = START_NS
+        self.commander = Commander(profile, reach=reach, dry_run=dry_run)
+        self.guard = make_arm_guard(profile, self._measure, world.joint_range_rad, TICK_NS / 1e9)
+        self.tamper: Tamper | None = None
+        self.trace = LockstepTrace()
+        self.events: list[Event] = []
+        self.refused: Counter[str] = Counter()
+        self._gripper_guard = GripperGuard(profile.robot.gripper)
+        self.guard_refused: Counter[str] = Counter()
+        policies = {profile.task.worker: policy, **(others or {})}
+        self.workers = {
+            name: LockstepWorker(profile, name, each, self.delays, random.Random(seed + index))
+            for index, (name, each) in enumerate(policies.items())
+        }
+        self.alive = {SIM, CAMERA, COMMAND, *(w.source for w in self.workers.values())}
+        self.camera_faults: dict[str, str] = {}
+        self._clock_ns: Counter[str] = Counter()
+        self._picture = picture or _gray
+        self._arrivals: list[tuple[int, int, Callable[[], None]]] = []
+        self._sent = 0
+        self._seq: Counter[str] = Counter()
+        self._inbox = Inputs([], [])
+        self._next_command_ns = self._next_state_ns = self._next_picture_ns = START_NS
+        self._publish_states()
+
+    # -- from outside -------------------------------------------------------------------------
+    def put(self, name: str, value: str | bool | float | None = None) -> None:
+        """Put a setting; it counts from the next tick of the commander on."""
+        self._inbox.settings = [*self._inbox.settings, Setting(name, value)]
+
+    def run(self, duration_s: float) -> None:
+        """Let `duration_s` pass."""
+        end_ns = self.now_ns + round(duration_s * 1e9)
+        while self.now_ns < end_ns:
+            self._tick()
+
+    def run_until(self, condition: Callable[[], bool], limit_s: float) -> bool:
+        """Let time pass until `condition` holds, at most `limit_s`; says whether it does."""
+        end_ns = self.now_ns + round(limit_s * 1e9)
+        while not condition() and self.now_ns < end_ns:
+            self._tick()
+        return condition()
+
+    def set_clock(self, node: str, offset_s: float) -> None:
+        """Set the wall clock of `node` (its stamps are its source) to this much past the others'.
+
+        The command node answers a step of its own clock as `vla_zenoh.nodes.command.node` does.
+        """
+        offset_ns = round(offset_s * 1e9)
+        step_s = (offset_ns - self._clock_ns[node]) / 1e9
+        self._clock_ns[node] = offset_ns
+        if node == COMMAND and abs(step_s) > self.profile.timing.max_clock_step_s:
+            self.put("lose", f"the wall clock was set by {step_s:+.3f} s")
+
+    def wall_ns(self, node: str) -> int:
+        """The wall clock of `node`."""
+        return self.now_ns + self._clock_ns[node]
+
+    # -- one millisecond ----------------------------------------------------------------------
+    def _tick(self) -> None:
+        self.now_ns += TICK_NS
+        if self.now_ns >= self._next_state_ns:
+            self._next_state_ns += round(1e9 / self.profile.timing.state_hz)
+            self._publish_states()
+        if self.now_ns >= self._next_picture_ns:
+            self._next_picture_ns += round(1e9 / self.delays.camera_hz)
+            self._publish_pictures()
+        self._receive()
+        for worker in self.workers.values():
+            chunk = worker.turn(self.now_ns, self.wall_ns(worker.source))
+            if chunk is not None:
+                # Published when the inference is over, and stamped with that time.
+                end_ns = chunk.inference_end_ns - self._clock_ns[worker.source]
+                self._send(worker.source, chunk, self._take_chunk, end_ns)
+        self._receive()
+        if self.now_ns >= self._next_command_ns:
+            self._next_command_ns += round(1e9 / self.profile.timing.command_hz)
+            self._command()
+        reference = self.guard.tick(self.wall_ns(SIM))
+        if isinstance(reference, JointReference):
+            self.world.tick_joint(reference)
+        else:
+            self.world.tick(reference)
+
+    def _measure(self) -> Measured:
+        state = self.world.joint_state()
+        return Measured(Pose(*self.world.tcp()), state.position_rad, state.velocity_rad_s)
+
+    def _receive(self) -> None:
+        while self._arrivals and self._arrivals[0][0] <= self.now_ns:
+            heapq.heappop(self._arrivals)[2]()
+
+    def _command(self) -> None:
+        self._inbox.around = PeerSnapshot(
+            alive=frozenset(self.alive),
+            robot_node=SIM,
+            specs={name: worker.spec for name, worker in self.workers.items()},
+            spec_sources={name: worker.source for name, worker in self.workers.items()},
+            camera_ages_s=dict.fromkeys(self.profile.cameras, 0.0),
+            camera_nodes=dict.fromkeys(self.profile.cameras, CAMERA),
+            beside=frozenset(self.alive),
+            camera_faults=dict(self.camera_faults),
+        )
+        inputs, self._inbox = self._inbox, Inputs([], [])
+        out = self.commander.step(inputs, self.wall_ns(COMMAND))
+        self._publish(out)
+        position_m, rotation = self.world.tcp()
+        self.trace.time_ns.append(self.now_ns)
+        self.trace.commands.append(out.pose)
+        self.trace.joints.append(out.joint)
+        self.trace.position_m.append(position_m)
+        self.trace.rotation.append(rotation)
+        self.trace.width_m.append(self.world.gripper_state().width_m)
+
+    def _publish(self, out: Outputs) -> None:
+        self.events += out.events
+        self.refused.update(refusal.reason for refusal in out.refusals)
+        if out.pose is not None:
+            self._send(COMMAND, out.pose, self._take_pose_command)
+        if out.joint is not None:
+            self._send(COMMAND, out.joint, self._take_joint_command)
+        if out.gripper is not None:
+            self._send(COMMAND, out.gripper, self._take_gripper_command)
+        if out.task_changed or any(worker.task is None for worker in self.workers.values()):
+            self._send(COMMAND, self.commander.task, self._take_task)
+
+    def _publish_states(self) -> None:
+        held = self.world.pose_state(self.guard.reference)
+        self._send(SIM, held, self._take_pose_state)
+        gripper = self.world.gripper_state()
+        if self.guard.braking or self.guard.unheeded:
+            gripper = replace(gripper, mode="braking" if self.guard.braking else "unheeded")
+        self._send(SIM, gripper, self._take_gripper_state)
+        wanted = {part for w in self.workers.values() for part in w.spec.observation.state}
+        if self.commander.reach is not None or "joint" in wanted:
+            self._send(SIM, self.world.joint_state(), self._take_joint_state)
+
+    def _publish_pictures(self) -> None:
+        self._seq[CAMERA] += 1
+        header = Header(self.wall_ns(CAMERA), self._seq[CAMERA], CAMERA)
+        arrival_ns = self.now_ns + round(self.delays.camera_s * 1e9)
+        seen = {c.camera for w in self.workers.values() for c in w.spec.observation.cameras}
+        for camera in sorted(seen):
+            picture = Stamped(header, self._picture(camera), arrival_ns)
+            self._deliver(arrival_ns, partial(self._take_picture, camera, picture))
+
+    # -- the wire -----------------------------------------------------------------------------
+    def _send(
+        self,
+        source: str,
+        record: Any,
+        take: Callable[[Stamped[Any]], None],
+        sent_ns: int | None = None,
+    ) -> None:
+        """Put a record on the wire; `take` gets it with the virtual time of its arrival."""
+        sent_ns = self.now_ns if sent_ns is None else sent_ns
+        self._seq[f"{source} {type(record).__name__}"] += 1
+        seq = self._seq[f"{source} {type(record).__name__}"]
+        message = Message(
+            type(record),
+            Header(sent_ns + self._clock_ns[source], seq, source),
+            records.encode(record),
+            sent_ns + round(self.delays.wire_s * 1e9),
+        )
+        for arriving in [message] if self.tamper is None else self.tamper(message):
+            self._deliver(arriving.arrival_ns, partial(self._arrive, arriving, take))
+
+    def _arrive(self, message: Message, take: Callable[[Stamped[Any]], None]) -> None:
+        try:
+            header = header_codec.decode(header_codec.encode(message.header))
+            record = records.decode(message.kind, message.payload)
+        except CodecError as error:
+            self.refused[error.reason] += 1
+            return
+        take(Stamped(header, record, message.arrival_ns))
+
+    def _at(self, node: str, arrived: Stamped[Any]) -> Stamped[Any]:
+        """As `node` dates it."""
+        return replace(arrived, received_ns=arrived.received_ns + self._clock_ns[node])
+
+    def _deliver(self, arrival_ns: int, arrive: Callable[[], None]) -> None:
+        self._sent += 1
+        heapq.heappush(self._arrivals, (arrival_ns, self._sent, arrive))
+
+    def _take_pose_state(self, state: Stamped[PoseState]) -> None:
+        self._inbox.pose = self._at(COMMAND, state)
+        self._take_state(state)
+
+    def _take_joint_state(self, state: Stamped[JointState]) -> None:
+        self._inbox.joint = self._at(COMMAND, state)
+        self._take_state(state)
+
+    def _take_gripper_state(self, state: Stamped[GripperState]) -> None:
+        self._inbox.gripper = self._at(COMMAND, state)
+        self._take_state(state)
+
+    def _take_state(self, state: Stamped[Any]) -> None:
+        for worker in self.workers.values():
+            worker.take_state(self._at(worker.source, state))
+
+    def _take_picture(self, camera: str, picture: Stamped[Image]) -> None:
+        for worker in self.workers.values():
+            worker.take_picture(camera, self._at(worker.source, picture))
+
+    def _take_task(self, task: Stamped[Task]) -> None:
+        for worker in self.workers.values():
+            worker.take_task(self._at(worker.source, task))
+
+    def _take_chunk(self, chunk: Stamped[ActionChunk]) -> None:
+        self._inbox.chunks = [*self._inbox.chunks, self._at(COMMAND, chunk)]
+
+    def _take_pose_command(self, command: Stamped[PoseCommand]) -> None:
+        refusal = self.guard.offer_pose(self._at(SIM, command), self.wall_ns(SIM))
+        if refusal is not None:
+            self.guard_refused[refusal] += 1
+
+    def _take_joint_command(self, command: Stamped[JointCommand]) -> None:
+        refusal = self.guard.offer_joint(self._at(SIM, command), self.wall_ns(SIM))
+        if refusal is not None:
+            self.guard_refused[refusal] += 1
+
+    def _take_gripper_command(self, command: Stamped[GripperCommand]) -> None:
+        try:
+            order = self._gripper_guard.take(
+                command, self.guard.writer, self.wall_ns(SIM), leads=self.guard.leads
+            )
+        except CodecError as error:
+            self.guard_refused[error.reason] += 1
+            return
+        self.world.set_gripper(order.width_m, order.speed_m_s, order.force_n)
+
+
+def _gray(camera: str) -> Image:
+    return Image(np.full((48, 64, 3), 128, np.uint8))

@@ -1,0 +1,118 @@
+"""A worker on the virtual clock."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from vla_zenoh.keys import worker_node
+from vla_zenoh.lab.lockstep.records import Delays
+from vla_zenoh.policy import Policy, check_steps, reset_of
+from vla_zenoh.policy.chunk_prefix import ChunkPrefix
+from vla_zenoh.policy.observation import History, NotYet, assemble
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import (
+    ActionChunk,
+    GripperState,
+    Image,
+    JointState,
+    PoseState,
+    Stamped,
+    Task,
+)
+
+STATE_KINDS: dict[str, type[Any]] = {
+    "joint": JointState,
+    "pose": PoseState,
+    "gripper": GripperState,
+}
+
+
+class LockstepWorker:
+    """A worker on the virtual clock: one inference at a time, at the task's rate."""
+
+    def __init__(
+        self, profile: Profile, name: str, policy: Policy, delays: Delays, jitter: random.Random
+    ) -> None:
+        self.name = name
+        self.source = worker_node(name)
+        self.policy, self.spec = policy, policy.spec
+        self._continuation = ChunkPrefix(policy)
+        self.task: Task | None = None
+        self._patience_ns = int(profile.timing.max_observation_age_s * 1e9)
+        self._delays, self._jitter = delays, jitter
+        self._images: dict[str, Stamped[Image]] = {}
+        self._states = {part: History() for part in self.spec.observation.state}
+        self._not_before_ns = self._due_ns = self._asked_ns = 0
+        load = getattr(policy, "load", None)
+        if callable(load):
+            load()
+
+    def take_task(self, task: Stamped[Task]) -> None:
+        """The task, as the command node published it."""
+        known, self.task = self.task, task.record
+        if known is not None and known.asked_hz != self.task.asked_hz:
+            self._due_ns = min(self._due_ns, self._asked_ns)
+        if known is None or known.episode != self.task.episode:
+            self._not_before_ns = task.header.stamp_wall_ns
+            reset = reset_of(self.policy)
+            if reset is not None:
+                reset()
+
+    def take_state(self, state: Stamped[Any]) -> None:
+        """A state; kept if the model asked for it."""
+        for part, history in self._states.items():
+            if isinstance(state.record, STATE_KINDS[part]):
+                history.add(state)
+
+    def take_picture(self, camera: str, picture: Stamped[Image]) -> None:
+        """The newest picture of a camera."""
+        self._images[camera] = picture
+
+    def turn(self, now_ns: int, wall_ns: int) -> ActionChunk | None:
+        """Begin an inference if it is time and there is something to see.
+
+        Args:
+            now_ns: virtual time.
+            wall_ns: this worker's wall clock, in which a chunk is dated.
+        """
+        self._asked_ns = now_ns
+        if self.task is None or now_ns < self._due_ns or wall_ns < self._not_before_ns:
+            return None
+        if self.task.asked_hz <= 0.0:
+            return None
+        observation = assemble(
+            self.spec,
+            self.task,
+            self._images,
+            self._states,
+            not_before_ns=self._not_before_ns,
+            now_ns=wall_ns,
+        )
+        if isinstance(observation, NotYet):
+            return None
+        answer = self._continuation.infer(observation)
+        steps = check_steps(self.spec.action, answer.steps)
+        share = 1.0 + self._delays.jitter * self._jitter.uniform(-1.0, 1.0)
+        duration_ns = round(self._delays.inference_s * share * 1e9)
+        # One inference at a time, and a period that was missed is not made up for.
+        period_ns = round(1e9 / self.task.asked_hz)
+        self._due_ns = max(self._due_ns + period_ns, now_ns + duration_ns)
+        self._not_before_ns = wall_ns + duration_ns
+        obeyed = self.task.active and self.task.worker == self.name
+        self._continuation.published(observation, steps, self._not_before_ns, obeyed=obeyed)
+        return ActionChunk(
+            worker=self.name,
+            spec_hash=self.spec.hash,
+            episode=observation.task.episode,
+            observation_stamp_ns=observation.stamp_wall_ns,
+            observation_seq=observation.seq,
+            valid_until_ns=observation.stamp_wall_ns
+            + int(len(steps) * self.spec.action.dt_s * 1e9)
+            + self._patience_ns,
+            steps=steps,
+            observed_ns=wall_ns,
+            inference_start_ns=wall_ns,
+            inference_end_ns=wall_ns + duration_ns,
+            done=answer.done,
+        )

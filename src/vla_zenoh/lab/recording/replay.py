@@ -1,0 +1,319 @@
+"""Puts a recorded run on keys again, with its own timing. Never onto a robot that lives."""
+
+from __future__ import annotations
+
+import queue
+import secrets
+import sys
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from vla_zenoh.bus.liveliness import alive_nodes
+from vla_zenoh.bus.node import Node
+from vla_zenoh.codec import image as image_codec
+from vla_zenoh.errors import CodecError, NodeError, RecordingError
+from vla_zenoh.lab.recording.reader import RecordedEntry, RunFile
+from vla_zenoh.lab.recording.restamp import Restamper
+from vla_zenoh.lab.recording.sample import JPEG, Sample
+from vla_zenoh.profile import Profile
+from vla_zenoh.runtime.scheduling import realtime_thread
+
+NAME = "replay"
+CAMERAS = "camera"
+GROUPS = (
+    CAMERAS,
+    "state",
+    "command",
+    "delta",
+    "spec",
+    "seen",
+    "task",
+    "prompt",
+    "active",
+    "worker",
+    "rate",
+    "speed",
+    "slower",
+    "stop",
+    "reset",
+    "status",
+    "event",
+    "sim",
+)
+"""Parts of a recording that can be chosen: what stands behind the robot in a key."""
+AHEAD = 400
+"""Samples that are made ready before their time."""
+START_AFTER_NS = 500_000_000
+"""Until the first sample: publishers are known to the router by then."""
+SLICE_S = 0.1
+SWITCH_INTERVAL_S = 5e-4
+MAX_ERRORS = 1_000_000
+# One way for all: Zenoh keeps the order within a priority, and nothing is dropped.
+QOS: dict[str, Any] = {
+    "congestion_control": zenoh.CongestionControl.BLOCK,
+    "priority": zenoh.Priority.DATA,
+    "express": True,
+}
+_BYSTANDERS = ("worker-", "camera", "recorder", "router", NAME)
+"""Names of nodes that neither are a robot nor move one."""
+
+
+@dataclass(slots=True)
+class Replayed:
+    """How a replay went.
+
+    Args:
+        samples: put, by key.
+        seconds: how long it took.
+        passes: over the file.
+        left_out: samples not put, by node that speaks for itself already.
+        late_ms: by how much puts were late: p50, p95, max.
+        interval_error_ms: by how much the time between two samples of a key differed from the
+            recorded one: p50, p95, max.
+        damage: why reading the file ended early.
+        failure: why the replay did.
+    """
+
+    samples: Counter[str] = field(default_factory=Counter)
+    seconds: float = 0.0
+    passes: int = 0
+    left_out: Counter[str] = field(default_factory=Counter)
+    late_ms: dict[str, float] = field(default_factory=dict)
+    interval_error_ms: dict[str, float] = field(default_factory=dict)
+    damage: str = ""
+    failure: str = ""
+
+
+class Replay:
+    """See the module.
+
+    Args:
+        profile: of the robot it is replayed as.
+        session: an open session, closed by whoever opened it.
+        file: what to replay.
+        groups: which of `GROUPS`.
+        speed: 2 is twice as fast.
+        loop: begin anew at the end.
+
+    Raises:
+        NodeError: a robot lives on these keys, and more than pictures is to be put; or nobody says
+            whether one does.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        session: zenoh.Session,
+        file: RunFile,
+        *,
+        groups: Collection[str] = GROUPS,
+        speed: float = 1.0,
+        loop: bool = False,
+    ) -> None:
+        self._file, self._groups = file, frozenset(groups)
+        self._speed, self._loop = speed, loop
+        self._here, self._there = file.keys, profile.keys
+        self._alive = alive_nodes(session, profile.keys)
+        self._refuse_a_live_robot()
+        self.node = Node(NAME, profile, session)
+        self.node.on_alive(self._on_alive)
+        self._publishers: dict[str, Any] = {}
+        self._raw: dict[str, Any] = {}
+        self.replayed = Replayed()
+        self._late_ns: deque[int] = deque(maxlen=MAX_ERRORS)
+        self._errors_ns: deque[int] = deque(maxlen=MAX_ERRORS)
+        self._last: dict[str, tuple[int, int]] = {}
+
+    # -- who is there -------------------------------------------------------------------------
+    def _on_alive(self, name: str, alive: bool) -> None:
+        (self._alive.add if alive else self._alive.discard)(name)
+
+    def _live_robot(self) -> list[str]:
+        return sorted(name for name in list(self._alive) if not name.startswith(_BYSTANDERS))
+
+    def _refuse_a_live_robot(self) -> None:
+        live = self._live_robot()
+        if live and self._groups != {CAMERAS}:
+            raise NodeError(
+                f"robot {self._there.robot!r} lives ({', '.join(live)}): a replay would command "
+                "it, or tell it what is not so. Replay as another one with --as NAME, or only its "
+                "pictures with --only cameras"
+            )
+
+    # -- running ------------------------------------------------------------------------------
+    def run(self, stop: threading.Event) -> Replayed:
+        """Replay until the end, or until `stop` is set."""
+        # Else this thread may wait 5 ms for the one that reads ahead.
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        began_s = time.monotonic()
+        try:
+            with realtime_thread():
+                self._all_passes(stop)
+        except NodeError as error:
+            self.replayed.failure = str(error)
+        self.replayed.seconds = time.monotonic() - began_s
+        self.replayed.damage = self._file.damage
+        self.replayed.late_ms = _summary(self._late_ns)
+        self.replayed.interval_error_ms = _summary(self._errors_ns)
+        self.node.report("stopped", now=True)
+        self.node.close()
+        return self.replayed
+
+    def _all_passes(self, stop: threading.Event) -> None:
+        while not stop.is_set():
+            if not self._one_pass(stop):
+                self.replayed.failure = self.replayed.failure or "nothing of it is to be put"
+                return
+            self.replayed.passes += 1
+            if not self._loop:
+                return
+
+    def _one_pass(self, stop: threading.Event) -> bool:
+        ready: queue.Queue[tuple[int, Sample] | None] = queue.Queue(AHEAD)
+        ending = threading.Event()
+        self._last.clear()
+        # Wall and monotonic clock are read once: a clock that is set does not tear the pass.
+        starts_ns = self.node.clock.wall_ns() + START_AFTER_NS
+        to_mono_ns = time.monotonic_ns() - self.node.clock.wall_ns()
+        reader = threading.Thread(
+            target=self._prepare, args=(ready, ending, starts_ns), name="reader", daemon=True
+        )
+        reader.start()
+        anything = False
+        try:
+            while not stop.is_set():
+                try:
+                    found = ready.get(timeout=SLICE_S)
+                except queue.Empty:
+                    continue
+                if found is None:
+                    break
+                anything = True
+                self._put(*found, to_mono_ns, stop)
+        finally:
+            ending.set()
+            reader.join()
+        return anything or stop.is_set()
+
+    # -- reading ahead ------------------------------------------------------------------------
+    def _prepare(self, ready: queue.Queue[Any], ending: threading.Event, starts_ns: int) -> None:
+        restamper: Restamper | None = None
+        suffix = secrets.token_hex(4)
+        for entry in self._chosen():
+            if restamper is None:
+                restamper = Restamper(
+                    entry.heard_ns, starts_ns, self._speed, self._here, self._there, suffix
+                )
+            sample = restamper.move(entry)
+            self._publisher(sample.key)
+            if not _hand_over(ready, (entry.heard_ns, sample), ending):
+                return
+        _hand_over(ready, None, ending)
+
+    def _chosen(self) -> Iterator[RecordedEntry]:
+        for entry in self._file.entries(lambda key: self._here.group(key) in self._groups):
+            writer = "" if entry.header is None else entry.header.source.partition("#")[0]
+            if writer in self._alive:
+                self.replayed.left_out[writer] += 1
+            else:
+                yield entry
+
+    def _publisher(self, key: str) -> Any:
+        if key not in self._publishers:
+            self._publishers[key] = self.node.session.declare_publisher(key, **QOS)
+            camera = key.split("/")[-2]
+            if self._there.group(key) == CAMERAS and key == self._there.camera_jpeg(camera):
+                raw = self._there.camera_raw(camera)
+                self._raw[key] = self.node.session.declare_publisher(raw, **QOS)
+        return self._publishers[key]
+
+    # -- writing ------------------------------------------------------------------------------
+    def _put(
+        self, recorded_ns: int, sample: Sample, to_mono_ns: int, stop: threading.Event
+    ) -> None:
+        due_ns = sample.heard_ns + to_mono_ns
+        while (left_s := (due_ns - time.monotonic_ns()) / 1e9) > 0:
+            if left_s > SLICE_S:
+                self._watch()
+                if stop.wait(SLICE_S):
+                    return
+            else:
+                time.sleep(left_s)
+        self._watch()
+        now_ns = time.monotonic_ns()
+        self._publishers[sample.key].put(
+            sample.payload, encoding=sample.encoding, attachment=sample.attached
+        )
+        raw = self._raw.get(sample.key)
+        if raw is not None and sample.encoding == JPEG and raw.matching_status.matching:
+            self._put_raw(raw, sample)
+        self.replayed.samples[sample.key] += 1
+        self._late_ns.append(now_ns - due_ns)
+        before = self._last.get(sample.key)
+        if before is not None:
+            asked_ns = (recorded_ns - before[0]) / self._speed
+            self._errors_ns.append(round(abs(now_ns - before[1] - asked_ns)))
+        self._last[sample.key] = (recorded_ns, now_ns)
+
+    def _put_raw(self, publisher: Any, sample: Sample) -> None:
+        """Pixels for a worker that takes those, made of the JPEG that the recording holds."""
+        with suppress(CodecError):  # who wants JPEG sees that it is none
+            image = image_codec.decode_jpeg(sample.payload)
+            schema = zenoh.Encoding.ZENOH_BYTES.with_schema(image_codec.raw_schema(image))
+            publisher.put(
+                image_codec.encode_raw(image), encoding=schema, attachment=sample.attached
+            )
+
+    def _watch(self) -> None:
+        """Status, and an end at once when a robot comes to life.
+
+        Raises:
+            NodeError: it does.
+        """
+        self._refuse_a_live_robot()
+        if self.node.report_due("replaying"):
+            self.node.counters["samples"] = self.replayed.samples.total()
+            detail = {"file": str(self._file.path), "pass": self.replayed.passes + 1}
+            self.node.report("replaying", detail=detail)
+
+
+def chosen_groups(names: Collection[str]) -> frozenset[str]:
+    """The groups that `names` say; none says all.
+
+    Raises:
+        RecordingError: there is no such group; names those there are.
+    """
+    plain = {"cameras": "camera", "states": "state", "commands": "command", "deltas": "delta"}
+    groups = {plain.get(name, name) for name in names}
+    unknown = sorted(groups - set(GROUPS))
+    if unknown:
+        raise RecordingError(
+            f"--only {unknown[0]}: there is no such part; there are cameras, {', '.join(GROUPS)}"
+        )
+    return frozenset(groups or GROUPS)
+
+
+def _hand_over(ready: queue.Queue[Any], item: Any, ending: threading.Event) -> bool:
+    """Put into the queue, or False when nobody takes from it any more."""
+    while not ending.is_set():
+        try:
+            ready.put(item, timeout=SLICE_S)
+            return True
+        except queue.Full:
+            continue
+    return False
+
+
+def _summary(values_ns: Collection[int]) -> dict[str, float]:
+    if not values_ns:
+        return {}
+    p50, p95, top = np.percentile(np.array(values_ns), (50, 95, 100)) / 1e6
+    return {"p50": float(p50), "p95": float(p95), "max": float(top)}

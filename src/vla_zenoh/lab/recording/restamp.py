@@ -1,0 +1,78 @@
+"""A recorded sample moved to another time, robot and writer, so that it is new to who hears it.
+
+Every stamp moves alike: that of the header, and every field of the record whose name ends in
+``_ns`` (when a chunk's observation was taken, until when it is valid, ...). At the original speed
+all move by one and the same number of nanoseconds, so every latency in them stays what it was. At
+another speed ages shrink or grow as everything else does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from vla_zenoh.keys import Keys
+from vla_zenoh.lab.recording import cdr
+from vla_zenoh.lab.recording.reader import RecordedEntry
+from vla_zenoh.lab.recording.sample import Sample
+from vla_zenoh.types import Header
+
+STAMP = "_ns"
+
+
+class Restamper:
+    """Moves samples of one pass over a file.
+
+    Args:
+        began_ns: when the recording began, wall clock of its recorder.
+        starts_ns: when the pass begins, wall clock here.
+        speed: 2 is twice as fast.
+        here: the recorded robot's keys.
+        there: of the robot it is replayed as.
+        suffix: a word that differs from pass to pass: what is said again is not taken for an echo.
+    """
+
+    def __init__(
+        self, began_ns: int, starts_ns: int, speed: float, here: Keys, there: Keys, suffix: str
+    ) -> None:
+        self._began_ns, self._starts_ns, self._speed = began_ns, starts_ns, speed
+        self._here, self._there, self._suffix = here, there, suffix
+
+    def moved_ns(self, stamp_ns: int) -> int:
+        """A stamp of the recording as one of the pass; 0 means none and stays."""
+        if stamp_ns == 0:
+            return 0
+        since_ns = stamp_ns - self._began_ns
+        if self._speed != 1.0:
+            since_ns = round(since_ns / self._speed)
+        return max(0, self._starts_ns + since_ns)
+
+    def move(self, entry: RecordedEntry) -> Sample:
+        """The sample to put, `heard_ns` being when it is to be put."""
+        header = entry.header
+        if header is not None:
+            node, _, _ = header.source.partition("#")
+            source = f"{node}#{self._suffix}"
+            header = Header(self.moved_ns(header.stamp_wall_ns), header.seq, source)
+        payload = entry.data
+        if entry.kind is not None:
+            payload = cdr.payload_of(entry.kind, _stamps_moved(entry.fields, self.moved_ns))
+        return Sample(
+            self._here.on(self._there, entry.key),
+            payload,
+            entry.encoding,
+            header,
+            self.moved_ns(entry.heard_ns),
+            entry.attachment,
+        )
+
+
+def _stamps_moved(fields: Mapping[str, Any], moved_ns: Callable[[int], int]) -> dict[str, Any]:
+    """Maps in maps are gone into as far as records have them: a command's cause."""
+    out = dict(fields)
+    for name, value in fields.items():
+        if name.endswith(STAMP) and type(value) is int:
+            out[name] = moved_ns(value)
+        elif name == "cause" and isinstance(value, Mapping):
+            out[name] = _stamps_moved(value, moved_ns)
+    return out

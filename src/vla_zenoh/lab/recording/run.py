@@ -1,0 +1,229 @@
+"""A recorded run as records: what evaluation, viewers and exports work on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from vla_zenoh.errors import CodecError
+from vla_zenoh.keys import Keys, last
+from vla_zenoh.lab.recording.reader import RunFile, open_recording
+from vla_zenoh.lab.recording.sample import JPEG
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.types import (
+    ActionChunk,
+    Cause,
+    Event,
+    GripperCommand,
+    GripperState,
+    Header,
+    JointCommand,
+    JointState,
+    NodeStatus,
+    ObjectPoses,
+    PoseCommand,
+    PoseState,
+    Seen,
+    Task,
+)
+
+MAX_PROBLEMS = 20
+
+
+class RecordedSample(NamedTuple):
+    """A record, its header, when it was heard (wall clock of the recorder), and on which key."""
+
+    header: Header
+    record: Any
+    heard_ns: int
+    key: str
+
+
+class RecordedImage(NamedTuple):
+    """A JPEG file, when it was heard, and when it was taken."""
+
+    heard_ns: int
+    stamp_ns: int
+    seq: int
+    jpeg: bytes
+
+
+class RecordedSetting(NamedTuple):
+    """What somebody put on a setting's key."""
+
+    heard_ns: int
+    name: str
+    text: str
+
+
+@dataclass(slots=True)
+class Run:
+    """All records of one robot in a file, oldest first; a minute is some 60 MB of memory.
+
+    Pictures stay in the file: see `pictures`.
+    """
+
+    file: RunFile
+    poses: list[RecordedSample] = field(default_factory=list)
+    joints: list[RecordedSample] = field(default_factory=list)
+    grippers: list[RecordedSample] = field(default_factory=list)
+    commands: list[RecordedSample] = field(default_factory=list)
+    joint_commands: list[RecordedSample] = field(default_factory=list)
+    gripper_commands: list[RecordedSample] = field(default_factory=list)
+    chunks: list[RecordedSample] = field(default_factory=list)
+    tasks: list[RecordedSample] = field(default_factory=list)
+    events: list[RecordedSample] = field(default_factory=list)
+    objects: list[RecordedSample] = field(default_factory=list)
+    seen: list[RecordedSample] = field(default_factory=list)
+    specs: dict[str, ModelSpec] = field(default_factory=dict)
+    """By hash."""
+    statuses: dict[str, NodeStatus] = field(default_factory=dict)
+    """The last of every node."""
+    first_statuses: dict[str, NodeStatus] = field(default_factory=dict)
+    """The first of every node."""
+    settings: list[RecordedSetting] = field(default_factory=list)
+    picture_counts: Counter[str] = field(default_factory=Counter)
+    """Pictures by camera."""
+    problems: list[str] = field(default_factory=list)
+    """What could not be read, in words."""
+    began_ns: int = 0
+    """When the first sample was heard."""
+    ended_ns: int = 0
+    """When the last one was."""
+
+    @property
+    def path(self) -> Path:
+        """Of the file."""
+        return self.file.path
+
+    @property
+    def keys(self) -> Keys:
+        """Of the robot."""
+        return self.file.keys
+
+    @property
+    def seconds(self) -> float:
+        """From the first sample to the last."""
+        return (self.ended_ns - self.began_ns) / 1e9
+
+    def prompts(self) -> list[tuple[int, str]]:
+        """(wall ns, prompt) of each prompt that was put."""
+        return [(put.heard_ns, put.text) for put in self.settings if put.name == "prompt"]
+
+    def first_commands(self) -> list[tuple[Cause, int]]:
+        """For each chunk its cause, and the stamp of the first command that carries it out."""
+        return first_commands(self.commands or self.joint_commands)
+
+
+def first_commands(commands: Sequence[RecordedSample]) -> list[tuple[Cause, int]]:
+    """For each chunk its cause, and the stamp of the first of `commands` that carries it out.
+
+    The stamp, because whoever records may hear late what a robot heard in time.
+    """
+    out: list[tuple[Cause, int]] = []
+    newest: tuple[str, int] | None = None
+    for entry in commands:
+        cause = entry.record.cause
+        if cause is not None and (cause.worker, cause.chunk_seq) != newest:
+            newest = (cause.worker, cause.chunk_seq)
+            out.append((cause, entry.header.stamp_wall_ns))
+    return out
+
+
+def load_run(path: Path) -> Run:
+    """Read a file of ``vla-zenoh record``; what cannot be read is in `Run.problems`.
+
+    Raises:
+        RecordingError: it cannot be opened at all, or is of another program.
+        MissingExtraError: rosbags is not installed.
+    """
+    file = open_recording(path)
+    run, keys, refused = Run(file), file.keys, Counter[str]()
+    lists = {
+        PoseState: run.poses,
+        JointState: run.joints,
+        GripperState: run.grippers,
+        PoseCommand: run.commands,
+        JointCommand: run.joint_commands,
+        GripperCommand: run.gripper_commands,
+        ActionChunk: run.chunks,
+        Task: run.tasks,
+        Event: run.events,
+        ObjectPoses: run.objects,
+        Seen: run.seen,
+    }
+    for entry in file.entries(_of_interest(keys)):
+        run.began_ns = run.began_ns or entry.heard_ns
+        run.ended_ns = max(run.ended_ns, entry.heard_ns)
+        if entry.kind is None:
+            if entry.header is None and entry.attachment is None:
+                run.settings.append(
+                    RecordedSetting(entry.heard_ns, keys.short(entry.key), entry.text)
+                )
+            elif entry.encoding == JPEG:
+                run.picture_counts[_camera(keys, entry.key)] += 1
+            else:
+                refused[f"{keys.short(entry.key)}: bytes that are no record"] += 1
+            continue
+        try:
+            record = entry.record()
+        except CodecError as error:
+            refused[f"{keys.short(entry.key)}: {error.reason} records"] += 1
+            continue
+        if entry.header is None:
+            continue
+        _keep(run, lists, RecordedSample(entry.header, record, entry.heard_ns, entry.key))
+    if file.damage:
+        run.problems.append(f"{path.name} is {file.damage}; evaluated up to there")
+    run.problems += [f"{what} ({count})" for what, count in refused.most_common(MAX_PROBLEMS)]
+    return run
+
+
+def _of_interest(keys: Keys) -> Callable[[str], bool]:
+    """Everything of the robot but raw pictures, and those that models saw."""
+
+    def wanted(key: str) -> bool:
+        group = keys.group(key)
+        if group == "camera":
+            return key == keys.camera_jpeg(_camera(keys, key))
+        if group == "seen":
+            return key == keys.seen_record(last(key))
+        return bool(group)
+
+    return wanted
+
+
+def _camera(keys: Keys, key: str) -> str:
+    return keys.short(key).split("/")[1]
+
+
+def _keep(run: Run, lists: dict[type, list[RecordedSample]], heard: RecordedSample) -> None:
+    kept = lists.get(type(heard.record))
+    if kept is not None:
+        kept.append(heard)
+    elif isinstance(heard.record, ModelSpec):
+        run.specs[heard.record.hash] = heard.record
+    elif isinstance(heard.record, NodeStatus):
+        node = last(heard.key)
+        run.first_statuses.setdefault(node, heard.record)
+        run.statuses[node] = heard.record
+
+
+def pictures(file: RunFile, camera: str) -> Iterator[RecordedImage]:
+    """Every JPEG of a camera, oldest first, one in memory at a time."""
+    return _jpegs(file, file.keys.camera_jpeg(camera))
+
+
+def seen_pictures(file: RunFile, worker: str, camera: str) -> Iterator[RecordedImage]:
+    """What a model was given of a camera; `seq` is its chunk's, the stamp the observation's."""
+    return _jpegs(file, file.keys.seen(worker, camera))
+
+
+def _jpegs(file: RunFile, key: str) -> Iterator[RecordedImage]:
+    for entry in file.entries(lambda each: each == key):
+        if entry.header is not None and entry.encoding == JPEG:
+            stamp_ns, seq = entry.header.stamp_wall_ns, entry.header.seq
+            yield RecordedImage(entry.heard_ns, stamp_ns, seq, entry.data)

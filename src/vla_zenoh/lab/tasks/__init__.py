@@ -1,0 +1,35 @@
+"""Tasks for the scene ``bricks``: what is asked, in which words, and whether it was done. Pure.
+
+Reset the scene with a seed, draw a `TaskEpisode` for it from the objects' true poses, put its
+prompt, and let a `Judge` look on::
+
+    episode = draw_episode(seed, objects)
+    judge = Judge(episode.order, objects)
+    while (verdict := judge.see(objects, width_m, time_s)) is None and time_s < LIMIT_S:
+        ...
+    verdict = verdict or judge.end()
+"""
+
+from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode, draw_stay
+from vla_zenoh.lab.tasks.judge import FAILURES, LIMIT_S, Judge, Verdict
+from vla_zenoh.lab.tasks.order import COLOURS, DIRECTIONS, FAMILIES, Order, brick
+from vla_zenoh.lab.tasks.words import HELD_OUT, NONSENSE, TRAINING, say
+
+__all__ = [
+    "COLOURS",
+    "DIRECTIONS",
+    "FAILURES",
+    "FAMILIES",
+    "HELD_OUT",
+    "LIMIT_S",
+    "NONSENSE",
+    "TRAINING",
+    "Judge",
+    "Order",
+    "TaskEpisode",
+    "Verdict",
+    "brick",
+    "draw_episode",
+    "draw_stay",
+    "say",
+]

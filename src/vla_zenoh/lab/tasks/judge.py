@@ -1,0 +1,198 @@
+"""Whether a task was done, and if not, what went wrong: from true poses, not from pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vla_zenoh.errors import RecordError
+from vla_zenoh.lab.tasks.order import BOX, COLOURS, DIRECTIONS, PUSH, PUT, STACK, STAY, Order, brick
+from vla_zenoh.types import FloatArray, ObjectPoses
+
+LIMIT_S = 30.0
+"""Time for one task; a policy that does its task at all needs about a third of it."""
+SETTLED_S = 0.5
+"""So long everything has to be as it should."""
+
+IN_BOX_M, IN_BOX_HEIGHT_M = 0.067, 0.05
+"""A brick in the box: its centre so near to the box's, along either axis, and so low."""
+BRICK_HEIGHT_M = 0.0192
+ON_TOP_M, ON_TOP_HEIGHT_M = 0.0159, 0.004
+"""A brick on another: centres apart by less than half a brick, one brick higher up to this."""
+PUSHED_M = 0.05
+"""A brick that was pushed: moved so far along the direction, and less than half of it beside."""
+RELEASED_M = 0.045
+"""The gripper has let go of a brick (of 0.032 m) when it is opened this wide."""
+LIFTED_M = 0.03
+MOVED_M = 0.02
+DISTURBED_M = 0.04
+"""A brick that was not meant may be brushed, but not moved as far as this."""
+SHUT_M = 0.02
+TABLE_EDGE_Z_M = -0.01
+STAYED_M = 0.01
+
+WRONG_BRICK, FELL, DROPPED, MISSED_GRASP = "wrong_brick", "fell", "dropped", "missed_grasp"
+KNOCKED, OFF_COURSE, NOT_MOVED, TIMEOUT, MOVED = (
+    "knocked",
+    "off_course",
+    "not_moved",
+    "timeout",
+    "moved",
+)
+FAILURES = {
+    WRONG_BRICK: "a brick that was not meant was lifted, moved or put in the box",
+    FELL: "a brick fell off the table",
+    DROPPED: "the brick was lifted, and lies somewhere else than it should",
+    MISSED_GRASP: "the gripper shut on nothing and the brick was never lifted",
+    KNOCKED: "the brick was moved, but never lifted",
+    OFF_COURSE: "the brick was pushed, but not far enough or in another direction",
+    NOT_MOVED: "no brick was moved",
+    TIMEOUT: "time was over while the brick was held, or before it was let go",
+    MOVED: "the arm was to stay, and it or a brick moved",
+}
+"""Kinds of failure and what they mean."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How an episode ended.
+
+    Args:
+        success: the order was carried out.
+        failure: one of `FAILURES`; empty after a success.
+        time_s: when it was decided, on the caller's clock.
+    """
+
+    success: bool
+    failure: str
+    time_s: float
+
+
+class Judge:
+    """Looks on while an order is carried out.
+
+    Args:
+        order: what is to be done.
+        before: all objects at the beginning.
+        tcp_m: (3,) where the TCP is at the beginning; only ``stay`` looks at it.
+
+    Raises:
+        RecordError: an object the order speaks of is not there.
+    """
+
+    def __init__(self, order: Order, before: ObjectPoses, tcp_m: FloatArray | None = None) -> None:
+        self.order = order
+        self._before = _places(before)
+        wanted = [brick(c) for c in COLOURS] + [BOX]
+        missing = [name for name in wanted if name not in self._before]
+        if missing:
+            raise RecordError(
+                f"there is no {', '.join(missing)} among the objects {', '.join(before.names)}; "
+                "tasks are done in the scene 'bricks'"
+            )
+        self._tcp_m = None if tcp_m is None else np.array(tcp_m, float)
+        self._now = self._before
+        self._time_s = 0.0
+        self._good_since_s: float | None = None
+        self._lifted: set[str] = set()
+        self._was_shut = self._tcp_moved = False
+        self._width_m = 1.0
+
+    def see(
+        self,
+        objects: ObjectPoses,
+        width_m: float,
+        time_s: float,
+        tcp_m: FloatArray | None = None,
+    ) -> Verdict | None:
+        """Take in how it stands now; call it several times a second.
+
+        Args:
+            objects: true poses.
+            width_m: opening of the gripper.
+            time_s: never less than the last time.
+            tcp_m: (3,) measured TCP; only ``stay`` looks at it.
+
+        Returns:
+            The verdict as soon as it is certain, else None.
+        """
+        self._now, self._time_s, self._width_m = _places(objects), time_s, width_m
+        self._was_shut |= width_m < SHUT_M
+        if self._tcp_m is not None and tcp_m is not None:
+            self._tcp_moved |= bool(np.linalg.norm(tcp_m - self._tcp_m) > STAYED_M)
+        for colour in COLOURS:
+            name = brick(colour)
+            if self._now[name][2] - self._before[name][2] > LIFTED_M:
+                self._lifted.add(colour)
+        if any(self._now[brick(colour)][2] < TABLE_EDGE_Z_M for colour in COLOURS):
+            return Verdict(False, FELL, time_s)
+        if self._wrong_brick():
+            return Verdict(False, WRONG_BRICK, time_s)
+        if self.order.family == STAY:
+            return None
+        if not self._done():
+            self._good_since_s = None
+        elif self._good_since_s is None:
+            self._good_since_s = time_s
+        elif time_s - self._good_since_s >= SETTLED_S:
+            return Verdict(True, "", time_s)
+        return None
+
+    def end(self) -> Verdict:
+        """The verdict now that time is over."""
+        failure = self._failure()
+        return Verdict(not failure, failure, self._time_s)
+
+    def _failure(self) -> str:
+        order = self.order
+        if order.family == STAY:
+            moved = self._tcp_moved or any(self._way_m(colour) > STAYED_M for colour in COLOURS)
+            return MOVED if moved else ""
+        way_m = self._way_m(order.target)
+        if order.family == PUSH:
+            return OFF_COURSE if way_m > STAYED_M else NOT_MOVED
+        height_m = self._now[brick(order.target)][2] - self._before[brick(order.target)][2]
+        if self._width_m < RELEASED_M and height_m > STAYED_M:
+            return TIMEOUT
+        if order.target in self._lifted:
+            return TIMEOUT if self._done() else DROPPED
+        if self._was_shut:
+            return MISSED_GRASP
+        return KNOCKED if way_m > MOVED_M else NOT_MOVED
+
+    def _wrong_brick(self) -> bool:
+        if self.order.family == STAY:
+            return False
+        for colour in COLOURS:
+            if colour == self.order.target:
+                continue
+            if colour in self._lifted or self._way_m(colour) > DISTURBED_M:
+                return True
+        return False
+
+    def _way_m(self, colour: str) -> float:
+        """How far a brick is from where it was, over the table."""
+        name = brick(colour)
+        return float(np.hypot(*(self._now[name] - self._before[name])[:2]))
+
+    def _done(self) -> bool:
+        order, place = self.order, self._now[brick(self.order.target)]
+        if order.family == PUSH:
+            way = (place - self._before[brick(order.target)])[:2]
+            along = float(way @ np.array(DIRECTIONS[order.direction]))
+            beside = float(np.hypot(*(way - along * np.array(DIRECTIONS[order.direction]))))
+            return along > PUSHED_M and beside < along / 2
+        if self._width_m < RELEASED_M:
+            return False
+        if order.family == PUT:
+            apart = np.abs(place - self._now[BOX])
+            return bool(apart[:2].max() < IN_BOX_M and place[2] < IN_BOX_HEIGHT_M)
+        assert order.family == STACK
+        apart = place - self._now[brick(order.onto)]
+        near = float(np.hypot(apart[0], apart[1])) < ON_TOP_M
+        return near and abs(apart[2] - BRICK_HEIGHT_M) < ON_TOP_HEIGHT_M
+
+
+def _places(objects: ObjectPoses) -> dict[str, FloatArray]:
+    return dict(zip(objects.names, objects.position_m, strict=True))

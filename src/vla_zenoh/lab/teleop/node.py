@@ -1,0 +1,142 @@
+"""Teleoperation: a `WorkerNode` whose policy is a person at this terminal."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+
+import zenoh
+
+from vla_zenoh.bus.client import Client
+from vla_zenoh.lab.teleop.keyboard import GIVE, LEGEND, QUIT, STOP, SWITCH, Keyboard
+from vla_zenoh.lab.teleop.keystrokes import KeystrokeParser
+from vla_zenoh.lab.teleop.operator_input import OperatorInput, joined
+from vla_zenoh.lab.teleop.policy import TeleopPolicy
+from vla_zenoh.lab.teleop.sticks import Stick
+from vla_zenoh.lab.teleop.terminal import Terminal
+from vla_zenoh.nodes.worker.node import WorkerNode
+from vla_zenoh.policy import Frame
+from vla_zenoh.profile import Profile
+from vla_zenoh.sanitize import one_line
+
+SHOW_PERIOD_S = 0.2
+
+
+class Teleop:
+    """See the module.
+
+    Args:
+        profile: the effective profile.
+        session: the worker's; its node has the rights of a worker.
+        people: a session that may put settings; None: the keys for them do nothing.
+        name: of the worker.
+        stick: a device beside the keyboard.
+        frame: axes of a step.
+        level: chosen speed at first.
+
+    Raises:
+        NodeError: there is no terminal, or a worker of this name is alive.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        session: zenoh.Session,
+        people: zenoh.Session | None,
+        name: str = "teleop",
+        *,
+        stick: Stick | None = None,
+        frame: Frame = "base",
+        level: int = 2,
+    ) -> None:
+        self._typed, self._keyboard = KeystrokeParser(), Keyboard(level)
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._stick, self._name = stick, name
+        self._terminal = Terminal(self._read, self._hung_up)
+        self.policy = TeleopPolicy(
+            profile, name, self._wish, lambda: self._keyboard.level, frame=frame
+        )
+        self.worker = WorkerNode(profile, session, self.policy, name)
+        self._client = Client(profile, people).follow() if people is not None else None
+        self._others = profile.task.worker
+        self._news: deque[str] = deque(maxlen=16)
+
+    def run(self, stop: threading.Event) -> None:
+        """Until `stop`, Ctrl-C, q, or the end of the terminal."""
+        self._stop = stop
+        with self._terminal as terminal:
+            for line in LEGEND.splitlines():
+                terminal.say(line)
+            shown = threading.Thread(target=self._show, args=(terminal,), name="screen")
+            shown.start()
+            try:
+                self.worker.run(stop)
+            finally:
+                stop.set()
+                shown.join()
+
+    # -- in -----------------------------------------------------------------------------------
+    def _read(self, data: bytes) -> None:
+        with self._lock:
+            strokes = self._typed.read(data)
+            orders = [self._keyboard.take(stroke, time.monotonic()) for stroke in strokes]
+        for order in orders:
+            if order is not None:
+                self._carry_out(order)
+
+    def _hung_up(self) -> None:
+        with self._lock:
+            self._keyboard.let_go()
+        self._stop.set()
+
+    def _wish(self) -> OperatorInput:
+        with self._lock:
+            typed = self._keyboard.wish(time.monotonic())
+        return typed if self._stick is None else joined(typed, self._stick.wish())
+
+    def _carry_out(self, order: str) -> None:
+        client = self._client
+        if order == QUIT:
+            self._stop.set()
+        elif client is None:
+            self._news.append("these keys need the certificate of an operator on this computer")
+        elif order == STOP:
+            client.put(client.keys.stop, "stop")
+        elif order == SWITCH:
+            active = client.task is not None and client.task.active
+            client.put(client.keys.active, "false" if active else "true")
+        elif order == GIVE:
+            obeyed = client.task.worker if client.task is not None else ""
+            if obeyed != self._name:
+                self._others = obeyed or self._others
+            client.put(client.keys.worker, self._others if obeyed == self._name else self._name)
+
+    # -- out ----------------------------------------------------------------------------------
+    def _show(self, terminal: Terminal) -> None:
+        while not self._stop.wait(SHOW_PERIOD_S):
+            for node, _, event in self._client.take_events() if self._client else ():
+                if event.level != "info" or event.kind == "transition":
+                    self._news.append(f"{node}: {event.what} {event.why}".rstrip())
+            while self._news:
+                terminal.say(one_line(self._news.popleft()))
+            terminal.show(self._line())
+
+    def _line(self) -> str:
+        speed = self.policy.speeds[self._keyboard.level]
+        task = self._client.task if self._client else None
+        status = self._client.status("command") if self._client else None
+        state = status.state if status else "no command node"
+        whose = "?" if task is None else "you" if task.worker == self._name else task.worker
+        moving = " ".join(
+            f"{name}{value:+.1f}"
+            for name, value in zip(
+                ("x", "y", "z", "rx", "ry", "rz"), self.policy.last.twist, strict=True
+            )
+            if value
+        )
+        return one_line(
+            f"{state}, obeys {whose} | {100 * speed.translation_m_s:g} cm/s, "
+            f"{speed.rotation_rad_s:.2g} rad/s | {moving or 'still'}"
+        )[:118]

@@ -1,0 +1,146 @@
+"""Gamepad and SpaceMouse: their axes as wishes.
+
+Both are read where they are asked, without a thread. Forward is x, left is y, up is z, as ROS's
+REP 103 has it.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any, Protocol
+
+from vla_zenoh.errors import MissingExtraError, NodeError, PeerError
+from vla_zenoh.lab.teleop.operator_input import Hand, OperatorInput, as_twist, of_stick
+
+MAX_READS = 64
+"""A SpaceMouse says more often how it stands than it is asked: only the newest counts."""
+
+
+class Stick(Hand, Protocol):
+    """A device."""
+
+    name: str
+
+    def close(self) -> None:
+        """Give it back."""
+        ...
+
+
+class Gamepad:
+    """The first gamepad that SDL knows. Left stick: x and y; right stick: z and about z; D-pad:
+    about x and y; triggers: gripper narrower and wider; A: gripper open or close.
+
+    Raises:
+        MissingExtraError: pygame-ce is not installed.
+        NodeError: there is none.
+    """
+
+    def __init__(self) -> None:
+        # SDL wants a screen for its events; the dummy one is enough for sticks.
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+        os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        try:
+            import pygame
+            from pygame._sdl2 import controller
+        except ImportError as error:
+            raise MissingExtraError("pygame", "teleop") from error
+        self._pygame = pygame
+        pygame.display.init()
+        controller.init()
+        known = [at for at in range(controller.get_count()) if controller.is_controller(at)]
+        if not known:
+            pygame.quit()
+            raise NodeError(
+                "no gamepad is connected, or SDL does not know it; plug one in, or leave "
+                "--device out and use the keyboard"
+            )
+        self._pad: Any = controller.Controller(known[0])
+        self.name = str(self._pad.name)
+        self._toggles, self._was_down = 0, False
+
+    def wish(self) -> OperatorInput:
+        """See `Hand`."""
+        pygame, pad = self._pygame, self._pad
+        pygame.event.pump()
+        pygame.event.clear()
+        if not pad.attached():
+            raise PeerError("device_lost", f"gamepad {self.name!r} is gone; plug it in, start anew")
+
+        def axis(number: int) -> float:
+            return of_stick(pad.get_axis(number) / 32767)
+
+        def button(number: int) -> float:
+            return float(pad.get_button(number))
+
+        down = bool(pad.get_button(pygame.CONTROLLER_BUTTON_A))
+        self._toggles += down and not self._was_down
+        self._was_down = down
+        twist = (
+            -axis(pygame.CONTROLLER_AXIS_LEFTY),
+            -axis(pygame.CONTROLLER_AXIS_LEFTX),
+            -axis(pygame.CONTROLLER_AXIS_RIGHTY),
+            button(pygame.CONTROLLER_BUTTON_DPAD_RIGHT)
+            - button(pygame.CONTROLLER_BUTTON_DPAD_LEFT),
+            button(pygame.CONTROLLER_BUTTON_DPAD_UP) - button(pygame.CONTROLLER_BUTTON_DPAD_DOWN),
+            -axis(pygame.CONTROLLER_AXIS_RIGHTX),
+        )
+        wider = axis(pygame.CONTROLLER_AXIS_TRIGGERLEFT)
+        narrower = axis(pygame.CONTROLLER_AXIS_TRIGGERRIGHT)
+        return OperatorInput(as_twist(twist), wider - narrower, self._toggles)
+
+    def close(self) -> None:
+        """See `Stick`."""
+        self._pygame.quit()
+
+
+class SpaceMouse:
+    """The first 3Dconnexion SpaceMouse. First button: gripper open or close.
+
+    Raises:
+        MissingExtraError: pyspacemouse is not installed.
+        NodeError: there is none, it cannot be opened, or the library hidapi is missing.
+    """
+
+    def __init__(self) -> None:
+        try:
+            import pyspacemouse
+        except ImportError as error:
+            raise MissingExtraError("pyspacemouse", "teleop") from error
+        try:
+            self._mouse: Any = pyspacemouse.open(axis_convention=pyspacemouse.AxisConvention.ROS)
+        except Exception as error:  # of the system's HID library too, which raises what it likes
+            raise NodeError(
+                f"no SpaceMouse can be used: {error} It needs the system's hidapi "
+                "(Debian: libhidapi-hidraw0) and the right to read /dev/hidraw*; or leave --device "
+                "out and use the keyboard"
+            ) from error
+        self.name = str(self._mouse.name)
+        self._toggles, self._was_down = 0, False
+
+    def wish(self) -> OperatorInput:
+        """See `Hand`."""
+        try:
+            state = self._mouse.read()
+            for _ in range(MAX_READS):
+                before = state.t
+                state = self._mouse.read()
+                if state.t == before:
+                    break
+        except Exception as error:
+            raise PeerError("device_lost", f"{self.name} is gone: {error}") from error
+        down = bool(state.buttons and state.buttons[0])
+        self._toggles += down and not self._was_down
+        self._was_down = down
+        axes = (state.x, state.y, state.z, state.roll, state.pitch, state.yaw)
+        return OperatorInput(as_twist([of_stick(axis) for axis in axes]), 0.0, self._toggles)
+
+    def close(self) -> None:
+        """See `Stick`."""
+        self._mouse.close()
+
+
+DEVICES: dict[str, type[Gamepad] | type[SpaceMouse]] = {
+    "gamepad": Gamepad,
+    "spacemouse": SpaceMouse,
+}

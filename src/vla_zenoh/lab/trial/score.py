@@ -1,0 +1,93 @@
+"""What a trial's verdicts add up to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import median
+
+from vla_zenoh.lab.bench.statistics import wilson_95
+from vla_zenoh.lab.evaluation.paired import Paired, paired
+from vla_zenoh.lab.trial.judged import INTERVENTIONS, EpisodeVerdict
+from vla_zenoh.lab.trial.plan import TrialPlan
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerScore:
+    """Of one worker; void episodes count in `void` alone.
+
+    Args:
+        worker: its name.
+        successes: of its episodes.
+        episodes: that were judged.
+        wilson_95: interval of the success rate.
+        time_to_success_s: median; None: there was none.
+        brakes: times the command node braked by itself.
+        interventions: episodes that an emergency stop or somebody else ended.
+        void: episodes that tell nothing.
+    """
+
+    worker: str
+    successes: int
+    episodes: int
+    wilson_95: tuple[float, float]
+    time_to_success_s: float | None
+    brakes: int
+    interventions: int
+    void: int
+
+    @property
+    def rate(self) -> float | None:
+        """Share of successes; None: there was no episode."""
+        return self.successes / self.episodes if self.episodes else None
+
+
+@dataclass(frozen=True, slots=True)
+class TrialScore:
+    """Of a trial.
+
+    Args:
+        workers: in the plan's order.
+        paired: of two workers: setups that both did; None: there are not two.
+        done: episodes that were judged.
+        of: all that are to be.
+    """
+
+    workers: tuple[WorkerScore, ...]
+    paired: Paired | None
+    done: int
+    of: int
+
+
+def score(plan: TrialPlan, episodes: Sequence[EpisodeVerdict]) -> TrialScore:
+    """All that was judged so far."""
+    judged = [each for each in episodes if each.verdict != "void"]
+    workers = tuple(_of(worker, episodes) for worker in plan.workers)
+    both = _both(plan, judged) if len(plan.workers) == 2 else None
+    return TrialScore(workers, both, len(judged), plan.episodes)
+
+
+def _of(worker: str, episodes: Sequence[EpisodeVerdict]) -> WorkerScore:
+    own = [each for each in episodes if each.worker == worker]
+    judged = [each for each in own if each.verdict != "void"]
+    times_s = [each.time_s for each in judged if each.verdict == "success"]
+    return WorkerScore(
+        worker,
+        len(times_s),
+        len(judged),
+        wilson_95(len(times_s), len(judged)),
+        median(times_s) if times_s else None,
+        sum(each.brakes for each in judged),
+        sum(each.end in INTERVENTIONS for each in judged),
+        len(own) - len(judged),
+    )
+
+
+def _both(plan: TrialPlan, judged: Sequence[EpisodeVerdict]) -> Paired:
+    succeeded = {(each.setup, each.worker): each.verdict == "success" for each in judged}
+    one, other = plan.workers
+    return paired(
+        (succeeded[setup, one], succeeded[setup, other])
+        for setup in range(1, len(plan.setups) + 1)
+        if (setup, one) in succeeded and (setup, other) in succeeded
+    )

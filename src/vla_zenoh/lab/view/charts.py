@@ -1,0 +1,98 @@
+"""Figures over time: latencies, speeds, gripper, tracking, bounds, joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+
+from vla_zenoh.lab.view import paths
+from vla_zenoh.types import ActionChunk, Cause, FloatArray, NodeStatus
+
+STAGES = {
+    "end to end": (150, 158, 172),
+    "camera to worker": (94, 166, 255),
+    "inference": (236, 92, 206),
+    "worker to command": (255, 176, 58),
+}
+
+
+class Charts:
+    """Logs figures at the time the stream is set to.
+
+    Args:
+        stream: to log into.
+        joints: names of the arm's, in the profile's order.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, joints: Sequence[str]) -> None:
+        self._stream, self._joints = stream, tuple(joints)
+        self._newest: tuple[str, int] | None = None
+        for stage, colour in STAGES.items():
+            self._style(paths.below(paths.LATENCY, stage), stage, colour)
+        for origin in (paths.SPEED, paths.GRIPPER):
+            for name in (paths.COMMANDED, paths.MEASURED):
+                # An order holds until the next one.
+                held = origin == paths.GRIPPER and name == paths.COMMANDED
+                self._style(f"{origin}/{name}", name, paths.COLOURS[name], held=held)
+        self._style(f"{paths.TRACKING}/distance", "distance", STAGES["end to end"])
+        self._style(f"{paths.BOUNDS}/share", "share", paths.COLOURS[paths.COMMANDED])
+
+    def _style(
+        self, path: str, name: str, colour: tuple[int, int, int], *, held: bool = False
+    ) -> None:
+        between = "StepAfter" if held else "Linear"
+        lines = rr.SeriesLines(
+            colors=[colour], names=[name], widths=[1.5], interpolation_mode=between
+        )
+        self._stream.log(path, lines, static=True)
+
+    def _put(self, path: str, value: float) -> None:
+        self._stream.log(path, rr.Scalars([value]))
+
+    # -- latency ------------------------------------------------------------------------------
+    def command(self, stamp_ns: int, cause: Cause | None) -> None:
+        """The first command of a chunk ends its way; later ones say nothing new."""
+        if cause is None or (cause.worker, cause.chunk_seq) == self._newest:
+            return
+        self._newest = (cause.worker, cause.chunk_seq)
+        seen_ns = cause.observation_stamp_ns
+        values_ns = (
+            stamp_ns - seen_ns,
+            cause.observed_ns - seen_ns,
+            cause.inference_end_ns - cause.inference_start_ns,
+            stamp_ns - cause.inference_end_ns,
+        )
+        for stage, value_ns in zip(STAGES, values_ns, strict=True):
+            self._put(paths.below(paths.LATENCY, stage), value_ns / 1e6)
+
+    def shadow(self, chunk: ActionChunk) -> None:
+        """What the model of a worker that is not obeyed took."""
+        took_ns = chunk.inference_end_ns - chunk.inference_start_ns
+        self._put(paths.below(paths.LATENCY, f"inference of {chunk.worker}"), took_ns / 1e6)
+
+    # -- motion -------------------------------------------------------------------------------
+    def speed(self, name: str, twist: FloatArray) -> None:
+        """Speed of the TCP: `commanded` or `measured`."""
+        self._put(f"{paths.SPEED}/{name}", float(np.linalg.norm(twist[:3])) * 1e3)
+
+    def tracking(self, apart_m: float) -> None:
+        """How far the measured TCP is from the commanded one."""
+        self._put(f"{paths.TRACKING}/distance", apart_m * 1e3)
+
+    def joints(self, names: Sequence[str], position_rad: FloatArray) -> None:
+        """Measured arm joints."""
+        for name, value in zip(names, position_rad.tolist(), strict=True):
+            if name in self._joints:
+                self._put(paths.below(paths.JOINTS, name), value)
+
+    def gripper(self, name: str, width_m: float) -> None:
+        """Width between the fingers: `commanded` or `measured`."""
+        self._put(f"{paths.GRIPPER}/{name}", width_m * 1e3)
+
+    def status(self, status: NodeStatus) -> None:
+        """What the command node says of its bounds."""
+        share = status.detail.get("speed_share")
+        if isinstance(share, (int, float)):
+            self._put(f"{paths.BOUNDS}/share", share * 100.0)

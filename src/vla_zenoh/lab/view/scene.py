@@ -1,0 +1,204 @@
+"""The 3-D part: the robot, poses with their trails, chunks as ribbons, objects."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+
+from vla_zenoh.control.actions import step_pose
+from vla_zenoh.control.plan_timeline import Goal, Plan
+from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
+from vla_zenoh.lab.view import paths
+from vla_zenoh.lab.view.shapes import RobotShapes
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import ActionChunk, FloatArray, ObjectPoses
+
+TRAIL_NS = 6_000_000_000
+TRAIL_PERIOD_NS = 100_000_000
+TRAIL_STEP_M = 0.0005
+HISTORY = 2000
+"""Goals that are kept: some seconds of a command stream, observations are not older."""
+STALE_NS = 2_000_000_000
+"""A ribbon that no newer chunk of its worker has replaced for so long is taken away."""
+TRAIL_RADIUS_M, RIBBON_RADIUS_M, AXIS_M = 0.0018, 0.003, 0.06
+OBJECT_RADIUS_M = 0.012
+
+
+class PoseTrail:
+    """Where a pose has been of late."""
+
+    def __init__(self, stream: rr.RecordingStream, name: str) -> None:
+        self._stream, self._name = stream, name
+        self._points: deque[tuple[int, FloatArray]] = deque()
+        self._drawn_ns, self._drawn = 0, 0
+
+    def add(self, stamp_ns: int, position_m: FloatArray) -> None:
+        """Go on to `position_m`, and draw now and then."""
+        points = self._points
+        if points and stamp_ns < points[-1][0]:  # a replay began anew
+            points.clear()
+            self._drawn_ns = 0
+        if not points or np.linalg.norm(position_m - points[-1][1]) > TRAIL_STEP_M:
+            points.append((stamp_ns, position_m))
+        while points and points[0][0] < stamp_ns - TRAIL_NS:
+            points.popleft()
+        if stamp_ns - self._drawn_ns < TRAIL_PERIOD_NS or not (points or self._drawn):
+            return
+        self._drawn_ns, self._drawn = stamp_ns, len(points)
+        line = [point for _, point in points] if len(points) > 1 else []
+        self._stream.log(
+            f"{paths.TRAILS}/{self._name}",
+            rr.LineStrips3D(
+                [line] if line else [], radii=TRAIL_RADIUS_M, colors=[paths.COLOURS[self._name]]
+            ),
+        )
+
+
+class Scene:
+    """Logs what stands in the robot's base frame, at the time the stream is set to.
+
+    Args:
+        stream: to log into.
+        profile: for the workspace.
+        shapes: of the robot; None: only poses are shown.
+    """
+
+    def __init__(
+        self, stream: rr.RecordingStream, profile: Profile, shapes: RobotShapes | None
+    ) -> None:
+        self._stream, self._shapes = stream, shapes
+        self._trails = {name: PoseTrail(stream, name) for name in paths.COLOURS}
+        self._goals: deque[tuple[int, Pose]] = deque(maxlen=HISTORY)
+        self._measured: Pose | None = None
+        self._plans: dict[str, Plan] = {}
+        self._ribbons: dict[str, int] = {}
+        self._begin(profile)
+
+    def _begin(self, profile: Profile) -> None:
+        log = self._stream.log
+        log(paths.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        space = profile.limits.workspace
+        low, high = np.array([space.x_m, space.y_m, space.z_m]).T
+        box = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[(120, 130, 150, 70)], radii=0.001)
+        log(f"{paths.WORLD}/workspace", box, static=True)
+        for mesh in self._shapes.meshes if self._shapes is not None else ():
+            log(
+                paths.below(paths.ROBOT, mesh.link),
+                rr.Mesh3D(
+                    vertex_positions=mesh.vertices_m,
+                    triangle_indices=mesh.triangles,
+                    vertex_normals=mesh.normals,
+                    albedo_factor=mesh.colour,
+                ),
+                static=True,
+            )
+
+    # -- robot and poses ----------------------------------------------------------------------
+    def joints(self, names: Sequence[str], positions: FloatArray) -> None:
+        """The robot's joints are there now."""
+        if self._shapes is not None:
+            self._shapes.move(dict(zip(names, positions.tolist(), strict=True)))
+            self.robot_moved()
+
+    def gripper(self, width_m: float) -> None:
+        """The gripper is so far open now; drawn with the next joints."""
+        if self._shapes is not None:
+            self._shapes.open(width_m)
+
+    def robot_moved(self) -> None:
+        """Draw the robot where its joints are."""
+        for link, pose in self._shapes.placements() if self._shapes is not None else ():
+            self._log_pose(paths.below(paths.ROBOT, link), pose)
+
+    def pose(self, name: str, stamp_ns: int, pose: Pose) -> None:
+        """`goal`, `commanded` or `measured` is here now."""
+        self._log_pose(f"{paths.POSES}/{name}", pose, rr.TransformAxes3D(AXIS_M))
+        self._trails[name].add(stamp_ns, pose.position_m)
+        if name == paths.MEASURED:
+            self._measured = pose
+            self._take_stale_ribbons(stamp_ns)
+
+    def goal(self, stamp_ns: int, pose: Pose) -> None:
+        """Keep a goal of the command stream: chunks stand on those of their observation."""
+        if self._goals and stamp_ns < self._goals[-1][0]:
+            self._goals.clear()
+        self._goals.append((stamp_ns, pose))
+
+    def _log_pose(self, path: str, pose: Pose, *more: rr.TransformAxes3D) -> None:
+        placed = rr.Transform3D(translation=pose.position_m, mat3x3=pose.rotation)
+        self._stream.log(path, placed, *more)
+
+    # -- chunks -------------------------------------------------------------------------------
+    def chunk(self, stamp_ns: int, chunk: ActionChunk, spec: ModelSpec, obeyed: bool) -> None:
+        """Draw what a chunk asks for: from the goal its observation saw, through its steps.
+
+        Raises:
+            RecordError: a step that this spec's meaning cannot have.
+        """
+        start = self._stands_on(chunk)
+        if start is None:
+            return
+        action, before, goals = spec.action, start, []
+        for step in chunk.steps:
+            if len(step) != action.dimension:
+                raise RecordError(
+                    f"a step has {len(step)} numbers, its spec says {action.dimension}"
+                )
+            before = step_pose(action, np.asarray(step, np.float64), before)
+            goals.append(Goal(before, 0.0))
+        dt_ns = max(int(action.dt_s * 1e9), 1)
+        self._plans[chunk.worker] = Plan(stamp_ns, chunk.observation_stamp_ns, dt_ns, goals)
+        self._ribbons[chunk.worker] = stamp_ns
+        line = np.array([start.position_m, *(goal.pose.position_m for goal in goals)])
+        colour = paths.CHUNK if obeyed else paths.SHADOW
+        path = paths.below(paths.CHUNKS, chunk.worker)
+        self._stream.log(path, rr.LineStrips3D([line], radii=RIBBON_RADIUS_M, colors=[colour]))
+        steps = rr.Points3D(line[1:], radii=1.8 * RIBBON_RADIUS_M, colors=[colour])
+        self._stream.log(f"{path}/steps", steps)
+
+    def _stands_on(self, chunk: ActionChunk) -> Pose | None:
+        """The goal that was in force when its observation was taken, else the measured pose.
+
+        The command stream says where the step under way ends; how far it had come by then the
+        worker's chunk before says.
+        """
+        seen_ns = chunk.observation_stamp_ns
+        goal = next((pose for stamp, pose in reversed(self._goals) if stamp <= seen_ns), None)
+        if goal is None:
+            return self._measured
+        plan = self._plans.get(chunk.worker)
+        if plan is None or not plan.start_ns <= seen_ns < plan.end_ns:
+            return goal
+        ends = plan.goals[plan.index_at(seen_ns)].pose.position_m
+        return Pose(
+            goal.position_m + plan.asked_until(seen_ns).pose.position_m - ends, goal.rotation
+        )
+
+    def _take_stale_ribbons(self, stamp_ns: int) -> None:
+        for worker, drawn_ns in list(self._ribbons.items()):
+            if not 0 <= stamp_ns - drawn_ns < STALE_NS:
+                del self._ribbons[worker]
+                self._stream.log(paths.below(paths.CHUNKS, worker), rr.Clear(recursive=True))
+
+    # -- objects ------------------------------------------------------------------------------
+    def objects(self, objects: ObjectPoses) -> None:
+        """The simulator's objects are there now."""
+        self._stream.log(
+            paths.OBJECTS,
+            rr.Points3D(
+                objects.position_m,
+                radii=OBJECT_RADIUS_M,
+                labels=list(objects.names),
+                colors=[(235, 90, 80)] * len(objects.names),
+            ),
+        )
+
+
+def pose_of(position_m: FloatArray, quat_xyzw: FloatArray) -> Pose:
+    """A record's pose."""
+    return Pose(position_m, rotation_from_quat(quat_xyzw))

@@ -1,0 +1,187 @@
+"""Whether a camera shows what is before it, by its own pictures: frozen, black, white, covered.
+
+A picture is sampled at about 96 x 128 points and looked at ten times a second at most, which costs
+some 0.1 ms whatever its size. What cannot be told from a true picture is not judged: blur, a loop
+of several pictures, a camera that was moved.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.profile.schema import CameraCheck
+
+ROWS, COLUMNS = 96, 128
+BLOCK = 8
+"""Samples of a block's side: in the mean of 64 the noise of a dark sensor is an eighth."""
+PERIOD_NS = 90_000_000
+REPEATS = 2
+"""A single picture that comes twice is no frozen camera, however slow it is."""
+CLOCK_SET_NS = 1_000_000_000
+"""A time stamp that is older by more is of a clock that was set: it counts anew."""
+BLACK_LEVEL, WHITE_LEVEL = 8, 247
+EVEN_LEVELS = 6
+"""Blocks whose means are within so many levels are of one even area."""
+FEW = 0.02
+"""Share of the blocks at either end that have no say in the contrast."""
+
+
+class ImageFault(NamedTuple):
+    """What is wrong with a camera.
+
+    Args:
+        check: the setting of `vla_zenoh.profile.schema.CameraCheck` that it met.
+        what: one short stable word: ``same``, ``stamps``, ``black``, ``white``, ``flat``, ``even``.
+        why: how a sentence that begins with ``camera NAME`` goes on, with value and limit.
+        value: what was found, in the unit of the setting.
+        limit: the setting.
+    """
+
+    check: str
+    what: str
+    why: str
+    value: float
+    limit: float
+
+
+class PictureCheck:
+    """Judges the pictures of one camera from `open` to `close` of its source, one after the other.
+
+    Args:
+        name: the camera's, for sentences.
+        limits: what the profile says.
+        same_s: where it leaves that open, so long a source of this kind may give the very same
+            picture; 0: for ever.
+    """
+
+    def __init__(self, name: str, limits: CameraCheck, same_s: float) -> None:
+        self._name, self._limits = name, limits
+        self._same_s = same_s if limits.same_s is None else limits.same_s
+        self.finding: ImageFault | None = None
+        self._looked_ns: int | None = None
+        self._sample: NDArray[Any] | None = None
+        self._same = self._stamps = _Run(0, 0)
+        self._stamp_ns: int | None = None
+        self._content: tuple[str, int] = ("", 0)
+
+    def look(
+        self, picture: NDArray[Any], now_ns: int, stamp_ns: int | None = None
+    ) -> ImageFault | None:
+        """Take a picture, and say what is wrong with the camera.
+
+        Args:
+            picture: (H, W) or (H, W, 1, 3 or 4), uint8 or uint16, colours in any order.
+            now_ns: of a clock that only goes forward.
+            stamp_ns: what the driver says of its time, on any clock; None where it says nothing.
+
+        Returns:
+            The first of the findings; None: nothing speaks against the camera.
+        """
+        if self._looked_ns is not None and 0 <= now_ns - self._looked_ns < PERIOD_NS:
+            return self.finding
+        self._looked_ns = now_ns
+        sample = _sampled(picture)
+        found = self._frozen_stamps(stamp_ns, now_ns)
+        found = self._same_picture(sample, now_ns) or found
+        self.finding = self._lasting(_content(sample, self._limits), now_ns) or found
+        if self.finding is not None:
+            why = f"{self.finding.why} (cameras.{self._name}.check.{self.finding.check})"
+            self.finding = self.finding._replace(why=why)
+        return self.finding
+
+    # -- what takes two pictures ---------------------------------------------------------------
+    def _same_picture(self, sample: NDArray[Any], now_ns: int) -> ImageFault | None:
+        before, self._sample = self._sample, sample
+        again = before is not None and np.array_equal(before, sample)
+        self._same = self._same.then(again, now_ns)
+        return self._same.finding("same_s", "same", "shows the same picture", now_ns, self._same_s)
+
+    def _frozen_stamps(self, stamp_ns: int | None, now_ns: int) -> ImageFault | None:
+        newest = self._stamp_ns
+        again = False
+        if stamp_ns is not None and newest is not None:
+            again = newest - CLOCK_SET_NS <= stamp_ns <= newest
+        if not again:
+            self._stamp_ns = stamp_ns
+        self._stamps = self._stamps.then(again, now_ns)
+        why = "gives pictures whose driver time stamp does not go forward"
+        return self._stamps.finding("stamp_s", "stamps", why, now_ns, self._limits.stamp_s)
+
+    # -- what one picture shows ----------------------------------------------------------------
+    def _lasting(self, found: ImageFault | None, now_ns: int) -> ImageFault | None:
+        """`found` where it has been so for a while: a hand that passes by is no covered lens."""
+        what, since_ns = self._content
+        if found is None or found.what != what:
+            since_ns = now_ns
+        self._content = ("" if found is None else found.what, since_ns)
+        return found if now_ns - since_ns >= self._limits.after_s * 1e9 else None
+
+
+class _Run(NamedTuple):
+    """Looks in a row in which nothing changed: how many, and the time of the first."""
+
+    times: int
+    since_ns: int
+
+    def then(self, again: bool, now_ns: int) -> _Run:
+        return _Run(self.times + 1, self.since_ns) if again else _Run(0, now_ns)
+
+    def finding(
+        self, check: str, what: str, why: str, now_ns: int, limit_s: float
+    ) -> ImageFault | None:
+        lasted_s = (now_ns - self.since_ns) / 1e9
+        if limit_s == 0 or self.times < REPEATS or lasted_s < limit_s:
+            return None
+        why = f"{why} since {lasted_s:.1f} s, less than {limit_s:g} s is allowed"
+        return ImageFault(check, what, why, lasted_s, limit_s)
+
+
+def _sampled(picture: NDArray[Any]) -> NDArray[Any]:
+    """(1 or 3, h, w) of about `ROWS` x `COLUMNS`, a copy: each colour by itself is quicker read."""
+    if picture.ndim == 2:
+        picture = picture[:, :, None]
+    down, across = max(1, picture.shape[0] // ROWS), max(1, picture.shape[1] // COLUMNS)
+    return np.ascontiguousarray(np.moveaxis(picture[::down, ::across, :3], 2, 0))
+
+
+def _content(sample: NDArray[Any], limits: CameraCheck) -> ImageFault | None:
+    if sample.dtype == np.uint16:
+        sample = (sample >> 8).astype(np.uint8)
+    share, most = float(np.mean(sample.max(axis=0) <= BLACK_LEVEL)), limits.clipped_share
+    if share > most:
+        why = f"is black: {share:.1%} of the picture, at most {most:.1%}"
+        return ImageFault("clipped_share", "black", why, share, most)
+    share = float(np.mean(sample.min(axis=0) >= WHITE_LEVEL))
+    if share > most:
+        why = f"is overexposed: {share:.1%} of the picture is white, at most {most:.1%}"
+        return ImageFault("clipped_share", "white", why, share, most)
+    levels = np.sort(_blocks(sample), axis=None)
+    cut = round(FEW * len(levels))
+    contrast, least = float(levels[-1 - cut] - levels[cut]), limits.contrast_levels
+    if contrast < least:
+        why = (
+            f"shows no contrast: {contrast:.1f} of 255 levels, at least {least:g} "
+            "(is the lens covered?)"
+        )
+        return ImageFault("contrast_levels", "flat", why, contrast, least)
+    ends = np.searchsorted(levels, levels + EVEN_LEVELS, side="right")
+    share, most = float(np.max(ends - np.arange(len(levels)))) / len(levels), limits.uniform_share
+    if share > most:
+        why = (
+            f"shows one even area: {share:.0%} of the picture, at most {most:.0%} "
+            "(is something before the lens?)"
+        )
+        return ImageFault("uniform_share", "even", why, share, most)
+    return None
+
+
+def _blocks(sample: NDArray[Any]) -> NDArray[np.float64]:
+    """Mean level of each block, all colours alike."""
+    grey = sample.sum(axis=0, dtype=np.uint32)
+    down, across = (max(1, min(BLOCK, length)) for length in grey.shape)
+    rows, columns = grey.shape[0] // down, grey.shape[1] // across
+    whole = grey[: rows * down, : columns * across].reshape(rows, down, columns, across)
+    return whole.sum(axis=1).sum(axis=2) / (down * across * len(sample))

@@ -1,0 +1,68 @@
+"""OpenCV's way to devices, streams and video files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+import cv2
+
+from vla_zenoh.nodes.camera.source import STALL_S, Pixels
+
+_SILENT = 0
+# OpenCV reads these when it first opens something, so they must be there before; a user's own win.
+_ENVIRONMENT = {
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",  # FFmpeg's "quiet"
+    "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT": f"{STALL_S:.0f}",
+}
+
+
+def prepare() -> None:
+    """Make OpenCV silent and impatient; call it before threads start."""
+    for name, value in _ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    if "OPENCV_LOG_LEVEL" not in os.environ:
+        cv2.utils.logging.setLogLevel(_SILENT)
+
+
+class Capture:
+    """A `cv2.VideoCapture` that can be opened again."""
+
+    def __init__(self) -> None:
+        self._capture: cv2.VideoCapture | None = None
+
+    def open(self, what: str, api: int, options: Sequence[int] = ()) -> bool:
+        """Open `what`; False when that does not work, without saying why."""
+        self.close()
+        capture = cv2.VideoCapture(what, api, list(options))
+        if not capture.isOpened():
+            capture.release()
+            return False
+        self._capture = capture
+        return True
+
+    @property
+    def backend(self) -> str:
+        """OpenCV's name of what reads it."""
+        return "" if self._capture is None else self._capture.getBackendName()
+
+    def get(self, quantity: int) -> float:
+        """A property, 0 where unknown."""
+        return 0.0 if self._capture is None else self._capture.get(quantity)
+
+    def grab(self) -> bool:
+        """Wait for the next picture."""
+        return self._capture is not None and self._capture.grab()
+
+    def retrieve(self) -> Pixels | None:
+        """Decode the grabbed picture."""
+        if self._capture is None:
+            return None
+        good, picture = self._capture.retrieve()
+        return picture if good else None
+
+    def close(self) -> None:
+        """Let go of it."""
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None

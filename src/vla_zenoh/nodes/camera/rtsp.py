@@ -1,0 +1,82 @@
+"""Network cameras, through RTSP over TCP."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+
+import cv2
+
+from vla_zenoh.errors import NodeError
+from vla_zenoh.nodes.camera.opencv import Capture
+from vla_zenoh.nodes.camera.source import STALL_S, Pixels
+
+_USER = re.compile(r"(?<=://)[^/]*@")
+_SECRET = re.compile(r"(?i)(password|passwd|pass|pwd|token)=[^&/?]*")
+OPEN_S = 10.0
+"""To log in and wait for a picture to begin with: cameras send one in several seconds."""
+INSTANT_S = 0.015
+MAX_BACKLOG = 500
+SAME_S = 5.0
+"""Compression may repeat a still scene until its next whole picture, which is seldom later."""
+_OPTIONS = (
+    *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(OPEN_S * 1000)),
+    *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(STALL_S * 1000)),
+    # Each further decoding thread keeps one more picture back.
+    *(cv2.CAP_PROP_N_THREADS, 1),
+)
+
+
+def without_password(url: str) -> str:
+    """`url` without user and password, in front or among its parameters: fit for logs."""
+    return _SECRET.sub(r"\1=***", _USER.sub("", url))
+
+
+class RtspSource:
+    """A stream that is stamped when it arrives: its own clock is not ours.
+
+    Args:
+        url: ``rtsp://[user:password@]host[:port]/path``.
+    """
+
+    same_s, stamp_ns = SAME_S, None
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self._capture = Capture()
+
+    @property
+    def backend(self) -> str:
+        return self._capture.backend
+
+    def open(self) -> None:
+        if not self._capture.open(self._url, cv2.CAP_FFMPEG, _OPTIONS):
+            raise NodeError(
+                f"{without_password(self._url)} does not answer with a picture within "
+                f"{OPEN_S:g} s; is the camera on, and are address, user and password right?"
+            )
+        self._skip_backlog()
+
+    def grab(self, stop: threading.Event) -> int | None:
+        began = time.monotonic()
+        good = self._capture.grab()
+        # After its time-out OpenCV first hands out what the decoder still had: that is old.
+        if not good or time.monotonic() - began > 0.9 * STALL_S:
+            raise NodeError(
+                f"{without_password(self._url)} has ended, or sent nothing for {STALL_S:g} s"
+            )
+        return time.monotonic_ns()
+
+    def _skip_backlog(self) -> None:
+        """Leave out what came while OpenCV looked at the stream: it is old and comes at once."""
+        for _ in range(MAX_BACKLOG):
+            began = time.monotonic()
+            if not self._capture.grab() or time.monotonic() - began > INSTANT_S:
+                return
+
+    def retrieve(self) -> Pixels | None:
+        return self._capture.retrieve()
+
+    def close(self) -> None:
+        self._capture.close()

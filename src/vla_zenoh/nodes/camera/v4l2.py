@@ -1,0 +1,117 @@
+"""Cameras of this computer, through Video4Linux."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+
+import cv2
+
+from vla_zenoh.errors import NodeError
+from vla_zenoh.nodes.camera.opencv import Capture
+from vla_zenoh.nodes.camera.source import STALL_S, Pixels
+from vla_zenoh.profile.schema import CameraProfile
+
+DEV = Path("/dev")
+MAX_UNCOMPRESSED_PX = 640 * 480
+"""USB 2 carries this many pixels 30 times a second uncompressed, and no more."""
+SANE_AGE_S = 1.0
+SAME_S = 1.0
+"""No two pictures of a sensor are alike, in every bit of thousands of pixels."""
+SYS = Path("/sys/class/video4linux")
+VIRTUAL = "/sys/devices/virtual/"
+
+
+class V4l2Source:
+    """A device such as ``/dev/video0`` or ``/dev/v4l/by-id/...``, or its number.
+
+    Args:
+        device: path or number.
+        profile: asks the device for this size and rate; it may give another.
+    """
+
+    def __init__(self, device: str, profile: CameraProfile) -> None:
+        self._path = DEV / f"video{device}" if device.isdecimal() else Path(device)
+        self._profile = profile
+        self._capture = Capture()
+        self.same_s = SAME_S
+        self.stamp_ns: int | None = None
+
+    @property
+    def backend(self) -> str:
+        return self._capture.backend
+
+    def open(self) -> None:
+        why = why_not(self._path)
+        if why:
+            raise NodeError(why)
+        self.same_s = 0.0 if is_virtual(self._path) else SAME_S
+        width, height = self._profile.width, self._profile.height
+        options = [
+            *(cv2.CAP_PROP_FRAME_WIDTH, width),
+            *(cv2.CAP_PROP_FRAME_HEIGHT, height),
+            *(cv2.CAP_PROP_FPS, max(1, round(self._profile.rate_hz))),
+        ]
+        if width * height > MAX_UNCOMPRESSED_PX:
+            options = [cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"), *options]
+        # A device that cannot be set so refuses to open with options, and may do without.
+        if not self._capture.open(str(self._path), cv2.CAP_V4L2, options) and not (
+            self._capture.open(str(self._path), cv2.CAP_V4L2)
+        ):
+            raise NodeError(
+                f"{self._path} is there but cannot be opened as a camera: does another program use "
+                f"it (fuser -v {self._path})? Where one camera has several devices, only the first "
+                "gives pictures"
+            )
+
+    def grab(self, stop: threading.Event) -> int | None:
+        if not self._capture.grab():
+            raise NodeError(f"{self._path} gave no picture for {STALL_S:g} s, or was pulled out")
+        position_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+        self.stamp_ns = round(position_ms * 1e6) if position_ms > 0 else None
+        return captured_ns(position_ms, time.monotonic_ns())
+
+    def retrieve(self) -> Pixels | None:
+        return self._capture.retrieve()
+
+    def close(self) -> None:
+        self._capture.close()
+
+
+def captured_ns(position_ms: float, now_ns: int) -> int:
+    """Time of capture, from the kernel's stamp where that is of the monotonic clock.
+
+    Args:
+        position_ms: what the driver says; some say 0, or wall time.
+        now_ns: monotonic time right after the picture was grabbed.
+    """
+    stamp_ns = round(position_ms * 1e6)
+    return stamp_ns if 0 <= now_ns - stamp_ns < SANE_AGE_S * 1e9 else now_ns
+
+
+def is_virtual(path: Path, sys: Path = SYS) -> bool:
+    """Whether `path` is a program's device, as of v4l2loopback: it may show a scene without noise.
+
+    Args:
+        path: of the device, may be a link.
+        sys: where the kernel tells what video devices are.
+    """
+    return (sys / path.resolve().name).resolve().is_relative_to(VIRTUAL)
+
+
+def why_not(path: Path) -> str:
+    """Why this user cannot open `path`, and what to do; empty when nothing speaks against it."""
+    if not path.exists():
+        there = ", ".join(map(str, sorted(DEV.glob("video[0-9]*")))) or "none"
+        return (
+            f"there is no {path}; cameras here: {there}. Plug it in, or correct its source in the "
+            f"profile; in a container: --device={path}"
+        )
+    if not os.access(path, os.R_OK | os.W_OK):
+        return (
+            f"no permission for {path}: sudo usermod --append --groups video $USER, then log in "
+            "again"
+        )
+    return ""

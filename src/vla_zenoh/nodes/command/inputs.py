@@ -1,0 +1,161 @@
+"""What the command node takes in at every tick: settings, chunks, states, and its own clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from vla_zenoh import keys as key_names
+from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample, ZenohRing
+from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.session import MAX_MESSAGE_BYTES
+from vla_zenoh.bus.writer_filter import SingleWriterFilter
+from vla_zenoh.codec import settings
+from vla_zenoh.codec.records import SMALL_BYTES
+from vla_zenoh.control.commander_io import Inputs, Setting
+from vla_zenoh.errors import CodecError
+from vla_zenoh.nodes.command.peer_monitor import PeerMonitor
+from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped
+
+STATES = 16
+"""States kept between two looks; room for the robot's own beside a stranger's."""
+CHUNKS = 64
+ANYTHING = MAX_MESSAGE_BYTES
+"""A stop is obeyed whatever it says, and never read."""
+WORDS = settings.MAX_SETTING_BYTES
+CLOCK_PERIOD_S = 0.1
+JOINT_PERIOD_S = 0.025
+"""Joints are looked at so often while nobody asks for the arm."""
+
+
+class CommandInputs:
+    """Listens to the robot, the workers and the people.
+
+    Args:
+        node: the command node; it counts and tells what is refused.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        keys = node.keys
+        self._neighbours = PeerMonitor(node)
+        self._chunks = node.listen(keys.all_deltas, CallbackRing(CHUNKS))
+        self._pose_slot = node.listen(keys.state_pose, CallbackRing(STATES, SMALL_BYTES))
+        self._gripper_slot = node.listen(keys.state_gripper, CallbackRing(STATES, SMALL_BYTES))
+        self._joint_slot = node.listen(keys.state_joint, CallbackRing(STATES, SMALL_BYTES))
+        self._settings: list[tuple[str, ZenohRing, Callable[[bytes], Any]]] = [
+            ("stop", node.listen(keys.stop, ZenohRing(8, ANYTHING)), lambda _: None),
+            ("reset", node.listen(keys.reset, ZenohRing(8, ANYTHING)), lambda _: None),
+            ("prompt", node.listen(keys.prompt, ZenohRing(16, WORDS)), settings.decode_text),
+            ("worker", node.listen(keys.worker, ZenohRing(16, WORDS)), settings.decode_name),
+            ("rate", node.listen(keys.rate, ZenohRing(16, WORDS)), settings.decode_rate),
+            ("speed", node.listen(keys.speed, ZenohRing(16, WORDS)), settings.decode_percent),
+            ("slower", node.listen(keys.slower, ZenohRing(16, WORDS)), settings.decode_percent),
+            ("active", node.listen(keys.active, ZenohRing(16, WORDS)), settings.decode_activation),
+        ]
+        self._speakers = {
+            kind: SingleWriterFilter(node.profile.timing.state_timeout_s)
+            for kind in (PoseState, JointState, GripperState)
+        }
+        self._last_clock = self._last_joint = 0.0
+
+    @property
+    def chunks_dropped(self) -> int:
+        """Chunks that came faster than they were looked at."""
+        return self._chunks.dropped
+
+    def take(self, now_ns: int) -> Inputs:
+        """What arrived since the last call.
+
+        Args:
+            now_ns: nominal time of this tick on the node's wall clock.
+        """
+        put = self._settings_put()
+        around = self._neighbours.look(now_ns)
+        chunks = [self._chunk(arrival) for arrival in self._chunks.take_all()]
+        clock = self._check_clock()
+        return Inputs(
+            settings=[*put, *clock],
+            chunks=[chunk for chunk in chunks if chunk is not None],
+            pose=self._state(PoseState, self._pose_slot),
+            joint=self._joints(put),
+            gripper=self._state(GripperState, self._gripper_slot),
+            around=around,
+        )
+
+    def _settings_put(self) -> list[Setting]:
+        """What was put since the last tick, in the order in which the router saw it.
+
+        Each setting has a mailbox of its own, so that a flood of one does not push out another.
+        Where the router does not stamp samples, each key's own order is kept then.
+        """
+        arrivals = [
+            (name, decode, arrival)
+            for name, inbox, decode in self._settings
+            for arrival in inbox.take_all()
+        ]
+        stamps = [
+            stamp.get_time() for *_, arrival in arrivals if (stamp := arrival.sample.timestamp)
+        ]
+        if len(stamps) == len(arrivals):
+            order = sorted(range(len(arrivals)), key=stamps.__getitem__)
+            arrivals = [arrivals[index] for index in order]
+        put: list[Setting] = []
+        for name, decode, arrival in arrivals:
+            if name in ("stop", "reset"):
+                put.append(Setting(name))
+                continue
+            value = self._node.read_text(decode, arrival)
+            if value is not None:
+                put.append(Setting(name, value))
+        return put
+
+    def _chunk(self, arrival: ReceivedSample) -> Stamped[ActionChunk] | None:
+        """A chunk by the worker whose key it came on, None for any other."""
+        worker = key_names.last(str(arrival.sample.key_expr))
+        owner = self._neighbours.owner(worker)
+        try:
+            source = self._node.header(arrival).source
+        except CodecError as error:
+            self._node.refuse(error.reason, f"delta/{worker}: {error}")
+            return None
+        if owner is not None and source != owner:  # before its payload is looked at: it may be many
+            self._node.refuse(
+                "foreign", f"delta/{worker} by {source[:60]!r}, the worker is {owner[:60]!r}"
+            )
+            return None
+        chunk = self._node.read(ActionChunk, arrival)
+        if chunk is not None and chunk.record.worker != worker:
+            self._node.refuse("foreign", "a chunk on another worker's delta key")
+            return None
+        return chunk
+
+    def _state(self, kind: type[Any], slot: CallbackRing) -> Stamped[Any] | None:
+        """The newest state by the writer that speaks for the robot, whoever else writes."""
+        newest: Stamped[Any] | None = None
+        for arrival in slot.take_all():
+            newest = self._node.read(kind, arrival, self._speakers[kind]) or newest
+        return newest
+
+    def _joints(self, put: list[Setting]) -> Stamped[JointState] | None:
+        """The newest joints, where it is time to look at some: decoding them costs."""
+        given = any(setting.name in ("active", "worker") for setting in put)
+        if not given and time.monotonic() - self._last_joint < JOINT_PERIOD_S:
+            return None
+        for arrival in reversed(self._joint_slot.take_all()):
+            found = self._node.read(JointState, arrival, self._speakers[JointState])
+            if found is not None:
+                self._last_joint = time.monotonic()
+                return found
+        return None
+
+    def _check_clock(self) -> list[Setting]:
+        if time.monotonic() - self._last_clock < CLOCK_PERIOD_S:
+            return []
+        self._last_clock = time.monotonic()
+        step_s = self._node.clock.follow()
+        if abs(step_s) <= self._node.profile.timing.max_clock_step_s:
+            return []
+        self._node.refuse("clock_step", f"the wall clock was set by {step_s:+.3f} s")
+        return [Setting("lose", f"the wall clock was set by {step_s:+.3f} s")]

@@ -1,0 +1,217 @@
+"""What the command node hears of the other nodes: who is alive, specs, camera ages."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from vla_zenoh import keys as key_names
+from vla_zenoh.bus.buffers import ReceivedSample, ZenohRing
+from vla_zenoh.bus.host_id import HostId
+from vla_zenoh.bus.node import Node
+from vla_zenoh.control.preflight import PeerSnapshot
+from vla_zenoh.errors import CodecError
+from vla_zenoh.keys import worker_node
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.profile.servers import camera_servers
+from vla_zenoh.types import NodeStatus
+
+MAX_WORKERS, MAX_HOLDERS = 32, 32
+MAX_WHY = 300
+CLOCKS_PERIOD_S = 0.25
+STATUSES_A_TICK, SPECS_A_TICK = 8, 4
+"""What is more was not sent by any node of ours: each says something twice a second."""
+
+
+class PeerMonitor:
+    """Collects status, specs and liveliness into a `PeerSnapshot`."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._lock = threading.Lock()
+        self._alive: set[str] = set()
+        self._holders: set[str] = set()
+        self._changed = True
+        self._specs: dict[str, ModelSpec] = {}
+        self._spec_sources: dict[str, str] = {}
+        self._voices: dict[str, str] = {}
+        self._complaints: dict[str, str] = {}
+        self._servers = camera_servers(node.profile)
+        self._cameras: dict[str, tuple[float, int]] = {}
+        self._camera_faults: dict[str, str] = {}
+        self._places: dict[str, HostId] = {}
+        self._next_clocks_s = 0.0
+        self._statuses = node.listen(node.keys.all_status, ZenohRing(STATUSES_A_TICK))
+        self._new_specs = node.listen(node.keys.all_specs, ZenohRing(SPECS_A_TICK))
+        node.on_alive(self._on_alive)
+        node.on_tokens(node.keys.all_holding, self._on_holding)
+        self._robot_node = node.profile.robot.driver
+
+    def _on_alive(self, name: str, alive: bool) -> None:
+        with self._lock:
+            (self._alive.add if alive else self._alive.discard)(name)
+            self._changed = True
+            if not alive:
+                self._voices.pop(name, None)
+                self._places.pop(name, None)
+            if not alive and name.startswith("worker-"):
+                worker = name.removeprefix("worker-")
+                self._specs.pop(worker, None)
+                self._spec_sources.pop(worker, None)
+                self._complaints.pop(worker, None)
+
+    def _on_holding(self, name: str, there: bool) -> None:
+        with self._lock:
+            self._changed = True
+            if not there:
+                self._holders.discard(name)
+            elif len(self._holders) < MAX_HOLDERS:
+                self._holders.add(name)
+            else:
+                self._node.counters["refused.holder"] += 1
+
+    def look(self, now_ns: int) -> PeerSnapshot | None:
+        """The surroundings now, or None when nothing changed."""
+        for arrival in self._statuses.take_all():
+            self._hear_status(arrival, now_ns)
+        for arrival in self._new_specs.take_all():
+            self._hear_spec(arrival)
+        self._follow_clocks()
+        with self._lock:
+            if not self._changed:
+                return None
+            self._changed = False
+            return PeerSnapshot(
+                frozenset(self._alive),
+                self._robot_node,
+                dict(self._specs),
+                dict(self._spec_sources),
+                dict(self._complaints),
+                {
+                    camera: age_s + (now_ns - heard_ns) / 1e9
+                    for camera, (age_s, heard_ns) in self._cameras.items()
+                },
+                {camera: self._servers[camera] for camera in self._cameras},
+                {name: place.host for name, place in self._places.items()},
+                frozenset(
+                    name
+                    for name, place in self._places.items()
+                    if place.shares_clock(self._node.place)
+                ),
+                self._node.clocks.known(),
+                frozenset(self._holders),
+                dict(self._camera_faults),
+            )
+
+    def _follow_clocks(self) -> None:
+        """Measure the clocks of all nodes, and look at them now and then."""
+        if time.monotonic() < self._next_clocks_s:
+            return
+        self._next_clocks_s = time.monotonic() + CLOCKS_PERIOD_S
+        with self._lock:
+            for name in self._alive:
+                self._node.clocks.follow(name)
+            self._changed = True
+
+    def owner(self, worker: str) -> str | None:
+        """The source that speaks for a worker: who published its spec."""
+        with self._lock:
+            return self._spec_sources.get(worker)
+
+    # Who speaks is looked at before what is said: a stranger's words are not decoded, and nobody
+    # is asked for the clock of a name that he made up.
+    def _hear_status(self, arrival: ReceivedSample, now_ns: int) -> None:
+        """A node's status counts on its own key, while it is alive, by the first who wrote it."""
+        name, source = self._said(arrival)
+        if source is None:
+            return
+        with self._lock:
+            ours = name in self._alive and self._voices.get(name, source) == source
+        stamped = self._node.read(NodeStatus, arrival) if ours else None
+        if ours and stamped is None:
+            return  # refused for what it is
+        status = stamped.record if stamped is not None and stamped.record.node == name else None
+        with self._lock:
+            # Who has left meanwhile does not keep the place of who comes back in his name.
+            if status is not None and name in self._alive:
+                self._voices[name] = source
+                self._take_status(status)
+            else:
+                self._node.counters["refused.foreign_status"] += 1
+                return
+        cameras = status.detail.get("cameras")
+        for camera, fields in cameras.items() if isinstance(cameras, dict) else ():
+            if camera in self._servers and isinstance(fields, dict):
+                self._take_camera(name, camera, fields, now_ns)
+
+    def _hear_spec(self, arrival: ReceivedSample) -> None:
+        """Likewise for the spec of a worker."""
+        worker, source = self._said(arrival)
+        if source is None:
+            return
+        node = worker_node(worker)
+        with self._lock:
+            known = self._spec_sources.get(worker)
+            ours = node in self._alive and known in (None, source)
+            if ours and known is None and len(self._specs) >= MAX_WORKERS:
+                self._node.counters["refused.more_workers"] += 1
+                return
+        stamped = self._node.read(ModelSpec, arrival) if ours else None
+        if ours and stamped is None:
+            return
+        with self._lock:
+            if stamped is not None and node in self._alive:
+                if self._specs.get(worker) != stamped.record:
+                    self._specs[worker] = stamped.record
+                    self._spec_sources[worker] = source
+                    self._changed = True
+                return
+        self._node.counters["refused.foreign_spec"] += 1
+
+    def _said(self, arrival: ReceivedSample) -> tuple[str, str | None]:
+        """Whom it is about, by its key, and its source where it has one."""
+        key = str(arrival.sample.key_expr)
+        try:
+            return key_names.last(key), self._node.header(arrival).source
+        except CodecError as error:
+            short = self._node.keys.short(key)
+            self._node.refuse(error.reason, f"{short}: {error}", short)
+            return key_names.last(key), None
+
+    def _take_status(self, status: NodeStatus) -> None:
+        self._places[status.node] = HostId(status.host, status.boot)
+        if status.node.startswith("worker-"):
+            complaint = status.detail.get("complaint", "")
+            worker = status.node.removeprefix("worker-")
+            if not isinstance(complaint, str):
+                return
+            known, self._changed = self._complaints, True
+            if not complaint:  # who has none takes no room
+                known.pop(worker, None)
+            elif worker in known or len(known) < MAX_WORKERS:
+                known[worker] = complaint[:MAX_WHY]
+            else:
+                self._node.counters["refused.more_workers"] += 1
+
+    def _take_camera(self, node: str, camera: str, fields: Mapping[Any, Any], now_ns: int) -> None:
+        """How a camera is, as the node says that serves it by the profile."""
+        server = self._servers[camera]
+        if node != server:
+            self._node.refuse(
+                "foreign_camera",
+                f"node {node!r} speaks for camera {camera!r}, which node {server!r} serves by the "
+                "profile (hosts.HOST.cameras; --name of `vla-zenoh camera`)",
+                node,
+            )
+            return
+        age_s, bad = fields.get("age_s"), fields.get("bad")
+        why = bad.get("why") if isinstance(bad, Mapping) else None
+        if isinstance(why, str):
+            self._camera_faults[camera], self._changed = why[:MAX_WHY], True
+        elif self._camera_faults.pop(camera, None) is not None:
+            self._changed = True
+        if isinstance(age_s, (int, float)) and not isinstance(age_s, bool):
+            self._cameras[camera] = (max(float(age_s), 0.0), now_ns)
+            self._changed = True

@@ -1,0 +1,345 @@
+"""The model contract: what a model declares, what it is given, what it returns.
+
+A model is a class with a `spec` and ``infer(observation) -> ActionSteps``; `Policy` is the whole
+contract. `ModelSpec` is published before anything moves, and its hash travels in every chunk, so
+that steps are never read with another meaning than the one agreed at activation.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
+
+from vla_zenoh.errors import SpecError
+from vla_zenoh.pydantic_errors import in_words
+from vla_zenoh.types import GripperState, JointState, PoseState, Task
+
+StatePart = Literal["joint", "pose", "gripper"]
+Resize = Literal["none", "stretch", "pad", "crop"]
+Frame = Literal["base", "tcp"]
+Rotation = Literal["rpy", "rotvec", "quaternion"]
+MotionKind = Literal["delta", "absolute"]
+GripperMeaning = Literal["none", "delta_m", "absolute_m", "open_fraction", "binary"]
+
+ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
+
+
+MAX_CAMERAS = 16
+MAX_FAULTS = 20
+
+Text = Annotated[str, Field(min_length=1, max_length=128)]
+
+
+def _differ(values: tuple[Any, ...]) -> tuple[Any, ...]:
+    if len(set(values)) != len(values):
+        raise ValueError(f"every entry may be given once: {', '.join(map(str, values))}")
+    return values
+
+
+class _Spec(BaseModel):
+    """Strict: neither ``"8"`` nor ``true`` is a number, so a slip is not read as a meaning."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+
+class CameraSpec(_Spec):
+    """One picture the model needs.
+
+    Args:
+        camera: name of the camera in the profile.
+        width: pixels the model is given; None: as they come.
+        height: likewise.
+        resize: how other sizes become this one. ``stretch`` ignores the aspect ratio, ``pad`` keeps
+            it and fills with black, ``crop`` keeps it and cuts the longer side.
+        colour: channel order the model is given.
+    """
+
+    camera: Text
+    width: int | None = Field(default=None, ge=8, le=8192)
+    height: int | None = Field(default=None, ge=8, le=8192)
+    resize: Resize = "none"
+    colour: Literal["rgb", "bgr"] = "rgb"
+
+    @model_validator(mode="after")
+    def _size_goes_with_resize(self) -> CameraSpec:
+        if (self.width is None) != (self.height is None):
+            raise ValueError("give both width and height, or neither")
+        if self.resize != "none" and self.width is None:
+            raise ValueError(f"resize {self.resize!r} needs width and height")
+        return self
+
+
+class ObservationSpec(_Spec):
+    """What the model has to see.
+
+    Args:
+        cameras: pictures, may be empty.
+        state: which parts of the robot's state.
+        prompt: the model needs a prompt that is not empty.
+        max_skew_s: the parts of one observation may lie this far apart in time.
+        max_age_s: an older observation is not given to the model.
+    """
+
+    cameras: tuple[CameraSpec, ...] = Field(default=(), max_length=MAX_CAMERAS, strict=False)
+    state: Annotated[tuple[StatePart, ...], AfterValidator(_differ)] = Field(
+        default=("pose", "gripper"), strict=False
+    )
+    prompt: bool = True
+    max_skew_s: float = Field(default=0.1, gt=0, le=10)
+    max_age_s: float = Field(default=0.5, gt=0, le=10)
+
+    @model_validator(mode="after")
+    def _one_picture_of_a_camera(self) -> ObservationSpec:
+        _differ(tuple(camera.camera for camera in self.cameras))
+        return self
+
+
+class ActionSpec(_Spec):
+    """What the numbers of a chunk mean: ``[x y z | rotation | gripper]`` in each of H steps.
+
+    Args:
+        horizon: H, steps in a chunk (at most; a shorter chunk is allowed).
+        dt_s: duration of one step.
+        kind: ``delta`` adds to the goal, ``absolute`` is the goal.
+        frame: axes of a delta: the robot's ``base`` or the ``tcp`` at that moment. An absolute pose
+            is always in the base frame.
+        rotation: ``rpy`` extrinsic x, y, z in rad; ``rotvec`` axis times angle in rad;
+            ``quaternion`` x, y, z, w.
+        position_scale_m: metres of one unit of x, y, z.
+        gripper: ``none`` no such number; ``delta_m`` added to the width; ``absolute_m`` the width;
+            ``open_fraction`` 0 shut to 1 open; ``binary`` above or below `gripper_threshold`.
+        gripper_open_is_high: polarity of ``open_fraction`` and ``binary``: True: a large value
+            means open (OpenVLA), False: it means closed.
+        gripper_threshold: where ``binary`` switches.
+        pace: ``steady``: a step lasts `dt_s`, and the arm neither stops nor rushes between steps
+            that come in time; ``soonest``: it goes to each goal as fast as its limits allow.
+        normalisation: the key of the statistics the model's output was scaled with, for people.
+    """
+
+    horizon: int = Field(ge=1, le=1000)
+    dt_s: float = Field(gt=0, le=60)
+    kind: MotionKind = "delta"
+    frame: Frame = "base"
+    rotation: Rotation = "rpy"
+    position_scale_m: float = Field(default=1.0, gt=0, le=10)
+    gripper: GripperMeaning = "absolute_m"
+    gripper_open_is_high: bool = True
+    # Adding zero makes -0.0 zero: they mean the same, and must have the same hash.
+    gripper_threshold: Annotated[float, AfterValidator(lambda value: value + 0.0)] = 0.5
+    normalisation: Text | None = None
+    pace: Literal["steady", "soonest"] = "steady"
+
+    @property
+    def dimension(self) -> int:
+        """D: numbers in one step."""
+        return 3 + ROTATION_SIZE[self.rotation] + (self.gripper != "none")
+
+    @model_validator(mode="after")
+    def _absolute_is_in_base(self) -> ActionSpec:
+        if self.kind == "absolute" and self.frame != "base":
+            raise ValueError("an absolute pose is given in the base frame; set frame: base")
+        return self
+
+
+class ModelSpec(_Spec):
+    """Everything a command node has to know of a model before it obeys it."""
+
+    name: Text
+    observation: ObservationSpec = ObservationSpec()
+    action: ActionSpec
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain types, ready for the wire."""
+        return self.model_dump(mode="json")
+
+    @property
+    def hash(self) -> str:
+        """16 hex digits that differ when any declared meaning differs."""
+        return _digest(self)  # pyright: ignore[reportArgumentType]  # frozen, so it has a hash
+
+    @staticmethod
+    def from_dict(data: Any) -> ModelSpec:
+        """Read what `to_dict` wrote.
+
+        Raises:
+            SpecError: names every wrong field.
+        """
+        try:
+            return ModelSpec.model_validate(data)
+        except ValidationError as error:
+            faults = "; ".join(
+                f"{'.'.join(map(str, fault['loc'])) or 'spec'}: {in_words(fault)}"[:300]
+                for fault in error.errors(include_url=False)[:MAX_FAULTS]
+            )
+            raise SpecError(f"not a valid model spec: {faults}") from error
+
+
+@lru_cache(maxsize=256)
+def _digest(spec: ModelSpec) -> str:
+    # Not kept in the spec itself: a copy with other fields would take it along.
+    canonical = json.dumps(spec.to_dict(), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+class ActionSteps(NamedTuple):
+    """What `Policy.infer` returns.
+
+    Args:
+        steps: (H, D), H at most the declared horizon; anything numpy can read.
+        done: the task is finished with these steps, as far as the model can tell.
+        raw: what stood before `steps`, for people: tokens, normalised actions, whatever the model
+            has, as text and numbers. Shown by ``vla-zenoh seen``, used by nobody.
+        pictures: camera -> (H, W, 3) RGB uint8 as it went into the network, where the model itself
+            changes what it is given (a crop).
+    """
+
+    steps: ArrayLike
+    done: bool = False
+    raw: Mapping[str, Any] | None = None
+    pictures: Mapping[str, NDArray[np.uint8]] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """One coherent look at the world, in the form the spec asks for.
+
+    Args:
+        stamp_wall_ns: capture time of its oldest picture (of its state, without pictures).
+        seq: number of that part.
+        images: camera -> (H, W, 3) uint8 in the declared order and size.
+        joint: arm joints, where asked for.
+        pose: TCP pose, where asked for.
+        gripper: gripper state, where asked for.
+        task: prompt, episode and rate.
+        robot: whose it is, for a model that serves several and remembers something of each.
+    """
+
+    stamp_wall_ns: int
+    seq: int
+    task: Task
+    images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    joint: JointState | None = None
+    pose: PoseState | None = None
+    gripper: GripperState | None = None
+    robot: str = ""
+
+    @property
+    def prompt(self) -> str:
+        return self.task.prompt
+
+    @property
+    def rate_hz(self) -> float:
+        return self.task.rate_hz
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """A model. Only `spec` and `infer` are needed; the others are called if they are there.
+
+    ``load()`` runs once before the first inference: heavy imports and weights belong there.
+    ``reset()`` runs at the start of every episode, ``close()`` when the worker ends.
+    ``normalisation_keys``, where a model has it, names the statistics its weights came with:
+    `ActionSpec.normalisation` must be one of them.
+    ``example_prompts`` likewise names prompts it knows, the first of which makes it move.
+    ``takes_committed = True``: it is called as ``infer(observation, committed=...)`` and told what
+    of its last chunk is under way, see `vla_zenoh.policy.chunk_prefix`.
+    ``infer_batch(observations)`` answers several robots at once, one answer for each in their
+    order, at most ``max_batch`` of them where that is given. `Observation.robot` says whose each
+    is; ``reset`` takes that name then. With ``takes_committed`` it is called as
+    ``infer_batch(observations, committed=[...])``.
+    """
+
+    @property
+    def spec(self) -> ModelSpec: ...
+
+    def infer(self, observation: Observation) -> ActionSteps: ...
+
+
+def reset_of(policy: Policy, robot: str = "") -> Callable[[], Any] | None:
+    """What begins an episode of `robot`; None: the model has no ``reset``."""
+    reset = getattr(policy, "reset", None)
+    if not callable(reset):
+        return None
+    return partial(reset, robot) if takes_robot(policy) else reset
+
+
+def takes_robot(policy: Policy) -> bool:
+    """Whether the model's ``reset`` takes the name of the robot whose episode begins."""
+    reset = getattr(policy, "reset", None)
+    return callable(reset) and len(inspect.signature(reset).parameters) > 0
+
+
+def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
+    """`steps` as finite float32 (H, D) of the declared shape.
+
+    Raises:
+        SpecError: says what is wrong and what was declared; its reason is ``dtype``, ``shape``,
+            ``horizon`` or ``not_finite``.
+    """
+    try:
+        given = np.asarray(steps)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise SpecError(f"steps are not numbers: {error}", "dtype") from error
+    if given.dtype.kind not in "iuf":
+        raise SpecError(f"steps are not numbers but {given.dtype}", "dtype")
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, seen below
+        array = np.array(given, dtype=np.float32, order="C")
+    if array.ndim == 1 and array.shape[0] == spec.dimension:
+        array = array[None]
+    if array.ndim != 2 or array.shape[1] != spec.dimension:
+        raise SpecError(
+            f"steps have shape {array.shape}, the spec says (H, {spec.dimension})", "shape"
+        )
+    if not 1 <= array.shape[0] <= spec.horizon:
+        raise SpecError(
+            f"a chunk of {array.shape[0]} steps, the spec says 1 to {spec.horizon}", "horizon"
+        )
+    if not np.isfinite(array).all():
+        raise SpecError("steps hold NaN or infinity", "not_finite")
+    return array
+
+
+def example_observation(
+    spec: ModelSpec, *, prompt: str = "put the red brick in the box"
+) -> Observation:
+    """A valid observation of the declared form, gray pictures and an arm at rest: for dry runs.
+
+    It has the parts of the state that the spec asks for, and no others.
+    """
+    asked = spec.observation.state
+    images = {
+        camera.camera: np.full((camera.height or 480, camera.width or 640, 3), 128, np.uint8)
+        for camera in spec.observation.cameras
+    }
+    zeros = np.zeros(7)
+    return Observation(
+        stamp_wall_ns=0,
+        seq=0,
+        task=Task(episode=0, active=False, prompt=prompt, worker=spec.name, rate_hz=5.0),
+        images=images,
+        joint=JointState(tuple(f"joint{i}" for i in range(1, 8)), zeros, zeros, zeros)
+        if "joint" in asked
+        else None,
+        pose=PoseState(np.array([0.45, 0.0, 0.3]), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(6))
+        if "pose" in asked
+        else None,
+        gripper=GripperState(width_m=0.08, moving=False, holding=False)
+        if "gripper" in asked
+        else None,
+    )

@@ -1,0 +1,1 @@
+"""An arm driven by a Python file."""

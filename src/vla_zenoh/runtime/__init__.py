@@ -1,0 +1,1 @@
+"""Processes of a host: starting, supervising, scheduling and stopping nodes; the Zenoh router."""

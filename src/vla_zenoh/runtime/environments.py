@@ -1,0 +1,103 @@
+"""Runs a model in an environment of its own, as its PEP 723 header asks.
+
+Pins of different models cannot live in one environment, so a model whose dependencies are not here
+is started again by uv, which makes (and keeps) an environment with the model's pins and this very
+package in it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import sysconfig
+from collections.abc import Sequence
+from pathlib import Path
+
+from vla_zenoh import __version__
+from vla_zenoh.errors import WorkerError
+from vla_zenoh.policy.loader import ModelFile
+from vla_zenoh.runtime.parent_watch import die_with_parent
+
+INSIDE_VARIABLE = "VLA_ZENOH_WORKER_ENVIRONMENT"
+
+
+def run_in_own_environment(
+    model: ModelFile, python: str | None, *, extra: str = "", program: str = "vla_zenoh"
+) -> None:
+    """Replace this process by one in the right environment; returns where this one is right.
+
+    Args:
+        model: the file.
+        python: interpreter of a prepared environment, which must have this package.
+        extra: of this package, which the command needs beside the model's own packages; a prepared
+            environment has to have it.
+
+    Raises:
+        WorkerError: another environment is needed and cannot be made.
+    """
+    die_with_parent()  # before the model itself is made, which may take long or hang
+    missing = model.missing()
+    if INSIDE_VARIABLE in os.environ:
+        if missing:
+            raise WorkerError(
+                f"{model.path}: its environment lacks {', '.join(missing)}; is the header right?"
+            )
+        return
+    if python is None and not missing:
+        return
+    arguments = ["-m", program, *sys.argv[1:]]
+    environment = {**os.environ, INSIDE_VARIABLE: str(model.path)}
+    if python is not None:
+        if shutil.which(python) is None:
+            raise WorkerError(f"--python {python!r} is not an interpreter")
+        os.execvpe(python, [python, *arguments], environment)
+    command = environment_command(model, extra=extra)
+    # Not on stdout, where `vla-zenoh check --json` writes its result.
+    said = f"preparing an environment for {model.name}: {', '.join(model.dependencies)}"
+    print(said, file=sys.stderr, flush=True)
+    os.execve(command[0], [*command, "python", *arguments], environment)
+
+
+def environment_command(
+    model: ModelFile, more: Sequence[str] = (), *, extra: str = ""
+) -> list[str]:
+    """What runs a command in the environment that the model's header asks for.
+
+    uv makes it at the first time and keeps it.
+
+    Args:
+        model: the file.
+        more: further packages.
+        extra: of this package.
+
+    Raises:
+        WorkerError: there is no uv.
+    """
+    uv = _uv()
+    if uv is None:
+        raise WorkerError(
+            f"model {model.name!r} needs {', '.join(model.dependencies)}. Install uv (pip install "
+            "uv) and it gets an environment of its own, or name a prepared one with --python"
+        )
+    # Isolated, because uv would put the packages of a .venv in the working directory below.
+    command = [uv, "run", "--no-project", "--isolated", "--quiet"]
+    if model.requires_python:
+        command += ["--python", model.requires_python]
+    for requirement in (*model.dependencies, *more):
+        command += ["--with", requirement]
+    return [*command, *_this_package(extra)]
+
+
+def _uv() -> str | None:
+    beside = Path(sysconfig.get_path("scripts")) / "uv"
+    return str(beside) if beside.is_file() else shutil.which("uv")
+
+
+def _this_package(extra: str) -> list[str]:
+    """How uv gets the package that is running now: the checkout, else the same version."""
+    extras = f"[{extra}]" if extra else ""
+    checkout = Path(__file__).resolve().parents[3]
+    if (checkout / "pyproject.toml").is_file() and (checkout / "src" / "vla_zenoh").is_dir():
+        return ["--with-editable", f"{checkout}{extras}"]
+    return ["--with", f"vla-zenoh{extras}=={__version__}"]

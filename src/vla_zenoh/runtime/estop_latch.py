@@ -1,0 +1,72 @@
+"""A file that stands while an emergency stop or a fault is latched."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+FLUSH_S = 0.5
+
+
+class EstopLatch:
+    """Kept by a thread of its own: a full or slow disk must not hold up the loop that commands.
+
+    Args:
+        path: the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._wanted: queue.SimpleQueue[str | threading.Event | None] = queue.SimpleQueue()
+        self._failures: queue.SimpleQueue[str] = queue.SimpleQueue()
+        threading.Thread(target=self._run, name="latch", daemon=True).start()
+
+    def read(self) -> str | None:
+        """Why it stands; None where it does not. What cannot be read stands."""
+        try:
+            return self._path.read_text("utf-8", errors="replace")
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            return f"{self._path} cannot be read: {error}"
+
+    def keep(self, why: str | None) -> None:
+        """Let it stand for a reason, or be gone; returns at once."""
+        self._wanted.put(why)
+
+    def failure(self) -> str | None:
+        """What went wrong since the last call, one at a time."""
+        with suppress(queue.Empty):
+            return self._failures.get_nowait()
+        return None
+
+    def close(self) -> None:
+        """Wait, a little, until all of that is done; then it is kept no more."""
+        done = threading.Event()
+        self._wanted.put(done)
+        done.wait(FLUSH_S)
+
+    def _run(self) -> None:
+        while True:
+            wanted = self._wanted.get()
+            if isinstance(wanted, threading.Event):
+                wanted.set()
+                return
+            try:
+                self._write(wanted)
+            except OSError as error:
+                done = "removed" if wanted is None else "written"
+                self._failures.put(
+                    f"{self._path} cannot be {done} ({error}): a command node that is started "
+                    "again will not know whether it is stopped"
+                )
+
+    def _write(self, why: str | None) -> None:
+        if why is None:
+            self._path.unlink(missing_ok=True)
+            return
+        # The folder may have been tidied away in the days since it was made.
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._path.write_text(why, "utf-8", errors="replace")

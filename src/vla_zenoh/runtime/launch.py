@@ -1,0 +1,332 @@
+"""Which nodes of a profile run on which host, and how a whole host is brought up and down."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import zenoh
+
+from vla_zenoh.bus.client import LEFT_OUT, Client
+from vla_zenoh.bus.host_id import HOST_VARIABLE, own_boot
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.errors import NodeError, ProfileError, SessionError
+from vla_zenoh.keys import worker_node
+from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
+from vla_zenoh.profile.fit import node_name, workers_of
+from vla_zenoh.runtime.certificate_expiry import Expiry
+from vla_zenoh.runtime.hang_detection import LastStatus, hanging
+from vla_zenoh.runtime.supervisor import NodeCommand, Supervisor
+from vla_zenoh.security.identity import Role, person
+
+START_ORDER = ("router", "sim", "ros2", "arm", "command", "camera", "worker")
+EXPENDABLE = ("worker",)
+ROUTER_PATIENCE_S = 10.0
+BRAKE_PATIENCE_S = 1.0
+STOP_BUDGET_S = 2.9
+STRANGERS_PERIOD_S = 600.0
+"""What strangers write is told of no more often."""
+
+
+def choose_host(profile: Profile, host: str | None) -> tuple[str, HostProfile]:
+    """The part of the profile for this computer.
+
+    Raises:
+        ProfileError: no such host, or several and none named.
+    """
+    if host is None:
+        if len(profile.hosts) == 1:
+            return next(iter(profile.hosts.items()))
+        raise ProfileError(
+            f"profile {profile.name} has hosts {', '.join(profile.hosts)}: say which one this is "
+            "with --host"
+        )
+    if host not in profile.hosts:
+        raise ProfileError(
+            f"profile {profile.name} has no host {host!r}; it has: {', '.join(profile.hosts)}"
+        )
+    return host, profile.hosts[host]
+
+
+def node_commands(
+    profile: Profile,
+    host: str,
+    profile_file: Path,
+    worker_options: Mapping[str, Sequence[str]] | None = None,
+    worker_arguments: Sequence[str] = (),
+    also_files: Sequence[Path] = (),
+    *,
+    dry_run: bool = False,
+) -> list[NodeCommand]:
+    """Command lines of all nodes of `host`, in the order to start them.
+
+    Args:
+        profile: the effective profile.
+        host: one of its hosts.
+        profile_file: where nodes find that profile.
+        worker_options: worker -> ``name=value`` options.
+        worker_arguments: more of the command line of every worker.
+        also_files: profiles of other robots that the router of this host serves.
+        dry_run: the command node commands nothing.
+
+    Raises:
+        ProfileError: there are such robots, and no router on this host; or nothing to be run dry.
+    """
+    part = profile.hosts[host]
+    if dry_run and "command" not in part.nodes:
+        raise ProfileError(
+            f"host {host!r} of profile {profile.name} runs no command node, which --dry-run is for"
+        )
+    if also_files and "router" not in part.nodes:
+        routers = [name for name, other in profile.hosts.items() if "router" in other.nodes]
+        raise ProfileError(
+            f"host {host!r} of profile {profile.name} runs no router, which --also is for; "
+            f"{' and '.join(routers) or 'no host'} does"
+        )
+    common = ("--profile", str(profile_file))
+    commands: list[NodeCommand] = []
+    for kind in sorted(part.nodes, key=START_ORDER.index):
+        name = node_name(profile, host, kind)
+        if kind == "worker":
+            for worker in workers_of(profile, part):
+                arguments = ["worker", worker, *common, "--host", host, *worker_arguments]
+                for option in (worker_options or {}).get(worker, ()):
+                    arguments += ["--set", option]
+                commands.append(NodeCommand(worker_node(worker), kind, tuple(arguments)))
+        elif kind == "camera":
+            arguments = ["camera", *(part.cameras or ()), *common, "--name", name]
+            commands.append(NodeCommand(name, kind, tuple(arguments)))
+        elif kind == "router":
+            others = [word for file in also_files for word in ("--also", str(file))]
+            commands.append(NodeCommand(name, kind, (kind, *common, "--host", host, *others)))
+        elif kind == "command" and dry_run:
+            commands.append(NodeCommand(kind, kind, (kind, *common, "--dry-run")))
+        else:
+            commands.append(NodeCommand(kind, kind, (kind, *common)))
+    return commands
+
+
+class Host:
+    """All nodes of one host, up while the context lasts.
+
+    Args:
+        profile: the effective profile.
+        host: which host; None where there is only one.
+        log: (node, line) for what nodes write.
+        tell: (node, sentence) for what happens to them.
+        own_router: refuse to use a router that answers already.
+        worker_options: worker -> ``name=value`` options.
+        worker_arguments: more of the command line of every worker.
+        also: other robots' profiles that the router of this host serves.
+        dry_run: the command node computes and checks everything and commands nothing.
+
+    Raises:
+        NodeError: a router answers although `own_router`, or does not know who is in `also`.
+        ProfileError: there is no such host, or it has no router for `also`, or no command node
+            for `dry_run`.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        host: str | None,
+        *,
+        log: Callable[[str, str], None],
+        tell: Callable[[str, str], None],
+        own_router: bool = False,
+        worker_options: Mapping[str, Sequence[str]] | None = None,
+        worker_arguments: Sequence[str] = (),
+        also: Sequence[Profile] = (),
+        dry_run: bool = False,
+    ) -> None:
+        self.host, part = choose_host(profile, host)
+        changes: dict[str, Any] = {}
+        if part.connect is not None:
+            changes["connect"] = list(part.connect)
+        if profile.session.security is not None:
+            changes["security"] = {"host": self.host}
+        if changes:
+            profile = override(profile, {"session": changes})
+        self.profile, self._part, self._tell = profile, part, tell
+        self._folder = tempfile.TemporaryDirectory(prefix="vla-zenoh-")
+        # A lab is up for weeks, and systemd-tmpfiles takes away what is 10 days old, but for what
+        # is below a folder that somebody has locked (tmpfiles.d(5)).
+        self._lock: int | None = os.open(self._folder.name, os.O_RDONLY | os.O_DIRECTORY)
+        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        # Children read the very profile that is in force here, whatever its options were.
+        self.profile_file = self._write(profile)
+        self._also = [self._write(other) for other in also]
+        self.supervisor = Supervisor(
+            node_commands(
+                profile,
+                self.host,
+                self.profile_file,
+                worker_options,
+                worker_arguments,
+                self._also,
+                dry_run=dry_run,
+            ),
+            log=log,
+            tell=tell,
+            folder=Path(self._folder.name),
+            variables={HOST_VARIABLE: self.host},
+        )
+        self._own_router = own_router
+        self._expiry = Expiry(profile.session.security)
+        self._left_out, self._strangers_told_s = 0, -1e9
+        self.session: zenoh.Session | None = None
+        self.client: Client | None = None
+
+    def _write(self, profile: Profile) -> Path:
+        folder = Path(tempfile.mkdtemp(dir=self._folder.name))
+        path = folder / f"{profile.name}.yaml"
+        path.write_text(to_yaml(profile), "utf-8")
+        return path
+
+    def __enter__(self) -> Host:
+        try:
+            self._start()
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def _start(self) -> None:
+        answers = self._router_answers()
+        if answers and self._own_router:
+            where = ", ".join(self.profile.session.connect)
+            raise NodeError(f"a router answers already at {where}")
+        if answers and self._also:
+            raise NodeError(
+                "a router answers already, and cannot be told of other robots; end it, or start it "
+                "with --also itself"
+            )
+        if "router" in self._part.nodes:
+            if answers:
+                self._tell("router", "one answers already; using it")
+                self.supervisor.children = [
+                    child for child in self.supervisor.children if child.command.kind != "router"
+                ]
+            else:
+                self.supervisor.start(["router"])
+        self.session = open_session(self.profile.session, wait_s=ROUTER_PATIENCE_S)
+        self.client = Client(self.profile, self.session).follow()
+        self.supervisor.start()
+
+    def _router_answers(self) -> bool:
+        # Where this host runs a router it names that one first; the others stand in for it.
+        own = self.profile.session.connect[:1] if "router" in self._part.nodes else None
+        try:
+            open_session(self.profile.session, connect=own).close()
+        except SessionError:
+            return False
+        return True
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """Brake the arm, then end every node; within `STOP_BUDGET_S` in all.
+
+        An arm that needs no node of ours goes on: where a lab runs already, and all that was
+        started here was refused as there twice, it is none of our business.
+        """
+        deadline_s = time.monotonic() + STOP_BUDGET_S
+        # Where people may only look on, the arm brakes because the nodes of this host end.
+        may = (
+            self.profile.session.security is None
+            or person(self.profile, self.host) is Role.OPERATOR
+        )
+        client = self.client
+        if may and client is not None and "command" in client.alive and self._takes_part(client):
+            self._brake(client)
+        if self.session is not None:
+            self.session.close()
+            self.session = self.client = None
+        self.supervisor.stop(deadline_s)
+        self._folder.cleanup()
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def _takes_part(self, client: Client) -> bool:
+        """Whether a node that lives is one of ours, and not another one of its name."""
+        alive = client.alive
+        return any(
+            kind == "router"  # which starts where no other one answers, and may be silent: zenohd
+            or (
+                name in alive
+                and (status := client.status(name)) is not None
+                and status.boot == own_boot()
+                and self.supervisor.owns(name, status.pid)
+            )
+            for name, (kind, _) in self.supervisor.running().items()
+        )
+
+    def _brake(self, client: Client) -> None:
+        try:
+            if not client.deactivate(BRAKE_PATIENCE_S):
+                self._tell("command", "does not say that the arm stands")
+        except zenoh.ZError as error:
+            self._tell("command", f"cannot be told to brake ({error}); ending it brakes too")
+
+    def serve(self, stop: threading.Event) -> None:
+        """Watch over the nodes until `stop` is set: what dies or hangs is started again.
+
+        Tells once a day what is wrong with the certificates of this host, or is soon.
+
+        A worker that dies again and again is left alone: somebody's broken model must not end the
+        robot's nodes beside it.
+
+        Raises:
+            NodeError: another node dies again and again, or nothing is left here but such workers.
+        """
+        while not stop.wait(0.1):
+            self._end_what_hangs()
+            for sentence in self._expiry.due():
+                self._tell("up", sentence)
+            self._tell_of_strangers()
+            self.watch(spare=EXPENDABLE)
+
+    def watch(self, spare: Sequence[str] = ()) -> None:
+        """Start again what died.
+
+        Args:
+            spare: kinds without which the others go on.
+
+        Raises:
+            NodeError: another node dies again and again.
+        """
+        if not self.supervisor.watch(spare=spare):
+            given_up = self.supervisor.given_up
+            name = given_up.command.name if given_up else "a node"
+            raise NodeError(f"{name} dies again and again; its last lines above say why")
+
+    def _tell_of_strangers(self) -> None:
+        left_out = self.client.left_out if self.client is not None else 0
+        now_s = time.monotonic()
+        if left_out > self._left_out and now_s - self._strangers_told_s > STRANGERS_PERIOD_S:
+            self._tell("up", f"{left_out} {LEFT_OUT}")
+            self._left_out, self._strangers_told_s = left_out, now_s
+
+    def _end_what_hangs(self) -> None:
+        if self.client is None:
+            return
+        said = {
+            name: LastStatus(status.pid, age_s)
+            for name, (status, age_s, _) in self.client.snapshot().items()
+        }
+        for name in hanging(self.supervisor.running(), said):
+            self.supervisor.end(name, f"silent for {said[name].age_s:.0f} s; it hangs, ending it")

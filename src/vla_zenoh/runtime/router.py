@@ -1,0 +1,141 @@
+"""A Zenoh router: what every client session of the profile connects to."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NoReturn
+
+from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.session import config, open_session
+from vla_zenoh.bus.tcp_user_timeout import TcpUserTimeout
+from vla_zenoh.errors import NodeError
+from vla_zenoh.profile import Profile
+from vla_zenoh.profile.fit import node_name
+from vla_zenoh.profile.session import is_loopback
+from vla_zenoh.runtime.certificate_expiry import Expiry
+from vla_zenoh.security.rules import access_control
+
+POLL_S = 0.25
+ZENOHD = "zenohd"
+RUNTIME_VARIABLE, RUNTIME = "ZENOH_RUNTIME", "(rx: (worker_threads: 16))"
+"""What arrives is handed on by the thread that received it, which waits where a link is stuck. With
+the usual two of them one bad link would hold up all others, the arm's among them."""
+
+
+def run_router(
+    profile: Profile,
+    stop: threading.Event,
+    *,
+    host: str | None = None,
+    also: Sequence[Profile] = (),
+) -> None:
+    """Route until `stop` is set.
+
+    Args:
+        profile: the session section, and whom to let in.
+        stop: ends it.
+        host: which host of the profile this is; it matters where several have a router.
+        also: other robots' profiles that this router serves.
+
+    Raises:
+        SecurityError: the router's certificate is not there.
+        SessionError: the address is taken.
+    """
+    profile, name, links = _placed(profile, host)
+    access = _access(profile, also)
+    os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)
+    with open_session(
+        profile.session, mode="router", connect=links, identity=name, access=access
+    ) as session:
+        node = Node(name, profile, session, host=host)
+        detail: dict[str, Any] = {
+            "listen": list(profile.session.listen),
+            "security": security_of(profile),
+        }
+        impatience, expiry = (
+            TcpUserTimeout(profile.session.lease_ms / 1e3),
+            Expiry(profile.session.security),
+        )
+        while not stop.wait(POLL_S):
+            impatience.look()
+            links_now = len(list(session.info.links()))
+            if profile.session.security is not None:
+                detail["certificates"] = asdict(expiry.outlook)
+            node.report("routing", detail={**detail, "links": links_now})
+        node.close()
+
+
+def run_zenohd(
+    profile: Profile, folder: Path, *, host: str | None = None, also: Sequence[Profile] = ()
+) -> NoReturn:
+    """Become the program ``zenohd``, with the configuration that our own router would have.
+
+    Args:
+        profile: as in `run_router`.
+        folder: where the configuration is left for it.
+        host: as in `run_router`.
+        also: likewise.
+
+    Raises:
+        NodeError: there is no such program.
+        SecurityError: the router's certificate is not there.
+    """
+    program = shutil.which(ZENOHD)
+    if program is None:
+        raise NodeError(
+            f"there is no {ZENOHD} on PATH: install Zenoh's router, or leave out "
+            "session.router: zenohd"
+        )
+    file = folder / "zenohd.json5"
+    file.write_text(json.dumps(router_config(profile, host=host, also=also), indent=2))
+    os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)
+    os.execv(program, [ZENOHD, "--config", str(file)])
+
+
+def router_config(
+    profile: Profile, *, host: str | None = None, also: Sequence[Profile] = ()
+) -> dict[str, Any]:
+    """Zenoh's configuration of the profile's router.
+
+    Raises:
+        SecurityError: the router's certificate is not there.
+    """
+    profile, name, links = _placed(profile, host)
+    return config(
+        profile.session,
+        mode="router",
+        connect=links,
+        identity=name,
+        access=_access(profile, also),
+    )
+
+
+def security_of(profile: Profile) -> str:
+    """``tls``: only who has a certificate; ``loopback``: only this computer; ``insecure``: all."""
+    if profile.session.security is not None:
+        return "tls"
+    return "loopback" if all(map(is_loopback, profile.session.listen)) else "insecure"
+
+
+def _placed(profile: Profile, host: str | None) -> tuple[Profile, str, tuple[str, ...]]:
+    """The profile as seen from `host`, the router's name, and the routers it connects to."""
+    if host is None:
+        hosts = [name for name, part in profile.hosts.items() if "router" in part.nodes]
+        host = hosts[0] if len(hosts) == 1 else None
+    if host is None or host not in profile.hosts:
+        return profile, "router", ()
+    part = profile.hosts[host]
+    if part.listen is not None:
+        session = profile.session.model_copy(update={"listen": part.listen})
+        profile = profile.model_copy(update={"session": session})
+    return profile, node_name(profile, host, "router"), part.link or ()
+
+
+def _access(profile: Profile, also: Sequence[Profile]) -> Mapping[str, Any] | None:
+    return None if profile.session.security is None else access_control((profile, *also))

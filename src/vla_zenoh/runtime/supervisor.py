@@ -1,0 +1,255 @@
+"""Starts a host's nodes, restarts those that die, and ends them all in an order that is safe."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from vla_zenoh.runtime.parent_watch import PARENT_VARIABLE, RUN_FOLDER_VARIABLE
+
+BACKOFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
+STABLE_S = 60.0
+"""A node that ran this long starts with the shortest backoff again. Longer than one takes to start
+and find, on a busy machine, that it cannot."""
+GIVE_UP_AFTER = 6
+"""Deaths in a row, each before `STABLE_S`."""
+STOP_ORDER = (
+    (("worker", "camera", "command"), 0.8),
+    (("sim", "ros2", "arm"), 0.4),
+    (("router",), 0.1),
+)
+"""What is ended one after the other, and how long before the deadline the next one has its turn."""
+POLL_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class NodeCommand:
+    """A node to run.
+
+    Args:
+        name: as in logs and status.
+        kind: router, sim, ros2, arm, camera, command or worker.
+        arguments: of the command line, after ``vla-zenoh``.
+    """
+
+    name: str
+    kind: str
+    arguments: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class Child:
+    """A running node."""
+
+    command: NodeCommand
+    process: subprocess.Popen[str] | None = None
+    started_s: float = 0.0
+    deaths_in_a_row: int = 0
+    left_alone: bool = False
+    restarts: int = 0
+    start_again_s: float = 0.0
+    threads: list[threading.Thread] = field(default_factory=list)
+
+
+class Supervisor:
+    """See the module. Start and stop from one thread that lives as long as the nodes.
+
+    Args:
+        commands: in the order to start them.
+        log: called with (node name, line) for every line a node writes.
+        tell: called with (node name, sentence) for what the supervisor does.
+        folder: where nodes may leave what one that is started again has to know.
+        variables: of the nodes' environment, beside ours.
+    """
+
+    def __init__(
+        self,
+        commands: Sequence[NodeCommand],
+        *,
+        log: Callable[[str, str], None],
+        tell: Callable[[str, str], None],
+        folder: Path | None = None,
+        variables: Mapping[str, str] | None = None,
+    ) -> None:
+        self._folder, self._variables = folder, dict(variables or {})
+        self.children = [Child(command) for command in commands]
+        self._log, self._tell = log, tell
+        self.given_up: Child | None = None
+
+    def start(self, kinds: Sequence[str] | None = None) -> None:
+        """Start those of `kinds` (None: all) that do not run yet."""
+        for child in self.children:
+            if child.process is None and (kinds is None or child.command.kind in kinds):
+                self._spawn(child)
+
+    def watch(self, spare: Sequence[str] = ()) -> bool:
+        """Restart what died. False: a node dies again and again, and it makes no sense to go on.
+
+        Args:
+            spare: kinds without which the others go on: one of them that dies again and again is
+                left alone, as long as there are others.
+        """
+        now = time.monotonic()
+        for child in self.children:
+            if child.process is not None and child.process.poll() is not None:
+                self._mourn(child, child.process.returncode, now)
+            elif child.process is None and child.start_again_s and now >= child.start_again_s:
+                child.restarts += 1
+                self._spawn(child)
+            if child.deaths_in_a_row < GIVE_UP_AFTER or child.left_alone:
+                continue
+            said = f"died {GIVE_UP_AFTER} times in a row"
+            child.left_alone = child.command.kind in spare
+            if not child.left_alone or all(each.left_alone for each in self.children):
+                self.given_up = child
+                self._tell(child.command.name, f"{said}; giving up")
+                return False
+            child.start_again_s = 0.0
+            self._tell(
+                child.command.name,
+                f"{said}; it is left alone until all are started anew, the others go on. Its last "
+                "lines above say why",
+            )
+        return True
+
+    def stop(self, deadline_s: float) -> None:
+        """End all nodes, commanding ones before the robot, the router last, by `deadline_s`.
+
+        Args:
+            deadline_s: on the monotonic clock; what still runs then is killed.
+        """
+        for kinds, left_s in STOP_ORDER:
+            self._signal(kinds, signal.SIGTERM)
+            self._await(kinds, deadline_s - left_s)
+        self.kill()
+        for child in self.children:
+            for thread in child.threads:
+                thread.join(0.2)
+
+    def kill(self) -> None:
+        """End whatever still runs, at once."""
+        for child in self.children:
+            if child.process is not None:
+                _kill_group(child.process)
+                child.process.wait()
+
+    def pids(self) -> dict[str, int]:
+        """Node name -> process number of those that run."""
+        return {
+            child.command.name: child.process.pid
+            for child in self.children
+            if child.process is not None and child.process.poll() is None
+        }
+
+    def running(self) -> dict[str, tuple[str, int]]:
+        """Node name -> (kind, process number) of those that run."""
+        pids = self.pids()
+        return {
+            child.command.name: (child.command.kind, pids[child.command.name])
+            for child in self.children
+            if child.command.name in pids
+        }
+
+    def owns(self, name: str, pid: int) -> bool:
+        """Whether a process of this computer is that node as it was started here, and runs.
+
+        A model's own environment may stand between us and the process that speaks.
+        """
+        ours = self.pids().get(name)
+        try:
+            return ours is not None and os.getpgid(pid) == ours
+        except (ProcessLookupError, OverflowError):
+            return False
+
+    def end(self, name: str, why: str) -> None:
+        """End a node at once; `watch` starts it again."""
+        for child in self.children:
+            if child.command.name == name and child.process is not None:
+                self._tell(name, why)
+                _kill_group(child.process)
+
+    def _spawn(self, child: Child) -> None:
+        environment = {**os.environ, **self._variables}
+        environment[PARENT_VARIABLE] = str(os.getpid())
+        environment["PYTHONUNBUFFERED"] = "1"
+        # Zenoh colours its log also where it is read by us, and would look like a stranger's.
+        environment["NO_COLOR"] = "1"
+        if self._folder is not None:
+            environment[RUN_FOLDER_VARIABLE] = str(self._folder)
+        child.process = subprocess.Popen(
+            [sys.executable, "-m", "vla_zenoh", *child.command.arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env=environment,
+            # Ctrl-C in the terminal must reach the supervisor alone: it brakes the arm first.
+            start_new_session=True,
+        )
+        child.started_s, child.start_again_s = time.monotonic(), 0.0
+        thread = threading.Thread(
+            target=self._forward, args=(child.command.name, child.process), daemon=True
+        )
+        thread.start()
+        child.threads = [thread]
+        self._tell(child.command.name, f"started (pid {child.process.pid})")
+
+    def _forward(self, name: str, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        with process.stdout as lines:
+            for line in lines:
+                self._log(name, line.rstrip("\n"))
+
+    def _mourn(self, child: Child, code: int, now: float) -> None:
+        stable = now - child.started_s > STABLE_S
+        child.deaths_in_a_row = 1 if stable else child.deaths_in_a_row + 1
+        wait_s = BACKOFF_S[min(child.deaths_in_a_row, len(BACKOFF_S)) - 1]
+        if child.process is not None:
+            _kill_group(child.process)
+        child.process, child.start_again_s = None, now + wait_s
+        how = f"killed by {_signal_name(-code)}" if code < 0 else f"ended with code {code}"
+        if child.deaths_in_a_row < GIVE_UP_AFTER:
+            how += f"; starting again in {wait_s:g} s"
+        self._tell(child.command.name, how)
+
+    def _signal(self, kinds: Sequence[str], number: signal.Signals) -> None:
+        for process in self._running(kinds):
+            # All of its group: between us and the node there may be a process that made its
+            # environment.
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, number)
+
+    def _running(self, kinds: Sequence[str]) -> list[subprocess.Popen[str]]:
+        return [
+            child.process
+            for child in self.children
+            if child.command.kind in kinds
+            and child.process is not None
+            and child.process.poll() is None
+        ]
+
+    def _await(self, kinds: Sequence[str], deadline_s: float) -> None:
+        while self._running(kinds) and time.monotonic() < deadline_s:
+            time.sleep(POLL_S)
+
+
+def _kill_group(process: subprocess.Popen[str]) -> None:
+    """End the process and all that it started. Its group has its number (`start_new_session`)."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # a real-time signal has no name
+        return f"signal {number}"

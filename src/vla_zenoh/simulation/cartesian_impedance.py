@@ -1,0 +1,248 @@
+"""Cartesian impedance control of an arm by joint torques.
+
+The TCP behaves like a damped spring that hangs on a moving reference. With ``Lambda`` the inertia
+the TCP shows in task space and ``J`` its Jacobian::
+
+    e       = [p_ref - p ; log3(R_ref R^T)]            base frame, clamped to ``max_error_*``
+    Lambda  = (J M^-1 J^T)^-1
+    D       = zeta (Lambda^1/2 K^1/2 + K^1/2 Lambda^1/2)
+    I      += ki K e dt                                 clamped to ``max_integral_*``
+    F       = K e + D (xd_ref - J qd) + Lambda (xdd_ref - Jd qd) + I
+    Jbar    = M^-1 J^T Lambda                           dynamically consistent inverse
+    tau     = J^T F + (1 - J^T Jbar^T) tau_posture + h
+
+with ``h`` the bias of Coriolis, centrifugal and gravity torques. The formulation in task space
+and the dynamically consistent nullspace are Khatib's (*A unified approach for motion and force
+control of robot manipulators: the operational space formulation*, IEEE J. Robotics and Automation
+3(1), 1987). The damping is the factorisation design of Albu-Schaeffer, Ott, Frese and Hirzinger
+(*Cartesian impedance control of redundant robots*, ICRA 2003; Ott, *Cartesian Impedance Control of
+Redundant and Flexible-Joint Robots*, Springer 2008), which keeps the damping ratio in every pose
+where a constant matrix does not. The integral term carries joint friction and payload that the
+model does not know.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vla_zenoh.types.references import PoseReference
+
+FloatArray = NDArray[np.float64]
+
+# Below this task-space mobility (1/kg or 1/(kg m^2)) a direction counts as singular; the inertia
+# seen there grows without bound and would turn damping and feed-forward into a hammer.
+MIN_MOBILITY = 0.01
+
+
+class ArmState(NamedTuple):
+    """What the law has to know of the arm: n joints, everything in the base frame.
+
+    Args:
+        position_rad: (n,).
+        velocity_rad_s: (n,).
+        tcp_position_m: (3,).
+        tcp_rotation: (3, 3).
+        jacobian: (6, n) of the TCP, linear rows first, base axes.
+        drift: (6,) m/s^2 and rad/s^2, the TCP's acceleration from joint velocity alone, Jd qd.
+        inertia: (n, n) joint-space inertia, kg m^2.
+        bias_nm: (n,) Coriolis, centrifugal and gravity torques.
+    """
+
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+    tcp_position_m: FloatArray
+    tcp_rotation: FloatArray
+    jacobian: FloatArray
+    drift: FloatArray
+    inertia: FloatArray
+    bias_nm: FloatArray
+
+
+class ImpedanceOutput(NamedTuple):
+    """Result of one control period.
+
+    Args:
+        torque_nm: (n,) within the effort limits.
+        error: (6,) m and rad from TCP to reference, before the clamp.
+        wrench: (6,) N and Nm the law asks the TCP to exert, without the nullspace part.
+        saturated: an effort limit cut the torque.
+    """
+
+    torque_nm: FloatArray
+    error: FloatArray
+    wrench: FloatArray
+    saturated: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ImpedanceGains:
+    """Gains of the law; `stiff` and `compliant` are the presets.
+
+    Args:
+        translational_n_m: stiffness.
+        rotational_nm_rad: stiffness.
+        damping_ratio: zeta, 1 is critical.
+        integral_1_s: ki, 0 switches integral action off.
+        max_integral_n: bound of the integral force, per axis.
+        max_integral_nm: bound of the integral moment, per axis.
+        max_error_m: the spring is not stretched further, which bounds the pressing force.
+        max_error_rad: likewise for rotation.
+        posture_nm_rad: nullspace stiffness towards the posture.
+        limit_nm_rad: stiffness with which the nullspace leaves a joint limit.
+        limit_margin_rad: distance to a joint limit at which that begins.
+    """
+
+    translational_n_m: float = 2000.0
+    rotational_nm_rad: float = 120.0
+    damping_ratio: float = 1.0
+    integral_1_s: float = 4.0
+    max_integral_n: float = 15.0
+    max_integral_nm: float = 3.0
+    max_error_m: float = 0.02
+    max_error_rad: float = 0.2
+    posture_nm_rad: float = 20.0
+    limit_nm_rad: float = 30.0
+    limit_margin_rad: float = 0.1
+
+    @classmethod
+    def stiff(cls) -> ImpedanceGains:
+        """Follows within a millimetre; presses with at most 55 N."""
+        return cls()
+
+    @classmethod
+    def compliant(cls) -> ImpedanceGains:
+        """Gives way to a hand; presses with at most 39 N."""
+        return cls(
+            translational_n_m=400.0, rotational_nm_rad=20.0, max_error_m=0.06, max_error_rad=0.5
+        )
+
+
+class CartesianImpedance:
+    """The law with its only state, the integral wrench.
+
+    Args:
+        gains: stiffness, damping, bounds.
+        lower_rad: (n,) joint limits.
+        upper_rad: (n,) joint limits.
+        effort_nm: (n,) torque limits.
+        posture_rad: (n,) joints the nullspace prefers.
+        period_s: time between two calls of `torque`.
+    """
+
+    def __init__(
+        self,
+        gains: ImpedanceGains,
+        *,
+        lower_rad: FloatArray,
+        upper_rad: FloatArray,
+        effort_nm: FloatArray,
+        posture_rad: FloatArray,
+        period_s: float,
+    ) -> None:
+        self.gains = gains
+        self._soft_lower_rad = np.asarray(lower_rad, float) + gains.limit_margin_rad
+        self._soft_upper_rad = np.asarray(upper_rad, float) - gains.limit_margin_rad
+        self._effort_nm = np.array(effort_nm, float)
+        self._posture_rad = np.array(posture_rad, float)
+        self._posture_damping = 2.0 * math.sqrt(gains.posture_nm_rad)
+        self._stiffness = _per_axis(gains.translational_n_m, gains.rotational_nm_rad)
+        # zeta * sqrt(K_j) scales the columns of Lambda^1/2; its transpose gives the other half.
+        self._damping_scale = gains.damping_ratio * np.sqrt(self._stiffness)
+        self._integral_rate = gains.integral_1_s * period_s * self._stiffness
+        self._integral_limit = _per_axis(gains.max_integral_n, gains.max_integral_nm)
+        self._integral = np.zeros(6)
+
+    @property
+    def integral(self) -> FloatArray:
+        """(6,) N and Nm the integral action adds now; a copy."""
+        return self._integral.copy()
+
+    def reset(self, posture_rad: FloatArray | None = None) -> None:
+        """Forget the integral; take `posture_rad` (n,) as new posture where given."""
+        self._integral = np.zeros(6)
+        if posture_rad is not None:
+            self._posture_rad = np.array(posture_rad, float)
+
+    def take_over(self, torque_nm: FloatArray, state: ArmState) -> None:
+        """Begin where another law held the arm at rest with `torque_nm` (n,), in that posture.
+
+        What that torque carried at the TCP beyond the model (friction, payload) goes into the
+        integral, so that the first torque of this law equals the last of the other there.
+        """
+        compliance = np.linalg.solve(state.inertia, state.jacobian.T)
+        mobility, axes = np.linalg.eigh(state.jacobian @ compliance)
+        task_inertia = (axes / np.maximum(mobility, MIN_MOBILITY)) @ axes.T
+        wrench = task_inertia @ (compliance.T @ (torque_nm - state.bias_nm))
+        self._integral = np.minimum(np.maximum(wrench, -self._integral_limit), self._integral_limit)
+        self._posture_rad = state.position_rad.copy()
+
+    def torque(self, reference: PoseReference, state: ArmState) -> ImpedanceOutput:
+        """One control period: joint torques that pull the TCP to `reference`."""
+        jacobian, transposed = state.jacobian, state.jacobian.T
+        error = np.empty(6)
+        error[:3] = reference.position_m - state.tcp_position_m
+        error[3:] = pin.log3(reference.rotation @ state.tcp_rotation.T)
+        spring_error, feed = self._clamp(error)
+
+        compliance = np.linalg.solve(state.inertia, transposed)  # M^-1 J^T, (n, 6)
+        mobility, axes = np.linalg.eigh(jacobian @ compliance)
+        mobility = np.maximum(mobility, MIN_MOBILITY)
+        task_inertia = (axes / mobility) @ axes.T
+        half_damping = ((axes / np.sqrt(mobility)) @ axes.T) * self._damping_scale
+
+        spring = self._stiffness * spring_error
+        slip = feed * reference.twist - jacobian @ state.velocity_rad_s
+        wrench = spring + half_damping @ slip + half_damping.T @ slip + self._integral
+        wrench += task_inertia @ (feed * reference.acceleration - state.drift)
+
+        posture = self._posture_torque(state)
+        seen_at_tcp = task_inertia @ (compliance.T @ posture)  # Jbar^T tau_posture
+        wanted = transposed @ (wrench - seen_at_tcp) + posture + state.bias_nm
+        torque = np.minimum(np.maximum(wanted, -self._effort_nm), self._effort_nm)
+        saturated = bool((torque != wanted).any())
+        self._integrate(spring_error, held=saturated or feed <= 0.0)
+        return ImpedanceOutput(torque, error, wrench, saturated)
+
+    def _clamp(self, error: FloatArray) -> tuple[FloatArray, float]:
+        """Bound the spring's stretch; also how much of the feed-forward may stay, 1 to 0.
+
+        A reference that runs on while the arm is blocked would push through its velocity alone,
+        so the feed-forward fades over the second half of the allowed error.
+        """
+        x, y, z, a, b, c = error.tolist()
+        distance, angle = math.hypot(x, y, z), math.hypot(a, b, c)
+        stretch = max(distance / self.gains.max_error_m, angle / self.gains.max_error_rad)
+        if stretch <= 0.5:
+            return error, 1.0
+        clamped = error.copy()
+        clamped[:3] *= min(1.0, self.gains.max_error_m / max(distance, 1e-12))
+        clamped[3:] *= min(1.0, self.gains.max_error_rad / max(angle, 1e-12))
+        return clamped, max(0.0, 2.0 - 2.0 * stretch)
+
+    def _integrate(self, error: FloatArray, *, held: bool) -> None:
+        """Integrate; while the arm is blocked or a torque is at its limit only towards zero."""
+        step = self._integral_rate * error
+        if held:
+            step = np.where(step * self._integral < 0.0, step, 0.0)
+        total = self._integral + step
+        self._integral = np.minimum(np.maximum(total, -self._integral_limit), self._integral_limit)
+
+    def _posture_torque(self, state: ArmState) -> FloatArray:
+        position = state.position_rad
+        below = np.maximum(self._soft_lower_rad - position, 0.0)
+        above = np.maximum(position - self._soft_upper_rad, 0.0)
+        return (
+            self.gains.posture_nm_rad * (self._posture_rad - position)
+            - self._posture_damping * state.velocity_rad_s
+            + self.gains.limit_nm_rad * (below - above)
+        )
+
+
+def _per_axis(translational: float, rotational: float) -> FloatArray:
+    return np.array([translational] * 3 + [rotational] * 3)

@@ -1,0 +1,224 @@
+"""Who may import whom: an order of folders, checked in the text and by importing."""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import vla_zenoh
+
+PACKAGE = Path(vla_zenoh.__file__).parent
+
+ORDER = (
+    # A folder, or a module beside them, imports those of the lines above and of its own line.
+    ("errors",),
+    ("keys", "ntp", "pydantic_errors", "resources", "robot", "sanitize", "types"),
+    ("policy",),
+    ("profile",),
+    ("codec",),
+    ("kinematics",),
+    ("control",),
+    ("guard",),
+    ("interop", "security", "simulation"),
+    ("bus",),
+    ("runtime",),
+    ("nodes",),
+    ("robots",),
+    ("cli", "__main__"),
+    ("lab",),
+)
+LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
+
+IO = frozenset({"zenoh", "typer", "mujoco", "torch", "time", "threading", "asyncio"})
+NODE = frozenset({"typer", "torch", "mujoco", "asyncio"})
+ALLOWED = {
+    # folder or file, the longest one counts: what of IO it may import
+    "bus": IO - NODE,
+    "runtime": IO - NODE,
+    "nodes": IO - NODE,
+    "nodes/openpi_server.py": IO - NODE | {"asyncio"},
+    "robots": IO - NODE,
+    "simulation": frozenset({"mujoco"}),
+    "cli": IO - {"torch", "mujoco", "asyncio"},
+    "__main__.py": IO - {"torch", "mujoco", "asyncio"},
+    "lab/cli": IO - {"torch", "mujoco", "asyncio"},
+    # What of the lab listens to a robot, drives it or starts processes.
+    **dict.fromkeys(
+        (
+            "lab/bench/command_runner.py",
+            "lab/bench/cpu_time.py",
+            "lab/bench/motion_lockstep.py",
+            "lab/bench/motion_runner.py",
+            "lab/bench/task_lockstep.py",
+            "lab/bench/task_runner.py",
+            "lab/check/own_process.py",
+            "lab/compare/listener.py",
+            "lab/demo/runner.py",
+            "lab/doctor/rehearsal.py",
+            "lab/doctor/rehearsal_acts.py",
+            "lab/recording/recorder.py",
+            "lab/recording/replay.py",
+            "lab/recording/stream_listener.py",
+            "lab/teleop/node.py",
+            "lab/teleop/sticks.py",
+            "lab/teleop/terminal.py",
+            "lab/trial/runner.py",
+            "lab/view/listener.py",
+            "lab/view/viewer.py",
+        ),
+        IO - NODE,
+    ),
+}
+HEAVY = ("zenoh", "typer", "torch", "mujoco", "matplotlib", "av", "pyarrow", "rerun")
+
+
+def room(module: str) -> str:
+    """Folder of a module of ours, or its own name where it lies beside them."""
+    return module.split(".")[1]
+
+
+def allowed(path: Path) -> frozenset[str]:
+    steps = [path, *path.parents]
+    return next((ALLOWED[str(step)] for step in steps if str(step) in ALLOWED), frozenset())
+
+
+def imported_names(source: str) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return names
+
+
+def offences(source: str, forbidden: frozenset[str]) -> list[str]:
+    return sorted(
+        name
+        for name in imported_names(source)
+        if any(name == banned or name.startswith(f"{banned}.") for banned in forbidden)
+    )
+
+
+SOURCES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=str)
+def test_a_module_imports_only_what_its_layer_may(path: Path) -> None:
+    assert offences((PACKAGE / path).read_text(), IO - allowed(path)) == []
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=str)
+def test_a_module_imports_no_folder_above_its_own(path: Path) -> None:
+    here = path.parts[0].removesuffix(".py")
+    if here == "__init__":
+        return
+    ours = {
+        name
+        for name in imported_names((PACKAGE / path).read_text())
+        if name.startswith("vla_zenoh.") and name != "vla_zenoh.__version__"
+    }
+    assert {name for name in ours if LEVEL[room(name)] > LEVEL[here]} == set()
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    """Imports for types alone count."""
+    modules = {module_name(path): path for path in SOURCES}
+    waiting = {
+        name: {
+            found
+            for imported in imported_names((PACKAGE / path).read_text())
+            if (found := imported if imported in modules else imported.rpartition(".")[0])
+            in modules
+        }
+        - {name, "vla_zenoh"}
+        for name, path in modules.items()
+    }
+    while free := {name for name, needed in waiting.items() if not needed & waiting.keys()}:
+        waiting = {name: needed for name, needed in waiting.items() if name not in free}
+    while outer := waiting.keys() - {name for needed in waiting.values() for name in needed}:
+        waiting = {name: needed for name, needed in waiting.items() if name not in outer}
+    assert sorted(waiting) == []
+
+
+def module_name(path: Path) -> str:
+    parts = ("vla_zenoh", *path.with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def test_every_folder_has_its_place_in_the_order() -> None:
+    rooms = {path.parts[0].removesuffix(".py") for path in SOURCES} - {"__init__"}
+    assert rooms == LEVEL.keys()
+
+
+def test_imports_inside_functions_and_of_parts_are_seen() -> None:
+    source = "def f():\n    from zenoh import Session\n    import time.x as s\n"
+    assert offences(source, IO) == ["time.x", "zenoh.Session"]
+
+
+def loaded_after(module: str) -> set[str]:
+    code = f"import json, sys, {module}; print(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    return set(json.loads(done.stdout))
+
+
+def core_modules() -> list[str]:
+    beside = [path.stem for path in PACKAGE.glob("*.py") if not path.stem.startswith("__")]
+    folders = [path.parent.name for path in PACKAGE.glob("*/__init__.py")]
+    outer = ("bus", "runtime", "nodes", "robots", "cli", "simulation")
+    core = [name for name in beside + folders if name not in outer]
+    return sorted(core)
+
+
+@pytest.mark.parametrize("name", core_modules())
+def test_importing_the_core_loads_nothing_heavy(name: str) -> None:
+    assert loaded_after(f"vla_zenoh.{name}").isdisjoint(HEAVY)
+
+
+def test_importing_the_package_loads_no_library_at_all() -> None:
+    assert loaded_after("vla_zenoh").isdisjoint({*HEAVY, "numpy", "cv2", "pydantic", "pinocchio"})
+
+
+OPTIONAL = (
+    "pinocchio",
+    "ruckig",
+    "mujoco",
+    "matplotlib",
+    "av",
+    "flask",
+    "zmq",
+    "websockets",
+    "rerun",
+)
+
+
+def test_the_command_line_knows_every_command_without_any_optional_library() -> None:
+    """A model's environment has what the package itself needs, and no more."""
+    code = (
+        f"import sys\nfor name in {OPTIONAL!r}: sys.modules[name] = None\n"
+        "import typer, vla_zenoh.cli.main as main\n"
+        "for name, found in typer.main.get_command(main.app).commands.items():\n"
+        "    assert found.name == name and found.help, name"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_command_that_is_not_called_is_not_imported() -> None:
+    """Every node and every word of a person waits for the import of the command line."""
+    loaded = loaded_after("vla_zenoh.cli.main")
+    assert {name for name in loaded if name.startswith("vla_zenoh.cli.")} == {
+        "vla_zenoh.cli.lazy_group",
+        "vla_zenoh.cli.main",
+    }
+    assert loaded.isdisjoint({"numpy", "pydantic", "vla_zenoh.nodes"})

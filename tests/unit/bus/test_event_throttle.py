@@ -1,0 +1,95 @@
+"""Which events of a node are written, and for how many others each of them stands."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vla_zenoh.bus.event_throttle import KINDS, PERIOD_S, EventThrottle
+from vla_zenoh.types import Event
+
+REFUSED = Event("warning", "refusal", "activate_refused", "worker 'a' is not alive")
+MALFORMED = Event("warning", "refusal", "malformed", "no map")
+MOVED = Event("info", "transition", "inactive->active")
+
+
+class Desk:
+    """Somebody who reads the news, and sets the clock."""
+
+    def __init__(self) -> None:
+        self.read: list[Event] = []
+        self.now_s = 0.0
+        self.news = EventThrottle(self.read.append, lambda: self.now_s)
+
+    @property
+    def counts(self) -> list[int]:
+        return [event.count for event in self.read]
+
+
+def test_a_flood_is_told_at_once_and_then_now_and_then_with_its_count() -> None:
+    desk = Desk()
+    for _ in range(100):
+        desk.news.tell(MALFORMED, "delta/a")
+    assert desk.counts == [1]
+    desk.now_s += PERIOD_S
+    desk.news.tell(MALFORMED, "delta/a")
+    assert desk.counts == [1, 100]
+
+
+def test_a_flood_about_one_thing_does_not_silence_another_nor_a_transition() -> None:
+    desk = Desk()
+    for _ in range(3):
+        desk.news.tell(MALFORMED, "delta/a")
+        desk.news.tell(MALFORMED, "delta/b")
+        desk.news.tell(MOVED)
+    assert desk.read.count(MOVED) == 3
+    assert len(desk.read) == 5
+
+
+def test_every_reason_of_a_refused_setting_is_told() -> None:
+    desk = Desk()
+    other = Event("warning", "refusal", "activate_refused", "no camera")
+    desk.news.tell(REFUSED)
+    desk.news.tell(other)
+    assert desk.read == [REFUSED, other]
+
+
+def test_who_asks_again_at_once_is_answered_a_little_later() -> None:
+    desk = Desk()
+    for _ in range(3):
+        desk.news.tell(REFUSED)
+        desk.news.tick()
+    assert desk.counts == [1]
+    desk.now_s += PERIOD_S
+    desk.news.tick()
+    assert desk.counts == [1, 2]
+    assert desk.read[-1].why == REFUSED.why
+    desk.now_s += PERIOD_S
+    desk.news.tick()
+    assert len(desk.read) == 2
+
+
+@given(st.lists(st.sampled_from(["ask", "tick", "wait"]), max_size=60))
+def test_in_the_end_every_refusal_of_a_setting_is_counted_once(acts: list[str]) -> None:
+    desk = Desk()
+    for act in [*acts, "wait", "tick"]:
+        if act == "ask":
+            desk.news.tell(REFUSED)
+        elif act == "tick":
+            desk.news.tick()
+        else:
+            desk.now_s += PERIOD_S
+    assert sum(desk.counts) == acts.count("ask")
+
+
+def test_whoever_makes_up_kinds_fills_no_memory_and_breaks_no_count() -> None:
+    desk = Desk()
+    for number in range(3 * KINDS):
+        made_up = Event("warning", "refusal", "rate_refused", f"not {number}")
+        for _ in range(2):
+            desk.news.tell(made_up)
+        desk.news.tick()
+    desk.now_s += PERIOD_S
+    desk.news.tick()
+    assert min(desk.counts) == 1
+    assert len(desk.read) <= 6 * KINDS

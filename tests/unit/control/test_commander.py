@@ -1,0 +1,928 @@
+"""The command node's mind: what it does with chunks, settings, losses, and what never happens."""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from command_rig import (
+    MS,
+    OTHER,
+    SOURCE,
+    START_M,
+    WORKER,
+    Rig,
+    model_spec,
+    profile,
+    quat_of,
+)
+
+from vla_zenoh.control.commander import Commander, Inputs, Setting
+from vla_zenoh.control.motion_pipeline import LINGER_NS
+from vla_zenoh.kinematics.so3 import norm3
+from vla_zenoh.profile import load_profile
+from vla_zenoh.types import GripperState, PoseState
+
+UP = [0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.0]
+FORTH = [0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+STAND = [0.0] * 7
+STEP_M = 0.01
+AT_GOAL_M, AT_GOAL_RAD = 1e-6, 1e-6
+
+
+def moving_rig(**kwargs: object) -> Rig:
+    """Active and in the middle of a move along x at some 0.3 m/s."""
+    rig = Rig(**kwargs)  # pyright: ignore[reportArgumentType]
+    rig.activate()
+    for _ in range(6):
+        rig.send([[0.03, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
+        rig.run(0.096)
+    assert norm3(rig.commands[-1].twist[:3]) > 0.2
+    return rig
+
+
+# -- before and after activation ------------------------------------------------------------------
+
+
+def test_before_activation_nothing_is_streamed_and_chunks_are_only_looked_at() -> None:
+    rig = Rig()
+    for _ in range(50):
+        assert rig.send([UP]).pose is None
+    assert rig.state == "inactive"
+    assert rig.refused == {}
+
+
+def test_activation_is_refused_with_every_reason_as_an_event() -> None:
+    rig = Rig()
+    rig.around = replace(rig.around, alive=frozenset())
+    rig.put("active", True)
+    assert rig.state == "inactive"
+    refusals = [event for event in rig.events if event.kind == "refusal"]
+    assert len(refusals) >= 3
+    assert {event.what for event in refusals} == {"activate_refused"}
+    assert rig.refused["activate_refused"] == len(refusals)
+
+
+def test_activation_begins_where_the_robot_holds_and_does_not_move_it() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.run(0.5)
+    assert len(rig.commands) > 100
+    for command in rig.commands:
+        np.testing.assert_allclose(command.position_m, START_M, atol=1e-12)
+    assert rig.widths_m == []
+
+
+def test_a_chunk_observed_before_the_activation_is_refused_in_silence() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.events.clear()
+    rig.send([UP], observed_ago_s=0.1)
+    assert rig.refused == {"before_activation": 1}
+    assert rig.events == []
+
+
+def test_a_dry_run_computes_everything_and_streams_nothing() -> None:
+    rig = Rig(dry_run=True)
+    rig.activate()
+    for _ in range(5):
+        out = rig.send([[*UP[:6], -0.03]])
+        assert out.accepted is not None
+        rig.run(0.2)
+    assert rig.commander.progress.steps == 5
+    assert rig.commander.goal is not None
+    np.testing.assert_allclose(rig.commander.goal.pose.position_m, START_M + [0, 0, 0.05])
+    assert rig.commands == []
+    assert rig.widths_m == []
+
+
+# -- composing ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate_hz", [1, 2, 5, 10, 20])
+@pytest.mark.parametrize("latency_s", [0.0, 0.05, 0.14, 0.3])
+def test_steps_are_neither_lost_nor_counted_twice_whatever_rate_latency_and_jitter(
+    rate_hz: int, latency_s: float
+) -> None:
+    jitter = random.Random(rate_hz)
+    rig = Rig(profile(timing={"watchdog_s": 2.0}))
+    rig.activate()
+    given, due_s, steps = 0.0, 0.0, 12
+    began_ns = rig.now_ns
+    for _ in range(steps):
+        # The observation is later than the last publication; the chunk comes after the latency.
+        while (rig.now_ns - began_ns) / 1e9 < due_s:
+            rig.tick()
+        observed_ns = rig.now_ns + rig.period_ns
+        wait_s = latency_s * jitter.uniform(0.7, 1.3)
+        rig.run(wait_s)
+        ago_s = (rig.now_ns + rig.period_ns - observed_ns) / 1e9
+        out = rig.send([UP], observed_ago_s=ago_s)
+        assert out.accepted is not None, rig.refused
+        due_s = max(due_s + 1 / rate_hz, (rig.now_ns - began_ns) / 1e9)
+        given += STEP_M
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, given], atol=AT_GOAL_M)
+    assert norm3(rig.turned_rad()) < AT_GOAL_RAD
+    rig.assert_smooth()
+
+
+def test_of_a_chunk_that_lasts_too_long_only_the_beginning_is_followed() -> None:
+    rig = Rig(profile(timing={"max_open_loop_s": 0.5}), horizon=50, dt_s=0.1)
+    rig.activate()
+    out = rig.send([UP] * 50, done=True)
+    assert out.accepted is not None
+    (event,) = [event for event in rig.events if event.what == "open_loop"]
+    assert (event.value, event.limit) == (pytest.approx(5.0), 0.5)
+    rig.run(3.0)
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, 5 * STEP_M], atol=AT_GOAL_M)
+    assert not rig.commander.progress.done
+    assert rig.state == "holding"
+
+
+def test_a_single_step_that_takes_too_long_does_not_keep_the_watchdog_waiting() -> None:
+    rig = Rig(profile(timing={"max_open_loop_s": 0.5}), dt_s=60.0)
+    rig.activate()
+    assert rig.send([UP]).accepted is not None
+    rig.run(1.5)
+    assert rig.state == "holding"
+
+
+def test_an_arm_that_holds_for_long_needs_activation_again() -> None:
+    rig = Rig(profile(timing={"max_hold_s": 2.0}))
+    rig.activate()
+    rig.send([UP])
+    rig.run(2.0)
+    assert rig.state == "holding"
+    rig.run(1.0)
+    assert rig.state == "inactive"
+    assert "held for 2 s" in rig.commander.why
+    rig.send([UP])
+    assert rig.state == "inactive"
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, STEP_M], atol=AT_GOAL_M)
+
+
+def test_a_chunk_whose_observation_does_not_show_the_last_chunk_replaces_it() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.run(0.1)
+    rig.send([UP])
+    rig.run(0.04)
+    rig.send([UP], observed_ago_s=0.05)  # taken just before the first one was published
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, STEP_M], atol=AT_GOAL_M)
+
+
+def test_a_chunk_counts_from_its_publication_however_long_it_was_on_its_way() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.run(0.2)
+    rig.send([UP], observed_ago_s=0.15, published_ago_s=0.1)
+    rig.run(0.02)
+    rig.send([UP], observed_ago_s=0.08)  # later than the first one's publication: on top of it
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, 2 * STEP_M], atol=AT_GOAL_M)
+
+
+def test_a_chunk_published_before_it_was_observed_counts_from_its_observation() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.run(0.2)
+    rig.send([UP], observed_ago_s=0.15)
+    rig.run(0.1)
+    rig.send([UP], observed_ago_s=0.05, published_ago_s=10.0)
+    rig.run(0.02)
+    rig.send([UP], observed_ago_s=0.01)
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, 3 * STEP_M], atol=AT_GOAL_M)
+
+
+def test_steps_whose_time_has_passed_are_skipped_and_no_way_is_lost() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.run(0.4)
+    out = rig.send([UP] * 8, observed_ago_s=0.35)
+    assert out.pose is not None
+    np.testing.assert_allclose(out.pose.goal_position_m, START_M + [0, 0, 0.04])
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, 0.08], atol=AT_GOAL_M)
+    rig.assert_smooth()
+
+
+@pytest.mark.parametrize("period_s", [0.1, 0.2, 0.28, 0.52])
+def test_overlapping_chunks_give_the_speed_that_was_asked_for(period_s: float) -> None:
+    rig = Rig()
+    rig.activate()
+    asked_s = 2.08
+    for _ in range(round(asked_s / period_s)):
+        rig.send([UP] * 10)
+        rig.run(period_s - 0.004)
+    goal = rig.commander.goal
+    assert goal is not None
+    spent_s = round(asked_s / period_s) * period_s
+    # The goal in force leads what was asked until now by a step at most.
+    asked_m = spent_s / 0.1 * STEP_M
+    lead_m = goal.pose.position_m[2] - START_M[2] - asked_m
+    assert -AT_GOAL_M <= lead_m <= STEP_M + AT_GOAL_M
+
+
+@pytest.mark.parametrize("cuts", [[12], [4, 8], [1] * 12, [5, 1, 6]])
+def test_the_same_steps_in_any_split_of_chunks_end_at_the_same_pose(cuts: list[int]) -> None:
+    step = [0.004, -0.003, 0.005, 0.02, -0.03, 0.04, 0.0]
+    rig = Rig()
+    rig.activate()
+    for count in cuts:
+        rig.send([step] * count)
+        rig.run(0.1 * count - 0.004)
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0.048, -0.036, 0.06], atol=AT_GOAL_M)
+    np.testing.assert_allclose(rig.turned_rad(), [0.24, -0.36, 0.48], atol=AT_GOAL_RAD)
+    rig.assert_smooth()
+
+
+def test_absolute_steps_go_to_the_pose_they_name() -> None:
+    rig = Rig(kind="absolute", rotation="quaternion", gripper="absolute_m")
+    goal = [0.45, 0.02, 0.32, *quat_of([0.0, 0.0, 0.1]), 0.04]
+    rig.tick(chunks=[rig.chunk([goal])])
+    rig.put("active", True)
+    for _ in range(3):
+        rig.send([goal])
+        rig.run(0.1)
+    rig.settle()
+    np.testing.assert_allclose(rig.position_m, goal[:3], atol=AT_GOAL_M)
+    np.testing.assert_allclose(rig.turned_rad(), [0, 0, 0.1], atol=AT_GOAL_RAD)
+    assert rig.widths_m == pytest.approx([0.04])
+
+
+# -- bounds ---------------------------------------------------------------------------------------
+
+
+def test_a_step_over_its_limit_is_shortened_and_told() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.send([[0.08, 0, 0, 0, 0, 0, 0]])
+    (event,) = [event for event in rig.events if event.kind == "limit"]
+    assert (event.what, event.limit) == ("step_m", rig.profile.limits.step_m)
+    assert event.value == pytest.approx(0.08)
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [rig.profile.limits.step_m, 0, 0], atol=AT_GOAL_M)
+
+
+def test_a_step_far_over_its_limit_refuses_the_whole_chunk() -> None:
+    rig = Rig()
+    rig.activate()
+    out = rig.send([UP, [10.0, 0, 0, 0, 0, 0, 0]])
+    assert out.accepted is None
+    assert rig.refused == {"step_m": 1}
+    assert any("is its unit right?" in event.why for event in rig.events)
+    rig.run(0.5)
+    np.testing.assert_allclose(rig.moved_m(), np.zeros(3), atol=AT_GOAL_M)
+
+
+def test_a_profile_that_says_refuse_drops_what_would_be_shortened() -> None:
+    rig = Rig(profile(limits={"out_of_bounds": "refuse"}))
+    rig.activate()
+    rig.send([UP, [0.08, 0, 0, 0, 0, 0, 0]])
+    assert rig.refused == {"step_m": 1}
+
+
+def test_a_gripper_number_of_another_meaning_is_refused() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.send([[0, 0, 0, 0, 0, 0, 1.0]])
+    assert rig.refused == {"meaning": 1}
+
+
+def test_the_goal_stops_at_the_border_of_the_workspace() -> None:
+    rig = Rig()
+    rig.activate()
+    for _ in range(20):
+        rig.send([[0.05, 0, 0, 0, 0, 0, 0]])
+        rig.run(0.196)
+    rig.settle()
+    assert rig.position_m[0] == pytest.approx(rig.profile.limits.workspace.x_m[1], abs=AT_GOAL_M)
+    assert max(command.position_m[0] for command in rig.commands) <= 0.75 + AT_GOAL_M
+    rig.assert_smooth()
+
+
+def test_the_leash_keeps_a_backlog_from_building_up_and_what_was_cut_does_not_come_back() -> None:
+    rig = Rig(profile(limits={"lead_m": 0.06}))
+    rig.activate()
+    for _ in range(10):
+        rig.send([[0.0, 0.04, 0.0, 0, 0, 0, 0]])
+        rig.run(0.02)
+    goal = rig.commander.goal
+    assert goal is not None
+    ahead_m = norm3(goal.pose.position_m - rig.position_m)
+    assert ahead_m <= 0.06 + 1e-9
+    assert any(event.what == "lead_m" and event.why == "leash" for event in rig.events)
+    end_m = goal.pose.position_m
+    rig.settle()
+    np.testing.assert_allclose(rig.position_m, end_m, atol=AT_GOAL_M)
+
+
+# -- silence, stop, loss --------------------------------------------------------------------------
+
+
+def test_without_fresh_chunks_it_brakes_holds_and_goes_on_with_the_next_one() -> None:
+    rig = moving_rig(of=profile(limits={"lead_m": 0.5}), horizon=1)
+    watchdog_s = rig.profile.timing.watchdog_s
+    began_ns = rig.now_ns
+    while rig.state == "active" and rig.now_ns < began_ns + 3 * 10**9:
+        rig.tick()
+    waited_s = (rig.now_ns - began_ns) / 1e9
+    assert watchdog_s < waited_s < watchdog_s + 1 / rig.commander.task.rate_hz + 0.1 + 0.01
+    rig.settle(1.0)
+    assert rig.state == "holding"
+    at_m = rig.position_m[0]
+    rig.send([FORTH])
+    assert rig.state == "active"
+    rig.settle()
+    assert rig.position_m[0] == pytest.approx(at_m + 0.02, abs=1e-4)
+    assert rig.transitions[-3:-1] == ["active->holding", "holding->active"]
+    rig.assert_smooth()
+
+
+@pytest.mark.parametrize("order", ["deactivate", "stop", "lose"])
+def test_whatever_ends_a_move_brakes_it_within_the_limits_and_nothing_pulls_it_on(
+    order: str,
+) -> None:
+    rig = moving_rig()
+    if order == "deactivate":
+        rig.put("active", False)
+    elif order == "stop":
+        rig.tick("stop")
+    else:
+        rig.put("lose", "the loop stood still")
+    at_m, speed = rig.position_m[0], rig.commands[-1].twist[0]
+    rig.run(1.0)
+    assert rig.commander.at_rest
+    limits = rig.profile.limits.translation
+    ramp_s = limits.acceleration_m_s2 / limits.jerk_m_s3
+    longest_m = speed**2 / (2 * limits.acceleration_m_s2) + speed * 2 * ramp_s
+    assert 0 < rig.position_m[0] - at_m < longest_m
+    assert min(command.twist[0] for command in rig.commands[-200:]) > -1e-9
+    rig.assert_smooth()
+
+
+def test_the_stream_ends_a_while_after_the_arm_stands() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.put("active", False)
+    began_ns = rig.now_ns
+    while rig.tick().pose is not None:
+        assert rig.now_ns < began_ns + 2 * LINGER_NS
+    assert rig.now_ns - began_ns == pytest.approx(LINGER_NS, abs=10 * MS)
+    assert not rig.commander.streaming
+
+
+def test_a_stop_is_latched_until_it_is_reset() -> None:
+    rig = moving_rig()
+    rig.tick("stop")
+    for name, value in (("active", True), ("active", False), ("prompt", "x"), ("rate", 2.0)):
+        rig.put(name, value)
+        rig.send([UP])
+        assert rig.state == "stopped"
+    assert rig.refused["activate_refused"] == 1
+    rig.tick("reset")
+    assert rig.state == "inactive"
+    rig.activate()
+    rig.assert_smooth()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["stop", "reset", Setting("active", True)],
+        ["reset", Setting("active", True), "stop"],
+        [Setting("active", True), "stop", "reset"],
+    ],
+)
+@pytest.mark.parametrize("before", ["inactive", "active", "stopped"])
+def test_a_stop_beats_whatever_else_is_put_in_the_same_tick(
+    settings: list[Setting | str], before: str
+) -> None:
+    rig = Rig()
+    rig.tick(chunks=[rig.chunk([STAND])])
+    if before == "active":
+        rig.put("active", True)
+    if before == "stopped":
+        rig.tick("stop")
+    rig.tick(*settings)
+    assert rig.state == "stopped"
+    assert rig.refused["reset_refused"] == 1
+
+
+def test_a_stop_and_a_chunk_in_one_tick_is_a_stop() -> None:
+    rig = moving_rig()
+    out = rig.tick("stop", chunks=[rig.chunk([UP])])
+    assert rig.state == "stopped"
+    assert out.accepted is None
+
+
+def test_a_fault_of_the_robot_is_latched_while_it_lasts_and_until_reset() -> None:
+    rig = moving_rig()
+    rig.gripper = replace(rig.gripper, faults=("joint 4 is too hot",))
+    rig.tick()
+    assert rig.state == "fault"
+    rig.tick("reset")
+    assert rig.state == "fault"
+    assert any("still reports: joint 4" in event.why for event in rig.events)
+    rig.gripper = replace(rig.gripper, faults=())
+    rig.run(1.0)
+    assert rig.state == "fault"
+    rig.tick("reset")
+    assert rig.state == "inactive"
+    rig.assert_smooth()
+
+
+def test_a_robot_that_leaves_its_ready_mode_ends_the_activation() -> None:
+    rig = moving_rig()
+    rig.gripper = replace(rig.gripper, mode="guiding")
+    rig.tick()
+    assert rig.state == "inactive"
+    assert "not ready but 'guiding'" in rig.commander.why
+
+
+@pytest.mark.parametrize("node", ["sim", "camera", "worker-scripted"])
+def test_a_node_that_is_gone_ends_the_activation_and_coming_back_does_not_renew_it(
+    node: str,
+) -> None:
+    rig = moving_rig()
+    whole = rig.around
+    rig.around = replace(whole, alive=whole.alive - {node})
+    rig.tick()
+    assert rig.state == "inactive"
+    assert node in rig.commander.why
+    rig.around = whole
+    rig.run(1.0)
+    assert rig.state == "inactive"
+    rig.assert_smooth()
+    rig.activate()
+
+
+def test_a_camera_that_lies_ends_the_activation_by_name() -> None:
+    rig = moving_rig()
+    frozen = {"front": "shows the same picture since 1.2 s"}
+    rig.around = replace(rig.around, camera_faults=frozen)
+    rig.tick()
+    assert rig.state == "inactive"
+    assert rig.commander.why == "camera 'front' shows the same picture since 1.2 s"
+    rig.around = replace(rig.around, camera_faults={})
+    rig.run(1.0)
+    assert rig.state == "inactive"
+    rig.assert_smooth()
+    rig.activate()
+
+
+def test_a_camera_that_the_model_does_not_use_may_lie() -> None:
+    rig = moving_rig()
+    rig.around = replace(rig.around, camera_faults={"wrist": "is black"})
+    rig.tick()
+    assert rig.state == "active"
+
+
+def test_a_node_that_is_not_needed_may_go() -> None:
+    rig = moving_rig()
+    rig.around = replace(rig.around, alive=rig.around.alive - {f"worker-{OTHER}"})
+    rig.tick()
+    assert rig.state == "active"
+
+
+def test_a_worker_that_was_started_anew_has_to_be_activated_anew() -> None:
+    rig = moving_rig()
+    rig.around = replace(rig.around, spec_sources={WORKER: "worker-scripted-2"})
+    rig.tick()
+    assert rig.state == "inactive"
+    assert "started anew" in rig.commander.why
+    rig.put("active", True)
+    assert rig.state == "inactive"  # its chunks of before do not count
+    rig.activate()
+
+
+def test_robot_state_that_falls_silent_ends_the_activation() -> None:
+    rig = moving_rig()
+    rig.silent = True
+    began_ns = rig.now_ns
+    while rig.state == "active":
+        rig.tick()
+    waited_s = (rig.now_ns - began_ns) / 1e9
+    assert waited_s == pytest.approx(rig.profile.timing.state_timeout_s, abs=0.01)
+    assert "robot state lost" in rig.commander.why
+    rig.run(1.0)
+    rig.silent = False
+    rig.run(0.1)
+    assert rig.state == "inactive"
+    rig.assert_smooth()
+
+
+def test_robot_state_that_comes_late_ends_the_activation() -> None:
+    rig = moving_rig()
+    late = rig.pose_state()
+    header = replace(late.header, stamp_wall_ns=rig.now_ns - 10**9)
+    inputs = Inputs(pose=replace(late, header=header), gripper=rig.gripper_state())
+    rig.commander.step(inputs, rig.now_ns)
+    assert rig.state == "inactive"
+    assert "comes late" in rig.commander.why
+
+
+def test_a_gripper_that_falls_silent_ends_the_activation() -> None:
+    rig = moving_rig()
+    for _ in range(50):
+        rig.now_ns += rig.period_ns
+        rig.commander.step(Inputs(pose=rig.pose_state(), around=rig.around), rig.now_ns)
+    assert rig.state == "inactive"
+    assert "robot state lost: gripper" in rig.commander.why
+
+
+def test_a_blocked_arm_ends_the_activation() -> None:
+    rig = moving_rig()
+    rig.blocked = True
+    for _ in range(20):
+        rig.send([[0.04, 0, 0, 0, 0, 0, 0]])
+        rig.run(0.096)
+        if rig.state != "active":
+            break
+    assert rig.state == "inactive"
+    assert "is it blocked?" in rig.commander.why
+    last_m = rig.commands[-1].position_m
+    limits = rig.profile.limits
+    assert norm3(last_m - rig.position_m) < limits.tracking_m + 0.1
+    rig.assert_smooth()
+
+
+def test_an_arm_activated_again_while_blocked_is_led_back_to_where_it_is() -> None:
+    rig = moving_rig()
+    rig.blocked = True
+    while rig.state == "active":
+        rig.send([[0.04, 0, 0, 0, 0, 0, 0]])
+        rig.run(0.096)
+    rig.put("stop")  # it is not led back before
+    rig.run(2.0)
+    assert norm3(rig.commands[-1].position_m - rig.position_m) > rig.profile.limits.tracking_m
+    rig.put("reset")
+    rig.activate()
+    rig.run(1.0)
+    assert rig.state == "active", rig.commander.why
+    np.testing.assert_allclose(rig.commands[-1].position_m, rig.position_m, atol=1e-6)
+    rig.assert_smooth()
+    # From here on it is guarded as ever.
+    for _ in range(6):
+        rig.send([[0.04, 0, 0, 0, 0, 0, 0]])
+        rig.run(0.096)
+    assert rig.state == "inactive"
+
+
+# -- who is obeyed --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("source", ["worker-scripted-9", "", "x" * 128])
+def test_a_source_that_did_not_publish_the_workers_spec_is_never_obeyed(source: str) -> None:
+    rig = Rig()
+    rig.tick(chunks=[rig.chunk([STAND], source=source)])
+    rig.put("active", True)
+    assert rig.state == "inactive"  # it cannot get the lease
+    rig.activate()
+    rig.send([UP], source=source, seq=10**6)
+    assert rig.refused["foreign"] == 2
+    assert rig.send([UP]).accepted is not None
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, STEP_M], atol=AT_GOAL_M)
+
+
+def test_a_worker_without_a_spec_is_not_obeyed() -> None:
+    rig = Rig()
+    rig.tick(chunks=[rig.chunk([STAND], worker="ghost", source="ghost-1")])
+    assert rig.refused == {"unknown_worker": 1}
+
+
+def test_a_worker_without_the_lease_runs_in_the_shadow() -> None:
+    rig = Rig()
+    rig.activate()
+    out = rig.send([UP], worker=OTHER)
+    assert out.accepted is None
+    assert rig.refused == {}
+    rig.run(0.3)
+    np.testing.assert_allclose(rig.moved_m(), np.zeros(3), atol=1e-12)
+
+
+def test_a_chunk_that_comes_again_is_refused() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.run(0.1)
+    chunk = rig.chunk([UP])
+    assert rig.tick(chunks=[chunk]).accepted is not None
+    assert rig.tick(chunks=[chunk]).accepted is None
+    assert rig.refused == {"replayed": 1}
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, STEP_M], atol=AT_GOAL_M)
+
+
+def test_chunks_of_another_spec_than_agreed_are_refused() -> None:
+    rig = Rig()
+    rig.activate()
+    changed = model_spec(dt_s=0.2)
+    rig.around = replace(rig.around, specs={WORKER: changed})
+    rig.send([UP], spec_hash=changed.hash)
+    assert rig.refused == {"spec_mismatch": 1}
+
+
+# -- settings in motion ---------------------------------------------------------------------------
+
+
+def test_a_new_prompt_in_motion_supersedes_chunks_under_way_without_a_jump() -> None:
+    rig = moving_rig()
+    episode = rig.commander.task.episode
+    out = rig.put("prompt", "HARD: go down")
+    assert out.task_changed
+    assert rig.commander.task.prompt == "HARD: go down"
+    assert rig.commander.task.episode > episode
+    rig.send([FORTH], episode=episode)
+    assert rig.refused == {"superseded": 1}
+    assert rig.send([FORTH]).accepted is not None
+    rig.settle()
+    rig.assert_smooth()
+
+
+def test_the_same_prompt_again_is_no_new_episode() -> None:
+    rig = moving_rig()
+    task = rig.commander.task
+    assert not rig.put("prompt", task.prompt).task_changed
+
+
+def test_the_lease_passes_to_another_worker_in_motion_without_a_jump() -> None:
+    rig = moving_rig()
+    rig.send([STAND], worker=OTHER)
+    rig.put("worker", OTHER)
+    assert rig.state == "active"
+    assert rig.commander.task.worker == OTHER
+    rig.run(0.1)
+    assert rig.send([FORTH]).accepted is None  # of the worker before
+    assert rig.send([UP], worker=OTHER).accepted is not None
+    rig.settle()
+    rig.assert_smooth()
+
+
+def test_the_lease_does_not_pass_to_a_worker_that_is_not_fit() -> None:
+    rig = moving_rig()
+    rig.put("worker", "ghost")
+    assert rig.commander.task.worker == WORKER
+    assert rig.refused["worker_refused"] >= 1
+    assert rig.send([FORTH]).accepted is not None
+
+
+def test_while_inactive_any_worker_may_be_named() -> None:
+    rig = Rig()
+    rig.put("worker", "ghost")
+    assert rig.commander.task.worker == "ghost"
+    rig.put("active", True)
+    assert rig.state == "inactive"
+
+
+def test_a_new_rate_in_motion_changes_nothing_but_the_task() -> None:
+    rig = moving_rig()
+    assert rig.put("rate", 20.0).task_changed
+    assert rig.commander.task.rate_hz == 20.0
+    assert rig.state == "active"
+    rig.settle()
+    rig.assert_smooth()
+
+
+def test_the_speed_is_part_of_the_task_and_no_new_episode() -> None:
+    rig = moving_rig()
+    episode = rig.commander.task.episode
+    assert rig.commander.task.speed_percent == 100.0
+    assert rig.put("speed", 30.0).task_changed
+    assert rig.commander.task.speed_percent == 30.0
+    assert rig.put("speed", 80.0).task_changed
+    assert (rig.commander.task.speed_percent, rig.commander.task.episode) == (80.0, episode)
+    assert rig.state == "active"
+
+
+def test_slower_only_ever_lowers_the_speed() -> None:
+    rig = Rig()
+    rig.put("slower", 40.0)
+    assert rig.commander.task.speed_percent == 40.0
+    out = rig.put("slower", 40.5)
+    assert rig.commander.task.speed_percent == 40.0
+    assert rig.refused == {"slower_refused": 1}
+    assert [event.why for event in out.events] == [
+        "40.5 % is more than the 40 % in force; put it on speed to go faster"
+    ]
+    rig.put("slower", 40.0)
+    rig.put("slower", 0.0)
+    assert rig.commander.task.speed_percent == 0.0
+    rig.put("speed", 100.0)
+    assert rig.commander.task.speed_percent == 100.0
+    assert rig.refused == {"slower_refused": 1}
+
+
+def test_the_speed_at_the_beginning_is_that_of_the_profile() -> None:
+    profile = load_profile("panda_sim")
+    slow = profile.task.model_copy(update={"speed_percent": 25.0})
+    commander = Commander(profile.model_copy(update={"task": slow}))
+    assert commander.task.speed_percent == 25.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("rate", math.nan),
+        ("rate", -1.0),
+        ("rate", True),
+        ("rate", "fast"),
+        *((name, value) for name in ("speed", "slower") for value in (math.nan, -1.0, True, "30")),
+        ("speed", 100.5),
+        ("prompt", "x" * 5000),
+        ("prompt", 3.0),
+        ("prompt", "\ud800"),
+        ("worker", "x" * 200),
+        ("active", math.nan),
+        ("active", 1.0),
+        ("colour", "red"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused_and_changes_nothing(
+    name: str, value: str | bool | float
+) -> None:
+    rig = Rig()
+    rig.tick(chunks=[rig.chunk([STAND])])
+    task = rig.commander.task
+    rig.put(name, value)
+    assert rig.commander.task == task
+    assert rig.state == "inactive"
+    assert rig.refused == {f"{name}_refused": 1}
+
+
+def test_activated_again_while_it_brakes_it_comes_to_rest_without_turning_back() -> None:
+    rig = moving_rig()
+    rig.put("active", False)
+    rig.run(0.04)
+    count = len(rig.commands)
+    rig.activate()
+    rig.run(1.0)
+    assert rig.state == "active"
+    assert rig.commander.at_rest
+    assert min(command.twist[0] for command in rig.commands[count:]) > -1e-9
+    rig.assert_smooth()
+    at_m = rig.position_m[0]
+    rig.send([FORTH])
+    rig.settle()
+    assert rig.position_m[0] == pytest.approx(at_m + 0.02, abs=AT_GOAL_M)
+
+
+@pytest.mark.slow
+def test_a_minute_of_toggling_active_ten_times_a_second_stays_smooth() -> None:
+    rig = Rig()
+    rig.activate()
+    for k in range(600):  # 0.1 s each
+        rig.put("active", k % 2 == 1)
+        for _ in range(4):
+            rig.send([[0.02, 0.0, 0.01 * (-1) ** (k // 50), 0.0, 0.0, 0.05, 0.0]])
+            rig.run(0.02)
+    rig.put("active", False)
+    rig.settle(1.0)
+    assert rig.commander.progress.steps > 0
+    assert rig.commander.smoothing_failures == 0
+    rig.assert_smooth()
+
+
+# -- time -----------------------------------------------------------------------------------------
+
+
+def test_a_late_call_samples_the_same_trajectory_later() -> None:
+    steady, late = Rig(), Rig()
+    positions: dict[str, dict[int, np.ndarray]] = {"steady": {}, "late": {}}
+    for rig, name, pattern in ((steady, "steady", [1]), (late, "late", [1, 3, 1, 2, 5])):
+        rig.activate()
+        rig.send([[0.04, 0.02, 0.01, 0.1, 0.0, 0.1, 0.0]])
+        begin_ns, k = rig.now_ns, 0
+        while rig.now_ns < begin_ns + 500 * MS:
+            out = rig.tick(ticks=pattern[k % len(pattern)])
+            assert out.pose is not None
+            positions[name][rig.now_ns - begin_ns] = out.pose.position_m
+            k += 1
+    for at_ns, position_m in positions["late"].items():
+        if at_ns in positions["steady"]:
+            np.testing.assert_allclose(position_m, positions["steady"][at_ns], atol=1e-12)
+    assert len(positions["late"]) < len(positions["steady"]) / 2
+
+
+def test_the_same_inputs_give_the_same_commands_to_the_bit() -> None:
+    def run() -> list[np.ndarray]:
+        rig = moving_rig()
+        rig.put("active", False)
+        rig.run(0.2)
+        return [command.position_m for command in rig.commands]
+
+    for first, second in zip(run(), run(), strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+# -- gripper --------------------------------------------------------------------------------------
+
+
+def test_gripper_deltas_add_up_from_the_width_at_activation() -> None:
+    rig = Rig()
+    rig.activate()
+    for _ in range(4):
+        rig.send([[0, 0, 0, 0, 0, 0, -0.01]])
+        rig.run(0.2)
+    assert rig.widths_m == pytest.approx([0.07, 0.06, 0.05, 0.04])
+
+
+def test_a_grip_is_kept_over_a_new_activation() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.send([[0, 0, 0, 0, 0, 0, -0.05]])
+    rig.run(0.2)
+    rig.gripper = GripperState(0.045, moving=False, holding=True)  # on a brick
+    rig.put("active", False)
+    rig.run(1.0)
+    rig.activate()
+    rig.send([STAND])
+    rig.run(0.5)
+    assert rig.widths_m == pytest.approx([0.03])
+
+
+def test_a_grip_that_somebody_else_made_can_be_opened() -> None:
+    rig = Rig(gripper="absolute_m")
+    rig.tick(chunks=[rig.chunk([[0, 0, 0, 0, 0, 0, 0.08]])])
+    rig.put("active", True)
+    rig.send([[0, 0, 0, 0, 0, 0, 0.07]])
+    rig.run(0.3)
+    rig.put("active", False)
+    rig.run(1.0)
+    rig.gripper = GripperState(0.03, moving=False, holding=True)
+    rig.tick(chunks=[rig.chunk([[0, 0, 0, 0, 0, 0, 0.07]])])
+    rig.put("active", True)
+    rig.send([[0, 0, 0, 0, 0, 0, 0.07]])
+    rig.run(0.3)
+    assert rig.widths_m == pytest.approx([0.07, 0.07])
+
+
+def test_an_inactive_commander_moves_no_gripper() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.send([[0, 0, 0, 0, 0, 0, -0.05]])
+    rig.put("active", False)
+    rig.gripper = replace(rig.gripper, width_m=0.08)
+    rig.run(2.0)
+    assert len(rig.widths_m) == 1
+
+
+# -- details of what is told ----------------------------------------------------------------------
+
+
+def test_a_robot_with_very_much_to_complain_about_is_cut_short() -> None:
+    rig = Rig()
+    rig.gripper = replace(rig.gripper, faults=("x" * 500,) * 50)
+    rig.tick()
+    assert rig.state == "fault"
+    rig.tick("reset")
+    assert rig.state == "fault"
+
+
+def test_a_command_carries_the_chunk_that_caused_it() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.run(0.1)
+    out = rig.send([UP])
+    assert out.accepted is not None
+    assert out.pose is not None
+    assert out.pose.cause == out.accepted
+    assert (out.accepted.worker, out.accepted.chunk_seq) == (WORKER, rig.seq[WORKER])
+    rig.put("active", False)
+    assert rig.commands[-1].cause is None
+
+
+def test_an_arm_outside_the_workspace_is_not_activated() -> None:
+    rig = Rig()
+    rig.position_m = np.array([0.1, 0.0, 0.3])
+    rig.tick(chunks=[rig.chunk([STAND])])
+    rig.put("active", True)
+    assert rig.state == "inactive"
+    assert "outside the workspace" in rig.commander.why
+
+
+def test_the_robots_own_reference_is_where_it_begins() -> None:
+    rig = Rig()
+    held_m = START_M + [0.0, 0.0, 0.004]  # the arm sags below what its controller holds
+    record = PoseState(START_M, rig.quat_xyzw, np.zeros(6), None, held_m, rig.quat_xyzw)
+    rig.tick(chunks=[rig.chunk([STAND])])
+    pose = replace(rig.pose_state(), record=record)
+    inputs = Inputs([Setting("active", True)], [], pose, rig.gripper_state(), rig.around)
+    out = rig.commander.step(inputs, rig.now_ns)
+    assert out.pose is not None
+    np.testing.assert_allclose(out.pose.position_m, held_m, atol=1e-12)
+
+
+def test_source_is_the_one_of_the_spec() -> None:
+    rig = Rig()
+    rig.activate()
+    assert rig.commander.lease is not None
+    assert rig.commander.lease.source == SOURCE

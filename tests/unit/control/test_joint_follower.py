@@ -1,0 +1,270 @@
+"""Joints that follow a pose stream: near to it, within their limits, and standing in time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vla_zenoh.control.limits import into_workspace
+from vla_zenoh.control.pose_to_joint import FAR, NEAR_M, NEAR_RAD, PoseToJoint
+from vla_zenoh.control.profile_arm import make_kinematics, make_shadow
+from vla_zenoh.control.smoothing import Smoother, motion_limits
+from vla_zenoh.guard.joint_guard import joint_motion_limits
+from vla_zenoh.kinematics.so3 import Pose, distance, exp3
+from vla_zenoh.profile import Profile, load_profile, override
+from vla_zenoh.types import FloatArray
+
+BASE = load_profile("panda_sim")
+KINEMATICS = make_kinematics(BASE)
+HOME_RAD = KINEMATICS.ordered(BASE.robot.arm_joints, BASE.robot.home_rad)
+TICK_S = 1 / BASE.timing.command_hz
+STEP_TICKS = 25
+MOST_LAG_M, MOST_LAG_RAD = 1.25 * FAR * NEAR_M, 1.25 * FAR * NEAR_RAD
+STRAIGHT_M = 0.001
+RTOL = 1e-6
+# Straight on, and not quite as fast as each joint could by itself.
+LONGER, SETTLING_S = 1.5, 0.12
+STANDING_M_S = 0.002
+OVERSHOOT_M = 0.06  # of 0.2 m/s, with what the joints can
+
+
+def profile(**joint: float) -> Profile:
+    limits = {"limits": {"joint": joint}} if joint else {}
+    return override(BASE, {"robot": {"command": "joint"}, **limits})
+
+
+class Arm:
+    """A pose stream, and joints that follow it perfectly timed."""
+
+    def __init__(self, of: Profile) -> None:
+        self.limits = joint_motion_limits(of)
+        self.stage = PoseToJoint(of, KINEMATICS)
+        self.stage.restart(HOME_RAD)
+        self.goal = KINEMATICS.forward(HOME_RAD)
+        self.smoother = Smoother(self.goal, TICK_S, motion_limits(of.limits))
+        self.joints_rad, self.rate_rad_s = HOME_RAD, np.zeros(len(HOME_RAD))
+        self.acceleration = np.zeros(len(HOME_RAD))
+        self.jerk = 0.0
+
+    def step(self, way_m: FloatArray, turn_rad: FloatArray, ticks: int = STEP_TICKS) -> None:
+        """One step of a chunk, and the time it has."""
+        here = self.smoother.motion
+        goal = Pose(self.goal.position_m + way_m, exp3(turn_rad) @ self.goal.rotation)
+        if distance(here.pose, goal)[0] < BASE.limits.lead_m:
+            self.goal = goal
+        self.smoother.target(self.goal, self.stage.shares(here, self.goal, self.smoother.box))
+        for _ in range(ticks):
+            self.tick()
+
+    def tick(self, *, braking: bool = False) -> None:
+        if braking:
+            self.stage.brake(self.smoother)
+        self.stage.tick(self.smoother, braking=braking)
+        told = self.stage.command("active", None)
+        assert (np.abs(told.velocity_rad_s) <= self.limits.velocity_rad_s * (1 + RTOL)).all()
+        most = self.limits.acceleration_rad_s2 * (1 + RTOL)
+        assert (np.abs(told.acceleration_rad_s2) <= most).all()
+        change = np.abs(told.acceleration_rad_s2 - self.acceleration) / TICK_S
+        self.jerk = max(self.jerk, float((change / self.limits.jerk_rad_s3).max()))
+        self.joints_rad, self.rate_rad_s = told.position_rad, told.velocity_rad_s
+        self.acceleration = told.acceleration_rad_s2
+
+    def lag(self) -> tuple[float, float]:
+        return distance(KINEMATICS.forward(self.joints_rad), self.smoother.motion.pose)
+
+    def speed_m_s(self) -> float:
+        return float(np.linalg.norm((KINEMATICS.jacobian(self.joints_rad) @ self.rate_rad_s)[:3]))
+
+    def stop_s(self) -> float:
+        """How long it takes until the TCP stands."""
+        last = 0
+        for n in range(1, 400):
+            self.tick(braking=True)
+            if self.speed_m_s() > STANDING_M_S:
+                last = n
+            if self.stage.at_rest and self.smoother.at_rest:
+                break
+        return last * TICK_S
+
+    def shortest_stop_s(self) -> float:
+        """What the slowest joint needs for it."""
+        _, most, jerk = self.limits
+        return float((np.abs(self.rate_rad_s) / most + most / jerk).max())
+
+
+ways = st.tuples(*[st.floats(-0.03, 0.03)] * 3, *[st.floats(-0.1, 0.1)] * 3).map(np.array)
+
+
+@given(
+    st.lists(st.tuples(ways, st.integers(1, 8)), min_size=1, max_size=4),
+    st.sampled_from([{}, {"velocity_rad_s": 0.3}, {"acceleration_rad_s2": 0.7}]),
+)
+@settings(max_examples=5, deadline=None)
+def test_joints_are_never_far_from_the_pose_and_stop_when_told_whatever_they_can(
+    orders: list[tuple[FloatArray, int]], joint: dict[str, float]
+) -> None:
+    arm = Arm(profile(**joint))
+    for way, times in orders:
+        for _ in range(times):
+            arm.step(way[:3], way[3:])
+            apart_m, apart_rad = arm.lag()
+            assert apart_m <= MOST_LAG_M
+            assert apart_rad <= MOST_LAG_RAD
+    allowed_s = LONGER * arm.shortest_stop_s() + SETTLING_S
+    assert arm.stop_s() <= allowed_s
+    assert arm.stage.at_rest
+    assert arm.smoother.at_rest
+    assert arm.lag()[0] <= NEAR_M
+
+
+@pytest.mark.parametrize("speed_m_s", [0.1, 0.2, 0.3, 0.4])
+@pytest.mark.parametrize("axis", ["down", "aside"])
+def test_a_straight_motion_is_straight_smooth_and_stopped_as_fast_as_the_joints_can(
+    axis: str, speed_m_s: float
+) -> None:
+    arm = Arm(profile())
+    way_m = np.array([0.0, 0.0, -0.1] if axis == "down" else [0.0, 0.1, 0.0]) * speed_m_s
+    for _ in range(5):
+        arm.step(way_m, np.zeros(3))
+        assert arm.lag()[0] < STRAIGHT_M
+    allowed_s = LONGER * arm.shortest_stop_s() + SETTLING_S
+    assert arm.stop_s() <= allowed_s
+    assert arm.jerk <= 1.0
+
+
+def test_an_arm_that_was_held_back_is_stopped_where_it_is_and_not_where_it_was_to_be() -> None:
+    arm = Arm(profile())
+    for _ in range(4):
+        arm.step(np.array([0.0, 0.0, -0.02]), np.zeros(3))
+    # As a pose stream that was planned without the joints: far ahead of them at once.
+    arm.smoother.reset(Pose(arm.smoother.motion.pose.position_m - [0, 0, 0.04], arm.goal.rotation))
+    before_m, allowed_s = KINEMATICS.forward(arm.joints_rad).position_m, arm.shortest_stop_s()
+    rate = arm.speed_m_s()
+    assert arm.stop_s() <= allowed_s + SETTLING_S
+    way_m = float(np.linalg.norm(KINEMATICS.forward(arm.joints_rad).position_m - before_m))
+    assert way_m <= rate * allowed_s
+    assert arm.smoother.at_rest
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 10])
+def test_a_stop_of_the_joints_that_is_called_off_goes_on_from_where_they_are(ticks: int) -> None:
+    arm = Arm(profile())
+    for _ in range(4):
+        arm.step(np.array([0.0, 0.0, -0.02]), np.zeros(3))
+    arm.smoother.reset(Pose(arm.smoother.motion.pose.position_m - [0, 0, 0.04], arm.goal.rotation))
+    for _ in range(ticks):
+        arm.tick(braking=True)
+    arm.goal = arm.smoother.motion.pose
+    arm.step(np.zeros(3), np.zeros(3), 0)
+    furthest_m = 0.0
+    for _ in range(500):
+        arm.tick()
+        furthest_m = max(furthest_m, distance(arm.smoother.motion.pose, arm.goal)[0])
+    assert furthest_m < OVERSHOOT_M
+    assert arm.smoother.at_rest
+
+
+# -- what is held whatever is asked for ------------------------------------------------------------
+BOX = BASE.limits.workspace
+BEYOND_BOX_M = 1e-4
+BEYOND_STOP_M = 1e-3
+LEAST_JERK_RTOL = 1e-6
+
+
+def beyond_box_m(position_m: FloatArray) -> float:
+    low, high = np.array([BOX.x_m, BOX.y_m, BOX.z_m]).T
+    return float(np.maximum(low - position_m, position_m - high).max())
+
+
+@given(st.lists(st.tuples(ways, st.integers(1, 10), st.booleans()), min_size=2, max_size=5))
+@settings(max_examples=12, deadline=None)
+def test_every_joint_keeps_its_jerk_and_the_tcp_its_box_whatever_is_asked_for(
+    orders: list[tuple[FloatArray, int, bool]],
+) -> None:
+    arm = Arm(profile())
+    for way, times, stops in orders:
+        for _ in range(times):
+            goal_m, _ = into_workspace(BASE.limits, arm.goal.position_m + 3 * way[:3])
+            arm.step(goal_m - arm.goal.position_m, 3 * way[3:])
+            assert beyond_box_m(KINEMATICS.forward(arm.joints_rad).position_m) <= BEYOND_BOX_M
+        if stops:
+            arm.stop_s()
+            arm.goal = arm.smoother.motion.pose
+    assert arm.jerk <= 1.0 + LEAST_JERK_RTOL
+
+
+@pytest.mark.parametrize("way_m", [[0, 0.04, 0], [0, -0.02, 0.01], [-0.02, 0, 0.02], [0, 0, -0.03]])
+def test_a_pose_that_leaves_the_box_is_not_followed_out_of_it(way_m: list[float]) -> None:
+    arm = Arm(profile())
+    furthest_m = -1.0
+    for _ in range(40):
+        arm.step(np.array(way_m), np.zeros(3))
+        furthest_m = max(furthest_m, beyond_box_m(KINEMATICS.forward(arm.joints_rad).position_m))
+    assert beyond_box_m(arm.smoother.motion.pose.position_m) > 0.01
+    assert -0.001 < furthest_m <= BEYOND_BOX_M
+
+
+def test_an_arm_that_begins_outside_of_the_box_is_led_in() -> None:
+    arm = Arm(profile())
+    inside = KINEMATICS.forward(HOME_RAD)
+    arm.stage = PoseToJoint(
+        override(profile(), {"limits": {"workspace": {"x_m": [0.2, 0.4]}}}), KINEMATICS
+    )
+    arm.stage.restart(HOME_RAD)
+    assert inside.position_m[0] > 0.42
+    for _ in range(8):
+        arm.step(np.array([-0.01, 0, 0]), np.zeros(3))
+    for _ in range(100):
+        arm.tick()
+    assert KINEMATICS.forward(arm.joints_rad).position_m[0] < 0.4
+    assert arm.jerk <= 1.0 + LEAST_JERK_RTOL
+
+
+@pytest.mark.parametrize(
+    ("way_m", "turn_rad", "name"),
+    [
+        ([0.01, 0, -0.03], [0, 0, 0], "table_distance"),
+        ([-0.02, 0, 0.01], [0, 0.1, 0], "self_collision"),
+        ([0, 0.01, -0.01], [0.15, 0, 0], "table_distance"),
+    ],
+)
+def test_commanded_joints_stop_before_the_arm_touches_itself_or_the_table(
+    way_m: list[float], turn_rad: list[float], name: str
+) -> None:
+    """Whoever bounds the goals: here nobody does."""
+    low = override(BASE, {"limits": {"workspace": {"z_m": [-0.3, 0.9], "x_m": [-0.3, 0.75]}}})
+    of = override(low, {"robot": {"command": "joint"}})
+    barriers = make_shadow(of, KINEMATICS).barriers
+    arm = Arm(of)
+    arm.stage = PoseToJoint(of, KINEMATICS, barriers)
+    arm.stage.restart(HOME_RAD)
+    nearest_m = 1.0
+    for _ in range(40):
+        arm.step(np.array(way_m), np.array(turn_rad))
+        left_m = barriers.collisions.distances(arm.joints_rad) - barriers.stop[1:]
+        nearest_m = min(nearest_m, float(left_m.min()))
+    assert -BEYOND_STOP_M < nearest_m < 0.005
+    assert name in arm.stage.stuck
+    assert arm.jerk <= 1.0 + LEAST_JERK_RTOL
+
+
+def test_slopes_of_distances_are_those_of_small_steps() -> None:
+    collisions = make_shadow(BASE, KINEMATICS).barriers.collisions
+    random, compared = np.random.default_rng(0), 0
+    for _ in range(40):
+        joints_rad = np.clip(
+            HOME_RAD + 0.4 * random.normal(size=7), KINEMATICS.lower_rad, KINEMATICS.upper_rad
+        )
+        near = np.flatnonzero(np.abs(collisions.distances(joints_rad) - 0.05) < 0.04)
+        slopes = collisions.slopes(joints_rad, near)
+        for joint, unit in enumerate(np.eye(7) * 1e-5):
+            apart = collisions.distances(joints_rad + unit) - collisions.distances(
+                joints_rad - unit
+            )
+            error = np.abs(slopes[:, joint] - apart[near] / 2e-5)
+            assert (error < 0.1).all()  # m/rad; the nearest corner changes
+            compared += len(near)
+            assert not len(near) or np.median(error) < 0.01
+    assert compared > 100

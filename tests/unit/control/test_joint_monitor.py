@@ -1,0 +1,200 @@
+"""Measured joints while the arm moves: near to a bound it is slower, too near it brakes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from command_rig import Rig, profile
+
+from vla_zenoh.control.joint_monitor import JointMonitor
+from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.profile_arm import make_kinematics, make_shadow
+from vla_zenoh.kinematics.so3 import Pose, distance, quat_from_rotation
+from vla_zenoh.types import FloatArray
+
+PROFILE = profile()
+KINEMATICS = make_kinematics(PROFILE)
+HOME_RAD = KINEMATICS.ordered(PROFILE.robot.arm_joints, PROFILE.robot.home_rad)
+LIMITS = PROFILE.limits
+TICK_NS = 4_000_000
+TICKS_A_LOOK = 10
+JOINT = dict(zip(KINEMATICS.arm_joints, np.eye(KINEMATICS.size), strict=True))
+
+
+class Watching:
+    """A watch of the shipped arm, told its joints at every tick."""
+
+    def __init__(self, start_rad: FloatArray = HOME_RAD, commanded_rad: FloatArray | None = None):
+        shadow = make_shadow(PROFILE, KINEMATICS)
+        shadow.reset(start_rad)
+        self.watch, self.commanded_rad = JointMonitor(PROFILE, shadow), commanded_rad
+        self.now_ns = 0
+
+    def at(self, joints_rad: FloatArray, ticks: int = TICKS_A_LOOK) -> LimitHit | None:
+        for _ in range(ticks):
+            self.now_ns += TICK_NS
+            hit = self.watch.look(joints_rad, self.commanded_rad, self.now_ns)
+            if hit is not None:
+                return hit
+        return None
+
+    def along(self, way_rad: FloatArray, steps: int = 100) -> tuple[list[float], LimitHit | None]:
+        """The shares of a way that begins at home, until it says brake."""
+        shares: list[float] = []
+        for step in range(steps + 1):
+            joints_rad = HOME_RAD + step / steps * way_rad
+            self.commanded_rad = joints_rad
+            hit = self.at(joints_rad)
+            if hit is not None:
+                return shares, hit
+            slower = self.watch.slowdown
+            shares.append(slower.share if slower else 1.0)
+        return shares, None
+
+
+@pytest.mark.parametrize(
+    ("joint", "by_rad", "name", "where", "limit"),
+    [
+        ("panda_joint2", 1.5, "table_distance", "panda_", None),
+        ("panda_joint4", -0.5, "joint_limit", "panda_joint4", LIMITS.reach.joint_margin_rad),
+        ("panda_joint6", 1.2, "joint_limit", "panda_joint6", LIMITS.reach.joint_margin_rad),
+    ],
+)
+def test_an_arm_that_comes_near_to_a_bound_is_slower_and_then_brakes_and_says_where(
+    joint: str, by_rad: float, name: str, where: str, limit: float | None
+) -> None:
+    shares, hit = Watching().along(by_rad * JOINT[joint])
+    assert shares[0] == 1.0
+    assert min(shares) < 0.5
+    assert hit is not None
+    assert hit.name == name
+    assert hit.where.startswith(where)
+    assert hit.value < hit.limit
+    assert limit is None or hit.limit == limit
+
+
+def test_on_the_way_back_an_arm_is_neither_slower_nor_braked() -> None:
+    watching = Watching()
+    way_rad = -0.41 * JOINT["panda_joint4"]
+    shares, hit = watching.along(way_rad)
+    assert hit is None
+    assert min(shares) < 1.0
+    for step in range(50, -1, -1):
+        watching.commanded_rad = HOME_RAD + step / 50 * way_rad
+        assert watching.at(watching.commanded_rad) is None
+        if step < 49:
+            assert watching.watch.slowdown is None
+
+
+def test_an_arm_that_rests_beyond_a_stop_may_move_away() -> None:
+    beyond_rad = KINEMATICS.lower_rad[3] + 0.01 - HOME_RAD[3]
+    watching = Watching()
+    watching.commanded_rad = HOME_RAD + beyond_rad * JOINT["panda_joint4"]
+    noise = np.random.default_rng(1)
+    for _ in range(50):
+        jitter = noise.uniform(-5e-4, 5e-4, KINEMATICS.size)
+        assert watching.at(watching.commanded_rad + jitter) is None
+    assert watching.watch.slowdown is None
+
+
+def test_a_creep_towards_a_bound_is_an_approach_however_slow() -> None:
+    shares, hit = Watching().along(-0.5 * JOINT["panda_joint4"], steps=2000)
+    assert min(shares) < 0.5
+    assert hit is not None
+
+
+@pytest.mark.parametrize("commands_joints", [False, True])
+def test_an_elbow_that_goes_astray_slows_the_arm_and_then_brakes_it(commands_joints: bool) -> None:
+    """Swivelled about the line from shoulder to wrist, the TCP where it is."""
+    watching = Watching(commanded_rad=HOME_RAD if commands_joints else None)
+    joints_rad, here = HOME_RAD, KINEMATICS.forward(HOME_RAD)
+    shares: list[float] = []
+    hit = None
+    for _ in range(400):
+        jacobian = KINEMATICS.jacobian(joints_rad)
+        free = np.linalg.svd(jacobian)[2][-1]
+        way_rad = 0.01 * free * np.sign(free[0]) / np.abs(free).max()
+        joints_rad = joints_rad + way_rad
+        hit = watching.at(joints_rad, ticks=2 if commands_joints else 1)
+        if hit is not None:
+            break
+        slower = watching.watch.slowdown
+        shares.append(slower.share if slower else 1.0)
+        assert slower is None or slower.name == "elbow_rad"
+    assert distance(KINEMATICS.forward(joints_rad), here)[0] < 0.02
+    assert hit is not None
+    assert hit.name == "elbow_rad"
+    assert hit.limit == 2 * LIMITS.elbow_rad
+    assert hit.value > hit.limit
+    assert min(shares) < 0.5
+
+
+# -- in the command node --------------------------------------------------------------------------
+class Arm(Rig):
+    """Poses are commanded; the joints are where a test says."""
+
+    def __init__(self) -> None:
+        super().__init__(PROFILE, reach=make_shadow(PROFILE, KINEMATICS))
+        self.joints_rad, self.joints_of_shadow = HOME_RAD, False
+        self.place(KINEMATICS.forward(HOME_RAD))
+
+    def place(self, pose: Pose) -> None:
+        self.position_m, self.quat_xyzw = pose.position_m, quat_from_rotation(pose.rotation)
+
+
+def limits_told(arm: Rig) -> list[tuple[str, str, float | None, float | None]]:
+    return [(e.what, e.why, e.value, e.limit) for e in arm.events if e.kind == "limit"]
+
+
+def test_the_measured_arm_ends_the_activation_with_an_event_that_names_joint_value_and_limit() -> (
+    None
+):
+    arm = Arm()
+    arm.activate()
+    arm.send([[0, 0, 0.01, 0, 0, 0, 0]] * 16)
+    slowest = 1.0
+    joints_rad = HOME_RAD
+    for _ in range(400):
+        arm.joints_rad = joints_rad = joints_rad - 0.002 * JOINT["panda_joint4"]
+        arm.tick()
+        slowest = min(slowest, arm.commander.speed)
+        if arm.state != "active":
+            break
+    assert arm.state == "inactive"
+    assert slowest < 1.0
+    what, why, value, limit = limits_told(arm)[-1]
+    assert (what, why) == ("joint_limit", "braked at panda_joint4")
+    assert value is not None
+    assert value < LIMITS.reach.joint_margin_rad == limit
+    assert "joint_limit at panda_joint4" in arm.commander.why
+    arm.settle()
+    arm.assert_smooth()
+
+
+def test_an_arm_whose_joints_are_not_heard_any_more_brakes() -> None:
+    arm = Arm()
+    arm.activate()
+    joints_rad, arm.joints_rad = arm.joints_rad, None
+    arm.run(0.5)
+    assert arm.state == "inactive"
+    assert "joints" in arm.commander.why
+    arm.joints_rad = joints_rad
+    arm.tick()
+    arm.activate()
+
+
+def test_a_step_is_judged_by_the_elbow_that_the_arm_really_has() -> None:
+    """The elbow is swivelled; the same TCP, but not the same room."""
+    arm = Arm()
+    arm.activate()
+    shadow = arm.commander.reach
+    assert shadow is not None
+    joints_rad = HOME_RAD.copy()
+    for _ in range(40):
+        free = np.linalg.svd(KINEMATICS.jacobian(joints_rad))[2][-1]
+        joints_rad = joints_rad + 0.008 * free * np.sign(free[0]) / np.abs(free).max()
+    arm.joints_rad = joints_rad
+    arm.run(0.1)
+    arm.send([[0, 0, 0.001, 0, 0, 0, 0]])
+    apart_rad = np.abs(shadow.joints_rad - joints_rad).max()
+    assert apart_rad < 0.1 < np.abs(joints_rad - HOME_RAD).max()

@@ -1,0 +1,131 @@
+"""Joint commands out of the pose stream: how the elbow sets out and stops, how a stream begins."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vla_zenoh.control.chunk_planner import ChunkPlanner
+from vla_zenoh.control.commander_io import Outputs
+from vla_zenoh.control.motion_pipeline import MotionPipeline
+from vla_zenoh.control.pose_to_joint import PoseToJoint
+from vla_zenoh.control.profile_arm import make_kinematics, make_shadow
+from vla_zenoh.control.smoothing import Smoother, motion_limits
+from vla_zenoh.control.states import State
+from vla_zenoh.guard.joint_guard import joint_motion_limits
+from vla_zenoh.kinematics.so3 import Pose, exp3, quat_from_rotation
+from vla_zenoh.profile import load_profile, override
+from vla_zenoh.types import FloatArray, GripperState, JointCommand, JointState, PoseState, Task
+
+PROFILE = override(load_profile("panda_sim"), {"robot": {"command": "joint", "posture": "home"}})
+KINEMATICS = make_kinematics(PROFILE)
+LIMITS = joint_motion_limits(PROFILE)
+HOME_RAD = KINEMATICS.ordered(PROFILE.robot.arm_joints, PROFILE.robot.home_rad)
+ELBOW_OUT_RAD = HOME_RAD + np.array([0.3, 0.0, -0.3, 0.0, 0.3, 0.0, 0.0])
+TICK_S, TICK_NS = 0.004, 4_000_000
+START_NS = 1_700_000_000_000_000_000
+RTOL = 1e-6
+MOVING_RAD_S = 0.05
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(1, 60)), min_size=1, max_size=6))
+@settings(max_examples=6, deadline=None)
+def test_the_elbow_sets_out_and_stops_within_the_jerk_limit(
+    phases: list[tuple[bool, int]],
+) -> None:
+    stage = PoseToJoint(PROFILE, KINEMATICS)
+    stage.restart(ELBOW_OUT_RAD)
+    standing = Smoother(KINEMATICS.forward(ELBOW_OUT_RAD), TICK_S, motion_limits(PROFILE.limits))
+    before = np.zeros(len(HOME_RAD))
+    for braking, ticks in [*phases, (True, 250)]:
+        for _ in range(ticks):
+            stage.tick(standing, braking=braking)
+            acceleration = stage.command("active", None).acceleration_rad_s2
+            jerk = np.abs(acceleration - before) / TICK_S
+            assert (jerk <= LIMITS.jerk_rad_s3 * (1 + RTOL)).all()
+            before = acceleration
+    assert stage.at_rest
+
+
+class Moved:
+    """A mover of joints, and what the robot last said of itself."""
+
+    def __init__(self) -> None:
+        self.shadow = make_shadow(PROFILE)
+        self.mover = MotionPipeline(PROFILE, self.shadow, ChunkPlanner(PROFILE, self.shadow))
+        self.now_ns = START_NS
+
+    def activate(self, joints_rad: FloatArray) -> None:
+        pose, zero = KINEMATICS.forward(joints_rad), np.zeros(len(joints_rad))
+        self.mover.anchor(
+            PoseState(pose.position_m, quat_from_rotation(pose.rotation), np.zeros(6)),
+            GripperState(0.08, False, False),
+            JointState(KINEMATICS.arm_joints, joints_rad, zero, zero, joints_rad),
+            self.now_ns,
+            blocked=False,
+        )
+
+    def tick(self, ticks: int = 1) -> JointCommand:
+        out = Outputs()
+        self.now_ns += ticks * TICK_NS
+        task = Task(0, True, "hold", "scripted", 5.0)
+        overdue_ns = self.now_ns + 10**9
+        self.mover.advance(State.ACTIVE, task, overdue_ns, self.now_ns, ticks, out)
+        self.mover.command(State.ACTIVE, self.now_ns, None, out)
+        assert out.joint is not None
+        return out.joint
+
+
+def test_an_arm_of_which_the_elbow_alone_moves_is_activated_without_a_step() -> None:
+    robot = Moved()
+    robot.activate(ELBOW_OUT_RAD)
+    sent = [robot.tick() for _ in range(100)]
+    assert np.abs(sent[-1].velocity_rad_s).max() > MOVING_RAD_S
+    robot.activate(sent[-4].position_rad)  # the state heard is some milliseconds old
+    change = np.abs(robot.tick().velocity_rad_s - sent[-1].velocity_rad_s)
+    assert (change <= LIMITS.acceleration_rad_s2 * TICK_S * (1 + RTOL)).all()
+
+
+def test_a_stream_begins_at_rest_however_late_its_first_tick_is() -> None:
+    robot = Moved()
+    robot.activate(ELBOW_OUT_RAD)
+    first = robot.tick(ticks=20)
+    assert (np.abs(first.velocity_rad_s) <= LIMITS.jerk_rad_s3 * TICK_S**2).all()
+
+
+def test_an_arm_that_is_asked_for_nothing_keeps_its_elbow_unless_the_profile_says_home() -> None:
+    for posture, moves in (("start", False), ("home", True)):
+        of = override(PROFILE, {"robot": {"posture": posture}})
+        stage = PoseToJoint(of, KINEMATICS)
+        stage.restart(ELBOW_OUT_RAD)
+        pose = KINEMATICS.forward(ELBOW_OUT_RAD)
+        standing = Smoother(pose, TICK_S, motion_limits(of.limits))
+        for _ in range(500):
+            stage.tick(standing)
+        moved_rad = np.abs(stage.position_rad - ELBOW_OUT_RAD).max()
+        assert (moved_rad > 0.05) == moves
+        assert moves or (moved_rad < 1e-6 and stage.at_rest)
+
+
+def test_a_pose_that_the_joints_cannot_have_is_said_and_not_waited_for_for_ever() -> None:
+    stage = PoseToJoint(PROFILE, KINEMATICS)
+    stage.restart(HOME_RAD)
+    pose = KINEMATICS.forward(HOME_RAD)
+    stream = Smoother(pose, TICK_S, motion_limits(PROFILE.limits))
+    ahead = Pose(pose.position_m, exp3(np.array([0.0, 0.0, 1.2])) @ pose.rotation)
+    out_m = Pose(pose.position_m + [0.0, 0.0, 1.0], ahead.rotation)  # further than it reaches
+    stream.target(out_m)
+    assert stage.stuck == ""
+    for _ in range(2500):
+        stage.tick(stream)
+        if stage.stuck:
+            break
+    assert stage.stuck.startswith("the joints cannot follow the pose: it has waited for them")
+    for _ in range(500):
+        stage.brake(stream)
+        stage.tick(stream, braking=True)
+    assert stage.at_rest
+    assert stream.at_rest
+    stage.keep_elbow()
+    assert stage.stuck == ""

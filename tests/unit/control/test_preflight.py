@@ -1,0 +1,237 @@
+"""Every reason not to activate, and all of them at once."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from command_rig import MS, START_NS, WORKER, Rig, model_spec
+
+from vla_zenoh.control.preflight import PeerSnapshot, reasons_not_to_activate
+from vla_zenoh.ntp import Offset
+from vla_zenoh.policy import CameraSpec
+from vla_zenoh.types import GripperState, Header, PoseState, Stamped
+
+
+class Ready:
+    """Everything as it has to be; a test breaks one thing."""
+
+    def __init__(self) -> None:
+        rig = Rig()
+        self.profile, self.around = rig.profile, rig.around
+        self.worker, self.prompt, self.rate_hz = WORKER, "hold", 5.0
+        self.pose, self.gripper = rig.pose_state(), rig.gripper_state()
+        self.chunk = rig.chunk([[0.0] * 7], observed_ago_s=0.05)
+        self.now_ns = self.chunk.received_ns
+
+    def reasons(self) -> list[str]:
+        return reasons_not_to_activate(
+            self.profile,
+            self.worker,
+            self.prompt,
+            self.around,
+            self.pose,
+            self.gripper,
+            self.chunk,
+            self.now_ns,
+            self.rate_hz,
+        )
+
+
+def without(around: PeerSnapshot, *nodes: str) -> PeerSnapshot:
+    return replace(around, alive=around.alive - set(nodes))
+
+
+def pose_at(x: float) -> Stamped[PoseState]:
+    record = PoseState(np.array([x, 0.0, 0.3]), np.array([1.0, 0, 0, 0]), np.zeros(6))
+    return Stamped(Header(START_NS, 0, "sim-1"), record, START_NS)
+
+
+def gripper_that(**fields: object) -> Stamped[GripperState]:
+    record = GripperState(0.08, moving=False, holding=False, **fields)  # pyright: ignore
+    return Stamped(Header(START_NS, 0, "sim-1"), record, START_NS)
+
+
+def seen_ago(ready: Ready, seconds: float) -> None:
+    stamp_ns = ready.chunk.received_ns - round(seconds * 1e9)
+    record = replace(ready.chunk.record, observation_stamp_ns=stamp_ns)
+    ready.chunk = replace(ready.chunk, record=record)
+
+
+def set_(name: str, value: object) -> Callable[[Ready], None]:
+    return lambda ready: setattr(ready, name, value)
+
+
+def around(**fields: object) -> Callable[[Ready], None]:
+    def change(ready: Ready) -> None:
+        ready.around = replace(ready.around, **fields)  # pyright: ignore[reportArgumentType]
+
+    return change
+
+
+def gone(*nodes: str) -> Callable[[Ready], None]:
+    def change(ready: Ready) -> None:
+        ready.around = without(ready.around, *nodes)
+
+    return change
+
+
+def later(seconds: float) -> Callable[[Ready], None]:
+    def change(ready: Ready) -> None:
+        ready.now_ns += round(seconds * 1e9)
+
+    return change
+
+
+def another_chunk(**fields: object) -> Callable[[Ready], None]:
+    def change(ready: Ready) -> None:
+        record = replace(ready.chunk.record, **fields)  # pyright: ignore[reportArgumentType]
+        ready.chunk = replace(ready.chunk, record=record)
+
+    return change
+
+
+def by_another_source(ready: Ready) -> None:
+    header = replace(ready.chunk.header, source="worker-scripted-before")
+    ready.chunk = replace(ready.chunk, header=header)
+
+
+def clocks_apart(ready: Ready) -> None:
+    header = replace(ready.pose.header, stamp_wall_ns=ready.pose.received_ns - 900 * MS)
+    ready.pose = replace(ready.pose, header=header)
+
+
+def clock(node: str, offset: Offset) -> Callable[[Ready], None]:
+    return around(clocks={node: offset})
+
+
+def test_when_all_is_well_there_is_no_reason() -> None:
+    assert Ready().reasons() == []
+
+
+@pytest.mark.parametrize(
+    ("match", "change"),
+    [
+        ("the robot's node 'sim' is not alive", gone("sim")),
+        ("the TCP pose is not known", set_("pose", None)),
+        (r"the TCP pose is 0\.20 s old, at most 0\.15 s", later(0.196)),
+        (r"the gripper's state is 0\.20 s old", later(0.196)),
+        (r"the robot's clock and this one differ: .* \+0\.900 s", clocks_apart),
+        (
+            r"the TCP at \(0\.100, 0\.000, 0\.300\) m is 0\.100 m outside",
+            set_("pose", pose_at(0.1)),
+        ),
+        ("the gripper is not known", set_("gripper", None)),
+        ("the robot reports: hot; sore", set_("gripper", gripper_that(faults=("hot", "sore")))),
+        ("the robot is not ready but 'braking'", set_("gripper", gripper_that(mode="braking"))),
+        ("worker 'scripted' is not alive; alive are: other", gone("worker-scripted")),
+        ("alive are: none", gone("worker-scripted", "worker-other")),
+        ("worker 'ghost' is not alive", set_("worker", "ghost")),
+        ("has not published its spec", around(specs={})),
+        ("needs a prompt and there is none", set_("prompt", "")),
+        ("worker 'scripted' says: no sun", around(worker_complaints={WORKER: "no sun"})),
+        ("has published no chunk in the last 2.2 s", set_("chunk", None)),
+        ("has published no chunk in the last 2.2 s", later(2.3)),
+        ("has published no chunk", by_another_source),
+        ("has published no chunk", around(spec_sources={})),
+        ("chunks of another spec than its own", another_chunk(spec_hash="another")),
+        (r"newest chunk is not sane: .*\(H, 7\)", another_chunk(steps=np.zeros((1, 6)))),
+        (r"too slow: .* 1\.20 s after its observation, at most 1 s", lambda r: seen_ago(r, 1.2)),
+        (r"saw something 0\.500 s before it happened", lambda r: seen_ago(r, -0.5)),
+        (
+            r"newest chunk is not sane: position_units: a step of 10 m, over 4 times",
+            another_chunk(steps=np.array([[10.0, 0, 0, 0, 0, 0, 0]])),
+        ),
+        (
+            r"newest chunk is not sane: rotation_units: a step of 2\.865 rad",
+            another_chunk(steps=np.array([[0, 0, 0, 2.865, 0, 0, 0]])),
+        ),
+        (
+            r"newest chunk is not sane: gripper_range: gripper 80",
+            another_chunk(steps=np.array([[0, 0, 0, 0, 0, 0, 80.0]])),
+        ),
+        ("no living node serves camera 'front'", gone("camera")),
+        ("no living node serves camera 'front'", around(camera_nodes={})),
+        ("camera 'front' has sent no picture for 1.5 s", around(camera_ages_s={"front": 1.5})),
+        ("camera 'front' has sent no picture for inf s", around(camera_ages_s={})),
+        (
+            r"camera 'front' shows the same picture since 1\.2 s",
+            around(camera_faults={"front": "shows the same picture since 1.2 s"}),
+        ),
+        (r"the clock of node 'camera' is \+0\.150 s off", clock("camera", Offset(0.15, 0.1, 0.2))),
+        (r"the clock of node 'sim' is -0\.101 s off", clock("sim", Offset(-0.101, 0.3, 0.6))),
+        (
+            "the clock of node 'worker-scripted' on gpu is not known",
+            around(hosts={"worker-scripted": "gpu"}, beside=frozenset({"sim", "camera"})),
+        ),
+        # Whoever has not said yet where it is may be anywhere.
+        ("the clock of node 'sim' is not known", around(beside=frozenset())),
+    ],
+)
+def test_each_thing_that_is_missing_is_a_reason(
+    match: str, change: Callable[[Ready], None]
+) -> None:
+    ready = Ready()
+    change(ready)
+    assert any(re.search(match, reason) for reason in ready.reasons()), ready.reasons()
+
+
+def test_a_clock_that_is_reckoned_with_is_no_reason() -> None:
+    ready = Ready()
+    clock("camera", Offset(0.099, 0.3, 0.6))(ready)
+    assert ready.reasons() == []
+
+
+def test_a_clock_that_is_measured_need_not_be_our_own() -> None:
+    ready = Ready()
+    nodes = (*ready.around.beside, "camera")
+    around(beside=frozenset(), clocks=dict.fromkeys(nodes, Offset(0.0, 0.3, 0.6)))(ready)
+    assert ready.reasons() == []
+
+
+def test_a_camera_the_profile_does_not_have_is_a_reason() -> None:
+    ready = Ready()
+    ready.profile = ready.profile.model_copy(update={"cameras": {}})
+    assert ready.reasons() == ["worker 'scripted' needs camera 'front', the profile has: none"]
+
+
+def test_a_slow_rate_gives_the_worker_more_time() -> None:
+    ready = Ready()
+    ready.rate_hz = 0.05
+    ready.now_ns += 20 * 10**9
+    assert not any("no chunk" in reason for reason in ready.reasons())
+
+
+def test_all_reasons_come_at_once() -> None:
+    ready = Ready()
+    ready.pose = ready.gripper = ready.chunk = None  # pyright: ignore[reportAttributeAccessIssue]
+    ready.prompt = ""
+    ready.around = without(ready.around, "sim", "camera")
+    assert len(ready.reasons()) == 6
+
+
+def test_a_picture_of_a_size_the_spec_cannot_take_is_a_reason() -> None:
+    ready = Ready()
+    spec = ready.around.specs[WORKER]
+    small = CameraSpec(camera="front", width=64, height=48)
+    looks = spec.observation.model_copy(update={"cameras": (small,)})
+    spec = spec.model_copy(update={"observation": looks})
+    record = replace(ready.chunk.record, spec_hash=spec.hash)
+    ready.chunk = replace(ready.chunk, record=record)
+    ready.around = replace(ready.around, specs={WORKER: spec})
+    (reason,) = ready.reasons()
+    assert re.search(r"picture_size: camera 'front' sends \d+x\d+, the spec asks for 64x48", reason)
+
+
+def test_a_worker_that_needs_no_prompt_and_no_camera_gets_neither() -> None:
+    ready = Ready()
+    spec = model_spec()
+    looks = spec.observation.model_copy(update={"cameras": (), "prompt": False})
+    spec = spec.model_copy(update={"observation": looks})
+    ready.around = replace(without(ready.around, "camera"), specs={WORKER: spec})
+    another_chunk(spec_hash=spec.hash)(ready)
+    ready.prompt = ""
+    assert ready.reasons() == []

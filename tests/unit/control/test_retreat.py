@@ -1,0 +1,272 @@
+"""A blocked arm is led back: where to, how fast, how far, and when it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from command_rig import START_M, Rig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vla_zenoh.control.retreat import RELIEF_M, SPACE_M, CommandTrail
+from vla_zenoh.control.watchdog import Watchdog
+from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.types import PoseState, Stamped
+
+STIFFNESS_N_M = 2000.0
+QUIET_N = 3.0
+STANDING_M_S = 1e-6
+TICK_S = 1 / 250
+
+
+class Walled(Rig):
+    """An arm on a spring that follows its command until a wall, which does not give way.
+
+    Args:
+        along: (3,) the way it goes.
+        gap_m: to the wall.
+        told: it tells what presses against it.
+    """
+
+    def __init__(self, along: np.ndarray, gap_m: float, *, told: bool = True) -> None:
+        super().__init__()
+        self.along = along / np.linalg.norm(along)
+        self.gap_m, self.told = gap_m, told
+        self.moved_by_person_m = np.zeros(3)
+        self.force_n = np.zeros(3)
+        self.depths_m: list[float] = []
+
+    def pose_state(self) -> Stamped[PoseState]:
+        said = super().pose_state()
+        depth_m = max(float((self.position_m - START_M) @ self.along) - self.gap_m, 0.0)
+        self.depths_m.append(depth_m)
+        self.force_n = -STIFFNESS_N_M * (depth_m * self.along - self.moved_by_person_m)
+        wrench = np.concatenate([self.force_n, np.zeros(3)]) if self.told else None
+        at_m = self.position_m - depth_m * self.along + self.moved_by_person_m
+        return replace(said, record=replace(said.record, position_m=at_m, wrench=wrench))
+
+    def push(self, step_m: float) -> None:
+        """Go on until it is not active any more."""
+        self.activate()
+        for _ in range(400):
+            self.send([[*(step_m * self.along), 0, 0, 0, 0]])
+            self.run(0.096)
+            if self.state != "active":
+                return
+        raise AssertionError("it pushes on")
+
+    def brake(self) -> None:
+        """Until the command stands for the first time."""
+        for _ in range(500):
+            if np.abs(self.commands[-1].twist).max() < STANDING_M_S:
+                return
+            self.tick()
+        raise AssertionError("it does not brake")
+
+    def behind_m(self) -> float:
+        """How far the command is before the wall."""
+        return self.gap_m - float((self.commands[-1].position_m - START_M) @ self.along)
+
+
+directions = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.5)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    along=directions,
+    gap_m=st.floats(0.03, 0.08),
+    step_m=st.floats(0.004, 0.045),
+    told=st.booleans(),
+)
+def test_it_ends_where_nothing_presses_within_the_limits_and_never_goes_further_in(
+    along: tuple[float, ...], gap_m: float, step_m: float, told: bool
+) -> None:
+    rig = Walled(np.array(along), gap_m, told=told)
+    rig.push(step_m)
+    rig.brake()
+    since = len(rig.depths_m)
+    deepest_m = max(rig.depths_m)
+    rig.run(6.0)
+    assert max(rig.depths_m[since:]) <= deepest_m + 1e-6
+    assert float(np.linalg.norm(rig.force_n)) < QUIET_N
+    assert -QUIET_N / STIFFNESS_N_M <= rig.behind_m() <= RELIEF_M + 2 * SPACE_M
+    assert not rig.commander.streaming  # it lingers, and ends
+    assert rig.state == "inactive"
+    rig.assert_smooth()
+
+
+def test_it_goes_no_faster_than_the_profile_says() -> None:
+    rig = Walled(np.array([1.0, 0, 0]), 0.08)
+    rig.push(0.04)
+    rig.brake()
+    since = len(rig.commands)
+    rig.run(4.0)
+    speeds = [float(np.abs(command.twist[:3]).max()) for command in rig.commands[since:]]
+    assert 0.01 < max(speeds) <= rig.profile.limits.contact.retreat_m_s * (1 + 1e-6)
+
+
+def test_it_goes_back_the_way_it_came() -> None:
+    rig = Walled(np.array([1.0, 0, 0]), 0.06, told=False)
+    rig.push(0.02)
+    rig.run(4.0)
+    assert rig.behind_m() == pytest.approx(RELIEF_M, abs=2 * SPACE_M)
+    np.testing.assert_allclose(rig.commands[-1].position_m[1:], START_M[1:], atol=1e-4)
+
+
+def test_contact_stops_it_long_before_it_lags_and_slows_it_down_before() -> None:
+    rig = Walled(np.array([0.0, 1.0, 0]), 0.05)
+    rig.push(0.003)
+    limits = rig.profile.limits
+    assert max(rig.depths_m) < 0.6 * limits.tracking_m
+    told = {event.what: event for event in rig.events if event.kind == "limit"}
+    stopped = told["contact_force"]
+    assert stopped.value is not None
+    assert stopped.limit == limits.contact.force_stop_n
+    slowed = [event for event in rig.events if event.why == "slower"]
+    assert [event.limit for event in slowed] == [limits.contact.force_slow_n]
+    assert "contact_force" in rig.commander.why
+
+
+def test_an_arm_that_a_person_goes_on_pushing_is_not_run_after() -> None:
+    rig = Walled(np.array([1.0, 0, 0]), 0.05)
+    rig.push(0.02)
+    rig.brake()
+    ended_m = rig.commands[-1].position_m
+    for _ in range(1500):
+        rig.moved_by_person_m = rig.moved_by_person_m + np.array([0.0, 2e-4, 0.0])
+        rig.tick()
+    apart_m = rig.commands[-1].position_m - ended_m
+    assert np.abs(apart_m[1]) < 0.01
+    assert np.linalg.norm(apart_m) < max(rig.depths_m) + RELIEF_M + 2 * SPACE_M
+    assert rig.commander.at_rest
+    rig.assert_smooth()
+
+
+def still_after_the_brake(rig: Walled) -> bool:
+    rig.brake()
+    ended_m = rig.commands[-1].position_m
+    rig.run(4.0)
+    return bool(np.linalg.norm(rig.commands[-1].position_m - ended_m) < 1e-6)
+
+
+def test_it_stands_where_the_robot_says_that_it_is_not_ready() -> None:
+    rig = Walled(np.array([1.0, 0, 0]), 0.05)
+    rig.push(0.02)
+    rig.gripper = replace(rig.gripper, mode="guiding")
+    assert still_after_the_brake(rig)
+
+
+def test_it_stands_where_the_robot_has_a_fault() -> None:
+    rig = Walled(np.array([1.0, 0, 0]), 0.05)
+    rig.push(0.02)
+    rig.gripper = replace(rig.gripper, faults=("reflex",))
+    assert still_after_the_brake(rig)
+
+
+def test_it_stands_where_the_robot_is_not_heard() -> None:
+    rig = Walled(np.array([1.0, 0, 0]), 0.05)
+    rig.push(0.02)
+    rig.silent = True
+    rig.run(rig.profile.timing.state_timeout_s + 0.1)
+    assert still_after_the_brake(rig)
+
+
+def test_a_stop_ends_it_at_once() -> None:
+    rig = Walled(np.array([1.0, 0, 0]), 0.05)
+    rig.push(0.04)
+    rig.brake()
+    rig.run(0.2)
+    assert np.abs(rig.commands[-1].twist).max() > STANDING_M_S  # it is on its way back
+    rig.put("stop")
+    assert still_after_the_brake(rig)
+    rig.assert_smooth()
+
+
+def test_an_activation_takes_over_from_it_without_a_jump() -> None:
+    rig = Walled(np.array([1.0, 0, 0]), 0.05, told=False)
+    rig.push(0.04)
+    rig.brake()
+    rig.run(0.2)
+    rig.activate()
+    rig.send([[-0.03, 0, 0, 0, 0, 0, 0]])
+    rig.run(0.1)
+    assert rig.state == "active"
+    rig.run(4.0)
+    # It began at the wall, and went that step: nobody led it on.
+    assert rig.behind_m() == pytest.approx(0.03, abs=1e-4)
+    rig.assert_smooth()
+
+
+def test_an_arm_that_lags_and_feels_nothing_stands() -> None:
+    rig = Walled(np.array([1.0, 0, 0]), 9.0)
+    rig.activate()
+    rig.send([[0.04, 0, 0, 0, 0, 0, 0]])
+    rig.run(0.1)
+    rig.moved_by_person_m = np.zeros(3)
+    stuck = rig.pose_state().record
+    rig.pose_state = lambda: Stamped(  # pyright: ignore[reportAttributeAccessIssue]
+        rig.header("sim", "sim-1"), stuck, rig.now_ns
+    )
+    while rig.state == "active":
+        rig.send([[0.04, 0, 0, 0, 0, 0, 0]])
+        rig.run(0.096)
+    assert "does not follow" in rig.commander.why
+    assert still_after_the_brake(rig)
+
+
+def test_a_pose_that_jumped_far_away_is_not_gone_to() -> None:
+    rig = Walled(np.array([1.0, 0, 0]), 9.0, told=False)
+    rig.activate()
+    rig.send([[0.04, 0, 0, 0, 0, 0, 0]])
+    rig.run(0.1)
+    rig.moved_by_person_m = np.array([0.0, 0.3, 0.0])
+    rig.run(0.1)
+    assert rig.state == "inactive"
+    assert still_after_the_brake(rig)
+
+
+def test_a_robot_without_a_wrench_is_told_about_once() -> None:
+    rig = Walled(np.array([1.0, 0, 0]), 0.05, told=False)
+    rig.push(0.02)
+    rig.run(4.0)
+    rig.activate()
+    assert [event.what for event in rig.events].count("contact_not_told") == 1
+
+
+# -- the way it came ------------------------------------------------------------------------------
+def at(x_m: float, y_m: float = 0.0) -> Pose:
+    return Pose(np.array([x_m, y_m, 0.0]), np.eye(3))
+
+
+def test_a_trail_leads_back_over_the_last_places_newest_first() -> None:
+    trail = CommandTrail()
+    for x_m in np.arange(0, 0.05, 0.0005):
+        trail.go(at(x_m))
+    back = [float(pose.position_m[0]) for pose in trail.back(0.01)]
+    assert back == sorted(back, reverse=True)
+    assert 0.009 < 0.0495 - back[-1] < 0.0125
+
+
+def test_what_was_gone_there_and_back_is_left_out() -> None:
+    trail = CommandTrail()
+    for x_m in [*np.arange(0, 0.03, 0.001), *np.arange(0.03, 0.01, -0.001)]:
+        trail.go(at(x_m))
+    assert max(pose.position_m[0] for pose in trail.back(0.05)) <= 0.012
+
+
+def test_an_arm_that_turned_up_elsewhere_has_no_way_from_there() -> None:
+    trail = CommandTrail()
+    for x_m in np.arange(0, 0.03, 0.001):
+        trail.go(at(x_m))
+    trail.go(at(0.2))
+    assert trail.back(0.1) == []
+
+
+def test_a_watch_says_which_state_is_missing() -> None:
+    rig = Rig()
+    watch = Watchdog(rig.profile)
+    pose, gripper = rig.pose_state(), rig.gripper_state()
+    assert watch.unheard(pose, gripper, rig.now_ns) == ""
+    assert "pose" in watch.unheard(pose, gripper, rig.now_ns + 10**9)

@@ -1,0 +1,352 @@
+"""The smoothed motion: within its limits, an integral of its own twist, exactly at its target."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from vla_zenoh.control.smoothing import Motion, MotionLimits, Shares, Smoother
+from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, norm3
+
+DT_S = 0.004
+LIMITS = MotionLimits((0.5, 2.0, 20.0), (1.5, 6.0, 60.0))
+START = Pose(np.array([0.43, 0.0, 0.3]), exp3(np.array([3.0, 0.2, -0.4])))
+
+LIMIT_RTOL = 1e-6
+STILL = 1e-6  # m/s and rad/s
+AT_TARGET_M, AT_TARGET_RAD = 1e-8, 1e-7
+# Errors of the trapezium rule over one tick of a motion whose jerk is bounded.
+STEP_ATOL_M, STEP_ATOL_RAD = 2e-7, 1e-6
+BACKWARDS_M_S = 1e-9
+SPEED_ATOL = np.array([2e-4] * 3 + [1e-3] * 3)
+SLOWEST, REACH_M = 0.1, 0.15
+
+offsets = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
+targets = st.tuples(offsets, offsets).map(lambda pair: (REACH_M * pair[0], 0.6 * pair[1]))
+shares = st.builds(Shares, *[st.floats(0.1, 1.0)] * 3)
+orders = st.lists(
+    st.tuples(st.integers(1, 90), st.none() | shares | targets), min_size=1, max_size=12
+)
+
+
+def smoother() -> Smoother:
+    return Smoother(START, DT_S, LIMITS)
+
+
+def ordered(motion: Smoother, order: tuple[np.ndarray, np.ndarray] | Shares | None) -> None:
+    if order is None or isinstance(order, Shares):
+        motion.brake(order)
+        return
+    here = motion.motion.pose
+    parts = SLOWEST + (1 - SLOWEST) * np.abs(order[0]) / REACH_M
+    goal = Pose(START.position_m + order[0], exp3(order[1]) @ here.rotation)
+    motion.target(goal, Shares(*parts.tolist()))
+
+
+def check_tick(before: Motion, now: Motion) -> None:
+    jerk = (now.acceleration - before.acceleration) / DT_S
+    for order, values in enumerate((now.twist, now.acceleration, jerk)):
+        assert np.abs(values[:3]).max() <= LIMITS.translation[order] * (1 + LIMIT_RTOL)
+        assert norm3(values[3:]) <= LIMITS.rotation[order] * (1 + LIMIT_RTOL)
+    moved = now.pose.position_m - before.pose.position_m
+    mean = (before.twist + now.twist) * (DT_S / 2)
+    np.testing.assert_allclose(moved, mean[:3], atol=STEP_ATOL_M)
+    turned = log3(now.pose.rotation @ before.pose.rotation.T)
+    np.testing.assert_allclose(turned, mean[3:], atol=STEP_ATOL_RAD)
+    quicker = (before.acceleration + now.acceleration) * (DT_S / 2)
+    assert (np.abs(now.twist - before.twist - quicker) <= SPEED_ATOL).all()
+
+
+@settings(max_examples=40)
+@given(orders)
+def test_limits_hold_and_the_pose_is_the_integral_of_the_twist_whatever_is_ordered_when(
+    given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | Shares | None]],
+) -> None:
+    motion = smoother()
+    for ticks, order in given_orders:
+        ordered(motion, order)
+        for _ in range(ticks):
+            before = motion.motion
+            check_tick(before, motion.tick())
+    assert motion.failures == 0
+
+
+@settings(max_examples=40)
+@example([(3, (np.array([0.0, 0.0, 0.15]), np.array([0.0, 0.0, 0.6])))], (np.zeros(3), np.zeros(3)))
+@given(orders, targets)
+def test_it_ends_exactly_on_its_last_target(
+    given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | Shares | None]],
+    last: tuple[np.ndarray, np.ndarray],
+) -> None:
+    motion = smoother()
+    for ticks, order in given_orders:
+        ordered(motion, order)
+        for _ in range(ticks):
+            motion.tick()
+    goal = Pose(START.position_m + last[0], exp3(last[1]) @ motion.motion.pose.rotation)
+    motion.target(goal)
+    for _ in range(round(4.0 / DT_S)):
+        motion.tick()
+    assert motion.at_rest
+    assert norm3(motion.motion.pose.position_m - goal.position_m) < AT_TARGET_M
+    assert angle_between(motion.motion.pose.rotation, goal.rotation) < AT_TARGET_RAD
+
+
+@settings(max_examples=40)
+@given(orders)
+def test_a_brake_ends_where_it_was_foretold_and_stays_there(
+    given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | Shares | None]],
+) -> None:
+    motion = smoother()
+    for ticks, order in given_orders:
+        ordered(motion, order)
+        for _ in range(ticks):
+            motion.tick()
+    foretold = motion.resting_pose()
+    longest_s = max(
+        limit[0] / limit[1] + 2 * limit[1] / limit[2] for limit in (LIMITS.translation, LIMITS[1])
+    )
+    for _ in range(round(20 * longest_s / DT_S)):
+        if motion.at_rest:
+            break
+        before = motion.motion
+        check_tick(before, motion.tick())
+    assert motion.at_rest
+    assert norm3(motion.motion.pose.position_m - foretold.position_m) < AT_TARGET_M
+    assert angle_between(motion.motion.pose.rotation, foretold.rotation) < AT_TARGET_RAD
+
+
+@pytest.mark.parametrize("jerk", [0.02, 0.1, 1.0])
+def test_a_way_that_goes_on_with_little_jerk_gets_no_faster_than_it_may(jerk: float) -> None:
+    motion = smoother()
+    goal = Pose(START.position_m + [0.4, 0.0, 0.0], START.rotation)
+    motion.target(goal)
+    for _ in range(34):
+        motion.tick()
+    motion.target(goal, Shares(jerk=jerk))
+    while not motion.at_rest:
+        before = motion.motion
+        check_tick(before, motion.tick())
+    assert norm3(motion.motion.pose.position_m - goal.position_m) < AT_TARGET_M
+
+
+@pytest.mark.parametrize("jerk", [0.02, 0.1, 1.0])
+def test_a_brake_that_has_little_jerk_gets_no_faster_first(jerk: float) -> None:
+    motion = smoother()
+    motion.target(Pose(START.position_m + [0.15, 0.0, 0.0], exp3([-0.5, 0.0, -0.3])))
+    for _ in range(34):
+        motion.tick()
+    assert motion.motion.acceleration[0] > 0
+    motion.brake(Shares(jerk=jerk))
+    foretold = motion.resting_pose()
+    while not motion.at_rest:
+        before = motion.motion
+        check_tick(before, motion.tick())
+        assert motion.motion.twist[0] >= -BACKWARDS_M_S
+        again = motion.resting_pose()
+        assert norm3(again.position_m - foretold.position_m) < AT_TARGET_M
+
+
+def test_a_brake_stops_within_the_jerk_limit_and_never_turns_back() -> None:
+    motion = smoother()
+    motion.target(Pose(START.position_m + [0.3, 0.0, 0.0], START.rotation))
+    for _ in range(100):
+        motion.tick()
+    assert motion.motion.twist[0] > 0.4
+    motion.brake()
+    while not motion.at_rest:
+        before = motion.motion
+        now = motion.tick()
+        check_tick(before, now)
+        assert now.twist[0] >= -STILL
+    assert motion.motion.pose.position_m[0] < START.position_m[0] + 0.3
+
+
+def test_half_a_turn_is_reached_in_small_targets_without_wrapping() -> None:
+    motion = smoother()
+    goal = START.rotation
+    for _ in range(80):
+        goal = exp3(np.array([0.0, 0.0, 0.05])) @ goal
+        motion.target(Pose(START.position_m, goal))
+        for _ in range(25):
+            before = motion.motion
+            check_tick(before, motion.tick())
+    for _ in range(250):
+        motion.tick()
+    assert angle_between(motion.motion.pose.rotation, goal) < AT_TARGET_RAD
+    assert angle_between(START.rotation, goal) == pytest.approx(2 * math.pi - 4.0)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e9])
+def test_an_impossible_target_brakes_and_the_next_good_one_is_reached(bad: float) -> None:
+    motion = smoother()
+    good = Pose(START.position_m + [0.1, 0.0, 0.0], START.rotation)
+    motion.target(good)
+    for _ in range(50):
+        motion.tick()
+    assert motion.motion.twist[0] > 0.1
+    motion.target(Pose(np.array([bad, 0.0, 0.3]), START.rotation))
+    for _ in range(100):
+        before = motion.motion
+        check_tick(before, motion.tick())
+    assert motion.failures == 1
+    assert motion.braking
+    motion.target(good)
+    for _ in range(500):
+        before = motion.motion
+        check_tick(before, motion.tick())
+    assert norm3(motion.motion.pose.position_m - good.position_m) < AT_TARGET_M
+
+
+def test_a_motion_taken_over_goes_on_without_a_step_and_brakes() -> None:
+    leader, follower = smoother(), smoother()
+    leader.target(
+        Pose(START.position_m + [0.1, -0.05, 0.1], exp3([0.3, 0.2, 0.1]) @ START.rotation)
+    )
+    for _ in range(60):
+        leader.tick()
+    follower.brake_from(leader.motion)
+    leader.brake()
+    for _ in range(150):
+        before = follower.motion
+        now = follower.tick()
+        check_tick(before, now)
+        np.testing.assert_allclose(now.pose.position_m, leader.tick().pose.position_m, atol=1e-12)
+    assert follower.at_rest
+
+
+def test_it_stands_still_until_it_is_told_to_move() -> None:
+    motion = smoother()
+    for _ in range(10):
+        now = motion.tick()
+    assert motion.at_rest
+    np.testing.assert_array_equal(now.twist, np.zeros(6))
+    np.testing.assert_array_equal(now.pose.position_m, START.position_m)
+
+
+def test_who_is_given_less_speed_in_motion_slows_down_to_it_and_keeps_to_it() -> None:
+    motion, share = smoother(), 0.2
+    far = Pose(START.position_m + [0.3, 0.0, 0.0], START.rotation)
+    motion.target(far)
+    for _ in range(80):
+        motion.tick()
+    assert motion.motion.twist[0] > 2 * share * LIMITS.translation[0]
+    motion.target(far, Shares(share))
+    speeds: list[float] = []
+    for _ in range(150):
+        before = motion.motion
+        check_tick(before, motion.tick())
+        speeds.append(motion.motion.twist[0])
+    slow = share * LIMITS.translation[0]
+    assert speeds[-1] == pytest.approx(slow, abs=STILL)
+    assert motion.failures == 0
+
+
+def test_reset_forgets_all_motion() -> None:
+    motion = smoother()
+    motion.target(Pose(START.position_m + [0.1, 0.0, 0.0], START.rotation))
+    for _ in range(30):
+        motion.tick()
+    there = Pose(np.array([0.5, 0.1, 0.2]), exp3(np.array([0.0, 1.0, 0.0])))
+    motion.reset(there)
+    now = motion.tick()
+    assert motion.at_rest
+    np.testing.assert_allclose(now.pose.position_m, there.position_m, atol=1e-15)
+    np.testing.assert_allclose(now.pose.rotation, there.rotation, atol=1e-12)
+
+
+# An axis that stands at its goal, and the range that a motion keeps.
+AT_GOAL = np.array([1e-5] * 3 + [1e-5] * 3)  # m, rad
+noises = st.floats(-1.0, 1.0).flatmap(
+    lambda sign: st.sampled_from([1e-16, 1e-14, 1e-12, 1e-10]).map(lambda size: sign * size)
+)
+
+
+class Ends:
+    """A rotation-free view of a motion: translation, and turns about one base axis."""
+
+    def __init__(self, motion: Smoother) -> None:
+        self.motion = motion
+
+    def away(self) -> np.ndarray:
+        pose = self.motion.motion.pose
+        return np.concatenate(
+            [pose.position_m - START.position_m, log3(pose.rotation @ START.rotation.T)]
+        )
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(
+        st.tuples(st.integers(3, 90), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), noises),
+        min_size=3,
+        max_size=8,
+    )
+)
+def test_an_axis_at_its_goal_stays_there_whatever_the_others_do(
+    retargets: list[tuple[int, float, float, float]],
+) -> None:
+    motion = smoother()
+    turn = exp3(np.array([0.0, 0.0, 1.0]))
+    for ticks, x_m, yaw_rad, noise in retargets:
+        # Rounding in whoever computes the goals: z, roll and pitch are to stand.
+        position_m = START.position_m + [x_m, 0.0, noise]
+        rotation = exp3(np.array([noise, -noise, yaw_rad])) @ START.rotation
+        motion.target(Pose(position_m, turn.T @ turn @ rotation))
+        for _ in range(ticks):
+            motion.tick()
+            away = Ends(motion).away()
+            assert (np.abs(away[[1, 2, 3, 4]]) < AT_GOAL[[1, 2, 3, 4]]).all()
+
+
+def brake_range(motion: Smoother) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest positions (3,) m of the shortest stop from here."""
+    stopping = Smoother(motion.motion.pose, DT_S, LIMITS)
+    stopping.brake_from(motion.motion)
+    path = [stopping.motion.pose.position_m]
+    while not stopping.at_rest:
+        path.append(stopping.tick().pose.position_m)
+    return np.min(path, axis=0), np.max(path, axis=0)
+
+
+@settings(max_examples=120)
+@given(st.lists(st.tuples(st.integers(1, 70), offsets), min_size=2, max_size=6))
+def test_a_retargeted_motion_stays_between_its_start_its_target_and_where_it_can_stop(
+    retargets: list[tuple[int, np.ndarray]],
+) -> None:
+    motion = smoother()
+    for ticks, offset in retargets:
+        target = START.position_m + REACH_M * offset
+        start, (least, most) = motion.motion.pose.position_m, brake_range(motion)
+        least = np.minimum(np.minimum(least, start), target) - AT_GOAL[:3]
+        most = np.maximum(np.maximum(most, start), target) + AT_GOAL[:3]
+        motion.target(Pose(target, START.rotation))
+        for _ in range(ticks):
+            position_m = motion.tick().pose.position_m
+            assert (position_m >= least).all()
+            assert (position_m <= most).all()
+
+
+@settings(max_examples=60)
+@given(
+    offsets,
+    offsets,
+    st.lists(st.tuples(st.integers(1, 60), st.floats(0.05, 1.0), shares), min_size=2, max_size=8),
+)
+def test_a_motion_along_a_line_stays_on_it_whatever_the_limits_become(
+    along: np.ndarray, turn: np.ndarray, orders: list[tuple[int, float, Shares]]
+) -> None:
+    motion, way = smoother(), np.concatenate([REACH_M * along, 0.6 * turn])
+    length = float(np.linalg.norm(way))
+    for ticks, part, parts in orders:
+        goal = Pose(START.position_m + part * way[:3], exp3(part * way[3:]) @ START.rotation)
+        motion.target(goal, parts)
+        for _ in range(ticks):
+            motion.tick()
+            away = Ends(motion).away()
+            beside = away - (away @ way) / max(length, 1e-9) ** 2 * way
+            assert np.abs(beside).max() < AT_GOAL[0]

@@ -1,0 +1,141 @@
+"""A step of what is told does not become one of the reference: it goes over, within its limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vla_zenoh.control.smoothing import Motion, MotionLimits
+from vla_zenoh.guard.command_stream import BRAKE_MARGIN
+from vla_zenoh.guard.joint_guard import JointSpace
+from vla_zenoh.guard.pose_guard import GuardLimits, PoseGuard, PoseSpace
+from vla_zenoh.guard.reference_governor import GovernorLimits, ReferenceGovernor
+from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3
+from vla_zenoh.types import FloatArray, Header, PoseCommand, Stamped
+from vla_zenoh.types.references import JointReference
+
+DT_S = 1e-3
+SOON_S = 0.6
+SPEED_M_S = 0.2
+TICK_NS = 1_000_000
+STEP_SLACK_M = 2e-4
+OWN = np.array([0.5, 2.0, 20.0])
+RTOL = 1e-6
+
+
+def standing(*value: float) -> JointReference:
+    return JointReference.at_rest(np.array(value))
+
+
+def governor(axes: int = 1) -> ReferenceGovernor[JointReference]:
+    velocity, acceleration, jerk = (np.full(axes, BRAKE_MARGIN * limit) for limit in OWN)
+    limits = GovernorLimits(velocity, acceleration, jerk, np.ones(axes), np.ones(axes))
+    return ReferenceGovernor(JointSpace(), standing(*[0.0] * axes), DT_S, limits)
+
+
+def led(side: ReferenceGovernor[JointReference], told: JointReference, ticks: int) -> FloatArray:
+    """(ticks, n) where it is while the same is told."""
+    path: list[FloatArray] = []
+    for _ in range(ticks):
+        side.follow(told, steady=False)
+        path.append(side.motion.position_rad)
+    return np.array(path)
+
+
+@given(step=st.floats(-0.05, 0.05), small=st.floats(-1e-4, 1e-4))
+@settings(max_examples=25, deadline=None)
+def test_steps_of_any_size_are_joined_within_the_limits_and_made_up_for_wholly(
+    step: float, small: float
+) -> None:
+    side = governor(2)
+    path = led(side, standing(step, small), 1000)
+    np.testing.assert_array_equal(path[-1], [step, small])
+    assert not side.moving
+    still = np.zeros((3, 2))
+    for order, limit in enumerate(OWN, start=1):
+        differences = np.diff(np.vstack([still, path]), order, axis=0) / DT_S**order
+        assert np.abs(differences).max() <= BRAKE_MARGIN * limit * (1 + RTOL)
+
+
+def test_twenty_millimetres_are_gone_soon_and_a_tenth_of_one_sooner() -> None:
+    for step, after_s in ((0.02, SOON_S), (1e-4, SOON_S / 3)):
+        path = led(governor(), standing(step), round(SOON_S / DT_S))
+        np.testing.assert_array_equal(path[round(after_s / DT_S) :], step)
+
+
+@given(st.floats(-1e-15, 1e-15))
+def test_noise_of_rounding_is_answered_by_noise(noise: float) -> None:
+    side = governor(2)
+    for told in (standing(noise, 0.01), standing(0.0, 0.01)):
+        assert np.abs(led(side, told, 200)[:, 0]).max() <= 2e-15
+
+
+def test_what_goes_on_as_promised_passes_unchanged() -> None:
+    side = governor()
+    for tick in range(1, 400):
+        t = tick * DT_S
+        told = JointReference(
+            *(np.array([x]) for x in (OWN[2] * t**3 / 6, OWN[2] * t**2 / 2, OWN[2] * t))
+        )
+        side.follow(told, steady=False)
+        assert side.motion is told
+
+
+@pytest.mark.parametrize("at", [1, 20, 40, 60, 150])
+def test_a_stop_may_begin_at_any_time_of_a_step(at: int) -> None:
+    side, path = governor(), [0.0, 0.0, 0.0]
+    path += led(side, standing(0.03), at)[:, 0].tolist()
+    side.stop()
+    while side.moving:
+        side.rest()
+        path.append(float(side.motion.position_rad[0]))
+    for order, limit in enumerate(OWN, start=1):
+        differences = np.diff(path, order) / DT_S**order
+        assert np.abs(differences).max() <= BRAKE_MARGIN * limit * (1 + RTOL)
+    assert not side.motion.velocity_rad_s.any()
+
+
+numbers = st.lists(st.floats(-1, 1), min_size=18, max_size=18).map(np.array)
+
+
+@given(numbers, numbers)
+def test_a_pose_is_beside_another_where_it_was_found_to_be(a: FloatArray, b: FloatArray) -> None:
+    space = PoseSpace()
+    motion, base = (
+        Motion(Pose(x[:3], exp3(x[3:6])), 2 * x[6:12], 5 * x[12:]) for x in (a, 0.5 * b)
+    )
+    found = space.beside(base, space.apart(motion, base))
+    np.testing.assert_allclose(found.pose.position_m, motion.pose.position_m, atol=1e-9)
+    assert angle_between(found.pose.rotation, motion.pose.rotation) < 1e-7
+    np.testing.assert_allclose(found.twist, motion.twist, atol=1e-7)
+    np.testing.assert_allclose(found.acceleration, motion.acceleration, atol=1e-6)
+
+
+def test_a_stream_that_stood_still_for_a_moment_does_not_pull_the_reference_back() -> None:
+    start = Pose(np.array([0.4, 0.0, 0.3]), np.eye(3))
+    limits = GuardLimits(0.1, MotionLimits((1.0, 4.0, 40.0), (3.0, 12.0, 120.0)))
+    guard = PoseGuard(start, DT_S, limits)
+    now_ns, sent, way_m, positions = 10**18, 0, 0.0, []
+    for tick in range(1000):
+        now_ns += TICK_NS
+        # The writer stalls for 60 ms and then goes on where it was, not where it should be.
+        if tick % 4 == 0 and not 300 <= tick < 360:
+            speed_m_s = min(SPEED_M_S * sent / 25, SPEED_M_S)
+            way_m += speed_m_s * 0.004
+            record = PoseCommand(
+                start.position_m + [way_m, 0.0, 0.0],
+                [0.0, 0.0, 0.0, 1.0],
+                [speed_m_s, 0, 0, 0, 0, 0],
+                np.zeros(6),
+                start.position_m,
+                [0.0, 0.0, 0.0, 1.0],
+                "active",
+            )
+            sent += 1
+            assert guard.offer(Stamped(Header(now_ns, sent, "c"), record, now_ns), now_ns) is None
+        positions.append(guard.tick(now_ns).pose.position_m[0])
+    steps = np.diff(positions)[150:]
+    assert float(np.abs(steps - SPEED_M_S * DT_S).max()) < STEP_SLACK_M
+    assert abs(positions[-1] - (start.position_m[0] + way_m)) < 2 * SPEED_M_S * 0.004

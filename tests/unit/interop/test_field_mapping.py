@@ -1,0 +1,363 @@
+"""What a server is sent and what its answer means, for known robots and by options."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vla_zenoh.errors import PeerError, SpecError
+from vla_zenoh.interop import action_semantics as meaning
+from vla_zenoh.interop import groot, openpi, options, origami
+from vla_zenoh.interop.backoff import FIRST_S, LONGEST_S, Backoff
+from vla_zenoh.interop.field_mapping import FieldMapping
+from vla_zenoh.interop.joints import make_forward
+from vla_zenoh.interop.options import DEFAULTS, read_columns, read_layout
+from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, ORIGAMI, Presets
+from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
+from vla_zenoh.policy import Observation, example_observation
+from vla_zenoh.profile import load_profile
+from vla_zenoh.types import GripperState, JointState, PoseState
+
+WIDTH_M = 0.08
+ABSOLUTE = {"action": "absolute", "gripper": "binary", "gripper_open": "high", "dt_s": "0.1"}
+ATOL, ATOL_F32 = 1e-9, 1e-6
+ALL: dict[str, tuple[Presets, str]] = {
+    f"{model}/{preset}": (presets, preset)
+    for model, presets in {
+        "openpi": OPENPI,
+        "groot": GROOT,
+        "openvla_rest": OPENVLA_REST,
+        "origami": ORIGAMI,
+    }.items()
+    for preset in presets
+}
+
+
+def layout(presets: Presets = OPENPI, /, preset: str = "libero", **options: str) -> FieldMapping:
+    return read_layout("x", presets, preset, options, max_width_m=WIDTH_M)
+
+
+def seen(of: FieldMapping, rotvec: Any = (0.1, -0.2, 0.3), width_m: float = 0.06) -> Observation:
+    """An observation with a pose that tells its parts apart."""
+    found = example_observation(of.spec, prompt="put it there")
+    quat = quat_from_rotation(exp3(np.array(rotvec, float)))
+    home_rad = np.array(load_profile("panda_sim").robot.home_rad)
+    names, none = load_profile("panda_sim").robot.arm_joints, np.zeros(7)
+    return replace(
+        found,
+        pose=PoseState(np.array([0.4, -0.1, 0.3]), quat, np.zeros(6)) if found.pose else None,
+        joint=JointState(names, home_rad, none, none) if found.joint else None,
+        gripper=GripperState(width_m, False, False) if found.gripper else None,
+    )
+
+
+# -- what is sent ---------------------------------------------------------------------------------
+def test_liberos_state_is_position_axis_angle_and_both_fingers() -> None:
+    of = layout()
+    state = of.request(seen(of))["observation/state"]
+    assert state.dtype == np.float32
+    np.testing.assert_allclose(state, [0.4, -0.1, 0.3, 0.1, -0.2, 0.3, 0.03, -0.03], atol=ATOL_F32)
+
+
+def test_droids_gripper_is_0_when_open() -> None:
+    of = layout(preset="droid")
+    sent = of.request(seen(of, width_m=WIDTH_M))
+    assert sent["observation/gripper_position"].tolist() == [0.0]
+    assert sent["observation/joint_position"].shape == (7,)
+    assert set(sent) == {
+        "observation/exterior_image_1_left",
+        "observation/wrist_image_left",
+        "observation/joint_position",
+        "observation/gripper_position",
+        "prompt",
+    }
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_preset_makes_a_spec_and_a_question(name: str) -> None:
+    of = layout(*ALL[name])
+    sent = of.request(seen(of))
+    assert [value for value in sent.values() if isinstance(value, str)] == ["put it there"]
+    for value in sent.values():
+        assert isinstance(value, str) or value.dtype in (np.uint8, np.float32)
+
+
+# -- what an answer means -------------------------------------------------------------------------
+def test_one_unit_of_libero_is_5_cm_and_half_a_radian_and_more_is_clipped() -> None:
+    of = layout()
+    answer = {"actions": np.array([[1, -0.5, 0, 0, 0.5, 0, -1], [9, 0, 0, 0, 0, -9, 1]])}
+    steps = of.steps(answer, seen(of))
+    expected = [[0.05, -0.025, 0, 0, 0.25, 0, -1], [0.05, 0, 0, 0, 0, -0.5, 1]]
+    np.testing.assert_allclose(steps, expected, atol=ATOL)
+    action = of.spec.action
+    assert (action.kind, action.rotation) == ("delta", "rotvec")
+    assert (action.gripper, action.gripper_open_is_high, action.gripper_threshold) == (
+        "binary",
+        False,
+        0.0,
+    )
+
+
+def test_what_the_server_said_is_kept_for_people() -> None:
+    of = layout()
+    answer = np.array([[1.0, 0, 0, 0, 0, 0, -1]])
+    result = of.read(answer, seen(of))
+    assert result.raw == {"first_step": answer[0].tolist()}
+    np.testing.assert_array_equal(result.steps, of.steps(answer, seen(of)))
+
+
+def test_joint_deltas_add_up_from_the_measured_joints_and_become_poses() -> None:
+    of = layout(preset="droid")
+    observation, forward = seen(of), make_forward(load_profile("panda_sim"))
+    assert observation.joint is not None
+    answer = np.zeros((3, 8))
+    answer[:, 1], answer[:, 7] = 0.5, 1.0
+    steps = of.steps({"actions": answer}, observation, forward)
+    assert steps.shape == (3, 8)
+    turned = observation.joint.position_rad + np.outer([1, 2, 3], [0, 0.1, 0, 0, 0, 0, 0])
+    np.testing.assert_allclose(steps[:, :7], forward(observation.joint, turned), atol=ATOL)
+    assert (of.spec.action.kind, of.spec.action.rotation) == ("absolute", "quaternion")
+    assert not of.spec.action.gripper_open_is_high
+
+
+def test_joints_in_another_order_lead_to_the_same_poses() -> None:
+    of = layout(preset="droid")
+    observation, forward = seen(of), make_forward(load_profile("panda_sim"))
+    joint = observation.joint
+    assert joint is not None
+    turned = replace(
+        observation,
+        joint=JointState(joint.names[::-1], joint.position_rad[::-1], np.zeros(7), np.zeros(7)),
+    )
+    answer = np.random.default_rng(0).uniform(-1, 1, (4, 8))
+    flipped = np.concatenate([answer[:, 6::-1], answer[:, 7:]], axis=1)
+    np.testing.assert_allclose(
+        of.steps(answer, observation, forward), of.steps(flipped, turned, forward), atol=ATOL
+    )
+
+
+def test_origami_takes_the_columns_of_one_arm() -> None:
+    of = layout(ORIGAMI, "north_right")
+    observation, forward = seen(of), make_forward(load_profile("panda_sim"))
+    state = of.request(observation)["observation/state"]
+    assert observation.joint is not None
+    assert state.shape == (65,)
+    np.testing.assert_allclose(state[29:36], observation.joint.position_rad, atol=ATOL_F32)
+    poses = of.steps(state[None].astype(float), observation, forward)
+    home = forward(observation.joint, observation.joint.position_rad[None])
+    np.testing.assert_allclose(poses, home, atol=1e-5)
+
+
+def test_a_quaternion_may_begin_with_w() -> None:
+    of = layout(**ABSOLUTE, rotation="quat_wxyz")
+    answer = np.array([[0.4, 0, 0.3, 2**-0.5, 2**-0.5, 0, 0, 1]])
+    steps = of.steps(answer, seen(of))
+    np.testing.assert_allclose(steps, [[0.4, 0, 0.3, 2**-0.5, 0, 0, 2**-0.5, 1]], atol=ATOL)
+    with pytest.raises(PeerError, match="quaternion of norm"):
+        of.steps(np.array([[0.4, 0, 0.3, 0.1, 0, 0, 0, 1]]), seen(of))
+
+
+def test_named_parts_stand_side_by_side_whatever_their_shape() -> None:
+    of = layout(GROOT, "bridge", keys="move,gripper", horizon="3")
+    move = np.arange(24.0).reshape(1, 4, 6) / 100
+    for grip in (np.ones((1, 4, 1)), np.ones((4, 1)), np.ones(4)):
+        steps = of.steps({"move": move, "gripper": grip, "more": "x"}, seen(of))
+        assert steps.shape == (3, 7)
+        np.testing.assert_allclose(steps[:, :6], move[0, :3], atol=ATOL)
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        ({"other": np.zeros((2, 7))}, "has no 'actions'; it has: other"),
+        ({"actions": np.zeros((2, 6))}, "6 columns, wanted 7: position 3"),
+        ({"actions": np.zeros((0, 7))}, "has no steps"),
+        ({"actions": np.zeros((2, 2, 7))}, r"shape \(2, 2, 7\)"),
+        ({"actions": np.full((2, 7), np.nan)}, "NaN or infinity"),
+        ({"actions": np.full((2, 7), np.inf)}, "NaN or infinity"),
+        ({"actions": "up"}, "is not numbers"),
+        ({"actions": [[1, 2], [3]]}, "is not a table of numbers"),
+        ({"actions": None}, "is not numbers"),
+    ],
+)
+def test_an_answer_of_another_form_is_refused_by_name(answer: Any, why: str) -> None:
+    of = layout()
+    with pytest.raises(PeerError, match=why) as raised:
+        of.steps(answer, seen(of))
+    assert raised.value.reason == "peer_reply"
+
+
+# -- options --------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({"sice": "1x1"}, "no option 'sice'; known: map, size"),
+        ({"size": "big"}, "wanted WIDTHxHEIGHT"),
+        ({"resize": "squeeze"}, "resize"),
+        ({"map": "a"}, "NAME=SOURCE"),
+        ({"map": "a=posture"}, "no part of the state is called 'posture'; there are: joint"),
+        ({"map": "a=kamera:front"}, "a source is camera:NAME"),
+        ({"map": "a=x,a=y"}, "twice"),
+        ({"action": "velocity"}, "allowed: delta, absolute, joint_delta, joint_position"),
+        ({"rotation": "euler"}, "allowed: rpy, rotvec"),
+        ({"gripper": "maybe"}, "gripper"),
+        ({"gripper_open": "left"}, "allowed: high, low"),
+        ({"dt_s": "0"}, "dt_s"),
+        ({"dt_s": "soon"}, "wanted a number"),
+        ({"horizon": "1.5"}, "whole number"),
+        ({"position_scale_m": "-1"}, "from 0 up"),
+        ({"frame": "camera"}, "frame"),
+        ({**ABSOLUTE, "rotation": "rpy", "frame": "tcp"}, "base frame"),
+        ({"columns": "7:0"}, "wanted 0:7"),
+        ({"keys": "x,,y"}, "keys"),
+    ],
+)
+def test_an_option_that_cannot_be_is_refused_and_says_what_can(
+    options: dict[str, str], why: str
+) -> None:
+    with pytest.raises(SpecError, match=why):
+        layout(**options)
+
+
+MINE = {
+    "map": "image=camera:front, state=joint+gripper_open, prompt=prompt",
+    "action": "joint_position",
+    "gripper": "open_fraction",
+    "gripper_open": "high",
+    "dt_s": "0.05",
+    "horizon": "10",
+}
+"""A server of one's own: absolute joints, and a gripper from 0 to 1."""
+
+
+def test_a_server_of_ones_own_is_told_with_every_option_and_no_name_of_a_preset() -> None:
+    of = layout(preset="none", **MINE)
+    assert set(of.fields) == {"image", "state", "prompt"}
+    observation, forward = seen(of), make_forward(load_profile("panda_sim"))
+    assert observation.joint is not None
+    home_rad = observation.joint.position_rad
+    steps = of.steps({"actions": np.array([[*home_rad, 0.25]])}, observation, forward)
+    pose = forward(observation.joint, home_rad[None])[0]
+    np.testing.assert_allclose(steps, [[*pose, 0.25]], atol=ATOL)
+
+
+@pytest.mark.parametrize("name", ["action", "gripper", "gripper_open", "dt_s", "horizon"])
+def test_of_a_server_of_ones_own_no_meaning_is_guessed(name: str) -> None:
+    with pytest.raises(SpecError, match=rf"nobody says what the numbers mean: --set {name}=\("):
+        layout(preset="none", **{k: v for k, v in MINE.items() if k != name})
+    with pytest.raises(SpecError, match=r"--set rotation=\(rpy or rotvec"):
+        layout(preset="none", **{**MINE, "action": "delta"})
+
+
+def test_another_action_than_the_presets_keeps_nothing_of_what_it_says_of_numbers() -> None:
+    told = {"gripper": "none", "dt_s": "0.1"}
+    observed = seen(layout(preset="droid"))
+    assert observed.joint is not None
+    home_rad, forward = observed.joint.position_rad, make_forward(load_profile("panda_sim"))
+    wanted = forward(observed.joint, home_rad[None])
+    for preset in ("libero", "droid"):  # LIBERO's clip, DROID's 0.2 rad to the unit
+        of = layout(preset=preset, action="joint_position", **told)
+        steps = of.steps(home_rad[None].astype(float), observed, forward)
+        np.testing.assert_allclose(steps, wanted, atol=ATOL)
+    of = layout(action="absolute", rotation="rpy", **told)
+    steps = of.steps(np.array([[0.5, 0, 0.3, 0, 0, 2.0]]), seen(of))
+    np.testing.assert_allclose(steps, [[0.5, 0, 0.3, 0, 0, 2.0]], atol=ATOL)
+    with pytest.raises(SpecError, match="joint_position is not that of preset droid, so nobody"):
+        layout(preset="droid", action="joint_position")
+
+
+def test_the_action_that_the_preset_has_anyway_changes_nothing() -> None:
+    assert layout(action="delta") == layout()
+
+
+def test_an_unknown_preset_is_refused_with_those_there_are() -> None:
+    with pytest.raises(SpecError, match="preset is 'bridge', allowed: libero, droid, own, none"):
+        layout(preset="bridge")
+
+
+def test_a_map_changes_single_names_of_a_preset() -> None:
+    of = layout(map="observation/wrist_image=, observation/image=camera:top")
+    assert [camera.camera for camera in of.spec.observation.cameras] == ["top"]
+    assert set(of.fields) == {"observation/image", "observation/state", "prompt"}
+
+
+def test_columns() -> None:
+    assert read_columns("") is None
+    assert read_columns("2:5") == (2, 3, 4)
+    assert read_columns("0,1,6") == (0, 1, 6)
+
+
+def test_the_spec_of_every_option_has_its_default_documented() -> None:
+    told = f"{options.__doc__}{meaning.__doc__}"
+    assert all(name in told for name in DEFAULTS)
+
+
+# -- what servers say of themselves ---------------------------------------------------------------
+def test_a_server_that_says_what_is_set_fits() -> None:
+    of = layout(preset="own")
+    said = openpi.read_metadata(openpi.metadata(of.spec.action, {}))
+    assert openpi.mismatches(said, of) == []
+    assert openpi.mismatches({}, of) == []
+
+
+@pytest.mark.parametrize(
+    ("said", "named"),
+    [
+        ({"action_dim": 8}, "8 columns, 7 are wanted"),
+        ({"action_space": "joint_position"}, "action=delta is set"),
+        ({"image_resolution": [180, 320]}, "pictures of 320x180, size=224x224"),
+        ({"vla_zenoh_action": {"gripper_open_is_high": True}}, "gripper_open_is_high"),
+        ({"vla_zenoh_action": {"dt_s": 0.1}}, "dt_s is 0.1, 0.05 is set"),
+    ],
+)
+def test_what_openpis_server_says_otherwise_is_named(said: dict[str, Any], named: str) -> None:
+    (wrong,) = openpi.mismatches(said, layout())
+    assert named in wrong
+
+
+def test_what_groots_server_says_otherwise_is_named() -> None:
+    of = layout(GROOT, "bridge")
+    said = {
+        "video": {"modality_keys": ["image_0", "wrist"], "delta_indices": [-1, 0]},
+        "state": {"modality_keys": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]},
+        "action": {"modality_keys": ["eef"]},
+        "language": {"modality_keys": ["task"]},
+    }
+    told = "; ".join(groot.mismatches(said, of))
+    for part in (
+        "it wants video wrist",
+        "2 video entries in time",
+        "does not know state pad",
+        "it gives no action",
+        "its prompt is called task",
+    ):
+        assert part in told
+
+
+def test_what_origamis_policy_says_otherwise_is_named() -> None:
+    of = layout(ORIGAMI, "north_right")
+    fits = {"action_dim": 65, "action_type": "absolute_joint_position", "action_units": "radians"}
+    assert origami.mismatches(fits, of) == []
+    assert "column 35" in origami.mismatches({**fits, "action_dim": 14}, of)[0]
+    assert "'degrees'" in origami.mismatches({**fits, "action_units": "degrees"}, of)[0]
+    assert "delta_pose" in origami.mismatches({"action_type": "delta_pose"}, of)[0]
+    assert origami.mismatches(None, of)
+
+
+# -- trying again ---------------------------------------------------------------------------------
+def test_a_lost_server_is_tried_again_soon_then_less_often_and_after_success_at_once() -> None:
+    backoff, now_s, waits = Backoff(), 100.0, []
+    for _ in range(6):
+        assert backoff.wait_s(now_s) == 0
+        backoff.failed(now_s)
+        waits.append(backoff.wait_s(now_s))
+        now_s += waits[-1]
+    assert waits[0] == pytest.approx(FIRST_S)
+    assert waits == sorted(waits)
+    assert waits[-1] == pytest.approx(LONGEST_S)
+    backoff.failed(now_s)
+    backoff.succeeded()
+    assert backoff.wait_s(now_s) == 0

@@ -1,0 +1,232 @@
+"""Recorded runs to a LeRobot dataset: nothing of an action is lost or invented."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from chain import command_line
+from dataset_rig import CHUNK_MS, CHUNKS, DT_S, HEIGHT, HORIZON, PROMPTS, WIDTH, spec, steps_of
+from dataset_rig import write_run as make_run
+
+from vla_zenoh.errors import RecordingError
+from vla_zenoh.lab.dataset.episodes import episodes_of, fps_of, hold
+from vla_zenoh.lab.dataset.features import action_names
+from vla_zenoh.lab.dataset.lerobot import export
+from vla_zenoh.lab.dataset.openvla import openvla_statistics
+from vla_zenoh.lab.dataset.statistics import Colours, of_numbers
+from vla_zenoh.lab.recording.run import load_run
+from vla_zenoh.policy.state_vector import read_parts
+from vla_zenoh.types import JointState
+
+FPS, USED = 10, 2
+"""Steps of a chunk until the next one takes over."""
+PARTS = read_parts("position+rpy+gripper_m")
+BRIGHTNESS = 3
+"""Levels by which JPEG and H.264 together may change an evenly coloured picture."""
+STATE_ATOL = 1e-6
+
+
+@pytest.fixture(scope="module")
+def run_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("runs") / "teach.mcap")
+
+
+@pytest.fixture(scope="module")
+def dataset(run_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("data") / "bricks"
+    export(out, episodes_of(load_run(run_file)), ["front"], PARTS)
+    return out
+
+
+def expected_actions(activation: int) -> np.ndarray:
+    """Two of each chunk's four steps; the last chunk of an activation is cut by its end."""
+    return np.concatenate([steps_of(activation, chunk)[:USED] for chunk in range(CHUNKS)])
+
+
+def test_every_activation_is_an_episode_with_the_steps_as_they_were_published(
+    run_file: Path,
+) -> None:
+    episodes = episodes_of(load_run(run_file))
+    assert [episode.frames[0].prompt for episode in episodes] == list(PROMPTS)
+    for number, episode in enumerate(episodes):
+        actions = np.array([frame.action for frame in episode.frames])
+        np.testing.assert_array_equal(actions, expected_actions(number))
+        apart_s = np.diff([frame.stamp_ns for frame in episode.frames]) / 1e9
+        np.testing.assert_allclose(apart_s, DT_S)
+
+
+def test_a_chunk_that_ran_out_is_followed_by_frames_that_stand_still(tmp_path: Path) -> None:
+    (episode,) = episodes_of(
+        load_run(make_run(tmp_path / "run.mcap", prompts=PROMPTS[:1], silent=(3, 4)))
+    )
+    assert len(episode.frames) == USED * CHUNKS, "time goes on"
+    ran_out = steps_of(0, 2)
+    after = [frame.action for frame in episode.frames[2 * USED : 5 * USED]]
+    np.testing.assert_array_equal(after[:HORIZON], ran_out)
+    still = np.array([0, 0, 0, 0, 0, 0, ran_out[-1, -1]], np.float32)
+    np.testing.assert_array_equal(after[HORIZON:], [still] * 2)
+
+
+def test_standing_still_is_said_in_the_words_of_the_spec() -> None:
+    step = np.arange(1, 9, dtype=np.float32)
+    quaternion = spec(rotation="quaternion").action
+    np.testing.assert_array_equal(hold(quaternion, step), [0, 0, 0, 0, 0, 0, 1, 8])
+    absolute = spec(rotation="quaternion", kind="absolute").action
+    np.testing.assert_array_equal(hold(absolute, step), step)
+    delta = spec(gripper="delta_m").action
+    np.testing.assert_array_equal(hold(delta, step[:7]), np.zeros(7))
+    without = spec(gripper="none").action
+    np.testing.assert_array_equal(hold(without, step[:6]), np.zeros(6))
+
+
+def test_the_actions_in_the_file_are_those_of_the_chunks_to_the_bit(dataset: Path) -> None:
+    table = pq.read_table(dataset / "data/chunk-000/file-000.parquet")
+    actions = np.array(table["action"].to_pylist(), np.float32)
+    wanted = np.concatenate([expected_actions(0), expected_actions(1)])
+    np.testing.assert_array_equal(actions, wanted)
+    assert table["index"].to_pylist() == list(range(len(wanted)))
+    assert table["episode_index"].to_pylist() == [0] * 20 + [1] * 20
+    assert table["task_index"].to_pylist() == [0] * 20 + [1] * 20
+    np.testing.assert_allclose(
+        table["timestamp"].to_numpy(), np.tile(np.arange(20) / FPS, 2).astype(np.float32)
+    )
+    assert pq.ParquetFile(dataset / "data/chunk-000/file-000.parquet").num_row_groups == 2
+
+
+def test_states_are_those_of_the_frames_time(dataset: Path) -> None:
+    table = pq.read_table(dataset / "data/chunk-000/file-000.parquet")
+    states = np.array(table["observation.state"].to_pylist())
+    assert states.shape == (40, 7)
+    begin_ms = 500 + 5
+    seen_ms = begin_ms + np.arange(20) * CHUNK_MS / USED
+    np.testing.assert_allclose(states[:20, 2], seen_ms / 1e4, atol=6e-4)
+    np.testing.assert_allclose(states[:, [0, 1, 6]], [[0.4, 0.0, 0.05]] * 40, atol=STATE_ATOL)
+
+
+def test_the_video_shows_the_newest_picture_of_each_frame(dataset: Path) -> None:
+    for episode in range(2):
+        path = dataset / f"videos/observation.images.front/chunk-000/file-00{episode}.mp4"
+        with av.open(str(path)) as video:
+            stream = video.streams.video[0]
+            assert stream.average_rate == FPS
+            frames = [(frame.time, frame.to_ndarray(format="rgb24")) for frame in video.decode()]
+        assert len(frames) == 20
+        for index, (time_s, rgb) in enumerate(frames):
+            assert time_s == pytest.approx(index / FPS, abs=1e-4)
+            assert rgb.shape == (HEIGHT, WIDTH, 3)
+            at_ms = 505 + episode * (CHUNK_MS * CHUNKS + 500) + index * 100
+            assert abs(float(rgb.mean()) - 2 * (at_ms // 50)) < BRIGHTNESS
+
+
+def test_info_names_and_types_what_the_spec_declares(dataset: Path) -> None:
+    info = json.loads((dataset / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0"
+    assert (info["fps"], info["total_episodes"], info["total_frames"]) == (FPS, 2, 40)
+    action = info["features"]["action"]
+    assert action["names"] == ["x", "y", "z", "roll", "pitch", "yaw", "gripper_open_fraction"]
+    assert (action["dtype"], action["shape"]) == ("float32", [7])
+    assert info["features"]["observation.images.front"]["shape"] == [HEIGHT, WIDTH, 3]
+    ours = json.loads((dataset / "meta/vla_zenoh.json").read_text())
+    assert ours["spec"] == spec().to_dict()
+    assert action_names(spec(rotation="quaternion", gripper="none").action)[3:] == [
+        "qx",
+        "qy",
+        "qz",
+        "qw",
+    ]
+
+
+def test_openvla_statistics_are_those_of_the_actions(dataset: Path) -> None:
+    actions = np.concatenate([expected_actions(0), expected_actions(1)]).astype(float)
+    found = openvla_statistics(dataset, "bricks")["bricks"]
+    assert found["action"]["mask"] == [True] * 6 + [False]
+    assert (found["num_transitions"], found["num_trajectories"]) == (40, 2)
+    for name, wanted in (
+        ("q01", np.quantile(actions, 0.01, axis=0)),
+        ("q99", np.quantile(actions, 0.99, axis=0)),
+        ("mean", actions.mean(axis=0)),
+        ("std", actions.std(axis=0)),
+        ("min", actions.min(axis=0)),
+        ("max", actions.max(axis=0)),
+    ):
+        np.testing.assert_allclose(found["action"][name], wanted, rtol=1e-12)
+    assert found["proprio"]["mask"] == [True] * 6 + [False]
+
+
+def test_figures_of_pictures_are_those_of_their_pixels() -> None:
+    random = np.random.default_rng(0)
+    colours, seen = Colours(), []
+    for _ in range(3):
+        rgb = random.integers(0, 256, (40, 40, 3), np.uint8)
+        colours.see(rgb)
+        seen.append(rgb[::4, ::4].reshape(-1, 3) / 255)
+    found, wanted = colours.statistics(), of_numbers(np.concatenate(seen))
+    assert found["count"] == [3]
+    for name in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(np.reshape(found[name], 3), wanted[name], rtol=1e-9)
+    for name in ("q01", "q10", "q50", "q90", "q99"):
+        np.testing.assert_allclose(np.reshape(found[name], 3), wanted[name], atol=1.5 / 255)
+
+
+def test_the_state_of_an_arm_has_as_many_joints_as_it_was_recorded_with(
+    run_file: Path, tmp_path: Path
+) -> None:
+    run = load_run(run_file)
+    six, none = tuple(f"j{n}" for n in range(6)), np.zeros(6)
+    joint = JointState(six, np.arange(6) / 10, none, none)
+    run = replace(run, joints=[heard._replace(record=joint) for heard in run.poses])
+    export(tmp_path / "six", episodes_of(run), [], read_parts("joint+joint_deg+gripper_m"))
+    info = json.loads((tmp_path / "six" / "meta" / "info.json").read_text())
+    state = info["features"]["observation.state"]
+    assert state["shape"] == [13]
+    assert state["names"][5:7] == ["joint6", "joint1_deg"]
+    rows = pq.read_table(next((tmp_path / "six" / "data").rglob("*.parquet")))
+    first = rows.column("observation.state")[0].as_py()
+    np.testing.assert_allclose(first[:6], np.arange(6) / 10, atol=STATE_ATOL)
+    np.testing.assert_allclose(first[6:12], np.rad2deg(np.arange(6) / 10), rtol=STATE_ATOL)
+
+
+def test_what_cannot_become_a_dataset_is_named(run_file: Path, tmp_path: Path) -> None:
+    run = load_run(run_file)
+    assert episodes_of(run, "somebody") == []
+    with pytest.raises(RecordingError, match="hold no episode"):
+        export(tmp_path / "a", [], [], PARTS)
+    with pytest.raises(RecordingError, match="no picture of camera 'wrist'"):
+        export(tmp_path / "a", episodes_of(run), ["wrist"], PARTS)
+    with pytest.raises(RecordingError, match="no state/joint"):
+        export(tmp_path / "a", episodes_of(run), [], read_parts("joint"))
+    assert list(tmp_path.iterdir()) == [], "nothing half done is left"
+    other = load_run(make_run(tmp_path / "other.mcap", of=spec(gripper="binary")))
+    with pytest.raises(RecordingError, match=r"do not mean the same.*--worker"):
+        export(tmp_path / "a", [*episodes_of(run), *episodes_of(other)], [], PARTS)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine").write_text("kept")
+    with pytest.raises(RecordingError, match="there already"):
+        export(tmp_path / "full", episodes_of(run), [], PARTS)
+    nameless = load_run(make_run(tmp_path / "nameless.mcap", with_spec=False))
+    with pytest.raises(RecordingError, match="spec of worker 'teacher' is not in it"):
+        episodes_of(nameless)
+    with pytest.raises(RecordingError, match="whole number"):
+        fps_of(spec(dt_s=0.15).action)
+    with pytest.raises(RecordingError, match="no LeRobot dataset"):
+        openvla_statistics(tmp_path, "x")
+
+
+def test_the_commands_make_a_dataset_and_its_statistics(run_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "bricks"
+    done = command_line("dataset", "export", str(run_file.parent), "--out", str(out), "--json")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert (said["episodes"], said["frames"], said["cameras"]) == (2, 40, ["front"])
+    done = command_line("dataset", "stats", str(out), "--name", "mine")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((out / "dataset_statistics.json").read_text()).keys() == {"mine"}
+    done = command_line("dataset", "export", str(run_file), "--out", str(out))
+    assert done.returncode == 1
+    assert "there already" in done.stderr

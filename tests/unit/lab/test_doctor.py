@@ -1,0 +1,411 @@
+"""Doctor: what is missing is found, and the advice names the package or setting."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from vla_zenoh.errors import ProfileError, how_to_install
+from vla_zenoh.lab.cli.doctor import doctor as doctor_command
+from vla_zenoh.lab.cli.doctor import try_zenoh
+from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
+from vla_zenoh.lab.doctor.libraries import (
+    MODULES,
+    libraries,
+    load_errors,
+    msgpack_in_c,
+    python_version,
+    version_fault,
+)
+from vla_zenoh.lab.doctor.opengl import judge as judge_backend
+from vla_zenoh.lab.doctor.opengl import opengl
+from vla_zenoh.lab.doctor.realtime import governor, niceness, processors, real_time_priority
+from vla_zenoh.lab.doctor.robot import robot
+from vla_zenoh.lab.doctor.router import router
+from vla_zenoh.lab.doctor.storage import SHARED_MEMORY, disk, left_segments, shared_memory
+from vla_zenoh.lab.doctor.terminal import terminal
+from vla_zenoh.lab.doctor.video import video_devices
+from vla_zenoh.lab.doctor.wallclock import TIME_ERROR, judge, kernel_state
+from vla_zenoh.profile import SessionProfile, load_profile
+from vla_zenoh.simulation.backend import Backend
+
+TIBIBYTE_MIB = 1024 * 1024
+SEGMENT_BYTES = 3 * 1024 * 1024
+
+
+def app() -> typer.Typer:
+    made = typer.Typer()
+    made.command()(doctor_command)
+    return made
+
+
+# -- Python and libraries ---------------------------------------------------------------------
+def test_an_old_python_fails_and_a_new_one_passes() -> None:
+    old = python_version((3, 10, 9))
+    assert (old.level, old.advice) == ("fail", "install Python 3.11 or newer")
+    assert python_version((3, 11, 0)).level == "ok"
+
+
+def test_the_environment_of_the_tests_has_every_library() -> None:
+    for role in MODULES:
+        finding = libraries(role, required=True)
+        assert finding.level == "ok", finding
+    assert msgpack_in_c().level == "ok"
+
+
+def test_a_missing_library_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(MODULES, "control", {"no_such_module": "no-such-distribution"})
+    finding = libraries("control", required=True)
+    assert finding.level == "fail"
+    assert "no_such_module" in finding.found
+    assert finding.advice == how_to_install("control")
+    assert libraries("control", required=False).level == "warn"
+
+
+def test_a_library_that_misses_a_system_library_names_its_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "needs_gomp.py").write_text("import ctypes\nctypes.CDLL('libgomp.so.1.none')\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setitem(MODULES, "sim", {"needs_gomp": "numpy"})
+    finding = libraries("sim", required=True)
+    assert finding.level == "fail"
+    assert finding.advice == "sudo apt install libgomp1"
+
+
+def test_a_library_that_crashes_is_named_and_does_not_crash_the_doctor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "crasher.py").write_text("import os\nos.abort()\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    errors = load_errors(["json", "crasher", "numpy"])
+    assert list(errors) == ["crasher"]
+    assert "status -6" in errors["crasher"]
+
+
+@pytest.mark.parametrize(
+    ("distribution", "version", "fault"),
+    [
+        ("eclipse-zenoh", "1.10.0", ""),
+        ("eclipse-zenoh", "1.9.4", "eclipse-zenoh 1.9.4 is too old"),
+        ("eclipse-zenoh", "2.0.0", "eclipse-zenoh 2.0.0 is too new"),
+        ("numpy", "1.26.4", ""),
+        ("numpy", "1.24.0", "numpy 1.24.0 is too old"),
+        ("mujoco-core", "3.9.1", "mujoco-core 3.9.1 is too old"),
+        ("mujoco-core", "5.0.0", "mujoco-core 5.0.0 is too new"),
+        ("pyyaml", "1.0", ""),
+    ],
+)
+def test_versions_are_judged(distribution: str, version: str, fault: str) -> None:
+    assert version_fault(distribution, version) == fault
+
+
+# -- OpenGL -----------------------------------------------------------------------------------
+def test_where_opengl_draws_nothing_is_advised() -> None:
+    finding = judge_backend(Backend("egl"))
+    assert (finding.level, finding.advice) == ("ok", "")
+
+
+def test_where_opengl_is_missing_the_packages_are_named() -> None:
+    finding = judge_backend(Backend("raycast", "egl: no libEGL", "libegl1 libopengl0"))
+    assert finding.level == "warn"
+    assert "egl: no libEGL" in finding.found
+    assert finding.advice.startswith("sudo apt install libegl1 libopengl0 ")
+
+
+def test_ray_casting_that_is_asked_for_is_well() -> None:
+    assert opengl("raycast").level == "ok"
+
+
+def test_an_unknown_renderer_fails() -> None:
+    finding = opengl("vulkan")
+    assert finding.level == "fail"
+    assert "vulkan" in finding.found
+
+
+# -- time -------------------------------------------------------------------------------------
+def test_looking_at_niceness_leaves_the_process_as_it_was() -> None:
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    finding = niceness()
+    assert os.getpriority(os.PRIO_PROCESS, 0) == before
+    if finding.level != "ok":
+        assert "nice" in finding.advice
+
+
+def test_looking_at_real_time_priority_leaves_the_thread_as_it_was() -> None:
+    before = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
+    finding = real_time_priority()
+    assert (os.sched_getscheduler(0), os.sched_getparam(0).sched_priority) == before
+    if finding.level == "warn":
+        assert "/etc/security/limits.d/" in finding.advice
+        assert "rtprio" in finding.advice
+
+
+def test_one_processor_is_too_few() -> None:
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        assert processors().level == "warn"
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "level"), [([], "ok"), (["performance"] * 2, "ok"), (["performance", "slow"], "warn")]
+)
+def test_only_the_performance_governor_is_well(
+    kinds: list[str], level: str, tmp_path: Path
+) -> None:
+    for number, kind in enumerate(kinds):
+        folder = tmp_path / f"cpu{number}" / "cpufreq"
+        folder.mkdir(parents=True)
+        (folder / "scaling_governor").write_text(kind + "\n")
+    finding = governor(tmp_path)
+    assert finding.level == level
+    if level == "warn":
+        assert "cpupower frequency-set --governor performance" in finding.advice
+
+
+def test_an_unsynchronised_clock_is_a_warning() -> None:
+    assert judge(TIME_ERROR).level == "warn"
+    assert "chrony" in judge(TIME_ERROR).advice
+    assert judge(0).level == "ok"
+
+
+def test_the_kernel_says_how_the_clock_is() -> None:
+    assert kernel_state() in {0, 1, 2, 3, 4, TIME_ERROR}
+
+
+# -- memory and disk --------------------------------------------------------------------------
+def test_too_little_shared_memory_names_the_size_to_set(tmp_path: Path) -> None:
+    assert shared_memory(tmp_path, wanted_mib=1).level == "ok"
+    finding = shared_memory(tmp_path, wanted_mib=TIBIBYTE_MIB * 1024)
+    assert finding.level == "warn"
+    assert "--shm-size=" in finding.advice
+
+
+def test_absent_shared_memory_is_a_warning(tmp_path: Path) -> None:
+    assert shared_memory(tmp_path / "absent").level == "warn"
+
+
+def test_a_segment_that_nobody_holds_is_left_over_and_a_held_one_is_not(tmp_path: Path) -> None:
+    held, left = tmp_path / "1.zenoh", tmp_path / "2.zenoh"
+    for path in (held, left):
+        path.write_bytes(bytes(SEGMENT_BYTES))
+    with held.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
+        finding = left_segments(tmp_path)
+    assert finding.level == "warn"
+    assert finding.found.startswith("1 Zenoh segments, 3 MiB")
+    assert finding.advice.endswith(f"rm {left}")
+
+
+def test_segments_of_a_living_session_are_not_left_over_and_those_of_a_killed_one_are() -> None:
+    code = (
+        "import time, zenoh\n"
+        "provider = zenoh.shm.ShmProvider.default_backend(65536)\n"
+        "buffer = provider.alloc(4096)\n"
+        "print('ready', flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    before = set(SHARED_MEMORY.glob("*.zenoh"))
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"ready\n"
+            new = set(SHARED_MEMORY.glob("*.zenoh")) - before
+            living = left_segments()
+        finally:
+            process.kill()
+    killed = left_segments()
+    still_there = [path for path in new if path.exists()]  # any new session may have swept them
+    for path in still_there:
+        path.unlink(missing_ok=True)
+    assert new
+    assert all(str(path) not in living.advice for path in new)
+    assert all(str(path) in killed.advice for path in still_there)
+
+
+def test_a_full_disk_is_worse_than_a_nearly_full_one(tmp_path: Path) -> None:
+    assert disk(tmp_path, wanted_mib=1).level == "ok"
+    assert disk(tmp_path, wanted_mib=TIBIBYTE_MIB * 1024).level in {"warn", "fail"}
+
+
+# -- router -----------------------------------------------------------------------------------
+def refuse(_endpoint: str) -> str:
+    return "refused"
+
+
+def accept(_endpoint: str) -> str:
+    return ""
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+def test_a_free_port_is_well_where_the_router_is_to_run_and_a_warning_elsewhere() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    assert router(endpoint, is_router=True, try_zenoh=refuse).level == "ok"
+    finding = router(endpoint, is_router=False, try_zenoh=refuse)
+    assert finding.level == "warn"
+    assert "vla-zenoh up" in finding.advice
+
+
+def test_a_port_held_by_another_program_fails_and_says_how_to_find_it() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        finding = router(f"tcp/127.0.0.1:{port}", is_router=True, try_zenoh=refuse)
+    assert finding.level == "fail"
+    assert f"sport = :{port}" in finding.advice
+
+
+def test_a_real_session_tells_a_program_that_is_no_router() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+
+        def hang_up() -> None:
+            try:
+                while True:
+                    server.accept()[0].close()
+            except OSError:
+                return
+
+        thread = threading.Thread(target=hang_up)
+        thread.start()
+        try:
+            assert try_zenoh(SessionProfile(), endpoint)
+        finally:
+            server.shutdown(socket.SHUT_RDWR)
+            thread.join()
+
+
+def test_a_router_that_answers_is_well() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        assert router(endpoint, is_router=False, try_zenoh=accept).level == "ok"
+
+
+def test_a_host_that_does_not_exist_is_a_fault_of_the_profile() -> None:
+    finding = router("tcp/no-such-host.invalid:7447", is_router=False, try_zenoh=refuse)
+    assert finding.level == "fail"
+    assert "session.connect" in finding.advice
+
+
+def test_other_links_than_tcp_are_tried_with_a_session() -> None:
+    endpoint = "unixsock-stream/tmp/router.sock"
+    assert router(endpoint, is_router=False, try_zenoh=accept).level == "ok"
+    assert router(endpoint, is_router=False, try_zenoh=refuse).level == "warn"
+
+
+# -- cameras and terminal ---------------------------------------------------------------------
+def test_a_camera_the_profile_names_has_to_be_there(tmp_path: Path) -> None:
+    (tmp_path / "video0").write_bytes(b"")
+    assert video_devices(["0"], tmp_path).level == "ok"
+    finding = video_devices([str(tmp_path / "video4")], tmp_path)
+    assert finding.level == "fail"
+    assert "video4 not there" in finding.found
+    assert "video0" in finding.found
+
+
+def test_no_camera_is_well_when_none_is_needed(tmp_path: Path) -> None:
+    assert video_devices([], tmp_path) == HostFinding("video devices", "ok", "none")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
+def test_a_camera_without_permission_names_the_group(tmp_path: Path) -> None:
+    (tmp_path / "video0").write_bytes(b"")
+    (tmp_path / "video0").chmod(0)
+    finding = video_devices(["0"], tmp_path)
+    assert finding.level == "fail"
+    assert "--groups video" in finding.advice
+
+
+def test_a_terminal_without_utf_8_or_too_narrow_is_a_warning() -> None:
+    assert terminal({"TERM": "xterm"}, "utf-8", 80).level == "ok"
+    assert terminal({}, "ascii", 80).advice == "export LANG=C.UTF-8"
+    assert "80 columns" in terminal({"TERM": "xterm"}, "utf-8", 40).advice
+
+
+# -- needs ------------------------------------------------------------------------------------
+def test_a_host_needs_what_its_nodes_need() -> None:
+    profile = load_profile("panda_sim_two_hosts")
+    robot, gpu = needs_of(profile, "robot"), needs_of(profile, "gpu")
+    assert robot.roles == {"base", "control", "sim"}
+    assert robot.is_router
+    assert gpu.roles == {"base"}
+    assert not gpu.is_router
+    assert needs_of(profile).roles == {"base", "control", "sim"}
+    assert needs_of(load_profile("panda_ros2")).roles == {"base", "control", "ros2"}
+
+
+def test_usb_cameras_of_a_profile_are_needed_on_the_host_that_has_them() -> None:
+    profile = load_profile("panda_sim")
+    camera = profile.cameras["front"].model_copy(update={"source": "v4l2:/dev/video7"})
+    profile = profile.model_copy(update={"cameras": {"front": camera}})
+    assert needs_of(profile).devices == ("/dev/video7",)
+
+
+def test_an_unknown_host_gets_the_list() -> None:
+    with pytest.raises(ProfileError, match=r"no host 'moon'; it has: robot, gpu"):
+        needs_of(load_profile("panda_sim_two_hosts"), "moon")
+
+
+# -- the whole --------------------------------------------------------------------------------
+def test_every_finding_that_is_not_well_has_an_advice() -> None:
+    needs = Needs(endpoints=(f"tcp/127.0.0.1:{free_port()}",))
+    findings = list(examine(needs, refuse))
+    assert {"Python", "processors", "disk", "wall clock", "terminal"} <= {f.name for f in findings}
+    for finding in findings:
+        assert finding.found
+        assert bool(finding.advice) == (finding.level != "ok"), finding
+
+
+def test_json_is_a_list_of_findings() -> None:
+    result = CliRunner().invoke(app(), ["--json"])
+    findings = json.loads(result.stdout)
+    assert set(findings[0]) == {"name", "level", "found", "advice"}
+    failed = any(finding["level"] == "fail" for finding in findings)
+    assert result.exit_code == int(failed)
+
+
+def test_a_missing_camera_makes_the_command_fail(tmp_path: Path) -> None:
+    profile = tmp_path / "lab.yaml"
+    profile.write_text(
+        "extends: panda_sim\ncameras:\n  front: {source: 'v4l2:/dev/video_absent'}\n"
+    )
+    result = CliRunner().invoke(app(), ["--profile", str(profile)])
+    assert result.exit_code == 1
+    assert "video_absent" in result.stdout.replace("\n", "")
+    assert "will not work" in result.stdout
+
+
+def test_a_host_without_a_profile_is_refused() -> None:
+    result = CliRunner().invoke(app(), ["--host", "robot"])
+    assert result.exit_code == 2
+
+
+def test_a_robot_that_is_not_here_fails_the_host_that_commands_it_alone(tmp_path: Path) -> None:
+    (tmp_path / "lab.yaml").write_text(
+        f"extends: panda_sim\nrobot: {{description: {tmp_path}/arm.urdf}}\n"
+        "hosts: {desk: {nodes: [router, sim, command]}, gpu: {nodes: [worker, camera]}}\n"
+    )
+    lab = load_profile(str(tmp_path / "lab.yaml"))
+    for host in ("desk", None):
+        (found,) = robot(lab, host)
+        assert (found.name, found.level) == ("robot", "fail")
+        assert "arm.urdf' is not a file" in found.found
+    assert list(robot(lab, "gpu")) == []
+    (found,) = robot(load_profile("panda_sim"))
+    assert found.level == "ok"

@@ -1,0 +1,243 @@
+"""The evaluation of a recording, on runs whose figures are known beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vla_zenoh.codec import records
+from vla_zenoh.codec.image import encode_jpeg
+from vla_zenoh.keys import Keys
+from vla_zenoh.lab.evaluation.run_file import evaluate_run
+from vla_zenoh.lab.recording.reader import open_recording
+from vla_zenoh.lab.recording.restamp import Restamper
+from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, TEXT, Sample
+from vla_zenoh.lab.recording.writer import RunWriter
+from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
+from vla_zenoh.types import (
+    ActionChunk,
+    Cause,
+    GripperState,
+    Header,
+    Image,
+    NodeStatus,
+    PoseCommand,
+    PoseState,
+    Task,
+)
+
+KEYS = Keys("panda")
+ZERO_NS = 1_700_000_000_000_000_000
+TICK_NS = 4_000_000
+CHUNK_NS = 200_000_000
+STATE_NS = 5_000_000
+SECONDS = 4
+SPEED_M_S = 0.05
+LAG_M = 0.002
+JERK_M_S3 = 2.0
+CAMERA_MS, INFERENCE_MS, RECEIVED_MS, HEARD_MS = 10, 30, 2, 3
+POSITION_TOLERANCE_MM = 1e-3
+QUAT = np.array([1.0, 0.0, 0.0, 0.0])
+SPEC = ModelSpec(
+    name="scripted",
+    observation=ObservationSpec(
+        cameras=(CameraSpec(camera="front", width=64, height=64, resize="stretch"),)
+    ),
+    action=ActionSpec(horizon=1, dt_s=0.2, gripper="none"),
+)
+
+
+def put(key: str, record: Any, at_ns: int, seq: int, source: str = "node#1") -> Sample:
+    header = Header(ZERO_NS + at_ns, seq, source)
+    return Sample(key, records.encode(record), MSGPACK, header, ZERO_NS + at_ns + 1_000_000)
+
+
+def height_m(at_ns: int) -> float:
+    """Goes up evenly for the first half, then stands."""
+    return 0.2 + SPEED_M_S * min(at_ns, SECONDS * 500_000_000) / 1e9
+
+
+def cause(index: int) -> Cause:
+    taken_ns = ZERO_NS + index * CHUNK_NS
+    observed_ns = taken_ns + CAMERA_MS * 1_000_000
+    end_ns = observed_ns + INFERENCE_MS * 1_000_000
+    received_ns = end_ns + RECEIVED_MS * 1_000_000
+    return Cause("scripted", index, taken_ns, observed_ns, observed_ns, end_ns, end_ns, received_ns)
+
+
+def chunks() -> Iterable[Sample]:
+    for index in range(SECONDS * 1_000_000_000 // CHUNK_NS):
+        of = cause(index)
+        steps = np.array([[0.0, 0.0, 0.01, 0.0, 0.0, 0.0]], np.float32)
+        stamps = (of.observation_stamp_ns, index, of.inference_end_ns + 10**9)
+        times = (of.observed_ns, of.inference_start_ns, of.inference_end_ns)
+        chunk = ActionChunk("scripted", SPEC.hash, 1, *stamps, steps, *times)
+        yield put(KEYS.delta("scripted"), chunk, of.inference_end_ns - ZERO_NS, index)
+
+
+def commands() -> Iterable[Sample]:
+    for index in range(0, SECONDS * 1_000_000_000, TICK_NS):
+        newest = index // CHUNK_NS - 1
+        of = cause(newest) if newest >= 0 else None
+        position = np.array([0.4, 0.0, height_m(index)])
+        goal = np.array([0.4, 0.0, height_m(index) + (0.01 if index < SECONDS * 5e8 else 0.0)])
+        moving = index < SECONDS * 500_000_000
+        twist = np.array([0.0, 0.0, SPEED_M_S if moving else 0.0, 0.0, 0.0, 0.0])
+        # A triangle of 80 ms: the jerk has one size all the time.
+        phase = index % 80_000_000 / 1e9
+        level = JERK_M_S3 * (min(phase, 0.08 - phase) - 0.02)
+        acceleration = np.array([level, 0.0, 0.0, 0.0, 0.0, 0.0])
+        command = PoseCommand(position, QUAT, twist, acceleration, goal, QUAT, "active", of)
+        sample = put(KEYS.command_pose, command, index, index // TICK_NS)
+        yield Sample(*_heard(sample, HEARD_MS))
+
+
+def _heard(sample: Sample, later_ms: int) -> tuple[Any, ...]:
+    heard_ns = sample.stamp_ns + later_ms * 1_000_000
+    return sample.key, sample.payload, sample.encoding, sample.header, heard_ns, None
+
+
+def states() -> Iterable[Sample]:
+    for index in range(0, SECONDS * 1_000_000_000, STATE_NS):
+        moving = index < SECONDS * 500_000_000
+        position = np.array([0.4, LAG_M, height_m(index)])
+        twist = np.array([0.0, 0.0, SPEED_M_S if moving else 0.0, 0.0, 0.0, 0.0])
+        seq = index // STATE_NS
+        yield put(KEYS.state_pose, PoseState(position, QUAT, twist), index, seq)
+        width_m = 0.08 if moving else 0.03
+        yield put(KEYS.state_gripper, GripperState(width_m, False, False), index, seq)
+
+
+def others() -> Iterable[Sample]:
+    yield Sample(KEYS.prompt, b"HARD: go up", TEXT, None, ZERO_NS)
+    yield put(KEYS.spec("scripted"), SPEC, 0, 0)
+    for index in range(0, SECONDS * 1_000_000_000, 200_000_000):
+        task = Task(1, True, "HARD: go up", "scripted", 5.0)
+        yield put(KEYS.task, task, index, index // 200_000_000)
+    for index in range(SECONDS + 1):
+        counters = {"refused.stale": 7 + index, "skipped.superseded": index, "samples": 9}
+        status = NodeStatus("command", "active", "here", 1, ZERO_NS, counters=counters)
+        yield put(KEYS.status("command"), status, index * 999_000_000, index)
+    for index in range(0, SECONDS * 30):
+        jpeg = encode_jpeg(Image(np.full((48, 64, 3), index, np.uint8)))
+        at_ns = index * 1_000_000_000 // 30
+        header = Header(ZERO_NS + at_ns, index, "camera#1")
+        yield Sample(KEYS.camera_jpeg("front"), jpeg, JPEG, header, header.stamp_wall_ns)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("run") / "lab" / "run.mcap"
+    out = RunWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
+    samples = [*chunks(), *commands(), *states(), *others()]
+    for sample in sorted(samples, key=lambda each: each.heard_ns):
+        out.write(sample)
+    out.finish({"dropped": {}})
+    return path
+
+
+def test_stages_are_measured_and_add_up(recording: Path) -> None:
+    latency = evaluate_run(recording).latency()
+    assert latency["outbound"].mean == CAMERA_MS
+    assert latency["inference"].max == INFERENCE_MS
+    assert latency["worker_to_command"].min == RECEIVED_MS
+    # The first command of a chunk is that of the next tick of 200 ms; when it was heard is the
+    # recorder's own affair.
+    assert latency["end_to_end"].p95 == CHUNK_NS / 1e6
+    assert latency["inbound"].p50 == CHUNK_NS / 1e6 - CAMERA_MS - INFERENCE_MS
+
+
+def test_ways_tracking_jerk_and_rest_are_those_that_were_put_in(recording: Path) -> None:
+    run = evaluate_run(recording)
+    way_m = SPEED_M_S * SECONDS / 2
+    assert run.name == "lab"
+    assert run.path_m == pytest.approx(way_m)
+    assert run.command_path_m == pytest.approx(way_m)
+    np.testing.assert_allclose(run.tracking_mm, LAG_M * 1e3, atol=POSITION_TOLERANCE_MM)
+    np.testing.assert_allclose(run.jerk, JERK_M_S3, rtol=1e-6)
+    assert run.active_s == pytest.approx(SECONDS, abs=0.01)
+    assert run.idle_s == pytest.approx(SECONDS / 2, abs=0.02)
+
+
+def test_requests_are_those_of_the_obeyed_worker_and_their_success_is_counted(
+    recording: Path,
+) -> None:
+    run = evaluate_run(recording)
+    asked = SECONDS * 1_000_000_000 // CHUNK_NS
+    assert run.requests == asked
+    assert run.succeeded == asked - 1, "the last chunk came too late for any command"
+    assert evaluate_run(recording, 5).requests == 5
+
+
+def test_seams_tell_how_far_the_goal_went(recording: Path) -> None:
+    run = evaluate_run(recording)
+    assert len(run.seam_goal_mm) == SECONDS * 5 - 2
+    assert run.seam_goal_mm.max() == pytest.approx(10.0 - SPEED_M_S * TICK_NS / 1e6, abs=0.01)
+    assert run.seam_velocity_mm_s.max() == pytest.approx(50.0, abs=0.01), "it stops at once"
+
+
+def test_refusals_are_those_of_the_recorded_time(recording: Path) -> None:
+    run = evaluate_run(recording)
+    assert (run.refusals, run.skipped) == ({"stale": SECONDS}, {"superseded": SECONDS})
+
+
+def test_the_drift_off_the_asked_axis_and_the_gripper_are_told(recording: Path) -> None:
+    (segment,) = evaluate_run(recording).segments
+    assert segment.along_m == pytest.approx(SPEED_M_S * SECONDS / 2)
+    assert segment.drift_m == pytest.approx(0.0, abs=1e-12)
+    assert segment.width_m == (0.08, 0.03)
+    assert evaluate_run(recording).row()["gripper_travel_m"] == pytest.approx(0.05)
+
+
+def test_the_strip_shows_the_pictures_that_chunks_were_made_of(recording: Path) -> None:
+    views = evaluate_run(recording, pictures=4).views
+    assert [view.model for view in views] == [False, True] * 4
+    np.testing.assert_allclose([v.t_s for v in views[::2]], [0.0, 1.2, 2.4, 3.8], atol=0.05)
+
+
+def test_a_recording_that_was_cut_off_is_evaluated_up_to_there(
+    recording: Path, tmp_path: Path
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    whole = recording.read_bytes()
+    cut.write_bytes(whole[: len(whole) // 2])
+    run = evaluate_run(cut)
+    assert any("cut off or damaged after" in problem for problem in run.problems)
+    assert 0 < run.requests <= evaluate_run(recording).requests
+
+
+def test_a_run_that_moves_to_another_time_and_robot_keeps_its_latencies(recording: Path) -> None:
+    later_ns = 77_777_777
+    ghost = Keys("ghost", "lab")
+    restamper = Restamper(ZERO_NS, ZERO_NS + later_ns, 1.0, KEYS, ghost, "abc")
+    for entry in open_recording(recording).entries():
+        moved = restamper.move(entry)
+        assert moved.key == entry.key.replace("vla/panda", "lab/ghost")
+        assert moved.heard_ns == entry.heard_ns + later_ns
+        if entry.header is None:
+            assert moved.payload == entry.data
+            continue
+        assert moved.header is not None
+        assert moved.header.stamp_wall_ns == entry.header.stamp_wall_ns + later_ns
+        assert moved.header.seq == entry.header.seq
+        assert moved.header.source == entry.header.source.split("#")[0] + "#abc"
+        if entry.kind is PoseCommand and entry.fields["cause"]:
+            found = records.decode(PoseCommand, moved.payload).cause
+            for name in Cause.__dataclass_fields__:
+                if name.endswith("_ns"):
+                    assert getattr(found, name) == entry.fields["cause"][name] + later_ns
+        if entry.kind is ActionChunk:
+            found = records.decode(ActionChunk, moved.payload)
+            assert found.valid_until_ns == entry.fields["valid_until_ns"] + later_ns
+
+
+def test_at_twice_the_speed_everything_takes_half_the_time(recording: Path) -> None:
+    restamper = Restamper(ZERO_NS, ZERO_NS, 2.0, KEYS, KEYS, "abc")
+    entries = list(open_recording(recording).entries())
+    moved = [restamper.move(entry) for entry in entries]
+    assert moved[-1].heard_ns - ZERO_NS == (entries[-1].heard_ns - ZERO_NS) // 2
+    assert restamper.moved_ns(0) == 0

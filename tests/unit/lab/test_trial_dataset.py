@@ -1,0 +1,53 @@
+"""A person's verdict reaches the dataset by way of the recording it stands in."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pyarrow.parquet as pq
+from dataset_rig import PROMPTS, write_run
+from typer.testing import CliRunner
+
+from vla_zenoh.lab.cli.dataset import dataset_app
+from vla_zenoh.lab.dataset.episodes import episodes_of
+from vla_zenoh.lab.dataset.success import succeeded
+from vla_zenoh.lab.recording.run import load_run
+from vla_zenoh.lab.trial.judged import FACT, EpisodeVerdict, Verdict
+
+
+def fact(verdict: Verdict, worker: str = "teacher") -> dict[str, object]:
+    judged = EpisodeVerdict(
+        *(1, 1, 1, worker, verdict, "by a hair", "person", "", 2.0, 10, 0, 1, None, "a.mcap", 0)
+    )
+    return {FACT: asdict(judged)}
+
+
+def test_only_what_a_person_called_a_success_is_exported_where_that_is_asked(
+    tmp_path: Path,
+) -> None:
+    """The prompt is no task that a program can judge."""
+    verdicts: tuple[Verdict, ...] = ("failure", "success")
+    for verdict in verdicts:
+        write_run(tmp_path / f"{verdict}.mcap", prompts=PROMPTS[:1], ended=fact(verdict))
+    (episode,) = episodes_of(load_run(tmp_path / "success.mcap"))
+    assert succeeded(episode) is True
+    for ended, known in (
+        (fact("failure"), False),
+        (fact("void"), None),
+        (fact("success", "somebody"), None),
+        ({}, None),
+        (None, None),
+    ):
+        episode.run.file.ended = ended
+        assert succeeded(episode) is known
+
+    out = tmp_path / "good"
+    words = ["export", str(tmp_path), "--out", str(out), "--successful", "--json"]
+    done = CliRunner().invoke(dataset_app, words)
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["episodes"] == 1
+    table = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet")
+    assert table["run"].to_pylist() == ["success.mcap"]
+    assert table["success"].to_pylist() == [True]

@@ -1,0 +1,392 @@
+"""What a run's samples become in Rerun, read back from its file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import coal
+import numpy as np
+import pytest
+import rerun as rr
+from view_rig import Shown
+
+from vla_zenoh.codec import records
+from vla_zenoh.codec.image import encode_jpeg
+from vla_zenoh.keys import Keys
+from vla_zenoh.lab.recording.reader import open_recording
+from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, TEXT, Sample
+from vla_zenoh.lab.recording.writer import RunWriter
+from vla_zenoh.lab.view.shapes import RobotShapes, primitive_corners
+from vla_zenoh.lab.view.show import DRAW_NS, Show
+from vla_zenoh.policy import ActionSpec, ModelSpec
+from vla_zenoh.profile import (
+    Profile,
+    load_profile,
+    override,
+    profile_names,
+    read_profile,
+    to_yaml,
+)
+from vla_zenoh.types import (
+    ActionChunk,
+    Cause,
+    Event,
+    GripperCommand,
+    GripperState,
+    Header,
+    Image,
+    JointCommand,
+    JointState,
+    NodeStatus,
+    ObjectPoses,
+    PoseCommand,
+    PoseState,
+    Seen,
+    Task,
+)
+
+PROFILE = load_profile("panda_sim")
+BARE = override(PROFILE, {"robot": {"description": "/nowhere/arm.urdf"}})
+KEYS = PROFILE.keys
+ZERO_NS = 1_700_000_000_000_000_000
+MS = 1_000_000
+SECOND = 1000 * MS
+DOWN = np.array([1.0, 0.0, 0.0, 0.0])
+HOME_TCP_M = (0.43, 0.0, 0.16)
+STEP_M = 0.01
+POSITION_TOLERANCE_M = 1e-6
+TCP_TOLERANCE_M = 1e-3
+"""The profile gives its home to ten digits, its comment the TCP to a centimetre's hundredth."""
+FINGER_MM = 20.0
+SPEC = ModelSpec(name="scripted", action=ActionSpec(horizon=3, dt_s=0.2, gripper="none"))
+
+
+def put(key: str, record: Any, at_ns: int, seq: int = 0, source: str = "node#1") -> Sample:
+    header = Header(ZERO_NS + at_ns, seq, source)
+    return Sample(key, records.encode(record), MSGPACK, header, ZERO_NS + at_ns + MS)
+
+
+def picture(key: str, at_ns: int, seq: int = 0) -> Sample:
+    jpeg = encode_jpeg(Image(np.full((48, 64, 3), 128, np.uint8)))
+    return Sample(key, jpeg, JPEG, Header(ZERO_NS + at_ns, seq, "c#1"), ZERO_NS + at_ns + MS)
+
+
+def goal_m(at_ns: int) -> np.ndarray:
+    """The goal goes up by a step every 0.2 s."""
+    return np.array([0.43, 0.0, 0.16 + STEP_M * (1 + at_ns // (200 * MS))])
+
+
+def command(at_ns: int, cause: Cause | None = None) -> PoseCommand:
+    goal = goal_m(at_ns)
+    return PoseCommand(goal - 0.002, DOWN, np.zeros(6), np.zeros(6), goal, DOWN, "active", cause)
+
+
+def chunk(at_ns: int, seq: int, **more: Any) -> Sample:
+    rows = np.zeros((3, 6), np.float32)
+    rows[:, 2] = STEP_M
+    of: dict[str, Any] = {
+        "worker": "scripted",
+        "spec_hash": SPEC.hash,
+        "episode": 1,
+        "observation_stamp_ns": ZERO_NS + at_ns - 50 * MS,
+        "observation_seq": seq,
+        "valid_until_ns": ZERO_NS + at_ns + SECOND,
+        "steps": rows,
+        "observed_ns": ZERO_NS + at_ns - 40 * MS,
+        "inference_start_ns": ZERO_NS + at_ns - 40 * MS,
+        "inference_end_ns": ZERO_NS + at_ns - 10 * MS,
+    }
+    record = ActionChunk(**{**of, **more})
+    return put(KEYS.delta(record.worker), record, at_ns, seq)
+
+
+def status(**more: Any) -> NodeStatus:
+    detail = {"speed_share": 0.25, "why": "waiting for a chunk"}
+    counters = {"refused.stale": 3, "skipped.superseded": 2, "refused.schema": 0}
+    said = {"node": "command", "state": "active", "host": "lab", "pid": 1, "started_wall_ns": 1}
+    return NodeStatus(**{**said, "counters": counters, "detail": detail, **more})
+
+
+def run() -> Iterable[Sample]:
+    """A second of a robot that works, with what strangers put among it."""
+    joints = PROFILE.robot.arm_joints
+    angles = np.array(PROFILE.robot.home_rad)
+    for setting, text in (("prompt", "HARD: go *up*"), ("active", "true")):
+        yield Sample(KEYS.whole(setting), text.encode(), TEXT, None, ZERO_NS)
+    yield put(KEYS.task, Task(1, True, "HARD: go *up*", "scripted", 5.0), 0)
+    yield put(KEYS.spec("scripted"), SPEC, 0)
+    for index in range(200):
+        at_ns = index * 5 * MS
+        pose = PoseState(goal_m(at_ns) - 0.003, DOWN, np.full(6, 0.1))
+        yield put(KEYS.state_pose, pose, at_ns, index)
+        yield put(
+            KEYS.state_joint,
+            JointState(joints, angles, np.zeros(7), np.zeros(7)),
+            at_ns,
+            index,
+        )
+        yield put(KEYS.state_gripper, GripperState(0.04, False, False), at_ns, index)
+        yield put(KEYS.command_pose, command(at_ns), at_ns, index)
+    objects = ObjectPoses(("brick",), np.array([[0.5, 0.1, 0.01]]), np.array([[0.0, 0, 0, 1]]))
+    yield put(KEYS.sim_objects, objects, SECOND)
+    yield chunk(SECOND, 1)
+    cause = Cause("scripted", 1, *(ZERO_NS + SECOND + ms * MS for ms in (-50, -40, -40, -10)),
+                  ZERO_NS + SECOND, ZERO_NS + SECOND + MS)  # fmt: skip
+    yield put(KEYS.command_pose, command(SECOND, cause), SECOND + 5 * MS, 201)
+    yield put(KEYS.command_pose, command(SECOND, cause), SECOND + 9 * MS, 202)
+    yield put(KEYS.command_gripper, GripperCommand(0.08, 0.1, 20.0), SECOND)
+    yield picture(KEYS.camera_jpeg("front"), SECOND)
+    yield picture(KEYS.camera_jpeg("extra"), SECOND)
+    yield picture(KEYS.seen("scripted", "front"), SECOND)
+    seen = Seen("scripted", 1, SPEC.hash, 1, ZERO_NS, "go up", np.zeros((3, 6)), 30.0, {"a": 1.5})
+    yield put(KEYS.seen_record("scripted"), seen, SECOND)
+    bound = Event("warning", "limit", "singularity", "panda_joint4", 0.02, 0.05, 4)
+    yield put(KEYS.event("command"), bound, SECOND)
+    yield put(KEYS.status("command"), status(), SECOND + MS)
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
+    """The run, written as a recording, read from it, and shown."""
+    folder = tmp_path_factory.mktemp("view")
+    writer = RunWriter(
+        folder / "run.mcap", KEYS, profile_yaml="about: x\n", base_frame="base", began_ns=ZERO_NS
+    )
+    for sample in run():
+        writer.write(sample)
+    writer.finish({"dropped": {}})
+    show = Show(PROFILE, stream := stream_to(folder / "run.rrd"))
+    for entry in open_recording(folder / "run.mcap").entries():
+        show.take(entry)
+    assert show.refused == {}
+    stream.disconnect()
+    return Shown(folder / "run.rrd")
+
+
+def stream_to(path: Path) -> rr.RecordingStream:
+    stream = rr.RecordingStream("test")
+    stream.save(path)
+    return stream
+
+
+def heard(tmp_path: Path, *samples: Sample, profile: Profile = BARE) -> tuple[Show, Shown]:
+    """Samples off the wire, shown."""
+    show = Show(profile, stream := stream_to(tmp_path / "a.rrd"), live=True)
+    for sample in samples:
+        show.hear(sample)
+    stream.disconnect()
+    return show, Shown(tmp_path / "a.rrd")
+
+
+# -- the robot ------------------------------------------------------------------------------------
+def test_every_link_has_a_mesh_once_and_a_place_at_all_times(shown: Shown) -> None:
+    links = {path for path in shown.paths if path.startswith("world/robot/")}
+    assert {
+        f"world/robot/panda_{name}" for name in ("link0", "link7", "hand", "leftfinger")
+    } < links
+    for link in links:
+        assert shown.static(link) >= {"Mesh3D:vertex_positions", "Mesh3D:vertex_normals"}
+        assert "Transform3D:translation" not in shown.static(link), "it would hide the moving one"
+        assert len(shown.stamps_ns(link)) > 5
+
+
+def test_the_hand_stands_where_kinematics_has_it(shown: Shown) -> None:
+    (hand,) = shown.values("world/robot/panda_hand", "Transform3D:translation")[-1]
+    assert hand[:2] == pytest.approx(HOME_TCP_M[:2], abs=TCP_TOLERANCE_M)
+    (left,) = shown.values("world/robot/panda_leftfinger", "Transform3D:translation")[-1]
+    (right,) = shown.values("world/robot/panda_rightfinger", "Transform3D:translation")[-1]
+    assert math.dist(left, right) * 1e3 == pytest.approx(2 * FINGER_MM, abs=1e-3)
+
+
+def test_normals_are_unit_and_point_outwards() -> None:
+    shapes = RobotShapes(PROFILE)
+    for mesh in shapes.meshes:
+        lengths = np.linalg.norm(mesh.normals, axis=1)
+        assert np.median(lengths) == pytest.approx(1.0, abs=1e-5)
+        outwards = np.einsum("ij,ij->i", mesh.normals, mesh.vertices_m - mesh.vertices_m.mean(0))
+        assert np.mean(outwards > 0) > 0.5, mesh.link
+
+
+@pytest.mark.parametrize(
+    ("shape", "volume_m3"),
+    [
+        (coal.Box(0.1, 0.2, 0.3), 0.006),
+        (coal.Cylinder(0.1, 0.4), math.pi * 0.1**2 * 0.4),
+        (coal.Sphere(0.1), 4 / 3 * math.pi * 0.1**3),
+        (coal.Capsule(0.1, 0.2), 4 / 3 * math.pi * 0.1**3 + math.pi * 0.1**2 * 0.2),
+    ],
+    ids=["box", "cylinder", "sphere", "capsule"],
+)
+def test_primitive_shapes_are_closed_and_have_their_volume(shape: Any, volume_m3: float) -> None:
+    corners = primitive_corners(shape)
+    assert np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(
+        axis=0
+    ) == pytest.approx(np.zeros(3), abs=1e-9), "a closed surface has as much of every side"
+    found = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    assert found == pytest.approx(volume_m3, rel=0.05)
+
+
+def test_without_a_description_all_else_is_shown(tmp_path: Path) -> None:
+    show, shown = heard(tmp_path, *run())
+    assert show.refused == {}
+    assert not any(path.startswith("world/robot") for path in shown.paths)
+    assert shown.values("world/pose/measured", "Transform3D:translation")
+    assert "The robot itself is not shown" in shown.texts("text/now")[-1]
+
+
+# -- poses, chunks --------------------------------------------------------------------------------
+def test_states_and_commands_are_thinned_out_evenly(shown: Shown) -> None:
+    drawn = shown.values("world/pose/measured", "Transform3D:translation")
+    assert len(drawn) == pytest.approx(SECOND / DRAW_NS, rel=0.15)
+    assert shown.values("world/pose/goal", "Transform3D:translation")[0][0] == pytest.approx(
+        goal_m(0), abs=POSITION_TOLERANCE_M
+    )
+
+
+def test_trails_follow_the_poses(shown: Shown) -> None:
+    for name in ("goal", "commanded", "measured"):
+        (strip,) = shown.values(f"world/trail/{name}", "LineStrips3D:strips")[-1]
+        heights = [point[2] for point in strip]
+        assert heights == sorted(heights)
+        assert heights[-1] - heights[0] == pytest.approx(4 * STEP_M, abs=STEP_M + 1e-6)
+
+
+def test_a_chunk_is_a_ribbon_from_the_goal_its_observation_saw(shown: Shown) -> None:
+    ((strip,),) = shown.values("world/chunk/scripted", "LineStrips3D:strips")
+    expected = [goal_m(SECOND - 50 * MS) + (0, 0, STEP_M * step) for step in range(4)]
+    np.testing.assert_allclose(strip, expected, atol=POSITION_TOLERANCE_M)
+
+
+def test_a_chunk_in_the_middle_of_another_stands_on_what_that_had_asked_for(tmp_path: Path) -> None:
+    """The command stream says where a step ends; half of it is done when the observation is."""
+    start_ns = 150 * MS
+    shown = heard(
+        tmp_path,
+        put(KEYS.spec("scripted"), SPEC, 0),
+        put(KEYS.command_pose, command(0), 0),
+        chunk(start_ns, 1),  # observed at 100 ms: its step 2 ends at 500 ms
+        put(KEYS.command_pose, command(200 * MS), start_ns, 1),
+        chunk(400 * MS + 50 * MS, 2),
+    )[1]
+    _, ((second, *_),) = shown.values("world/chunk/scripted", "LineStrips3D:strips")
+    # Two steps are asked for by 500 ms; at 400 ms one and a half of them.
+    assert second[2] == pytest.approx(goal_m(200 * MS)[2] - 0.5 * STEP_M, abs=POSITION_TOLERANCE_M)
+
+
+def test_a_ribbon_that_nobody_renews_is_taken_away(tmp_path: Path) -> None:
+    pose = PoseState(goal_m(0), DOWN, np.zeros(6))
+    _, shown = heard(
+        tmp_path,
+        put(KEYS.spec("scripted"), SPEC, 0),
+        put(KEYS.command_pose, command(0), 0),
+        chunk(100 * MS, 1),
+        put(KEYS.state_pose, pose, SECOND),
+        put(KEYS.state_pose, pose, 3 * SECOND, 1),
+    )
+    (cleared,) = shown.values("world/chunk/scripted", "Clear:is_recursive")
+    assert cleared == [True]
+
+
+def test_joint_commands_are_shown_as_the_pose_they_lead_to(tmp_path: Path) -> None:
+    home = np.array(PROFILE.robot.home_rad)
+    still = np.zeros(7)
+    told = JointCommand(PROFILE.robot.arm_joints, home, still, still, "active")
+    _, shown = heard(tmp_path, put(KEYS.command_joint, told, 0), profile=PROFILE)
+    ((position,),) = shown.values("world/pose/commanded", "Transform3D:translation")
+    assert position == pytest.approx(HOME_TCP_M, abs=TCP_TOLERANCE_M)
+
+
+# -- figures and words ----------------------------------------------------------------------------
+def test_latencies_are_those_of_a_chunks_first_command(shown: Shown) -> None:
+    found = {
+        name: shown.scalars(f"plot/latency/{name}")
+        for name in ("end\\ to\\ end", "camera\\ to\\ worker", "inference", "worker\\ to\\ command")
+    }
+    assert list(found.values()) == [[55.0], [10.0], [30.0], [15.0]]
+
+
+def test_figures_have_the_units_of_their_titles(shown: Shown) -> None:
+    assert shown.scalars("plot/gripper/measured")[-1] == pytest.approx(40.0)
+    assert shown.scalars("plot/gripper/commanded") == pytest.approx([80.0])
+    assert shown.scalars("plot/speed/measured")[-1] == pytest.approx(100.0 * math.sqrt(3))
+    assert shown.scalars("plot/bounds/share") == pytest.approx([25.0])
+    assert shown.scalars("plot/joints/panda_joint4")[-1] == pytest.approx(PROFILE.robot.home_rad[3])
+    assert shown.scalars("plot/tracking/distance")[-1] == pytest.approx(math.sqrt(3), abs=1e-6)
+
+
+def test_now_says_prompt_state_bounds_and_refusals(shown: Shown) -> None:
+    now = shown.texts("text/now")[-1]
+    for words in ("HARD: go \\*up\\*", "**active**, waiting for a chunk", "scripted at 5 Hz"):
+        assert words in now
+    assert "Bounds acting: singularity panda\\_joint4" in now
+    assert "Refused by the command node: stale 3" in now
+    assert "schema" not in now
+
+
+def test_events_and_settings_stand_in_the_log(shown: Shown) -> None:
+    assert shown.texts("events/command") == [
+        "command: singularity panda_joint4 (0.02, limit 0.05) x4"
+    ]
+    assert shown.texts("events/settings") == ["prompt: HARD: go *up*", "active: true"]
+
+
+def test_pictures_and_the_models_view_are_there(shown: Shown) -> None:
+    for path in ("camera/front", "camera/extra", "seen/scripted/front"):
+        (media,) = shown.values(path, "EncodedImage:media_type")
+        assert media == ["image/jpeg"]
+    (answer,) = shown.texts("seen/scripted/answer")
+    assert "30.0 ms, 3 steps" in answer
+    assert '{"a": 1.5}' in answer
+
+
+@pytest.mark.parametrize("name", profile_names())
+def test_the_profile_in_a_recording_is_read_as_it_was(name: str) -> None:
+    profile = load_profile(name)
+    assert read_profile(to_yaml(profile), "run.mcap") == profile
+
+
+# -- what cannot be shown -------------------------------------------------------------------------
+def test_broken_samples_are_counted_by_key_and_reason_and_shown(tmp_path: Path) -> None:
+    header = Header(ZERO_NS, 0, "x#1")
+    broken = [
+        Sample(KEYS.state_pose, b"\xff\xff", MSGPACK, header, ZERO_NS),
+        Sample(KEYS.state_pose, b"", MSGPACK, None, ZERO_NS),
+        Sample(KEYS.camera_jpeg("front"), b"no picture", JPEG, header, ZERO_NS),
+        Sample(KEYS.whole("camera/front"), b"", JPEG, header, ZERO_NS),
+        Sample(KEYS.prompt, b"\xff\xfe", TEXT, None, ZERO_NS),
+        Sample(KEYS.whole("some/thing"), b"", TEXT, None, ZERO_NS),
+        put(KEYS.spec("scripted"), SPEC, 0),
+        chunk(0, 1, spec_hash="ffff"),
+        chunk(0, 2, steps=np.zeros((1, 9), np.float32)),
+        put(KEYS.event("command"), Event("info", "notice", "x"), 0),
+        put(KEYS.status("command"), status(), MS),
+    ]
+    before = put(KEYS.command_pose, command(-SECOND), -SECOND)
+    show, shown = heard(tmp_path, before, *broken)
+    assert show.refused == {
+        "state/pose: malformed": 1,
+        "state/pose: no_header": 1,
+        "camera/front/jpeg: malformed": 1,
+        "prompt: malformed": 1,
+        "some/thing: malformed": 1,
+        "delta/scripted: no_spec": 1,
+        "delta/scripted: does not fit its spec": 1,
+    }
+    assert "**Not shown here:**" in shown.texts("text/now")[-1]
+    assert shown.texts("events/command") == ["command: x"]
+
+
+def test_what_is_not_of_the_robot_is_passed_over(tmp_path: Path) -> None:
+    other = Keys("somebody")
+    show, _ = heard(tmp_path, Sample(other.prompt, b"go", TEXT, None, ZERO_NS))
+    assert (show.shown, show.refused) == ({}, {})
+
+
+def test_a_stamp_of_another_clock_does_not_stretch_the_time_line(tmp_path: Path) -> None:
+    sample = put(KEYS.event("command"), Event("info", "notice", "x"), 0)
+    far = Sample(sample.key, sample.payload, MSGPACK, Header(1, 0, "x#1"), ZERO_NS)
+    _, shown = heard(tmp_path, far)
+    assert shown.stamps_ns("events/command") == [ZERO_NS]

@@ -1,0 +1,146 @@
+"""A robot's state as the numbers a policy was trained on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, example, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from vla_zenoh.errors import SpecError
+from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation, rotation_from_quat, rotation_from_rpy
+from vla_zenoh.policy import (
+    ActionSpec,
+    ModelSpec,
+    Observation,
+    ObservationSpec,
+    example_observation,
+    state_vector,
+)
+from vla_zenoh.types import GripperState, JointState, PoseState
+
+ATOL = 1e-6
+"""Of rotation matrices; extrinsic angles lose digits near a pitch of 90 degrees."""
+MAX_WIDTH_M = 0.08
+PANDA, UR = 7, 6
+"""Joints of arms."""
+
+
+def seen(quat_xyzw: Any = (0, 0, -(0.5**0.5), -(0.5**0.5)), width_m: float = 0.02) -> Observation:
+    spec = ModelSpec(
+        name="all",
+        observation=ObservationSpec(state=("joint", "pose", "gripper")),
+        action=ActionSpec(horizon=1, dt_s=0.1),
+    )
+    return replace(
+        example_observation(spec),
+        pose=PoseState(np.array([0.4, 0.1, 0.3]), np.array(quat_xyzw), np.zeros(6)),
+        gripper=GripperState(width_m=width_m, moving=False, holding=False),
+    )
+
+
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4))
+@example([1.0, 0.0, 1.0, 0.0])
+@example([0.0, 1.0, 0.0, 1.0])
+@example([0.1, 1.0, 0.1, 1.0 + 1e-9])
+@example([0.3, -1.0, 0.3, 1.0])
+def test_all_forms_of_a_rotation_are_the_same_rotation(numbers: list[float]) -> None:
+    length = float(np.linalg.norm(numbers))
+    assume(length > 0.1)
+    unit = [value / length for value in numbers]
+    wanted = rotation_from_quat(np.array(unit))
+    w, *axis = state_vector.quat_wxyz(unit)
+    assert w >= 0
+    for same in (
+        rotation_from_quat(np.array(state_vector.quat_xyzw(unit))),
+        rotation_from_quat(np.array([*axis, w])),
+        exp3(np.array(state_vector.rotvec(unit))),
+        rotation_from_rpy(np.array(state_vector.rpy(unit))),
+    ):
+        np.testing.assert_allclose(same, wanted, atol=ATOL)
+
+
+def test_parts_come_in_the_order_they_are_named() -> None:
+    names = state_vector.read_state(
+        "gripper_closed+zero+fingers_m+position+rotvec+gripper_m", 11, PANDA
+    )
+    numbers = state_vector.state_vector(names, seen(), MAX_WIDTH_M)
+    wanted = [0.75, 0, 0.01, -0.01, 0.4, 0.1, 0.3, 0, 0, np.pi / 2, 0.02]
+    np.testing.assert_allclose(numbers, wanted, atol=ATOL)
+    assert numbers.dtype == np.float32
+    assert state_vector.parts_of(names) == ("gripper", "pose")
+
+
+def test_every_part_has_as_many_numbers_as_it_says() -> None:
+    for name in state_vector.PARTS:
+        numbers = state_vector.state_vector([name], seen(), MAX_WIDTH_M)
+        assert len(numbers) == state_vector.size_of(name, PANDA)
+
+
+@pytest.mark.parametrize("joints", [UR, PANDA])
+@pytest.mark.parametrize(("part", "unit"), [("joint", 1.0), ("joint_deg", 180 / np.pi)])
+def test_joints_are_as_many_as_the_arm_has(joints: int, part: str, unit: float) -> None:
+    names = state_vector.read_state(f"{part}+gripper_open", joints + 1, joints)
+    zeros = np.zeros(joints)
+    arm = JointState(tuple(f"j{n}" for n in range(joints)), np.arange(joints) / 10, zeros, zeros)
+    numbers = state_vector.state_vector(names, replace(seen(), joint=arm), MAX_WIDTH_M)
+    wanted = unit * np.arange(joints) / 10
+    np.testing.assert_allclose(numbers, [*wanted, 0.25], rtol=ATOL)
+    back = state_vector.state_of(names, numbers.astype(float), joints, MAX_WIDTH_M)
+    np.testing.assert_allclose(back["joint"], arm.position_rad, atol=ATOL)
+    with pytest.raises(SpecError, match=rf"has 9 numbers, 'joint' has {joints}; .*\({joints}\)"):
+        state_vector.read_state("joint", 9, joints)
+
+
+@given(
+    rotvec=hnp.arrays(np.float64, 3, elements=st.floats(-3.0, 3.0)),
+    width_m=st.floats(0, MAX_WIDTH_M),
+    turn=st.sampled_from(tuple(state_vector.ROTATIONS)),
+    grip=st.sampled_from(tuple(state_vector.GRIPPERS)),
+)
+@example(np.zeros(3), 0.0, "rotvec", "gripper_m")
+def test_a_state_in_any_form_is_read_back(
+    rotvec: np.ndarray[Any, Any], width_m: float, turn: str, grip: str
+) -> None:
+    quat = quat_from_rotation(exp3(rotvec))
+    names = state_vector.read_parts(f"position+{turn}+zero*2+{grip}")
+    numbers = state_vector.state_vector(names, seen(quat, width_m), MAX_WIDTH_M)
+    back = state_vector.state_of(names, numbers.astype(float), 7, MAX_WIDTH_M)
+    np.testing.assert_allclose(back["position_m"], [0.4, 0.1, 0.3], atol=ATOL)
+    assert abs(back["quat_xyzw"] @ quat) == pytest.approx(1.0, abs=1e-5)
+    assert back["width_m"] == pytest.approx(width_m, abs=ATOL)
+
+
+@pytest.mark.parametrize("whole", state_vector.COORDINATES)
+def test_single_coordinates_are_those_of_the_whole(whole: str) -> None:
+    names = state_vector.COORDINATES[whole]
+    observation = seen(quat_from_rotation(exp3(np.array([0.1, -0.2, 0.3]))))
+    np.testing.assert_array_equal(
+        state_vector.state_vector(names, observation, MAX_WIDTH_M),
+        state_vector.state_vector([whole], observation, MAX_WIDTH_M),
+    )
+
+
+def test_what_says_too_little_is_not_read_back() -> None:
+    with pytest.raises(SpecError, match="roll alone says too little"):
+        state_vector.state_of(["roll"], np.zeros(1), 7, MAX_WIDTH_M)
+    with pytest.raises(SpecError, match=r"rpy has shape \(2,\), wanted \(3,\)"):
+        state_vector.state_of(["rpy"], np.zeros(2), 7, MAX_WIDTH_M)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("position+grip", r"called 'grip'; there are: joint \(one for each"),
+        ("position+", r"called ''; there are"),
+        ("position", r"state has 8 numbers, 'position' has 3"),
+        ("", r"state has 8 numbers, '' has 0"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused(text: str, match: str) -> None:
+    with pytest.raises(SpecError, match=match):
+        state_vector.read_state(text, 8, PANDA)

@@ -1,0 +1,55 @@
+"""Which nodes are ended because they hang."""
+
+from __future__ import annotations
+
+from vla_zenoh.runtime.hang_detection import HANG_S, LastStatus, hanging
+
+RUNNING = {
+    "router": ("router", 1),
+    "sim": ("sim", 2),
+    "command": ("command", 3),
+    "worker-big": ("worker", 4),
+}
+FRESH_S, LONG_S = 0.3, HANG_S + 1.0
+
+
+def said(**ages_s: float) -> dict[str, LastStatus]:
+    """Everybody was heard just now, but those named."""
+    heard = {name: FRESH_S for name in RUNNING}
+    heard.update({name.replace("_", "-"): age_s for name, age_s in ages_s.items()})
+    return {name: LastStatus(RUNNING[name][1], age_s) for name, age_s in heard.items()}
+
+
+def test_nobody_hangs_while_all_speak() -> None:
+    assert hanging(RUNNING, said()) == []
+
+
+def test_a_node_that_is_silent_while_others_speak_hangs() -> None:
+    assert hanging(RUNNING, said(sim=LONG_S)) == ["sim"]
+    assert hanging(RUNNING, said(sim=HANG_S - 1.0)) == []
+
+
+def test_a_worker_may_think_as_long_as_it_likes() -> None:
+    assert hanging(RUNNING, said(worker_big=600.0)) == []
+
+
+def test_a_node_that_was_started_anew_is_not_blamed_for_what_ran_before() -> None:
+    before = {**said(), "sim": LastStatus(17, LONG_S)}
+    assert hanging(RUNNING, before) == []
+
+
+def test_a_node_that_has_said_nothing_yet_is_starting() -> None:
+    heard = said()
+    del heard["command"]
+    assert hanging(RUNNING, heard) == []
+
+
+def test_when_nobody_is_heard_the_router_is_ended_alone() -> None:
+    silence = said(router=LONG_S, sim=LONG_S, command=LONG_S, worker_big=LONG_S)
+    assert hanging(RUNNING, silence) == ["router"]
+
+
+def test_when_nobody_is_heard_and_the_router_is_elsewhere_nothing_is_ended() -> None:
+    silence = said(router=LONG_S, sim=LONG_S, command=LONG_S, worker_big=LONG_S)
+    here = {name: RUNNING[name] for name in ("sim", "command")}
+    assert hanging(here, silence) == []

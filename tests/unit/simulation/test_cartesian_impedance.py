@@ -1,0 +1,207 @@
+"""The impedance law as an equation, on the dynamics Pinocchio computes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from vla_zenoh import resources
+from vla_zenoh.simulation.cartesian_impedance import ArmState, CartesianImpedance, ImpedanceGains
+from vla_zenoh.types.references import PoseReference
+
+URDF = "example-robot-data:panda_description/urdf/panda.urdf"
+JOINTS = 7
+PERIOD_S = 1e-3
+TORQUE_ATOL_NM = 1e-9
+WRENCH_ATOL = 1e-9
+DAMPING_RTOL = 0.05
+MIN_POSTURE_NM = 0.3  # less would say nothing about where it goes
+NULL_ACCELERATION = 1e-9  # m/s^2, rad/s^2
+POSTURE_RAD = np.array([0.0, -0.05, 0.0, -2.6, 0.0, 2.6, 0.8])
+
+
+class Arm:
+    """A Panda's arm, fingers locked."""
+
+    def __init__(self) -> None:
+        whole = pin.buildModelFromUrdf(str(resources.robot_urdf(URDF)))
+        fingers = [whole.getJointId(f"panda_finger_joint{i}") for i in (1, 2)]
+        self.model = pin.buildReducedModel(whole, fingers, np.zeros(whole.nq))
+        self.data = self.model.createData()
+        self.tcp = self.model.getFrameId("panda_hand_tcp")
+
+    def state(self, q: np.ndarray, v: np.ndarray) -> ArmState:
+        model, data, axes = self.model, self.data, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        pin.computeAllTerms(model, data, q, v)
+        pin.updateFramePlacements(model, data)
+        pin.forwardKinematics(model, data, q, v, np.zeros(JOINTS))
+        drift = pin.getFrameClassicalAcceleration(model, data, self.tcp, axes).vector
+        upper = np.triu(data.M)
+        return ArmState(
+            position_rad=q,
+            velocity_rad_s=v,
+            tcp_position_m=data.oMf[self.tcp].translation.copy(),
+            tcp_rotation=data.oMf[self.tcp].rotation.copy(),
+            jacobian=pin.getFrameJacobian(model, data, self.tcp, axes),
+            drift=drift,
+            inertia=upper + np.triu(upper, 1).T,
+            bias_nm=data.nle.copy(),
+        )
+
+
+@pytest.fixture(scope="module")
+def arm() -> Arm:
+    return Arm()
+
+
+def controller(arm: Arm, gains: ImpedanceGains, **changes: np.ndarray) -> CartesianImpedance:
+    settings = {
+        "lower_rad": arm.model.lowerPositionLimit,
+        "upper_rad": arm.model.upperPositionLimit,
+        "effort_nm": np.full(JOINTS, 1e6),
+        "posture_rad": POSTURE_RAD,
+    }
+    return CartesianImpedance(gains, **(settings | changes), period_s=PERIOD_S)
+
+
+def reference_at(state: ArmState) -> PoseReference:
+    return PoseReference(state.tcp_position_m, state.tcp_rotation, np.zeros(6), np.zeros(6))
+
+
+def moved(state: ArmState, by_m: tuple[float, float, float]) -> PoseReference:
+    return reference_at(state)._replace(position_m=state.tcp_position_m + by_m)
+
+
+def test_at_rest_on_the_reference_the_torque_is_gravity_alone(arm: Arm) -> None:
+    state = arm.state(POSTURE_RAD, np.zeros(JOINTS))
+    output = controller(arm, ImpedanceGains.stiff()).torque(reference_at(state), state)
+    np.testing.assert_allclose(output.torque_nm, state.bias_nm, atol=TORQUE_ATOL_NM)
+    assert not output.saturated
+
+
+def test_a_small_error_pulls_like_a_spring(arm: Arm) -> None:
+    gains = ImpedanceGains(translational_n_m=1000.0)
+    state = arm.state(POSTURE_RAD, np.zeros(JOINTS))
+    output = controller(arm, gains).torque(moved(state, (0.004, 0.0, -0.003)), state)
+    np.testing.assert_allclose(output.wrench, (4.0, 0, -3.0, 0, 0, 0), atol=WRENCH_ATOL)
+    np.testing.assert_allclose(
+        output.torque_nm - state.bias_nm, state.jacobian.T @ output.wrench, atol=TORQUE_ATOL_NM
+    )
+
+
+def test_a_turned_reference_pulls_about_its_axis_in_the_base_frame(arm: Arm) -> None:
+    gains = ImpedanceGains(rotational_nm_rad=50.0)
+    state = arm.state(POSTURE_RAD, np.zeros(JOINTS))
+    turned = pin.exp3(np.array([0.0, 0.05, 0.0])) @ state.tcp_rotation
+    output = controller(arm, gains).torque(reference_at(state)._replace(rotation=turned), state)
+    np.testing.assert_allclose(output.wrench, (0, 0, 0, 0, 2.5, 0), atol=WRENCH_ATOL)
+
+
+@pytest.mark.parametrize("gains", [ImpedanceGains.stiff(), ImpedanceGains.compliant()])
+def test_however_far_the_reference_the_pull_is_bounded(arm: Arm, gains: ImpedanceGains) -> None:
+    state = arm.state(POSTURE_RAD, np.zeros(JOINTS))
+    far = moved(state, (0.3, -0.4, 0.5))._replace(twist=np.full(6, 0.5), acceleration=np.ones(6))
+    output = controller(arm, gains).torque(far, state)
+    pull = gains.translational_n_m * gains.max_error_m
+    assert np.linalg.norm(output.wrench[:3]) == pytest.approx(pull)
+    assert np.linalg.norm(output.error[:3]) == pytest.approx(np.sqrt(0.5))
+
+
+@pytest.mark.parametrize("zeta", [0.7, 1.0])
+def test_the_damping_ratio_is_the_same_in_every_pose(arm: Arm, zeta: float) -> None:
+    gains = ImpedanceGains(damping_ratio=zeta)
+    stiffness = np.diag([gains.translational_n_m] * 3 + [gains.rotational_nm_rad] * 3)
+    random = np.random.default_rng(0)
+    for _ in range(20):
+        q = POSTURE_RAD + random.uniform(-0.6, 0.6, JOINTS)
+        state = arm.state(q, np.zeros(JOINTS))
+        law = controller(arm, gains, posture_rad=q)
+        columns = []
+        for axis in np.eye(6):
+            law.reset()
+            moving = reference_at(state)._replace(twist=axis)
+            columns.append(law.torque(moving, state).wrench)
+        damping = np.array(columns).T
+        inertia = np.linalg.inv(state.jacobian @ np.linalg.solve(state.inertia, state.jacobian.T))
+        system = np.block(
+            [
+                [np.zeros((6, 6)), np.eye(6)],
+                [-np.linalg.solve(inertia, stiffness), -np.linalg.solve(inertia, damping)],
+            ]
+        )
+        poles = np.linalg.eigvals(system)
+        assert (-poles.real / np.abs(poles)).min() > zeta * (1.0 - DAMPING_RTOL)
+
+
+def test_the_posture_torque_does_not_move_the_tcp(arm: Arm) -> None:
+    state = arm.state(POSTURE_RAD, np.zeros(JOINTS))
+    away = POSTURE_RAD + (0.3, -0.2, 0.4, 0.1, -0.3, 0.2, 0.5)
+    law = controller(arm, ImpedanceGains.stiff(), posture_rad=away)
+    torque = law.torque(reference_at(state), state).torque_nm - state.bias_nm
+    assert np.abs(torque).max() > MIN_POSTURE_NM
+    acceleration = state.jacobian @ np.linalg.solve(state.inertia, torque)
+    assert np.abs(acceleration).max() < NULL_ACCELERATION
+
+
+def test_with_feed_forward_a_moving_reference_is_matched_exactly(arm: Arm) -> None:
+    velocity = np.array([0.3, -0.2, 0.4, 0.5, -0.3, 0.2, 0.6])
+    state = arm.state(POSTURE_RAD, velocity)
+    wanted = np.array([0.5, -0.4, 0.3, 0.8, -0.6, 0.7])
+    reference = reference_at(state)._replace(twist=state.jacobian @ velocity, acceleration=wanted)
+    law = controller(arm, ImpedanceGains.stiff())
+    torque = law.torque(reference, state).torque_nm
+    joints = np.linalg.solve(state.inertia, torque - state.bias_nm)
+    np.testing.assert_allclose(state.jacobian @ joints + state.drift, wanted, atol=1e-8)
+
+
+def test_the_integral_grows_to_its_bound_and_a_reset_forgets_it(arm: Arm) -> None:
+    gains = ImpedanceGains.stiff()
+    state = arm.state(POSTURE_RAD, np.zeros(JOINTS))
+    law = controller(arm, gains)
+    off = moved(state, (0.0, 0.0, 0.005))
+    law.torque(off, state)
+    one_tick = gains.integral_1_s * gains.translational_n_m * 0.005 * PERIOD_S
+    np.testing.assert_allclose(law.integral, (0, 0, one_tick, 0, 0, 0), atol=1e-12)
+    for _ in range(2000):
+        law.torque(off, state)
+    assert law.integral[2] == gains.max_integral_n
+    law.reset()
+    assert not law.integral.any()
+
+
+def test_a_blocked_arm_winds_nothing_up_but_unwinds(arm: Arm) -> None:
+    state = arm.state(POSTURE_RAD, np.zeros(JOINTS))
+    law = controller(arm, ImpedanceGains.stiff())
+    for _ in range(100):
+        law.torque(moved(state, (0.0, 0.0, 0.2)), state)
+    assert not law.integral.any()
+    for _ in range(100):
+        law.torque(moved(state, (0.0, 0.0, 0.005)), state)
+    wound = law.integral[2]
+    law.torque(moved(state, (0.0, 0.0, -0.2)), state)
+    assert 0.0 < law.integral[2] < wound
+
+
+def test_a_torque_never_exceeds_the_effort_limit(arm: Arm) -> None:
+    limit = np.array([5.0, 5.0, 5.0, 5.0, 1.0, 1.0, 1.0])
+    state = arm.state(POSTURE_RAD, np.zeros(JOINTS))
+    law = controller(arm, ImpedanceGains.stiff(), effort_nm=limit)
+    output = law.torque(moved(state, (0.02, 0.02, 0.02)), state)
+    assert output.saturated
+    assert (np.abs(output.torque_nm) <= limit).all()
+
+
+def test_near_a_joint_limit_the_nullspace_pushes_back(arm: Arm) -> None:
+    q = POSTURE_RAD.copy()
+    q[0] = arm.model.upperPositionLimit[0] - 0.02
+    state = arm.state(q, np.zeros(JOINTS))
+    near = controller(arm, ImpedanceGains.stiff(), posture_rad=q)
+    push = near.torque(reference_at(state), state).torque_nm - state.bias_nm
+    assert push @ np.linalg.solve(state.inertia, np.eye(JOINTS)[0]) < 0.0  # joint 1 goes back
+    inside = q.copy()
+    inside[0] = 0.0
+    state = arm.state(inside, np.zeros(JOINTS))
+    free = controller(arm, ImpedanceGains.stiff(), posture_rad=inside)
+    still = free.torque(reference_at(state), state).torque_nm - state.bias_nm
+    np.testing.assert_allclose(still, 0.0, atol=TORQUE_ATOL_NM)
