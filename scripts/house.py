@@ -1,0 +1,272 @@
+"""How large the package is, and how much of it a reader has to open.
+
+    python scripts/house.py [--src FOLDER] [--trace] [--json]
+
+For each folder of ``src/vla_zenoh``: files and lines. For the whole: modules that Python loads for
+the four nodes of a simulated robot, import cycles (imports for types count), and class names that
+occur twice. ``--trace`` adds the files that run between an image and a motion: it starts the nodes,
+lets a model that needs a camera move the arm, and records which functions are called meanwhile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter, defaultdict
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "vla_zenoh"
+NODES = (
+    # today, and as they were called before there were rooms
+    ("nodes.camera.node", "nodes.camera"),
+    ("nodes.worker.node", "nodes.worker"),
+    ("nodes.command.node", "nodes.command"),
+    ("robots.sim.node", "nodes.sim"),
+)
+LAB, FRONT = "lab", ("lab", "cli")
+PROGRAMS = ("router", "sim", "camera", "worker", "command")
+START_S, MOVING_S, END_S = 30.0, 4.0, 10.0
+MODEL = """
+# /// script
+# dependencies = []
+# ///
+from vla_zenoh.policy import ActionSpec, ActionSteps, CameraSpec, ModelSpec, ObservationSpec
+
+
+class Policy:
+    spec = ModelSpec(
+        name="look",
+        observation=ObservationSpec(cameras=(CameraSpec("front", 224, 224),)),
+        action=ActionSpec(dt_s=0.2),
+    )
+
+    def infer(self, observation):
+        assert observation.images["front"].any()
+        return ActionSteps([[0, 0, 0.005, 0, 0, 0]])
+"""
+
+
+def modules_in(src: Path) -> dict[str, Path]:
+    """Name -> file of every module of the package."""
+    found = {}
+    for path in sorted((src / PACKAGE).rglob("*.py")):
+        parts = path.relative_to(src).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imports_of(modules: dict[str, Path]) -> dict[str, set[str]]:
+    """Module -> the modules of the package that it imports, at whatever place."""
+    out: dict[str, set[str]] = {}
+    for name, path in modules.items():
+        found = set()
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                for alias in node.names:
+                    whole = f"{node.module}.{alias.name}"
+                    found.add(whole if whole in modules else node.module)
+        out[name] = (found & modules.keys()) - {name}
+    return out
+
+
+def loaded_by(src: Path, names: list[str], modules: dict[str, Path]) -> list[str]:
+    """Modules of the package that Python has loaded when it has imported `names`.
+
+    Packages whose file is a docstring and no more do not count.
+    """
+    code = "import importlib, sys\nfor name in sys.argv[1:]: importlib.import_module(name)\n"
+    code += "print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *names],
+        env={**os.environ, "PYTHONPATH": str(src)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    loaded = [name for name in done.stdout.split() if name in modules]
+    return [name for name in loaded if not says_nothing(modules[name])]
+
+
+def in_cycles(imports: dict[str, set[str]]) -> list[str]:
+    """Modules that import themselves by way of others."""
+    left = {name: needed - {PACKAGE} for name, needed in imports.items()}
+    while True:
+        needed = {target for targets in left.values() for target in targets}
+        out = {name for name, targets in left.items() if not targets & left.keys()}
+        out |= left.keys() - needed
+        if not out:
+            return sorted(left)
+        left = {name: targets for name, targets in left.items() if name not in out}
+
+
+def class_names_twice(modules: dict[str, Path]) -> dict[str, list[str]]:
+    """Class name -> modules, where there is more than one; private ones do not count."""
+    found = defaultdict(list)
+    for name, path in modules.items():
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                found[node.name].append(name.removeprefix(f"{PACKAGE}."))
+    return {name: where for name, where in sorted(found.items()) if len(where) > 1}
+
+
+def says_nothing(path: Path) -> bool:
+    """Whether a file is a docstring and no more, as that of most packages."""
+    body = ast.parse(path.read_text("utf-8")).body
+    return all(isinstance(node, ast.Expr) for node in body)
+
+
+def measure(src: Path) -> dict[str, Any]:
+    """Everything that needs no process."""
+    modules = modules_in(src)
+    imports = imports_of(modules)
+    lines = {name: len(path.read_text("utf-8").splitlines()) for name, path in modules.items()}
+    files: Counter[str] = Counter()
+    sizes: Counter[str] = Counter()
+    for name, path in modules.items():
+        parts = path.relative_to(src / PACKAGE).parts
+        room = parts[0] if len(parts) > 1 else "(beside them)"
+        files[room] += 1
+        sizes[room] += lines[name]
+    roots = [f"{PACKAGE}.{name}" for names in NODES for name in names]
+    present = [name for name in roots if name in modules and modules[name].name != "__init__.py"]
+    loaded = loaded_by(src, present, modules)
+    return {
+        "rooms": {room: [files[room], sizes[room]] for room in sorted(files)},
+        "files": len(modules),
+        "lines": sum(lines.values()),
+        "core_lines": sum(sizes.values()) - sizes[LAB],
+        "node_modules": len(loaded),
+        "node_lines": sum(lines[name] for name in loaded),
+        "cycles": in_cycles(imports),
+        "class_names_twice": class_names_twice(modules),
+    }
+
+
+def traced_program(out: Path, arguments: list[str]) -> None:
+    """Be ``vla-zenoh`` with `arguments`; at the end write when each file's code was last called."""
+    import threading
+
+    last: dict[str, float] = {}
+
+    def note(frame: Any, event: str, _: Any) -> None:
+        if event == "call":
+            last[frame.f_code.co_filename] = time.time()
+
+    threading.setprofile(note)
+    sys.setprofile(note)
+    from vla_zenoh.cli.main import app_entry
+
+    sys.argv = ["vla-zenoh", *arguments]
+    try:
+        app_entry()
+    finally:
+        sys.setprofile(None)
+        out.write_text(json.dumps(dict(last)), "utf-8")
+
+
+def trace(src: Path) -> list[str]:
+    """Files of the package that run while pictures become motions, command line and lab aside."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        (folder / "look.py").write_text(MODEL, "utf-8")
+        profile = folder / "traced.yaml"
+        session = f"session: {{listen: [{endpoint}], connect: [{endpoint}]}}\n"
+        profile.write_text(
+            "extends: panda_sim\nworkers: [look]\nmodels: {look: look.py}\n"
+            "task: {worker: look, prompt: go, rate_hz: 5}\n" + session,
+            "utf-8",
+        )
+        environment = {**os.environ, "PYTHONPATH": str(src)}
+
+        def command(*words: str) -> list[str]:
+            return [sys.executable, "-m", PACKAGE, *words, "--profile", str(profile)]
+
+        programs = []
+        for program in PROGRAMS:
+            words = [program, *(["look"] if program == "worker" else []), "--profile", str(profile)]
+            whole = [sys.executable, __file__, "--as", str(folder / f"{program}.json"), *words]
+            programs.append(subprocess.Popen(whole, env=environment, cwd=folder))
+        try:
+            give_up = time.monotonic() + START_S
+            while subprocess.run(command("activate"), env=environment, check=False).returncode:
+                if time.monotonic() > give_up:
+                    raise SystemExit("the nodes are not ready")
+                time.sleep(0.5)
+            begun = time.time() + 1.0
+            time.sleep(1.0 + MOVING_S)
+            until = time.time()
+            time.sleep(0.5)
+        finally:
+            for process in reversed(programs):
+                process.send_signal(signal.SIGINT)
+            for process in programs:
+                process.wait(END_S)
+        called = set()
+        for program in PROGRAMS[1:]:
+            last = json.loads((folder / f"{program}.json").read_text("utf-8"))
+            called |= {file for file, at in last.items() if at >= begun and until > begun}
+    inside = sorted(Path(file) for file in called if Path(file).is_relative_to(src / PACKAGE))
+    names = [path.relative_to(src / PACKAGE) for path in inside]
+    return [
+        str(name) for name in names if name.parts[0] not in FRONT and name.name != "__init__.py"
+    ]
+
+
+def show(found: dict[str, Any]) -> None:
+    """A table of Markdown."""
+    print("| room | files | lines |\n|---|---|---|")
+    for room, (files, lines) in found["rooms"].items():
+        print(f"| {room} | {files} | {lines} |")
+    print(f"| **all** | {found['files']} | {found['lines']} |\n")
+    print(f"lines outside {LAB}/: {found['core_lines']}")
+    print(f"modules that the four nodes import: {found['node_modules']}", end="")
+    print(f" ({found['node_lines']} lines)")
+    if "trace" in found:
+        print(f"files that run between a picture and a motion: {len(found['trace'])}")
+        print("  " + " ".join(found["trace"]))
+    print(f"modules in cycles: {len(found['cycles'])} {' '.join(found['cycles'])}".rstrip())
+    twice = found["class_names_twice"]
+    print(f"class names that occur twice: {len(twice)}")
+    for name, where in twice.items():
+        print(f"  {name}: {', '.join(where)}")
+
+
+def main() -> None:
+    """Measure and show."""
+    if sys.argv[1:2] == ["--as"]:
+        traced_program(Path(sys.argv[2]), sys.argv[3:])
+        return
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--src", type=Path, default=ROOT / "src", help="of another checkout")
+    parser.add_argument("--trace", action="store_true", help="start the nodes, too")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    src = arguments.src.resolve()
+    found = measure(src)
+    if arguments.trace:
+        found["trace"] = trace(src)
+    if arguments.json:
+        print(json.dumps(found, indent=2))
+    else:
+        show(found)
+
+
+if __name__ == "__main__":
+    main()
