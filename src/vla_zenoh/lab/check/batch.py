@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.control.finding import Finding, error
+from vla_zenoh.control.policy_check import Finding, error
 from vla_zenoh.errors import SpecError
 from vla_zenoh.lab.check.judge import Steps
 from vla_zenoh.policy import ActionSpec, ActionSteps, Observation, Policy, check_steps
