@@ -134,14 +134,14 @@ class Barriers:
 
 
 class DistanceConstraints:
-    """What commanded joints are held before: the faces of the TCP's box, and distances of the arm.
+    """Linear constraints on joint velocities: the faces of the TCP's box, and distances of the arm.
 
-    A wall is a row ``g`` (n,) in m/rad and what is left of the way to it in m: with joint velocities
-    ``qd`` the arm comes nearer by ``g qd``. Distances of the arm to itself and to the table are looked
-    at now and then, and are linear in between: their slope is the relative velocity of the two nearest
-    points along the line that joins them.
+    Each constraint is a row ``g`` (n,) in m/rad and the distance left in m: joint velocities ``qd``
+    reduce it at the rate ``g qd``. Distances of the arm to itself and to the table are computed
+    every few ticks and linear in between; their slope is the relative velocity of the two nearest
+    points along the line between them.
 
-        Args:
+    Args:
             limits: with the box of the TCP.
             barriers: of the arm; None: only the box.
     """

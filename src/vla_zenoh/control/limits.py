@@ -147,7 +147,7 @@ def leash(limits: Limits, goal: Pose, commanded: Pose) -> tuple[Pose, list[Limit
     return Pose(commanded.position_m + ahead, orthonormal(exp3(turn) @ commanded.rotation)), hits
 
 
-# -- slowing down -----------------------------------------------------------------------------------
+# -- slowing down ---------------------------------------------------------------------------------
 class Slowdown(NamedTuple):
     """Why the arm goes slower.
 
