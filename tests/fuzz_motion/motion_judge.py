@@ -548,7 +548,7 @@ def ends_of(v: Array, a: Array, ahead: Array, limits: Array) -> tuple[Array, Arr
     low, high = np.minimum(ahead, 0.0), np.maximum(ahead, 0.0)
     shares = [np.ones(v.shape)]
     # All of it, or translation or rotation alone; what is beside the way takes 2 % of the limits.
-    for axes, same_host in ((slice(0, 6), 0.0), (slice(0, 3), 0.02), (slice(3, 6), 0.02)):
+    for axes, beside in ((slice(0, 6), 0.0), (slice(0, 3), 0.02), (slice(3, 6), 0.02)):
         parts = [part[:, axes] for part in (v, a, ahead)]
         scale = [np.linalg.norm(part, axis=1) for part in parts]
         along = np.where((scale[0] > 1e-9)[:, None], parts[0], parts[2])
@@ -556,10 +556,10 @@ def ends_of(v: Array, a: Array, ahead: Array, limits: Array) -> tuple[Array, Arr
         straight = np.ones(len(v), bool)
         for order, (part, length) in enumerate(zip(parts, scale, strict=True)):
             off = part - (part * along).sum(axis=1, keepdims=True) * along
-            little = same_host * limits[order, axes].min() if order < 2 else same_host * length
+            little = beside * limits[order, axes].min() if order < 2 else beside * length
             straight &= np.linalg.norm(off, axis=1) <= 1e-6 * length + 1e-9 + little
         ratio = np.abs(along) / limits[1, axes]
-        together = ratio / np.maximum(ratio.max(axis=1, keepdims=True), 1e-300) * (1 - same_host)
+        together = ratio / np.maximum(ratio.max(axis=1, keepdims=True), 1e-300) * (1 - beside)
         share = np.ones(v.shape)
         share[:, axes] = np.where(straight[:, None], np.maximum(together, 1e-9), 1.0)
         shares.append(share)

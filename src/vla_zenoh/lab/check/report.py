@@ -54,7 +54,7 @@ MEANINGS: Mapping[str, str] = {
 
 
 @dataclass(slots=True)
-class Report:
+class CheckReport:
     """See the module.
 
     Args:
