@@ -37,7 +37,7 @@ from vla_zenoh.lab.doctor.terminal import terminal
 from vla_zenoh.lab.doctor.video import video_devices
 from vla_zenoh.lab.doctor.wallclock import TIME_ERROR, judge, kernel_state
 from vla_zenoh.profile import SessionProfile, load_profile
-from vla_zenoh.simulation.backend import Backend
+from vla_zenoh.simulation.render import Backend
 
 TIBIBYTE_MIB = 1024 * 1024
 SEGMENT_BYTES = 3 * 1024 * 1024

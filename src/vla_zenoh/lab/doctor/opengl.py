@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.doctor.finding import HostFinding
-from vla_zenoh.simulation.backend import RAYCAST, VARIABLE, Backend, choose_backend
+from vla_zenoh.simulation.render import RAYCAST, VARIABLE, Backend, choose_backend
 
 NAME = "pictures"
 
