@@ -66,7 +66,7 @@ format: $(READY) ## Let ruff put files into shape
 bench: $(READY) ## Measure camera to command on this machine
 	$(BIN)/python -m benchmarks chain $(ARGS)
 
-bench-faults: $(READY) ## Faults of a lab network on an arm in motion (root), table into docs/reliability.md
+bench-faults: $(READY) ## Faults of a lab network on an arm in motion (root), table into docs/explanation/reliability.md
 	$(BIN)/python reliability/netns/bench_faults.py $(ARGS)
 
 bench-ros2: $(READY) ros2-bridge ## Measure a picture's way to a pose through ROS 2
