@@ -37,7 +37,7 @@ from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.evaluation.csv_file import evaluate_csv
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
-from vla_zenoh.lab.recording import cdr
+from vla_zenoh.lab.recording.record_json import record_from_json, record_to_json
 from vla_zenoh.lab.recording.record_types import RECORDS
 from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.nodes.worker.inference_debug import InferenceView
@@ -240,11 +240,8 @@ def _cdr_seed(kind: str) -> list[bytes]:
 
 
 def _bag_seed(kind: type) -> list[bytes]:
-    try:
-        fields = cdr.fields_in(kind, records.encode(examples()[kind]))
-        return [cdr.write_record(kind, fields, 10**18, "base")]
-    except CodecError:
-        return []
+    text, _ = record_to_json(kind, records.encode(examples()[kind]))
+    return [text.encode()]
 
 
 def _recording() -> list[bytes]:
@@ -405,7 +402,7 @@ def _targets() -> Iterator[Target]:
     for kind in RECORDS:
         yield Target(
             f"bag-{kind.__name__}",
-            partial(cdr.read_record, kind),
+            lambda data, kind=kind: record_from_json(kind, _text(data)),
             codec,
             lambda kind=kind: _bag_seed(kind),
         )
