@@ -239,7 +239,7 @@ def _cdr_seed(kind: str) -> list[bytes]:
     return [every.encode(every.new(kind, **fields.get(kind.rsplit("/", 1)[-1], {})))]
 
 
-def _bag_seed(kind: type) -> list[bytes]:
+def _recorded_seed(kind: type) -> list[bytes]:
     text, _ = record_to_json(kind, records.encode(examples()[kind]))
     return [text.encode()]
 
@@ -401,10 +401,10 @@ def _targets() -> Iterator[Target]:
     # -- files
     for kind in RECORDS:
         yield Target(
-            f"bag-{kind.__name__}",
+            f"recorded-{kind.__name__}",
             lambda data, kind=kind: record_from_json(kind, _text(data)),
             codec,
-            lambda kind=kind: _bag_seed(kind),
+            lambda kind=kind: _recorded_seed(kind),
         )
     own = (VlaZenohError,)
     yield Target("recording", partial(_in_file, ".mcap", evaluate_run), own, _recording)

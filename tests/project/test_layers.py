@@ -62,6 +62,7 @@ ALLOWED = {
             "lab/doctor/access_check.py",
             "lab/recording/recorder.py",
             "lab/recording/replay.py",
+            "lab/recording/sample_queue.py",
             "lab/recording/stream_listener.py",
             "lab/teleop/node.py",
             "lab/trial/runner.py",

@@ -132,12 +132,12 @@ class _Source:
                 header = Header(message.publish_time, message.sequence, self.writer)
             except RecordError as error:
                 raise CodecError("invalid", str(error)) from error
-        kind = _KINDS.get(self.json_of)
+        kind, fields = _KINDS.get(self.json_of), None
         if kind is not None:
-            payload = record_from_json(kind, data)
+            payload, fields = record_from_json(kind, data)
         else:
             payload = data.encode() if self.schema == ros2_messages.TEXT else data.tobytes()
-        return Sample(key, payload, encoding, header, received_ns, kind=kind)
+        return Sample(key, payload, encoding, header, received_ns, None, kind, fields)
 
 
 def _source(channel: Channel, schemas: dict[int, Schema]) -> _Source | None:

@@ -40,8 +40,8 @@ def record_to_json(kind: type, payload: bytes) -> tuple[str, dict[str, Any]]:
     return text if exact else _dumps({**fields, PAYLOAD: _base64(payload)}), fields
 
 
-def record_from_json(kind: type, text: str) -> bytes:
-    """The payload that `record_to_json` was given.
+def record_from_json(kind: type, text: str) -> tuple[bytes, dict[str, Any]]:
+    """The payload that `record_to_json` was given, and the decoded fields.
 
     Raises:
         CodecError: the text is not such JSON.
@@ -49,10 +49,12 @@ def record_from_json(kind: type, text: str) -> bytes:
     fields = _loads(text)
     try:
         if PAYLOAD not in fields:
-            return message.pack(_with_arrays(kind, fields))
+            fields = _with_arrays(kind, fields)
+            return message.pack(fields), fields
         payload = b64decode(fields[PAYLOAD])
-        if isinstance(message.unpack(payload), dict):
-            return payload
+        fields = message.unpack(payload)
+        if isinstance(fields, dict):
+            return payload, fields
         raise CodecError("malformed", f"{kind.__name__} is a map")
     except (TypeError, ValueError, OverflowError) as error:
         raise CodecError("malformed", f"{kind.__name__}: {str(error)[:200]}") from error

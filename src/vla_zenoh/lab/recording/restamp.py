@@ -54,8 +54,8 @@ class Restamper:
             source = f"{node}#{self._suffix}"
             header = Header(self.moved_ns(header.stamp_wall_ns), header.seq, source)
         payload = entry.payload
-        if entry.kind is not None:
-            payload = message.pack(_stamps_moved(message.unpack(payload), self.moved_ns))
+        if entry.fields is not None:
+            payload = message.pack(_stamps_moved(entry.fields, self.moved_ns))
         return Sample(
             self._here.on(self._there, entry.key),
             payload,

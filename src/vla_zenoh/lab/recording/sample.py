@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -28,8 +29,8 @@ class Sample:
         received_ns: time of reception, wall clock of the receiver.
         attachment: bytes of an attachment that is no header; None with a header, or without any
             attachment.
-        kind: type of the record that a recording has decoded the payload as; None for images,
-            settings and unknown bytes.
+        kind: type of the record; None for images, settings, unknown bytes, and off the wire.
+        fields: of the record as decoded, not validated; None as `kind`.
     """
 
     key: str
@@ -39,6 +40,7 @@ class Sample:
     received_ns: int
     attachment: bytes | None = None
     kind: type | None = field(default=None, compare=False)
+    fields: Mapping[str, Any] | None = field(default=None, compare=False)
 
     @property
     def stamp_ns(self) -> int:
@@ -63,7 +65,7 @@ class Sample:
         """
         if self.kind is None:
             raise CodecError("malformed", f"{self.key} carries no record")
-        return records.decode(self.kind, self.payload)
+        return records.from_map(self.kind, self.fields)
 
 
 def received_sample(
