@@ -117,7 +117,7 @@ def samples_of(chain: Chain, seconds: float = 1.2) -> dict[str, tuple[bytes, byt
         )
 
     subscriber = chain.session.declare_subscriber(
-        chain.profile.keys.everything, zenoh.handlers.Callback(keep, indirect=False)
+        chain.profile.keys.all_keys, zenoh.handlers.Callback(keep, indirect=False)
     )
     time.sleep(seconds)
     subscriber.undeclare()
@@ -236,7 +236,7 @@ def keep_moving(chain: Chain, seconds: float, work: Callable[[], None]) -> float
     while time.monotonic() < end:
         if time.monotonic() > turn_s:
             turn_s, down = time.monotonic() + 2.0, not down
-            chain.client.put(chain.client.keys.prompt, f"HARD: go {'down' if down else 'up'}")
+            chain.client.publish(chain.client.keys.prompt, f"HARD: go {'down' if down else 'up'}")
         work()
         looks += 1
         active += chain.state() == "active"
@@ -310,7 +310,7 @@ def be_a_nuisance(chain: Chain, seconds: float) -> None:
     chain.until("stopped", lambda: chain.state() == "stopped")
     chain.wait_still()
     assert chain.recorder.track().time_to_stand_s(stopped_ns) < BRAKE_S
-    chain.client.put(chain.client.keys.reset, "")
+    chain.client.publish(chain.client.keys.reset, "")
     chain.until("reset", lambda: chain.state() == "inactive")
     chain.activate_when_ready()
     direction, sign = ("up", 1) if chain.height_m() < 0.4 else ("down", -1)  # away from the table
@@ -382,7 +382,7 @@ def test_a_flood_does_not_slow_the_command_loop(chain: Chain) -> None:
     pid = chain.pid("command")
     missed = chain.counter("command.missed_ticks")
     chain.recorder.forget()
-    chain.client.put(keys.prompt, "HARD: go up x8")
+    chain.client.publish(keys.prompt, "HARD: go up x8")
     began, sent = time.monotonic(), 0
     began_ns = time.time_ns()
     while time.monotonic() - began < FLOOD_S:

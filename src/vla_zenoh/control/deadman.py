@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Set as AbstractSet
 
-from vla_zenoh.keys import NOT_SEEN
+from vla_zenoh.keys import NO_DEADMAN_TOKEN
 
 
 class Deadman:
@@ -31,7 +31,7 @@ class Deadman:
         """
         reasons = []
         if holder and holder not in there:
-            reasons.append(f"{holder!r}, who is to hold the arm active, {NOT_SEEN}")
+            reasons.append(f"{holder!r}, who is to hold the arm active, {NO_DEADMAN_TOKEN}")
         if obeying and holder and self.name and holder != self.name:
             reasons.append(f"it obeys already, while {self.name!r} holds it; deactivate it first")
         return reasons

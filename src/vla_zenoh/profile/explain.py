@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.section import Misfit, Place
 from vla_zenoh.profile.yaml_text import Lines
-from vla_zenoh.pydantic_errors import in_words, nearest
+from vla_zenoh.pydantic_errors import describe_fault, nearest
 from vla_zenoh.types import shown
 
 _NO_VALUE_SHOWN = {"missing", "extra_forbidden", "too_long", "too_short", "value_error"}
@@ -40,7 +40,7 @@ def _line(place: Place, why: str, lines: Lines) -> str:
 
 
 def _why(fault: Any, place: Place) -> str:
-    words, given = in_words(fault), fault.get("input")
+    words, given = describe_fault(fault), fault.get("input")
     if fault["type"] == "extra_forbidden":
         allowed = field_names(place[:-1])
         return f"unknown key{nearest(place[-1], allowed)} Known here: {', '.join(allowed)}"

@@ -43,7 +43,7 @@ def refuse(faults: Sequence[tuple[Place, str]]) -> None:
 
 def _key_part(value: str) -> str:
     try:
-        return keys.chunk(value, "name")
+        return keys.key_chunk(value, "name")
     except ProfileError as error:
         raise ValueError(str(error)) from error
 

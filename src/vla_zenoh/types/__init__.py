@@ -23,7 +23,7 @@ from vla_zenoh.types.commands import Cause, GripperCommand, JointCommand, PoseCo
 from vla_zenoh.types.image import Image
 from vla_zenoh.types.reports import Event, NodeStatus
 from vla_zenoh.types.scene import ObjectPoses, SceneState
-from vla_zenoh.types.seen import Seen
+from vla_zenoh.types.seen import InferenceDebug
 from vla_zenoh.types.stamped import Header, Stamped
 from vla_zenoh.types.states import GripperState, JointState, PoseState
 from vla_zenoh.types.task import Task
@@ -40,6 +40,7 @@ __all__ = [
     "GripperState",
     "Header",
     "Image",
+    "InferenceDebug",
     "JointCommand",
     "JointState",
     "NodeStatus",
@@ -47,7 +48,6 @@ __all__ = [
     "PoseCommand",
     "PoseState",
     "SceneState",
-    "Seen",
     "Stamped",
     "Task",
     "shown",

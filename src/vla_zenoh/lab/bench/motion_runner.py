@@ -61,7 +61,7 @@ def run_in_real_time(
                 host.client,
                 listener,
                 stop,
-                host.watch,
+                host.poll,
                 lambda _, done, trial=trial, each=each: progress(trial, each, done),
             )
             run.wait_until_ready()
@@ -95,7 +95,7 @@ def _go_home(host: Host, listener: StreamListener) -> None:
     client = host.client
     client.deactivate()
     resets = _resets(host)
-    client.put(client.keys.sim_reset, "")
+    client.publish(client.keys.sim_reset, "")
     if not client.wait_for(lambda: _resets(host) > resets, RESET_PATIENCE_S):
         raise NodeError("the simulator did not reset; it says: " + str(client.status("sim")))
     time.sleep(0.3)

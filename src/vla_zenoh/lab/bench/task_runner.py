@@ -121,7 +121,7 @@ class TaskRun:
         resets, give_up_s = self._resets(), time.monotonic() + RESET_PATIENCE_S
         while self._resets() == resets:
             # Refused while the last of the command stream is still followed.
-            client.put(client.keys.sim_reset, str(seed))
+            client.publish(client.keys.sim_reset, str(seed))
             client.wait_for(lambda: self._resets() > resets, RESET_PERIOD_S)
             if time.monotonic() > give_up_s:
                 raise NodeError(f"sim/reset is not obeyed in {RESET_PATIENCE_S:g} s")
@@ -150,7 +150,7 @@ class TaskRun:
                 self._client.activate()
                 return ""
             except SessionError as error:
-                if time.monotonic() > give_up or self._client.latched():
+                if time.monotonic() > give_up or self._client.latch_reason():
                     return str(error)
                 self._pause(0.2)
 
@@ -160,8 +160,8 @@ class TaskRun:
         Raises:
             NodeError: it was stopped, or somebody deactivated it.
         """
-        why = self._client.latched() or self._why_lost()
-        if self._client.latched() or why == DEACTIVATED:
+        why = self._client.latch_reason() or self._why_lost()
+        if self._client.latch_reason() or why == DEACTIVATED:
             raise NodeError(f"ended by somebody else: {why}")
 
     def _watch_it(self, episode: TaskEpisode, prompt: str) -> Ended:
@@ -237,7 +237,7 @@ class TaskRun:
             self._pause(LOOK_S)
 
     def _pause(self, seconds: float) -> None:
-        self._host.watch()
+        self._host.poll()
         if self._stop.wait(seconds):
             raise Interrupted
 

@@ -125,7 +125,7 @@ class DemoRun:
                 self._client.activate()
                 return
             except SessionError:
-                if time.monotonic() > give_up or self._client.latched():
+                if time.monotonic() > give_up or self._client.latch_reason():
                     raise
                 self._pause(0.3)
 

@@ -163,7 +163,7 @@ class Replay:
         self.replayed.damage = self._file.damage
         self.replayed.late_ms = _summary(self._late_ns)
         self.replayed.interval_error_ms = _summary(self._errors_ns)
-        self.node.report("stopped", now=True)
+        self.node.publish_status("stopped", now=True)
         self.node.close()
         return self.replayed
 
@@ -279,10 +279,10 @@ class Replay:
             NodeError: it does.
         """
         self._refuse_a_live_robot()
-        if self.node.report_due("replaying"):
+        if self.node.status_due("replaying"):
             self.node.counters["samples"] = self.replayed.samples.total()
             detail = {"file": str(self._file.path), "pass": self.replayed.passes + 1}
-            self.node.report("replaying", detail=detail)
+            self.node.publish_status("replaying", detail=detail)
 
 
 def chosen_groups(names: Collection[str]) -> frozenset[str]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from vla_zenoh.bus.node import Node, Stream
+from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.camera.rate_limiter import Pace
@@ -33,7 +33,7 @@ class Form:
         width: wider ones are made smaller.
     """
 
-    stream: Stream
+    stream: Publisher
     quality: int
     pace: Pace | None
     spec: CameraSpec | None = None
@@ -89,7 +89,7 @@ class Forms:
     def wanted(self) -> bool:
         """Somebody listens."""
         with self._lock:
-            return any(form.stream.wanted for form in self._all())
+            return any(form.stream.has_subscribers for form in self._all())
 
     def due(self, mono_ns: int) -> list[Form]:
         """Those in which somebody wants the picture of this time."""
@@ -97,7 +97,7 @@ class Forms:
             return [
                 form
                 for form in self._all()
-                if form.stream.wanted and (form.pace is None or form.pace.due(mono_ns))
+                if form.stream.has_subscribers and (form.pace is None or form.pace.due(mono_ns))
             ]
 
     def put(self, form: Form, image: Image, stamp_wall_ns: int) -> None:
@@ -105,7 +105,7 @@ class Forms:
         jpeg, encoding = form.made_of(image), zenoh.Encoding.IMAGE_JPEG
         with self._lock:
             if any(form is one for one in self._all()):
-                form.stream.put(jpeg, stamp_wall_ns=stamp_wall_ns, encoding=encoding)
+                form.stream.publish(jpeg, stamp_wall_ns=stamp_wall_ns, encoding=encoding)
 
     def _all(self) -> list[Form]:
         return [*self._whole, *(form for forms in self._sizes.values() for form in forms)]
@@ -123,7 +123,7 @@ class Forms:
         missing = [name for name in asked if name not in self._sizes]
         with self._lock:
             heard = {
-                name: any(form.stream.wanted for form in forms)
+                name: any(form.stream.has_subscribers for form in forms)
                 for name, forms in self._sizes.items()
                 if name not in asked
             }
@@ -151,7 +151,7 @@ class Forms:
         with self._lock:
             forms = self._sizes.pop(name)
             for form in forms:
-                self._node.end(form.stream)
+                self._node.undeclare(form.stream)
         why = f"pictures are no longer made as {name}: no living model asks for it"
         self._tell(Event("info", "notice", f"{self._camera}:size_given_back", why))
 
@@ -164,8 +164,10 @@ class Forms:
             )
             self._tell(Event("warning", "notice", f"{self._camera}:too_many_sizes", why[:1000]))
 
-    def _stream(self, form: str) -> Stream:
-        return self._node.stream(self._node.keys.camera_fitted(self._camera, form), Kind.FRAME)
+    def _stream(self, form: str) -> Publisher:
+        return self._node.declare_publisher(
+            self._node.keys.camera_fitted(self._camera, form), Kind.FRAME
+        )
 
 
 def _pace(rate_hz: float | None) -> Pace | None:
