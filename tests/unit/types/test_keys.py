@@ -17,7 +17,7 @@ MAX_SENTENCE = 1000  # characters of an error message
 
 KEYS = Keys("panda")
 SELECTORS = (
-    "everything",
+    "all_keys",
     "all_deltas",
     "all_specs",
     "all_seen",
@@ -27,10 +27,10 @@ SELECTORS = (
     "all_alive",
     "all_holding",
     "all_robots",
-    "without_pictures",
-    "without_raw_pictures",
+    "without_images",
+    "without_raw_images",
 )
-NO_KEYS = ("short", "of", "on", "all_seen_of", "group", "whole")
+NO_KEYS = ("short", "of", "on", "all_seen_of", "group", "full")
 """Methods that give something else than one key."""
 GOOD_CHUNKS = st.from_regex(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,20}", fullmatch=True)
 
