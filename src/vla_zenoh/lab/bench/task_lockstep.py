@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import encode_jpeg
-from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.errors import NodeError, SpecError, VlaZenohError, WorkerError
 from vla_zenoh.lab.bench.task import (
     ARM_LOST,
@@ -35,11 +35,9 @@ from vla_zenoh.lab.tasks import TaskJudge
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_of
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile
-from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.runtime.process import die_with_parent
-from vla_zenoh.simulation.backend import AUTO, choose_backend
-from vla_zenoh.simulation.render import Renderer
-from vla_zenoh.simulation.world import World
+from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
+from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses
 
 CAMERA_S, WIRE_S = 0.015, 0.0005
@@ -201,7 +199,7 @@ def _episode(bench: _Bench, asked: TaskRequest) -> TaskOutcome:
         bench.policy,
         delays=Delays(plan.delay_ms / 1e3, camera_s=CAMERA_S, wire_s=WIRE_S),
         picture=bench.picture,
-        reach=make_shadow(bench.profile),
+        reach=make_reachability_filter(bench.profile),
         seed=asked.seed,
     )
     beginning = bench.draw(bench.camera, world.qpos()) if bench.camera else None
