@@ -1,7 +1,7 @@
 """Whether the numbers of a chunk can be what their spec says they are.
 
 Wrong units show by size: a step in millimetres or degrees is far over what an arm is allowed, and
-what the command node takes for a mistake (`vla_zenoh.profile.REFUSE_FACTOR` times a limit).
+what the command node takes for a mistake (`vla_zenoh.profile.REJECT_FACTOR` times a limit).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.control.finding import Finding, error, warning
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec
-from vla_zenoh.profile import REACH_M, REFUSE_FACTOR, Limits
+from vla_zenoh.profile import REACH_M, REJECT_FACTOR, Limits
 from vla_zenoh.types import QUATERNION_NORM_TOLERANCE
 
 FRACTION_SLACK = 0.25
@@ -77,10 +77,10 @@ def _position(
                 f"z {box.z_m}: is it in the base frame?",
             )
         return
-    if longest_m > REFUSE_FACTOR * limits.step_m:
+    if longest_m > REJECT_FACTOR * limits.step_m:
         yield error(
             "position_units",
-            f"a step of {longest_m:.4g} m, over {REFUSE_FACTOR:g} times the limit of "
+            f"a step of {longest_m:.4g} m, over {REJECT_FACTOR:g} times the limit of "
             f"{limits.step_m:g} m; are these metres, and was the output unnormalised? "
             f"position_scale_m is {spec.position_scale_m:g}",
         )
@@ -108,10 +108,10 @@ def _rotation(spec: ActionSpec, rotation: NDArray[np.float64], limits: Limits) -
 
 
 def _turn(largest_rad: float, spec: ActionSpec, limits: Limits) -> Iterator[Finding]:
-    if largest_rad > REFUSE_FACTOR * limits.step_rad:
+    if largest_rad > REJECT_FACTOR * limits.step_rad:
         yield error(
             "rotation_units",
-            f"a step of {largest_rad:.4g} rad, over {REFUSE_FACTOR:g} times the limit of "
+            f"a step of {largest_rad:.4g} rad, over {REJECT_FACTOR:g} times the limit of "
             f"{limits.step_rad:g} rad; are these radians, and was the output unnormalised?",
         )
         return
@@ -144,7 +144,7 @@ def _quaternion(
     turns = 2 * np.arccos(np.clip(np.abs(rotation[:, 3]), 0.0, 1.0))
     swapped = 2 * np.arccos(np.clip(np.abs(rotation[:, 0]), 0.0, 1.0))
     largest = float(turns.max())
-    if largest > REFUSE_FACTOR * limits.step_rad >= float(swapped.max()):
+    if largest > REJECT_FACTOR * limits.step_rad >= float(swapped.max()):
         yield error(
             "quaternion",
             f"a step of {largest:.4g} rad, which would be {float(swapped.max()):.4g} rad read as "
