@@ -68,8 +68,8 @@ class LeRobot:
         resize: how a picture of another size becomes one of this.
         device: as torch names it; ``auto``: a GPU where there is one.
         profile: of the robot: its gripper, and its arm.
-        meaning: of the actions, see vla_zenoh/interop/action_semantics.py. `horizon` is, unless told
-            otherwise, as many steps as the policy was made to carry out.
+        meaning: of the actions, see vla_zenoh/interop/action_semantics.py. `horizon` defaults to
+            the number of steps that the policy was made to execute.
     """
 
     def __init__(

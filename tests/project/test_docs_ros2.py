@@ -1,4 +1,4 @@
-"""docs/ros2.md: its lab is secured as it says, and its bridge's file is what the command gives."""
+"""docs/how-to/ros2.md: its lab is secured, and its bridge's file is what the command writes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from vla_zenoh.cli.ros2 import ros2_app
 from vla_zenoh.cli.secure import secure_app
 
-TEXT = (Path(__file__).parents[2] / "docs" / "ros2.md").read_text("utf-8")
+TEXT = (Path(__file__).parents[2] / "docs" / "how-to" / "ros2.md").read_text("utf-8")
 RUNNER = CliRunner()
 
 

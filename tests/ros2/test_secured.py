@@ -111,7 +111,7 @@ class SecuredLab:
 
 @contextmanager
 def running(folder: Path, program: Path, protocol: str) -> Iterator[SecuredLab]:
-    """Made by the commands of docs/ros2.md; `protocol` is how the bridge is reached."""
+    """Made by the commands of docs/how-to/ros2.md; `protocol` is how the bridge is reached."""
     from bridge import Bridge
     from rig import HEIGHT, WIDTH, Lab, Robot
     from ros_node import free_domain

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from model import MAX_WORDS, UNKNOWN, words_of
 from states import draw_order
+from worker import MAX_WORDS, UNKNOWN, words_of
 
 from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, TRAINING, Order, say
 from vla_zenoh.lab.tasks.words import WAYS

@@ -78,7 +78,7 @@ def table(found: Found) -> Table:
 
 
 def line(found: Found) -> str:
-    """The result as a row of the table in docs/reliability.md."""
+    """The result as a row of the table in docs/explanation/reliability.md."""
     back_s = sorted(found.recovery_s.get("kill", []))
     killed = str(sum(found.killed.values()))
     if back_s:

@@ -1,10 +1,10 @@
 """What a lab network's faults do to an arm in motion, as a table.
 
-    make bench-faults        (python tests/netns/bench_faults.py --only cut-5 --json faults.json)
+    make bench-faults ARGS="--only cut-5 --json faults.json"
 
 Needs root. Hosts are network namespaces with mutual TLS and access control; every row is one motion
-of the simulated arm, measured by what its simulator wrote down. The table of docs/reliability.md is
-written anew; with --only, those rows.
+of the simulated arm, measured from what its simulator logged. Rewrites the table of
+docs/explanation/reliability.md; with --only, those rows.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from itertools import groupby
 from pathlib import Path
 
 # Run as a program, and not by pytest, which knows where the rest of the tests' own code is.
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT / "reliability"), str(ROOT / "tests")]
 
 from netns import table
 from netns.faults import catalogue
@@ -27,7 +28,7 @@ from netns.stage import stage
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "reliability.md"
+DOCUMENT = ROOT / "docs" / "explanation" / "reliability.md"
 MAX_FAULTS_A_LAB = 12
 """Then the lab is built anew: a row shall not suffer from those before it."""
 
@@ -59,7 +60,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, help="write all figures to this file")
     parser.add_argument("--only", action="append", help="this fault; may be given more than once")
-    parser.add_argument("--no-table", action="store_true", help="leave docs/reliability.md alone")
+    parser.add_argument("--no-table", action="store_true", help="do not rewrite the table in docs/")
     given = parser.parse_args()
     screen = Console(stderr=True)
     every = list(catalogue())

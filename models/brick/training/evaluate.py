@@ -26,8 +26,8 @@ import numpy as np
 from expert import Hand as TeacherHand
 from expert import Point, foretell
 from generate import labelled
-from model import HORIZON, Brick, Hand, Waypoints
 from states import Situation
+from worker import HORIZON, Brick, Hand, Waypoints
 
 from vla_zenoh.lab.bench.statistics import wilson_95
 from vla_zenoh.lab.lockstep import Delays, Lockstep

@@ -30,20 +30,19 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-TESTS = Path(__file__).parents[1]
-sys.path[:0] = [str(TESTS), str(TESTS / "fault")]
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
-import numpy as np  # noqa: E402
-import zenoh  # noqa: E402
-from chain import Chain, running_chain  # noqa: E402
-from ledger import Growth, Ledger, segments  # noqa: E402
-from refusals import EXPLAINS, STALL_S, Refusals, Witness, unexplained  # noqa: E402
-from report import Found, line, show  # noqa: E402
-from rich.console import Console  # noqa: E402
-from test_strangers import all_junk, all_keys, samples_of  # noqa: E402
+import numpy as np
+import zenoh
+from chain import Chain, running_chain
+from junk import all_junk, all_keys, samples_of
+from ledger import Growth, Ledger, segments
+from refusals import EXPLAINS, STALL_S, Refusals, Witness, unexplained
+from report import Found, line, show
+from rich.console import Console
 
-from vla_zenoh.errors import NodeError, SessionError  # noqa: E402
-from vla_zenoh.policy.loader import find_model  # noqa: E402
+from vla_zenoh.errors import NodeError, SessionError
+from vla_zenoh.policy.loader import find_model
 
 WORKERS = ("scripted", "twin")
 PROMPTS = (

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 from expert import foretell
-from model import Hand as Memory
 from states import Situation, draw, draw_order
+from worker import Hand as Memory
 
 from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, FAMILIES, Order
 

@@ -8,8 +8,8 @@
 
     python export.py RUN [--out FOLDER]
 
-Writes ``brick.onnx``, ``brick.safetensors`` and ``weights.json`` with the sha256 of both and the
-words the policy knows.
+Writes ``brick.onnx``, ``training/brick.safetensors`` and ``weights.json`` with the sha256 of both
+and the words the policy knows.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
-from model import FRONT, GRAPH, MANIFEST, MAX_WORDS, WRIST
 from net import HAND, Policy
 from phrases import vocabulary
 from safetensors.torch import load_file
+from worker import FOLDER, FRONT, GRAPH, MANIFEST, MAX_WORDS, WRIST
 
 INPUTS = ("tokens", "front", "wrist", "hand")
 OUTPUTS = ("offset", "opened", "understood", "bricks", "box")
@@ -66,7 +66,7 @@ def strip(graph: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="folder with policy.safetensors")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent)
+    parser.add_argument("--out", type=Path, default=FOLDER)
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     words = vocabulary()
@@ -99,9 +99,13 @@ def main() -> None:
         )
     if worst > TOLERANCE:
         raise SystemExit(f"the graph differs from PyTorch by {worst:.2g}, allowed: {TOLERANCE:g}")
-    weights = args.out / "brick.safetensors"
+    weights = args.out / "training" / "brick.safetensors"
+    weights.parent.mkdir(exist_ok=True)
     shutil.copyfile(args.run / "policy.safetensors", weights)
-    sha256 = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in (graph, weights)}
+    sha256 = {
+        str(p.relative_to(args.out)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in (graph, weights)
+    }
     manifest = {"sha256": sha256, "words": words}
     (args.out / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", "utf-8")
     size = sum(p.stat().st_size for p in (graph, weights))

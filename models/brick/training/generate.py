@@ -21,9 +21,9 @@ import numpy as np
 import pinocchio as pin
 from expert import OPEN_M, Hand
 from geometry import numbers
-from model import FRONT, WRIST
 from rich.progress import track
 from states import Situation, draw
+from worker import FRONT, WRIST
 
 from vla_zenoh.lab.tasks import brick
 from vla_zenoh.profile import load_profile
