@@ -309,7 +309,7 @@ def test_what_opencv_says_of_broken_sources_does_not_reach_the_terminal(tmp_path
     program = f"""
 import threading
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.camera.choose_source import make_source
+from vla_zenoh.nodes.camera.grabber import make_source
 from vla_zenoh.nodes.camera.opencv import prepare
 from vla_zenoh.profile.schema import CameraProfile
 prepare()

@@ -18,7 +18,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.codec.image import encode_jpeg, encode_raw, raw_schema
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.camera.fitted_streams import FittedStreams, RateLimiter, limiter, shrink
+from vla_zenoh.nodes.camera.fitted_streams import FittedStreams, RateLimiter, shrink
 from vla_zenoh.nodes.camera.image_check import ImageCheck, ImageFault
 from vla_zenoh.nodes.camera.source import Pixels
 from vla_zenoh.profile.schema import CameraProfile
@@ -60,7 +60,7 @@ class CameraPublisher:
         self._raw = node.stream(node.keys.camera_raw(name), Kind.FRAME)
         self._jpeg = node.stream(node.keys.camera_jpeg(name), Kind.FRAME)
         self.forms = FittedStreams(name, profile, node, tell)
-        self._jpeg_pace = limiter(profile.jpeg_rate_hz)
+        self._jpeg_pace = RateLimiter(profile.jpeg_rate_hz)
         self._seq = 0
         self._newest_mono_ns: int | None = None
         self._sizes: set[tuple[int, ...]] = set()
@@ -156,9 +156,8 @@ class CameraPublisher:
         """Write a finished picture, in each form that somebody listens to."""
         raw, jpeg = self._raw.wanted, self._jpeg.wanted
         fitted = self.forms.due(mono_ns)
-        thinned = self._jpeg_pace is not None
-        if jpeg and self._jpeg_pace is not None and not self._jpeg_pace.due(mono_ns):
-            jpeg = False
+        thinned = self.profile.jpeg_rate_hz is not None
+        jpeg = jpeg and self._jpeg_pace.due(mono_ns)
         if not (raw or jpeg or fitted):
             return
         image = Image(rgb)
@@ -176,7 +175,7 @@ class CameraPublisher:
                 encoding=zenoh.Encoding.IMAGE_JPEG,
             )
         for form in fitted:
-            self.forms.put(form, image, stamp_wall_ns)
+            self.forms.publish(form, image, stamp_wall_ns)
         self._seq += 1
         with self._lock:
             self._latency_ms.add((time.monotonic_ns() - mono_ns) / 1e6)

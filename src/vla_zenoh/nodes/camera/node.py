@@ -129,7 +129,7 @@ class CameraNode:
             worker = last(str(arrival.sample.key_expr))
             with self._voice:
                 stamped = self.node.read(ModelSpec, arrival)
-                if stamped is not None and not self._asked.hear(worker, stamped.record, now_s):
+                if stamped is not None and not self._asked.add(worker, stamped.record, now_s):
                     why = f"specs of {MAX_MODELS} workers are known; that of {worker!r} is not read"
                     self.node.refuse("too_many_models", why)
         if now_s - self._sized_s < SIZES_PERIOD_S:
