@@ -14,13 +14,11 @@ from chain import command_line
 from peer_rig import KINDS, free_port, reachable
 
 from vla_zenoh import resources
-from vla_zenoh.control import chunk_plausibility as plausible
-from vla_zenoh.control import spec_fit as fit
-from vla_zenoh.control.finding import MEANINGS
-from vla_zenoh.lab.check.examine import Examination
-from vla_zenoh.lab.check.examples import chart, looks
-from vla_zenoh.lab.check.own_process import CheckBench
-from vla_zenoh.lab.check.report import Report
+from vla_zenoh.control import policy_check
+from vla_zenoh.lab.check.examination import Examination
+from vla_zenoh.lab.check.examples import chart, example_styles
+from vla_zenoh.lab.check.model_runner import ModelRunner
+from vla_zenoh.lab.check.report import MEANINGS, CheckReport
 from vla_zenoh.policy import (
     ActionSpec,
     CameraSpec,
@@ -70,18 +68,18 @@ WARNINGS = {
 NEEDS_A_PROFILE = ("camera", "size")
 
 
-def examined(fault: str, *, against: str | None = None, **more: Any) -> Report:
+def examined(fault: str, *, against: str | None = None, **more: Any) -> CheckReport:
     return Examination(
         make_policy(find_model(str(BROKEN)), {"fault": fault}),
         "broken",
-        CheckBench(more.pop("patience_s", PATIENCE_S)),
+        ModelRunner(more.pop("patience_s", PATIENCE_S)),
         profile=load_profile(against) if against else None,
         runs=RUNS,
         **more,
     ).run()
 
 
-def names(report: Report, *levels: str) -> set[str]:
+def names(report: CheckReport, *levels: str) -> set[str]:
     return {finding.name for finding in report.findings if finding.level in levels}
 
 
@@ -112,7 +110,7 @@ def test_a_worker_too_slow_for_the_command_node_is_told_so_before_its_patience_e
     assert names(report, "note") == {"cut_short"}
 
 
-class SlowToLoad(CheckBench):
+class SlowToLoad(ModelRunner):
     """As if the first thing that is asked of a model, to load, had taken a minute."""
 
     asked = 0
@@ -158,7 +156,7 @@ def test_inference_longer_than_a_period_is_named(asked_hz: float) -> None:
     report = Examination(
         make_policy(find_model("scripted"), {"delay_ms": "100", "dt_s": "1"}),
         "scripted",
-        CheckBench(PATIENCE_S),
+        ModelRunner(PATIENCE_S),
         rate_hz=asked_hz,
         runs=3,
     ).run()
@@ -181,11 +179,11 @@ def test_every_shipped_worker_is_checked() -> None:
     assert here | IN_ENVIRONMENTS_OF_THEIR_OWN == set(resources.names("models"))
 
 
-def passes(model: str, **options: str) -> Report:
+def passes(model: str, **options: str) -> CheckReport:
     report = Examination(
         make_policy(find_model(model), options),
         model,
-        CheckBench(PATIENCE_S),
+        ModelRunner(PATIENCE_S),
         profile=load_profile("panda_sim"),
         runs=RUNS,
     ).run()
@@ -224,7 +222,7 @@ def test_an_adapter_keeps_its_contract_with_its_server(name: str) -> None:
 def test_an_adapter_without_its_server_is_said_to_fail_at_loading_or_inference() -> None:
     settings = KINDS["openpi"].settings(free_port())
     report = Examination(
-        make_policy(find_model("openpi"), settings), "openpi", CheckBench(PATIENCE_S), runs=3
+        make_policy(find_model("openpi"), settings), "openpi", ModelRunner(PATIENCE_S), runs=3
     ).run()
     assert names(report, "error") <= {"load_failed", "inference_failed"}
     assert not report.ok
@@ -288,12 +286,12 @@ def test_what_does_not_fit_a_profile_is_named(
     declared: ModelSpec, changes: dict[str, Any], wanted: set[tuple[str, str]]
 ) -> None:
     profile = override(load_profile("panda_sim"), {"workers": ["scripted", "m"], **changes})
-    found = fit.findings(profile, declared, worker="m")
+    found = policy_check.check_spec(profile, declared, worker="m")
     assert {finding[:2] for finding in found} == wanted
 
 
 def test_a_worker_that_the_profile_does_not_run_is_noted() -> None:
-    found = fit.findings(load_profile("panda_sim"), spec(FRONT), worker="m")
+    found = policy_check.check_spec(load_profile("panda_sim"), spec(FRONT), worker="m")
     assert [finding[:2] for finding in found] == [("note", "not_listed")]
 
 
@@ -305,7 +303,7 @@ DOWN_XYZW = [1.0, 0.0, 0.0, 0.0]
 
 def found_in(action: ActionSpec, row: list[float]) -> set[tuple[str, str]]:
     steps = check_steps(action, [row])
-    return {f[:2] for f in plausible.findings(action, steps, Limits(), MAX_WIDTH_M)}
+    return {f[:2] for f in policy_check.check_chunk(action, steps, Limits(), MAX_WIDTH_M)}
 
 
 @pytest.mark.parametrize(
@@ -364,7 +362,7 @@ def test_the_chart_differs_from_all_its_mirror_images_and_channel_orders() -> No
     others = [picture[::-1], picture[:, ::-1], picture[::-1, ::-1], picture[..., ::-1]]
     for other in others:
         assert np.abs(picture.astype(int) - other).mean() > 10
-    assert looks()[0].picture is chart
+    assert example_styles()[0].picture is chart
 
 
 # -- the command ----------------------------------------------------------------------------------
