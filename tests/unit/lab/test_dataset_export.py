@@ -16,10 +16,10 @@ from dataset_rig import write_run as make_run
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import episodes_of, fps_of, hold
+from vla_zenoh.lab.dataset.feature_statistics import Colours, of_numbers
 from vla_zenoh.lab.dataset.features import action_names
 from vla_zenoh.lab.dataset.lerobot import export
 from vla_zenoh.lab.dataset.openvla import openvla_statistics
-from vla_zenoh.lab.dataset.statistics import Colours, of_numbers
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.policy.state_vector import read_parts
 from vla_zenoh.types import JointState
@@ -164,7 +164,7 @@ def test_figures_of_pictures_are_those_of_their_pixels() -> None:
     colours, seen = Colours(), []
     for _ in range(3):
         rgb = random.integers(0, 256, (40, 40, 3), np.uint8)
-        colours.see(rgb)
+        colours.add(rgb)
         seen.append(rgb[::4, ::4].reshape(-1, 3) / 255)
     found, wanted = colours.statistics(), of_numbers(np.concatenate(seen))
     assert found["count"] == [3]

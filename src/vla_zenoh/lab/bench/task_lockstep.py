@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import encode_jpeg
-from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError
 from vla_zenoh.lab.bench.task import (
     ARM_LOST,
@@ -32,11 +32,9 @@ from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_of
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile
-from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.runtime.process import die_with_parent
-from vla_zenoh.simulation.backend import AUTO, choose_backend
-from vla_zenoh.simulation.render import Renderer
-from vla_zenoh.simulation.world import World
+from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
+from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses
 
 CAMERA_S, WIRE_S = 0.015, 0.0005
@@ -115,7 +113,7 @@ class _LockstepStage:
             self.policy,
             delays=Delays(self.plan.delay_ms / 1e3, camera_s=CAMERA_S, wire_s=WIRE_S),
             picture=lambda camera: _LazyImage(self, camera),  # pyright: ignore
-            reach=make_shadow(self.profile),
+            reach=make_reachability_filter(self.profile),
             seed=seed,
         )
         if self.plan.rate_hz is not None:

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import MissingExtraError, RecordingError
-from vla_zenoh.lab.dataset import statistics
+from vla_zenoh.lab.dataset import feature_statistics
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode, fps_of
+from vla_zenoh.lab.dataset.feature_statistics import Colours
 from vla_zenoh.lab.dataset.features import (
     ACTION,
     PICTURE,
@@ -30,15 +31,13 @@ from vla_zenoh.lab.dataset.features import (
     state_names,
     states_of,
 )
-from vla_zenoh.lab.dataset.pictures import (
-    CODEC,
-    PIXELS,
+from vla_zenoh.lab.dataset.videos import (
     EpisodeVideo,
     chosen,
     stamps_of,
     write_videos,
 )
-from vla_zenoh.lab.dataset.statistics import Colours
+from vla_zenoh.lab.video import CODEC, PIXEL_FORMAT
 
 VERSION = "v3.0"
 FILES_IN_A_CHUNK = 1000
@@ -173,7 +172,7 @@ class _Dataset:
                 for at in mine
             ]
             out.update(zip(mine, write_videos(run, camera, wanted, self._fps), strict=True))
-        sizes = {video.size for video in out.values()}
+        sizes = {video.video.size for video in out.values()}
         if len(sizes) > 1:
             raise RecordingError(f"camera {camera!r} has pictures of {len(sizes)} sizes: {sizes}")
         return [out[at] for at in range(len(self._episodes))]
@@ -259,7 +258,7 @@ class _Dataset:
                 "worker": episode.worker,
                 "run": episode.run.path.name,
             }
-            found = {name: statistics.of_numbers(values) for name, values in mine.items()}
+            found = {name: feature_statistics.of_numbers(values) for name, values in mine.items()}
             chunk, file = divmod(number, FILES_IN_A_CHUNK)
             for camera, of_episodes in videos.items():
                 name = PICTURE + camera
@@ -282,7 +281,7 @@ class _Dataset:
         self, rows: list[dict[str, NDArray[Any]]], videos: dict[str, list[EpisodeVideo]]
     ) -> None:
         stats = {
-            name: statistics.of_numbers(np.concatenate([each[name] for each in rows]))
+            name: feature_statistics.of_numbers(np.concatenate([each[name] for each in rows]))
             for name in rows[0]
         }
         for camera, of_episodes in videos.items():
@@ -325,7 +324,7 @@ class _Dataset:
     def _features(self, videos: dict[str, list[EpisodeVideo]]) -> dict[str, Any]:
         out: dict[str, Any] = {}
         for camera, of_episodes in videos.items():
-            height, width = of_episodes[0].size
+            height, width = of_episodes[0].video.size
             out[PICTURE + camera] = {
                 "dtype": "video",
                 "shape": [height, width, 3],
@@ -334,7 +333,7 @@ class _Dataset:
                     "video.height": height,
                     "video.width": width,
                     "video.codec": CODEC.replace("libx264", "h264"),
-                    "video.pix_fmt": PIXELS,
+                    "video.pix_fmt": PIXEL_FORMAT,
                     "video.fps": self._fps,
                     "video.channels": 3,
                     "is_depth_map": False,

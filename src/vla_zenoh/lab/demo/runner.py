@@ -202,12 +202,12 @@ class DemoRunner(EpisodeRunner):
         # Decoding may lag behind on a busy computer: samples received before now do not count.
         until_ns = time.time_ns() + REST_WINDOW_NS
         self.wait(
-            lambda: min(streams.poses[-1].heard_ns, streams.grippers[-1].heard_ns) > until_ns,
+            lambda: min(streams.poses[-1].received_ns, streams.grippers[-1].received_ns) > until_ns,
             SLACK_S,
             "the robot's states are silent",
         )
-        since_ns = streams.poses[-1].heard_ns - REST_WINDOW_NS
-        poses = [entry.record for entry in streams.poses[-200:] if entry.heard_ns >= since_ns]
+        since_ns = streams.poses[-1].received_ns - REST_WINDOW_NS
+        poses = [entry.record for entry in streams.poses[-200:] if entry.received_ns >= since_ns]
         position = np.mean([pose.position_m for pose in poses], axis=0)
         first = rotation_from_quat(poses[0].quat_xyzw)
         turns = [log3(rotation_from_quat(pose.quat_xyzw) @ first.T) for pose in poses]
