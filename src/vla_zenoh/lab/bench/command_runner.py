@@ -59,7 +59,7 @@ def measure_command(
         listener = StreamListener(host.session, profile.keys, profile.task.worker)
         run = DemoRunner(client, listener, stop, watch, lambda *_: None)
         run.wait_until_ready()
-        run.activate(RATE_HZ)
+        run.start("hold", RATE_HZ)
         listener.close()  # what it hears costs time that is not the command node's
         client.set_prompt(PROMPT)
         if stop.wait(STATUS_S):
