@@ -9,7 +9,7 @@ import zenoh
 from vla_zenoh.bus.payload_limits import bytes_of
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
-from vla_zenoh.keys import Keys, last
+from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.lab.compare.agreement import ArmStateHistory
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
 from vla_zenoh.policy import ModelSpec
@@ -52,8 +52,8 @@ class CompareListener:
             if not isinstance(record, ActionChunk):
                 self.standing.add(sample.header.stamp_wall_ns, record)
             # A worker that restarted may have another spec, which gives its steps another meaning.
-            elif record.spec_hash == self.specs[last(sample.key)].hash:
-                self.chunks[last(sample.key)].append(record)
+            elif record.spec_hash == self.specs[last_chunk(sample.key)].hash:
+                self.chunks[last_chunk(sample.key)].append(record)
 
     def close(self) -> None:
         """Stop receiving."""

@@ -71,9 +71,9 @@ def recorded_keys(keys: Keys, given: Sequence[str] = (), *, raw: bool = False) -
             but raw pictures, which are 1 MB each.
         raw: raw pictures too.
     """
-    found = dict.fromkeys(map(keys.whole, given)) or dict.fromkeys(keys.without_raw_pictures)
+    found = dict.fromkeys(map(keys.full, given)) or dict.fromkeys(keys.without_raw_images)
     if raw:
-        found[keys.all_raw_pictures] = None
+        found[keys.all_raw_images] = None
     # What two expressions mean would be heard, and recorded, twice.
     return tuple(
         each for each in found if not any(covers(other, each) for other in found if other != each)
@@ -207,7 +207,7 @@ class Recorder:
         self.recorded.failure = why
         self._queue.reject_all()
         self._writer.abandon()
-        self.node.tell(Event("error", "fault", "recording_failed", why[:1000]))
+        self.node.emit(Event("error", "fault", "recording_failed", why[:1000]))
 
     def _measure(self) -> None:
         self.recorded.seconds = time.monotonic() - self._began_s
@@ -219,7 +219,7 @@ class Recorder:
         recorded = self.recorded
         dropped = recorded.dropped.total()
         if dropped > self.node.counters["dropped"]:
-            self.node.tell(
+            self.node.emit(
                 Event(
                     "error",
                     "fault",
@@ -232,7 +232,7 @@ class Recorder:
         self.node.counters["dropped"] = dropped
         for reason, count in self._queue.rejected.items():
             self.node.counters[f"refused.{reason}"] = count
-        self.node.report(
+        self.node.publish_status(
             state,
             detail={
                 "file": str(recorded.path),

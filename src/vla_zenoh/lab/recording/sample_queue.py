@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import zenoh
 
 from vla_zenoh.bus.clock import Clock
-from vla_zenoh.bus.payload_limits import whole
+from vla_zenoh.bus.payload_limits import payload_and_attachment
 from vla_zenoh.errors import CodecError, RecordingError
 from vla_zenoh.lab.recording.sample import Sample, received_sample
 
@@ -61,7 +61,7 @@ class SampleQueue:
         """Add a sample from Zenoh, also from the reply to a query."""
         key = str(sample.key_expr)
         try:
-            payload, attachment = whole(sample, self._max_bytes)
+            payload, attachment = payload_and_attachment(sample, self._max_bytes)
         except CodecError as error:  # copying an oversized one costs as much as keeping it
             with self._lock:
                 if error.reason == "oversize":

@@ -11,7 +11,7 @@ import rerun as rr
 
 from vla_zenoh.codec import records, settings
 from vla_zenoh.errors import CodecError, RecordError
-from vla_zenoh.keys import Keys, last
+from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.lab.recording.record_types import RecordTypes
 from vla_zenoh.lab.recording.sample import JPEG, Sample
 from vla_zenoh.lab.view import paths
@@ -27,6 +27,7 @@ from vla_zenoh.types import (
     Event,
     GripperCommand,
     GripperState,
+    InferenceDebug,
     JointCommand,
     JointState,
     NodeStatus,
@@ -34,7 +35,6 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
     SceneState,
-    Seen,
     Task,
 )
 
@@ -105,7 +105,7 @@ class RerunLogger:
             Task: self._on_task,
             NodeStatus: self._status,
             Event: self._event,
-            Seen: self._on_seen,
+            InferenceDebug: self._on_seen,
         }
         self._often = (PoseState, JointState, GripperState, ObjectPoses)
 
@@ -238,7 +238,7 @@ class RerunLogger:
         if not obeyed:
             self._charts.shadow(chunk)
 
-    def _on_seen(self, _: Sample, stamp_ns: int, seen: Seen) -> None:
+    def _on_seen(self, _: Sample, stamp_ns: int, seen: InferenceDebug) -> None:
         if seen.worker not in self._seen:
             self._seen[seen.worker] = set()
             self._layout()
@@ -257,4 +257,4 @@ class RerunLogger:
         self._words.now(stamp_ns, self.refused, self.dropped)
 
     def _event(self, sample: Sample, stamp_ns: int, event: Event) -> None:
-        self._words.event(last(sample.key), stamp_ns, event)
+        self._words.event(last_chunk(sample.key), stamp_ns, event)
