@@ -6,7 +6,7 @@ import time
 
 import zenoh
 
-from vla_zenoh.bus.payload_limits import bytes_of
+from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Keys, last_chunk

@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError
 from vla_zenoh.types import Header
@@ -50,7 +49,7 @@ class Sample:
     @property
     def attached(self) -> bytes | None:
         """The attachment to publish the sample with."""
-        return self.attachment if self.header is None else header_codec.encode(self.header)
+        return self.attachment if self.header is None else records.encode_header(self.header)
 
     @property
     def text(self) -> str:
@@ -75,5 +74,5 @@ def received_sample(
     header = None
     if attachment is not None:
         with suppress(CodecError):
-            header, attachment = header_codec.decode(attachment), None
+            header, attachment = records.decode_header(attachment), None
     return Sample(key, payload, encoding, header, received_ns, attachment)

@@ -8,8 +8,8 @@ from collections.abc import Iterable
 
 import zenoh
 
+from vla_zenoh.bus.buffers import payload_and_attachment
 from vla_zenoh.bus.clock import Clock
-from vla_zenoh.bus.payload_limits import payload_and_attachment
 from vla_zenoh.errors import CodecError, RecordingError
 from vla_zenoh.lab.recording.sample import Sample, received_sample
 
