@@ -105,7 +105,7 @@ class EpisodeRunner:
         client, before = self.client, self._resets()
         give_up_s = time.monotonic() + RESET_PATIENCE_S
         while self._resets() == before:
-            client.put(client.keys.sim_reset, "" if seed is None else str(seed))
+            client.publish(client.keys.sim_reset, "" if seed is None else str(seed))
             client.wait_for(lambda: self._resets() > before, RESET_PERIOD_S)
             if time.monotonic() > give_up_s:
                 raise NodeError(
@@ -127,7 +127,7 @@ class EpisodeRunner:
                 self.client.set_prompt(prompt)
                 return self.activate()
             except SessionError:
-                if time.monotonic() > give_up_s or self.client.latched():
+                if time.monotonic() > give_up_s or self.client.latch_reason():
                     raise
                 self.pause(ACTIVATE_PERIOD_S)
 
@@ -141,14 +141,14 @@ class EpisodeRunner:
             SessionError: it was rejected, with every reason.
         """
         client = self.client
-        client.take_events()
+        client.pop_events()
         self._task, self._holds, self._deactivated = None, 0, False
-        self._task = client.activate_while_here(holder) if holder else client.activate()
+        self._task = client.activate_with_deadman(holder) if holder else client.activate()
         return self._task
 
     def view(self) -> EpisodeView:
         """State of the episode that was activated last."""
-        for node, _, event in self.client.take_events():
+        for node, _, event in self.client.pop_events():
             if node == COMMAND and event.kind == "transition":
                 if event.what == "active->holding":
                     self._holds += event.count

@@ -349,7 +349,7 @@ def test_files_that_are_not_as_they_were_written_are_refused_by_line(tmp_path: P
         with pytest.raises(RecordingError, match=why):
             trial.episodes()
     (tmp_path / PLAN).unlink()
-    with pytest.raises(RecordingError, match=r"plan.json, which says what it is about, is not"):
+    with pytest.raises(RecordingError, match=r"exists without its plan.json"):
         trial.plan()
     (tmp_path / PLAN).write_text(json.dumps({**asdict(PLAN_AB), "seconds": -1}))
     with pytest.raises(RecordingError, match="allowed: more than 0"):

@@ -53,7 +53,7 @@ def measure_command(
         client = host.client
 
         def watch() -> None:
-            if not host.supervisor.watch():
+            if not host.supervisor.poll():
                 raise NodeError("a node dies again and again")
 
         listener = StreamListener(host.session, profile.keys, profile.task.worker)

@@ -60,7 +60,7 @@ def run_in_real_time(
                 host.client,
                 listener,
                 stop,
-                host.watch,
+                host.poll,
                 lambda _, done, trial=trial, each=each: progress(trial, each, done),
             )
             run.wait_until_ready()

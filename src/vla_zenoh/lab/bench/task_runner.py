@@ -47,7 +47,7 @@ class TaskRunner:
     ) -> None:
         assert host.session is not None and host.client is not None
         self._plan, self._client, session = plan, host.client, host.session
-        self._runner = EpisodeRunner(host.client, stop, host.watch)
+        self._runner = EpisodeRunner(host.client, stop, host.poll)
         keys = host.profile.keys
         self._slots: dict[type[Any], TaskSlot] = {
             kind: TaskSlot() for kind in (ObjectPoses, GripperState, PoseState)
@@ -151,7 +151,7 @@ class TaskRunner:
         Raises:
             NodeError: there was one.
         """
-        latched, why = self._client.latched(), self._why_inactive()
+        latched, why = self._client.latch_reason(), self._why_inactive()
         if latched or why == DEACTIVATED:
             raise NodeError(f"another client ended the episode: {latched or why}")
 

@@ -205,7 +205,7 @@ class TrialRunner:
         end_s = time.monotonic() + self._plan.seconds + GRACE_S
         while not over.wait(POLL_S):
             if self._stop.is_set() or time.monotonic() > end_s:
-                self._client.put(self._client.keys.active, "false")
+                self._client.publish(self._client.keys.active, "false")
                 return
 
     def _follow(self, episode: EpisodeFsm) -> None:
@@ -284,7 +284,7 @@ class TrialRunner:
 
     # -- start pose ---------------------------------------------------------------------------
     def _tcp_m(self) -> tuple[float, float, float] | None:
-        arrival = self._pose.take()
+        arrival = self._pose.pop()
         if arrival is not None:
             with suppress(CodecError):
                 pose = records.decode(PoseState, bytes_of(arrival.sample.payload))
