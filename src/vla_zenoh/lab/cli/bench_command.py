@@ -37,7 +37,7 @@ def command(
 
     The real chain is started once for every rate.
     """
-    from vla_zenoh.cli.free_endpoint import own_address
+    from vla_zenoh.cli.addresses import own_address
     from vla_zenoh.lab.bench.command_runner import measure_command
     from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
 

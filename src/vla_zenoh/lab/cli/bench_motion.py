@@ -119,7 +119,7 @@ def _real_time(
     rows: Rows,
     out: Path | None,
 ) -> None:
-    from vla_zenoh.cli.free_endpoint import own_address
+    from vla_zenoh.cli.addresses import own_address
     from vla_zenoh.lab.demo.runner import Interrupted
     from vla_zenoh.runtime.process import die_with_parent
 

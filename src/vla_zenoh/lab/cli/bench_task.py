@@ -248,7 +248,7 @@ def _real_time(
     out: Path | None,
     advance: Callable[[TaskScore], None],
 ) -> None:
-    from vla_zenoh.cli.free_endpoint import own_address
+    from vla_zenoh.cli.addresses import own_address
     from vla_zenoh.lab.bench.task_runner import TaskRun
     from vla_zenoh.lab.demo.runner import Interrupted
     from vla_zenoh.runtime.launch import Host

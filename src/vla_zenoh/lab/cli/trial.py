@@ -13,14 +13,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from vla_zenoh.cli.options import (
-    DEFAULT_PROFILE,
-    ConnectOption,
-    HostOption,
-    JsonOption,
-    ProfileOption,
-    RobotOption,
-)
+from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, print_json, printable
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.lab.trial.folder import TrialFolder
