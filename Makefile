@@ -46,7 +46,7 @@ fuzz-motion: $(READY) ## Fuzz command node and guard with a perfect arm; MINUTES
 	$(BIN)/python tests/fuzz_motion/fuzz_motion.py --minutes $(MINUTES) $(ARGS)
 
 soak: $(READY) ## Run the whole chain with random faults; MINUTES=3 for a short one
-	$(BIN)/python tests/soak/soak.py --minutes $(MINUTES) $(ARGS)
+	$(BIN)/python reliability/soak/soak.py --minutes $(MINUTES) $(ARGS)
 
 test-ros2: $(READY) ros2-bridge ## Run the tests with a real ROS 2 bridge and a DDS robot
 	$(BIN)/python -m pytest $(AGAIN) -m ros2 $(ARGS)
@@ -66,8 +66,8 @@ format: $(READY) ## Let ruff put files into shape
 bench: $(READY) ## Measure camera to command on this machine
 	$(BIN)/python -m benchmarks chain $(ARGS)
 
-bench-faults: $(READY) ## Faults of a lab network on an arm in motion (root), table into docs/reliability.md
-	$(BIN)/python tests/netns/bench_faults.py $(ARGS)
+bench-faults: $(READY) ## Faults of a lab network on an arm in motion (root), table into docs/explanation/reliability.md
+	$(BIN)/python reliability/netns/bench_faults.py $(ARGS)
 
 bench-ros2: $(READY) ros2-bridge ## Measure a picture's way to a pose through ROS 2
 	$(BIN)/python tests/ros2/bench.py $(ARGS)

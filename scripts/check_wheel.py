@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import zipfile
 from pathlib import Path
 
 from bootstrap import CONSTRAINTS, ROOT, bring_openmp, uv_environment
@@ -15,6 +16,9 @@ from bootstrap import CONSTRAINTS, ROOT, bring_openmp, uv_environment
 DIST = ROOT / "dist"
 UV = Path(sys.executable).parent / "uv"
 LIMIT_S = 300
+
+LEFT_OUT = ("training/", ".safetensors", "benchmarks/", "tests/", "openvla/measure.py")
+"""Of the wheel."""
 
 TRIALS = [
     ["--help"],
@@ -73,6 +77,11 @@ def main() -> None:
     # The wheel is made from the sdist, so a file missing there is missed here.
     run(UV, "--quiet", "build", "--out-dir", DIST, ROOT)
     wheel, sdist = only("*.whl"), only("*.tar.gz")
+    with zipfile.ZipFile(wheel) as archive:
+        surplus = [n for n in archive.namelist() if any(part in n for part in LEFT_OUT)]
+    if surplus:
+        sys.exit(f"build: the wheel has what nobody needs there: {', '.join(surplus)}")
+    print(f"build: {wheel.name} has {wheel.stat().st_size / 1e6:.2f} MB")
     if options.only_build:
         return
     try_out(wheel, "all")

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import itertools
-import random
 import time
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
 from chain import Chain, Recorder
+from junk import OBEYED, OTHERS, SETTINGS, STRANGER, STREAMS, all_junk, all_keys, samples_of
 
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import message, records
-from vla_zenoh.keys import SCHEMA, Keys
-from vla_zenoh.security.roles import key_members
-from vla_zenoh.types import Event, GripperCommand, GripperState, Header, JointCommand, Task
+from vla_zenoh.types import GripperState, Header
 
 SHORT_S, LONG_S = 8.0, 30.0
 PAUSE_S = 0.001
 """Between two puts: a thousand a second, were they for nothing."""
-HUGE = bytes(2_000_000)
 FLOOD_HZ, FLOOD_S = 5000, 3.0
 FLOOD_SHARE = 0.6
 """Of those puts a busy machine must manage, or the flood is none."""
@@ -36,182 +33,11 @@ BOX_TOLERANCE_M = 0.003
 BRAKE_S = 0.5
 OPEN_M = 0.075
 """Nobody asked the gripper to close, but strangers."""
-STRANGER = "stranger#00000000"
-STREAMS = (
-    "state_joint",
-    "state_pose",
-    "state_gripper",
-    "task",
-    "delta",
-    "spec",
-    "command_pose",
-    "command_joint",
-    "command_gripper",
-    "status",
-    "event",
-    "sim_scene",
-    "sim_objects",
-)
-SETTINGS = ("prompt", "active", "worker", "rate", "speed", "slower", "reset", "sim_reset")
-OTHERS = (
-    "camera_raw",
-    "camera_jpeg",
-    "camera_fitted",
-    "seen",
-    "seen_record",
-    "alive",
-    "holding",
-    "clock",
-    "sim_step",
-)
-OBEYED = ("stop",)
-"""Whatever is put there stops the arm; it is tried at the end."""
-SELDOM = {
-    "command_gripper": GripperCommand(0.0, 0.1, 10.0),
-    "command_joint": JointCommand(("a", "b"), np.ones(2), np.zeros(2), np.zeros(2), "active"),
-    "event": Event("info", "notice", "nothing", "happened"),
-    "task": Task(1 << 60, True, "HARD: yaw left", "scripted", 100.0),
-}
-"""Not written all the time: true but for their writer."""
-NAMES = {
-    "camera": "front",
-    "form": "224x224-pad",
-    "worker": "scripted",
-    "node": "command",
-    "holder": "anna",
-}
-
-
-class Junk(NamedTuple):
-    """A put: on which key, what."""
-
-    kind: str
-    key: str
-    payload: bytes
-    attachment: bytes | None
-
-
-def all_keys(keys: Keys) -> dict[str, str]:
-    """Every key of the table by its name there, with names of parts that exist."""
-    out: dict[str, str] = {}
-    for name, parameters in key_members().items():
-        member = getattr(keys, name)
-        out[name] = member(*(NAMES[part] for part in parameters)) if parameters else member
-    return out
 
 
 def test_every_key_of_the_table_is_tried(shared_chain: Chain) -> None:
     known = {*STREAMS, *SETTINGS, *OTHERS, *OBEYED}
     assert set(all_keys(shared_chain.profile.keys)) == known
-
-
-def samples_of(chain: Chain, seconds: float = 1.2) -> dict[str, tuple[bytes, bytes | None]]:
-    """The newest true sample on each stream, to make false ones of."""
-    found: dict[str, tuple[bytes, bytes | None]] = {}
-
-    def keep(sample: zenoh.Sample) -> None:
-        attachment = sample.attachment
-        found[str(sample.key_expr)] = (
-            sample.payload.to_bytes(),
-            attachment.to_bytes() if attachment is not None else None,
-        )
-
-    subscriber = chain.session.declare_subscriber(
-        chain.profile.keys.everything, zenoh.handlers.Callback(keep, indirect=False)
-    )
-    time.sleep(seconds)
-    subscriber.undeclare()
-    keys = all_keys(chain.profile.keys)
-    for name, record in SELDOM.items():
-        header = header_codec.encode(Header(time.time_ns(), 0, STRANGER))
-        found.setdefault(keys[name], (records.encode(record), header))
-    return found
-
-
-def spoil(value: Any, make: Callable[[Any], Any]) -> Any:
-    """`value` with every number in it replaced by what `make` gives."""
-    if isinstance(value, dict):
-        return {key: spoil(item, make) for key, item in value.items()}
-    if isinstance(value, list):
-        return [spoil(item, make) for item in value]
-    if isinstance(value, bool) or value is None or isinstance(value, (str, bytes)):
-        return value
-    return make(value)
-
-
-def filled(with_: float) -> Callable[[Any], Any]:
-    def make(value: Any) -> Any:
-        return np.full_like(value, with_) if isinstance(value, np.ndarray) else with_
-
-    return make
-
-
-def wrong_shape(value: Any) -> Any:
-    return np.zeros((3, 1, 5)) if isinstance(value, np.ndarray) else [value]
-
-
-def junk_for_stream(key: str, payload: bytes, attachment: bytes, seq: int) -> Iterator[Junk]:
-    true = header_codec.decode(attachment)
-    stranger = header_codec.encode(Header(time.time_ns(), seq, STRANGER))
-    old = header_codec.encode(Header(time.time_ns() - 3_600_000_000_000, seq, STRANGER))
-    forged = header_codec.encode(true)
-    fields = message.unpack(payload)
-    yield Junk("noise", key, random.randbytes(200), forged)
-    yield Junk("truncated", key, payload[: len(payload) // 2], forged)
-    yield Junk("foreign", key, payload, stranger)
-    yield Junk("old stamp", key, payload, old)
-    yield Junk("replayed", key, payload, attachment)
-    yield Junk("no header", key, payload, None)
-    yield Junk("noise for a header", key, payload, random.randbytes(40))
-    schema = message.unpack(attachment) | {"schema": SCHEMA + 1}
-    yield Junk("schema", key, payload, message.pack(schema))
-    for what, make in (
-        ("nan", filled(np.nan)),
-        ("1e9", filled(1e9)),
-        ("wrong shape", wrong_shape),
-    ):
-        yield Junk(what, key, message.pack(spoil(fields, make)), forged)
-        yield Junk(f"foreign {what}", key, message.pack(spoil(fields, make)), stranger)
-    if "spec_hash" in fields:
-        yield Junk("spec hash", key, message.pack(fields | {"spec_hash": "0" * 16}), stranger)
-    yield Junk("huge", key, HUGE, forged)
-    yield Junk("empty", key, b"", forged)
-
-
-def junk_for_setting(name: str, key: str) -> Iterator[Junk]:
-    # What can be read is obeyed, by whomever it was put: these cannot.
-    yield Junk("noise", key, b"\xff\xfe" + random.randbytes(50), None)
-    yield Junk("control characters", key, b"\x00\x9b\x1b[2J", None)
-    yield Junk("huge", key, HUGE, None)
-    if name != "prompt":
-        yield Junk("nan", key, b"nan/nan", None)
-        yield Junk("1e9", key, b"-1e9 x", None)
-        yield Junk("empty", key, b"", None)
-
-
-def junk_for_other(key: str, sample: tuple[bytes, bytes | None] | None) -> Iterator[Junk]:
-    header = header_codec.encode(Header(time.time_ns(), 1, STRANGER))
-    yield Junk("noise", key, random.randbytes(200), header)
-    yield Junk("huge", key, HUGE, header)
-    yield Junk("empty", key, b"", header)
-    yield Junk("no header", key, random.randbytes(57_600), None)
-    if sample is not None:
-        yield Junk("replayed", key, *sample)
-        yield Junk("foreign", key, sample[0], header)
-
-
-def all_junk(chain: Chain, samples: dict[str, tuple[bytes, bytes | None]]) -> Iterator[Junk]:
-    """Without end, over all keys again and again."""
-    keys = all_keys(chain.profile.keys)
-    for seq in itertools.count():
-        for name in STREAMS:
-            payload, attachment = samples[keys[name]]
-            assert attachment is not None
-            yield from junk_for_stream(keys[name], payload, attachment, seq)
-        for name in SETTINGS:
-            yield from junk_for_setting(name, keys[name])
-        for name in OTHERS:
-            yield from junk_for_other(keys[name], samples.get(keys[name]))
 
 
 def assert_within_limits(chain: Chain, recorder: Recorder) -> None:

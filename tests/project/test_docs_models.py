@@ -1,4 +1,4 @@
-"""docs/models.md tells what works: its model and its adapter are taken out of the text and run."""
+"""The model and the adapter of docs/how-to/models.md run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from vla_zenoh.profile.fit import workers_of
 from vla_zenoh.robots.sim.node import build_world
 
 ROOT = Path(__file__).parents[2]
-TEXT = (ROOT / "docs" / "models.md").read_text("utf-8")
+TEXT = (ROOT / "docs" / "how-to" / "models.md").read_text("utf-8")
 LINES = 10
 STEP_M, SECONDS, RATE_HZ = 0.01, 1.0, 10.0
 WAY_M = STEP_M * RATE_HZ * SECONDS

@@ -1,4 +1,4 @@
-"""docs/robots.md: the profile of its text is right, and its arm can do what the text says of it."""
+"""The profile of docs/how-to/robots.md is valid, and its arm can do what the text says."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.resources import robot_urdf
 from vla_zenoh.types import JointCommand
 
-TEXT = (Path(__file__).parents[2] / "docs" / "robots.md").read_text("utf-8")
+TEXT = (Path(__file__).parents[2] / "docs" / "how-to" / "robots.md").read_text("utf-8")
 HOME_M = (0.49, 0.11, 0.43)
 TEXT_M = 0.005
 """The text rounds to centimetres."""

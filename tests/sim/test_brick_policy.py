@@ -20,12 +20,12 @@ from vla_zenoh.lab.tasks import (
     HELD_OUT,
     NONSENSE,
     TRAINING,
-    Judge,
     Order,
     TaskEpisode,
+    TaskJudge,
     Verdict,
     draw_episode,
-    say,
+    phrase,
 )
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, example_observation
 from vla_zenoh.policy.loader import find_model, make_policy
@@ -88,7 +88,7 @@ def carry_out(stage: Stage, episode: TaskEpisode, limit_s: float = LIMIT_S) -> V
     loop.put("active", True)
     loop.run(0.02)
     assert loop.commander.state.value == "active", loop.commander.why
-    judge = Judge(episode.order, stage.objects(), stage.world.tcp()[0])
+    judge = TaskJudge(episode.order, stage.objects(), stage.world.tcp()[0])
     begin_ns = loop.now_ns
     while (time_s := (loop.now_ns - begin_ns) / 1e9) < limit_s:
         loop.run(0.1)
@@ -162,7 +162,7 @@ def test_every_wording_is_understood(policy: Policy, wordings: dict) -> None:
         sentence
         for family, order in orders.items()
         for choice in range(len(wordings[family]))
-        if not understood(policy, sentence := say(order, choice, held_out=wordings is HELD_OUT))
+        if not understood(policy, sentence := phrase(order, choice, held_out=wordings is HELD_OUT))
     ]
     assert missed == []
 
@@ -180,7 +180,7 @@ def test_odd_prompts_make_it_stay(policy: Policy, prompt: str) -> None:
 def test_worker_and_teacher_remember_the_same_of_a_hand(
     policy: Policy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.syspath_prepend(str(FOLDER / "training"))
     monkeypatch.delitem(sys.modules, "expert", raising=False)
     from expert import Hand  # pyright: ignore[reportMissingImports]
 
@@ -221,12 +221,11 @@ def test_a_push_that_was_made_is_forgotten_with_another_prompt(policy: Policy) -
 
 def test_the_weights_are_small_and_are_those_of_the_manifest() -> None:
     manifest = json.loads((FOLDER / "weights.json").read_text())
-    files = [FOLDER / name for name in manifest["sha256"]]
+    files = {FOLDER / name: sha256 for name, sha256 in manifest["sha256"].items()}
     assert {file.suffix for file in files} == {".onnx", ".safetensors"}
     assert sum(file.stat().st_size for file in files) < MAX_WEIGHTS_BYTES
-    for file in files:
-        found = hashlib.sha256(file.read_bytes()).hexdigest()
-        assert found == manifest["sha256"][file.name]
+    for file, sha256 in files.items():
+        assert hashlib.sha256(file.read_bytes()).hexdigest() == sha256
 
 
 def test_changed_weights_are_refused_with_both_sums(tmp_path: Path) -> None:
@@ -249,7 +248,7 @@ def test_a_file_that_is_missing_is_named(tmp_path: Path, missing: str) -> None:
 
 
 def test_the_words_of_the_manifest_are_those_it_is_taught(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.syspath_prepend(str(FOLDER / "training"))
     for name in ("model", "expert", "states", "phrases"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     from phrases import vocabulary  # pyright: ignore[reportMissingImports]

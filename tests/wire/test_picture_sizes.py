@@ -19,8 +19,8 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.camera import node as camera_node
-from vla_zenoh.nodes.camera.fitted_streams import MAX_SIZES
 from vla_zenoh.nodes.camera import requested_sizes as asked
+from vla_zenoh.nodes.camera.fitted_streams import MAX_SIZES
 from vla_zenoh.nodes.worker.camera_subscriber import CameraInput, listen_to
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.observation import form_for, form_of

@@ -13,7 +13,7 @@ from camera_rig import free_endpoint
 from chain import command_line, running_chain
 from recording_rig import assert_same, ghost_of, recording
 
-from vla_zenoh.lab.evaluation.run_file import evaluate_run
+from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.recording.run import load_run, pictures
 
 LAB = """\
@@ -47,7 +47,7 @@ def test_a_minute_of_two_cameras_is_recorded_whole_and_replayed(tmp_path: Path) 
         thread.join()
         with recording(chain, again, ghost_of(chain)):
             done = command_line(
-                *("replay", str(first), "--as", "ghost", "--json"),
+                *("replay", str(first), "--robot", "ghost", "--json"),
                 profile=lab,
                 timeout_s=2 * LAB_S,
             )

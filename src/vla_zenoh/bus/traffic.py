@@ -1,4 +1,4 @@
-"""What a node sends and what it misses, for status and `vla-zenoh net`."""
+"""What a node sends and what it misses, for status and `vla-zenoh lab net`."""
 
 from __future__ import annotations
 

@@ -135,13 +135,15 @@ def table(newest: Mapping[str, InferenceView]) -> Table:
     out = Table(header_style="bold")
     for column in ("worker", "images", "prompt", "raw", "first step", "inference"):
         out.add_column(column, overflow="fold")
-    for name, view in sorted(newest.items()):
+    for worker, view in sorted(newest.items()):
         record = view.record
-        images = [one_line(f"{camera} {_size(jpeg)}") for camera, jpeg in sorted(view.jpegs.items())]
+        images = [
+            one_line(f"{camera} {_size(jpeg)}") for camera, jpeg in sorted(view.jpegs.items())
+        ]
         first = record.steps[0][:MAX_NUMBERS] if len(record.steps) else ()
         more = f"\n+ {len(record.steps) - 1} more" if len(record.steps) > 1 else ""
         out.add_row(
-            one_line(name),
+            one_line(worker),
             "\n".join(images[:MAX_CAMERAS]),
             one_line(record.prompt, MAX_PROMPT),
             one_line(json.dumps(record.raw) if record.raw else "", MAX_RAW),

@@ -114,7 +114,9 @@ class _LazyCommands(Mapping[str, Any]):
 
     def __init__(self, panels: Mapping[str | None, Mapping[str, str | Group]]) -> None:
         self._entries = {
-            name: (entry, panel) for panel, entries in panels.items() for name, entry in entries.items()
+            name: (entry, panel)
+            for panel, entries in panels.items()
+            for name, entry in entries.items()
         }
         self._loaded: dict[str, Any] = {}
 

@@ -85,8 +85,8 @@ def fail(message: str, code: int = 1) -> NoReturn:
 def plain_types(value: Any) -> Any:
     """`value` in types of JSON.
 
-    Records, profiles, arrays, paths, sets and numpy numbers become what they hold; NaN and infinity,
-    which JSON lacks, null.
+    Records, profiles, arrays, paths, sets and numpy numbers become what they hold; NaN and infinity
+    become null.
     """
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")

@@ -34,7 +34,7 @@ from vla_zenoh.security.store import Entry, Store
 from vla_zenoh.security.unused_certificates import stale
 
 secure_app = typer.Typer(
-    help="Certificates for a lab, so that only its hosts connect, each with the rights of its role.",
+    help="Certificates for a lab, so that only its hosts connect, with the rights of their roles.",
     no_args_is_help=True,
 )
 
@@ -45,16 +45,15 @@ AddressOption = Annotated[
     list[str] | None,
     typer.Option("--address", help="Another name or address of the router; repeatable."),
 ]
-DaysOption = Annotated[
-    int, typer.Option("--days", min=1, max=AUTHORITY_DAYS, help="Validity.")
-]
+DaysOption = Annotated[int, typer.Option("--days", min=1, max=AUTHORITY_DAYS, help="Validity.")]
 
 
 @secure_app.command("init")
 def init(
     profile: ProfileOption = DEFAULT_PROFILE,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Profile to write; default: NAME_secure.yaml.")
+        Path | None,
+        typer.Option("--output", "-o", help="File to write; default: NAME_secure.yaml."),
     ] = None,
     folder: FolderOption = None,
     lab: Annotated[str, typer.Option("--lab", help="Name of the lab, in its certificates.")] = (
@@ -123,9 +122,7 @@ def add(
     ] = None,
     address: AddressOption = None,
     days: DaysOption = CERTIFICATE_DAYS,
-    renew: Annotated[
-        bool, typer.Option("--renew", help="Replace existing ones.")
-    ] = False,
+    renew: Annotated[bool, typer.Option("--renew", help="Replace existing ones.")] = False,
 ) -> None:
     """Make the certificates of one more host, or of a person at a computer."""
     loaded = load_profile(profile)
@@ -162,7 +159,9 @@ def add(
     here, file = store.known_host(), profile_file(profile)
     routers = [name for name, part in loaded.hosts.items() if "router" in part.nodes]
     changed = [name for name in routers if new and name not in (host, here)]
-    for line in copy_commands(loaded, file, store, [name for name in (host,) if name != here], changed):
+    for line in copy_commands(
+        loaded, file, store, [name for name in (host,) if name != here], changed
+    ):
         out.print(line, soft_wrap=True)
     if here is None:
         out.print(f"Is {host} this computer? Then instead: vla-zenoh secure here {host}")
@@ -183,7 +182,9 @@ def here(
     if host not in store.hosts():
         known = ", ".join(store.hosts()) or "none"
         fail(f"{store.folder} has no certificates of {host!r}; it has those of: {known}")
-    console().print(f"this computer is {host}, noted in {store.note_this_host(host)}", soft_wrap=True)
+    console().print(
+        f"this computer is {host}, noted in {store.note_this_host(host)}", soft_wrap=True
+    )
 
 
 @secure_app.command("show")
@@ -247,8 +248,8 @@ def _print_here(host: str | None, target: RobotTarget) -> None:
         )
     else:
         out.print(
-            "Which host this computer is, is not known (--host): `vla-zenoh secure here HOST` notes "
-            "it. Until then commands here use the certificate of any operator.",
+            "This computer could be any of the hosts (--host): `vla-zenoh secure here HOST` notes "
+            "which. Until then commands here use the certificate of any operator.",
             soft_wrap=True,
         )
     out.print(f"To watch, here: {target.typed('status')}", soft_wrap=True)

@@ -137,9 +137,7 @@ class RobotTarget:
     def _others(self, client: Client, *command: str) -> str:
         others = [f"{name} (`{self.typed(*command, robot=name)}`)" for name in self.others(client)]
         if not others:
-            return (
-                "Nor is another robot visible on this router; `vla-zenoh up` starts one"
-            )
+            return "Nor is another robot visible on this router; `vla-zenoh up` starts one"
         return f"Alive on this router: {', '.join(others)}"
 
     def others(self, client: Client) -> list[str]:

@@ -37,9 +37,7 @@ def worker(
     ] = 0.0,
     robots: Annotated[
         str | None,
-        typer.Option(
-            help="Robots to serve, separated by commas; default: those of the profile."
-        ),
+        typer.Option(help="Robots to serve, separated by commas; default: those of the profile."),
     ] = None,
     host: HostOption = None,
 ) -> None:

@@ -9,7 +9,8 @@ from vla_zenoh.profile.profile import Profile
 def camera_servers(profile: Profile) -> dict[str, str]:
     """Camera -> name of the node that serves it.
 
-    A camera that no host runs is that of ``vla-zenoh camera``, started by hand under its own name.
+    A camera that no host runs is one of ``vla-zenoh node camera``, started by hand under its own
+    name.
     """
     servers = dict.fromkeys(profile.cameras, "camera")
     for host, part in profile.hosts.items():

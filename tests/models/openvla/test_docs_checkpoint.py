@@ -1,4 +1,4 @@
-"""docs/models.md has a model with weights: it is taken out of the text and run, where torch is."""
+"""The model with weights of docs/how-to/models.md runs where torch is installed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vla_zenoh.policy.loader import find_model, make_policy
 
 pytestmark = pytest.mark.models
 
-TEXT = (Path(__file__).parents[3] / "docs" / "models.md").read_text("utf-8")
+TEXT = (Path(__file__).parents[3] / "docs" / "how-to" / "models.md").read_text("utf-8")
 STEP_M, ATOL_M = 0.004, 1e-6
 
 

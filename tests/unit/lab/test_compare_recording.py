@@ -12,7 +12,7 @@ from chain import command_line
 from vla_zenoh.codec import records
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.sample import MSGPACK, Sample
-from vla_zenoh.lab.recording.writer import RunWriter
+from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.policy import ActionSpec, ModelSpec
 from vla_zenoh.types import ActionChunk, GripperState, Header, PoseState
 
@@ -29,7 +29,7 @@ def spec(name: str) -> ModelSpec:
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
     """Workers ``a`` and ``b``; b goes further along x by `BIAS_M` in two steps."""
-    out = RunWriter(
+    out = RecordingWriter(
         tmp_path / "run.mcap", KEYS, profile_yaml="about: t\n", base_frame="b", began_ns=START_NS
     )
 
@@ -57,7 +57,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 def test_their_difference_is_found(recording: Path) -> None:
-    done = command_line("compare", "a", "b", "--recording", str(recording), "--json")
+    done = command_line("lab", "compare", "a", "b", "--recording", str(recording), "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert (found["pairs"], found["only_a"], found["only_b"]) == (PAIRS, 0, 0)
@@ -66,6 +66,6 @@ def test_their_difference_is_found(recording: Path) -> None:
 
 
 def test_a_worker_that_is_not_in_it_is_named_with_those_that_are(recording: Path) -> None:
-    done = command_line("compare", "a", "ghost", "--recording", str(recording))
+    done = command_line("lab", "compare", "a", "ghost", "--recording", str(recording))
     assert done.returncode == 1
     assert "has no chunks of 'ghost'; it has: a, b" in done.stderr

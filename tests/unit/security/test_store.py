@@ -28,7 +28,7 @@ runner = CliRunner()
 
 
 @pytest.fixture(scope="module")
-def authority() -> ca.Pair:
+def authority() -> ca.KeyPair:
     return ca.make_authority("test lab", NOW)
 
 
@@ -40,7 +40,7 @@ def store(tmp_path: Path) -> Store:
 
 
 # -- certificates -----------------------------------------------------------------------------
-def test_a_certificate_says_whose_it_is_and_who_signed_it(authority: ca.Pair) -> None:
+def test_a_certificate_says_whose_it_is_and_who_signed_it(authority: ca.KeyPair) -> None:
     made = ca.issue(authority, "worker-scripted@gpu", NOW)
     found = ca.read(made.certificate)
     assert found.common_name == "worker-scripted@gpu"
@@ -49,10 +49,10 @@ def test_a_certificate_says_whose_it_is_and_who_signed_it(authority: ca.Pair) ->
     assert found.days_left(NOW) == ca.CERTIFICATE_DAYS
     assert ca.signed_by(made.certificate, authority.certificate)
     assert ca.key_fits(made)
-    assert not ca.key_fits(ca.Pair(made.certificate, authority.key))
+    assert not ca.key_fits(ca.KeyPair(made.certificate, authority.key))
 
 
-def test_another_authority_of_the_same_name_signed_something_else(authority: ca.Pair) -> None:
+def test_another_authority_of_the_same_name_signed_something_else(authority: ca.KeyPair) -> None:
     other = ca.make_authority("test lab", NOW)
     made = ca.issue(other, "operator@desk", NOW)
     assert not ca.signed_by(made.certificate, authority.certificate)
@@ -63,7 +63,7 @@ def usages(pem: bytes) -> list[x509.ObjectIdentifier]:
     return list(found.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
 
 
-def test_only_a_router_may_serve(authority: ca.Pair) -> None:
+def test_only_a_router_may_serve(authority: ca.KeyPair) -> None:
     router = ca.issue(authority, "router@robot", NOW, addresses=["10.0.0.2", "robot.lab", "::1"])
     assert ca.read(router.certificate).addresses == ("10.0.0.2", "robot.lab", "::1")
     assert ExtendedKeyUsageOID.SERVER_AUTH in usages(router.certificate)
@@ -91,7 +91,7 @@ def test_nothing_outlives_the_authority() -> None:
     ],
 )
 def test_the_end_of_a_certificate_is_told_in_time(
-    authority: ca.Pair, days: int, fault: str, warning: str
+    authority: ca.KeyPair, days: int, fault: str, warning: str
 ) -> None:
     found = ca.read(ca.issue(authority, "a@b", NOW).certificate)
     then = NOW + dt.timedelta(days=days)
@@ -99,7 +99,7 @@ def test_the_end_of_a_certificate_is_told_in_time(
     assert found.warning(then) == warning
 
 
-def test_a_name_that_no_certificate_can_hold_is_refused(authority: ca.Pair) -> None:
+def test_a_name_that_no_certificate_can_hold_is_refused(authority: ca.KeyPair) -> None:
     with pytest.raises(SecurityError, match="give 1 to 64 characters"):
         ca.issue(authority, f"worker-{'x' * 60}@gpu", NOW)
     with pytest.raises(SecurityError, match="no host name and no IP address"):
@@ -313,7 +313,7 @@ def test_a_lab_is_secured_by_one_command(tmp_path: Path, monkeypatch: pytest.Mon
     done = runner.invoke(secure_app, add)
     assert done.exit_code == 0, done.output
     assert f"  scp -rp {folder}/desk desk:{folder}/" in done.output.splitlines()
-    assert f"For people, there: vla-zenoh status --profile ./{secured}" in done.output
+    assert f"To watch, there: vla-zenoh status --profile ./{secured}" in done.output
     assert " up " not in done.output
     assert (folder / "desk" / "operator.pem").exists()
 

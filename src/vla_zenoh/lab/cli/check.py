@@ -22,9 +22,9 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import console, print_json, styled
 from vla_zenoh.control.finding import Finding, error
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.lab.check.examine import DEFAULT_RUNS, Examination
-from vla_zenoh.lab.check.own_process import CheckBench
-from vla_zenoh.lab.check.report import Report
+from vla_zenoh.lab.check.examination import DEFAULT_RUNS, Examination
+from vla_zenoh.lab.check.model_runner import ModelRunner
+from vla_zenoh.lab.check.report import CheckReport
 from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.runtime.environments import run_in_own_environment
@@ -53,7 +53,9 @@ class CheckPlan:
         float, typer.Option("--patience", help="Seconds for one call of the model.", min=0.1)
     ] = 300.0
 
-    def examine(self, chosen: WorkerChoice, named: str | None, profile: Profile | None) -> Report:
+    def examine(
+        self, chosen: WorkerChoice, named: str | None, profile: Profile | None
+    ) -> CheckReport:
         """Load the model and test it.
 
         Args:
@@ -64,11 +66,11 @@ class CheckPlan:
         try:
             policy = make_policy(chosen.model, chosen.options, profile=named)
         except WorkerError as fault:
-            return Report(chosen.name, findings=[error("cannot_be_made", str(fault))])
+            return CheckReport(chosen.name, findings=[error("cannot_be_made", str(fault))])
         return Examination(
             policy,
             chosen.name,
-            CheckBench(self.patience_s),
+            ModelRunner(self.patience_s),
             profile=profile,
             rate_hz=self.rate_hz,
             prompts=self.prompts,
@@ -114,11 +116,11 @@ def check(
     os._exit(1 if failed else 0)  # threads of a model's library may keep the process alive
 
 
-def _of(report: Report, level: str) -> list[Finding]:
+def _of(report: CheckReport, level: str) -> list[Finding]:
     return [finding for finding in report.findings if finding.level == level]
 
 
-def _print(report: Report) -> None:
+def _print(report: CheckReport) -> None:
     out = console()
     table = Table(show_header=False, title=f"worker {report.worker}", title_justify="left")
     for name, value in _rows(report):
@@ -137,7 +139,7 @@ def _print(report: Report) -> None:
         out.print(Text.assemble(("breaks its contract", "bold red"), counts))
 
 
-def _rows(report: Report) -> list[tuple[str, str]]:
+def _rows(report: CheckReport) -> list[tuple[str, str]]:
     spec = report.spec
     if spec is None:
         return []
@@ -167,14 +169,18 @@ def _rows(report: Report) -> list[tuple[str, str]]:
         before, loaded, after = report.memory_mib
         growth = report.growth_kib_per_run
         memory = f"{before:.0f} MiB before load, {loaded:.0f} loaded, {after:.0f} after all runs"
-        rows.append(("memory", memory + (f"; {growth:+.1f} KiB a run" if growth is not None else "")))
+        rows.append(
+            ("memory", memory + (f"; {growth:+.1f} KiB a run" if growth is not None else ""))
+        )
     if report.deterministic is not None:
         rows.append(("same answer again", "yes" if report.deterministic else "no"))
     words = {True: "yes", False: "no", None: "unknown"}
-    return rows + [(f"depends on {what}", words[known]) for what, known in report.depends_on.items()]
+    return rows + [
+        (f"depends on {what}", words[known]) for what, known in report.depends_on.items()
+    ]
 
 
-def _inputs(report: Report) -> str:
+def _inputs(report: CheckReport) -> str:
     assert report.spec is not None
     observation = report.spec.observation
     cameras = [

@@ -25,13 +25,11 @@ def record(
         typer.Option(
             "--keys",
             "-k",
-            help="Only these: a key expression below <root>/<robot>/, or whole; repeatable. Default: "
-            "everything but raw images.",
+            help="Only these: a key expression below <root>/<robot>/, or whole; repeatable. "
+            "Default: everything but raw images.",
         ),
     ] = None,
-    raw: Annotated[
-        bool, typer.Option("--raw", help="Raw images too; they are 1 MB each.")
-    ] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="Raw images too; they are 1 MB each.")] = False,
     seconds: Annotated[
         float | None, typer.Option("--seconds", "-s", help="End after this time.", min=0.1)
     ] = None,
@@ -45,12 +43,12 @@ def record(
     Foxglove, Rerun and `ros2 bag` open it. The file is valid at any time, also when the recorder is
     killed or the disk is full.
     """
-    from vla_zenoh.lab.recording.recorder import Recorded, Recorder, to_record
+    from vla_zenoh.lab.recording.recorder import Recorder, RecordingResult, recorded_keys
 
     loaded = target.load()
     path = out or Path("runs") / time.strftime("record-%Y%m%d-%H%M%S.mcap")
-    expressions = to_record(loaded.keys, keys or (), raw=raw)
-    done: list[Recorded] = []
+    expressions = recorded_keys(loaded.keys, keys or (), raw=raw)
+    done: list[RecordingResult] = []
 
     def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
         recorder = Recorder(loaded, session, path, expressions=expressions, name=name)

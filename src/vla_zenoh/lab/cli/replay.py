@@ -26,9 +26,7 @@ def replay(
     loop: Annotated[bool, typer.Option("--loop", help="Start again at the end.")] = False,
     only: Annotated[
         list[str] | None,
-        typer.Option(
-            "--only", help="Only this group: cameras, state, task, ...; repeatable."
-        ),
+        typer.Option("--only", help="Only this group: cameras, state, task, ...; repeatable."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -38,13 +36,13 @@ def replay(
     where a robot is alive on these keys, unless only images are replayed.
     """
     from vla_zenoh.lab.recording.reader import open_recording
-    from vla_zenoh.lab.recording.replay import Replay, Replayed, chosen_groups
+    from vla_zenoh.lab.recording.replay import Replay, ReplayResult, parse_groups
 
-    groups = chosen_groups(only or ())
+    groups = parse_groups(only or ())
     run_file = open_recording(file)
     loaded = as_robot(target.load(), target.robot or run_file.keys.robot)
     _require_replay_role(loaded)
-    done: list[Replayed] = []
+    done: list[ReplayResult] = []
 
     def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
         node = Replay(loaded, session, run_file, groups=groups, speed=speed, loop=loop)

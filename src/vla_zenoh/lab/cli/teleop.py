@@ -26,7 +26,8 @@ def teleop(
         typer.Option("--device", "-d", help="Input besides the keyboard, which always works."),
     ] = "keyboard",
     frame: Annotated[
-        Literal["base", "tcp"], typer.Option(help="Axes of the motion: of the robot base or the TCP.")
+        Literal["base", "tcp"],
+        typer.Option(help="Axes of the motion: robot base or TCP."),
     ] = "base",
     speed: Annotated[int, typer.Option("--speed", min=1, max=5, help="Initial speed level.")] = 3,
     name: Annotated[str, typer.Option("--name", help="Name of the worker.")] = "teleop",

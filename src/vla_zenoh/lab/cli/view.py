@@ -22,8 +22,8 @@ from vla_zenoh.profile import Profile, read_profile
 from vla_zenoh.runtime.process import run_node, stop_on_signals
 
 if TYPE_CHECKING:
-    from vla_zenoh.lab.recording.reader import RunFile
-    from vla_zenoh.lab.view.show import Show
+    from vla_zenoh.lab.recording.reader import Recording
+    from vla_zenoh.lab.view.rerun_logger import RerunLogger
 
 POLL_S = 0.03
 FLUSH_S = 5.0
@@ -52,7 +52,10 @@ class ViewOutput:
     port: Annotated[
         int,
         typer.Option(
-            "--port", help="With --serve: of the page; the data is at the next port.", min=1, max=65534
+            "--port",
+            help="With --serve: of the page; the data is at the next port.",
+            min=1,
+            max=65534,
         ),
     ] = PAGE_PORT
 
@@ -80,7 +83,7 @@ class ViewOutput:
         """Open a stream of Rerun called `name`, and the viewer unless it goes only to a file."""
         import rerun as rr
 
-        from vla_zenoh.lab.view.show import APPLICATION
+        from vla_zenoh.lab.view.rerun_logger import APPLICATION
 
         sinks: list[Any] = []
         if self.save is not None:
@@ -140,14 +143,14 @@ def view(
 
 def _live(profile: Profile, output: ViewOutput, seconds: float | None) -> None:
     from vla_zenoh.lab.view.listener import ViewListener
-    from vla_zenoh.lab.view.show import Show
+    from vla_zenoh.lab.view.rerun_logger import RerunLogger
 
-    done: list[Show] = []
+    done: list[RerunLogger] = []
     output.check(profile)
 
     def run(session: Any, stop: threading.Event) -> None:
         with output.open(profile.robot.name) as (stream, viewer):
-            show = Show(profile, stream, live=True)
+            logger = RerunLogger(profile, stream, live=True)
             listener = ViewListener(session, profile)
             errors().print(f"viewing robot {profile.robot.name}; Ctrl-C ends it")
             end_s = None if seconds is None else time.monotonic() + seconds
@@ -155,11 +158,11 @@ def _live(profile: Profile, output: ViewOutput, seconds: float | None) -> None:
                 if end_s is not None and time.monotonic() >= end_s:
                     break
                 for sample in listener.take():
-                    show.hear(sample)
-                show.dropped = listener.dropped.total()
+                    logger.hear(sample)
+                logger.dropped = listener.dropped.total()
                 stop.wait(POLL_S)
             listener.close()
-            done.append(show)
+            done.append(logger)
 
     run_node(profile, run, identity=None)
     if not done:  # interrupted before it began
@@ -171,28 +174,28 @@ def _live(profile: Profile, output: ViewOutput, seconds: float | None) -> None:
 
 def _recorded(path: Path, profile_name: str, output: ViewOutput) -> None:
     from vla_zenoh.lab.recording.reader import open_recording
-    from vla_zenoh.lab.view.show import Show
+    from vla_zenoh.lab.view.rerun_logger import RerunLogger
 
     stop = stop_on_signals()
     file = open_recording(path)
     profile = _profile_of(file, profile_name)
     output.check(profile)
     with output.open(path.stem) as (stream, viewer):
-        show = Show(profile, stream, keys=file.keys)
+        logger = RerunLogger(profile, stream, keys=file.keys)
         for entry in file.entries(lambda key: not key.endswith("/raw")):
             if stop.is_set() or (viewer is not None and viewer.closed):
                 break
-            show.take(entry)
-        _summarise(show, output.save)
+            logger.take(entry)
+        _summarise(logger, output.save)
         if file.damage:
             errors().print(f"{path} is {file.damage}", style="yellow")
         while viewer is not None and not stop.is_set() and not viewer.closed:
             stop.wait(POLL_S)
-    if not show.shown and not stop.is_set():
+    if not logger.shown and not stop.is_set():
         fail(f"{path} holds nothing that can be shown")
 
 
-def _profile_of(file: RunFile, name: str) -> Profile:
+def _profile_of(file: Recording, name: str) -> Profile:
     try:
         return read_profile(file.profile_yaml, f"profile in {file.path}")
     except ProfileError as error:
@@ -200,16 +203,18 @@ def _profile_of(file: RunFile, name: str) -> Profile:
         return RobotTarget(name).load()
 
 
-def _summarise(show: Show, save: Path | None) -> None:
+def _summarise(logger: RerunLogger, save: Path | None) -> None:
     screen = errors()
     where = f" in {save}" if save is not None else ""
     screen.print(
-        f"{show.shown.total():,} samples of {len(show.shown)} keys{where}",
+        f"{logger.shown.total():,} samples of {len(logger.shown)} keys{where}",
         soft_wrap=True,
     )
-    if show.refused:
-        worst = show.refused.most_common(SHOWN_REASONS)
+    if logger.refused:
+        worst = logger.refused.most_common(SHOWN_REASONS)
         reasons = ", ".join(f"{why} ({count})" for why, count in worst)
         screen.print(f"not shown: {reasons}", style="yellow")
-    if show.dropped:
-        screen.print(f"dropped, because this was too slow: {show.dropped} samples", style="yellow")
+    if logger.dropped:
+        screen.print(
+            f"dropped, because this was too slow: {logger.dropped} samples", style="yellow"
+        )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from vla_zenoh.lab.evaluation.numbers import spread
 from vla_zenoh.lab.evaluation.result import Evaluation
+from vla_zenoh.lab.evaluation.trajectory import spread
 from vla_zenoh.types import FloatArray
 
 LATENCY_COLUMNS = ("min", "mean", "p50", "p95", "max")
@@ -98,7 +98,7 @@ SEGMENT_COLUMNS = (
 
 
 def figures(run: Evaluation) -> list[tuple[str, str]]:
-    """Name and value of everything that has one, see docs/recording.md for what they mean."""
+    """Name and value of every figure; docs/how-to/recording.md says what they mean."""
     jerk_unit = run.jerk_unit.replace("_s3", "/s³")
     rows = [
         ("requests", str(run.requests)),

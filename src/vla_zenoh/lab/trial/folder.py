@@ -20,8 +20,8 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.trial.judged import EpisodeVerdict
 from vla_zenoh.lab.trial.plan import TrialPlan
+from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 
 PLAN, TRIALS = "plan.json", "trials.jsonl"
 _RECORDING = re.compile(r"episode-(\d+)\.mcap")
@@ -102,7 +102,7 @@ class TrialFolder:
             at = ".".join(map(str, fault["loc"]))
             raise RecordingError(
                 f"{self.path / where}: {at}{': ' if at else ''}{fault['msg']}; it is as "
-                "`vla-zenoh trial` writes it, or another --out is to be given"
+                "`vla-zenoh lab trial` writes it, or another --out is to be given"
             ) from error
 
     # -- writing ------------------------------------------------------------------------------
@@ -123,7 +123,7 @@ class TrialFolder:
                 fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 raise RecordingError(
-                    f"another `vla-zenoh trial` is at work in {self.path}"
+                    f"another `vla-zenoh lab trial` is at work in {self.path}"
                 ) from error
             yield
         finally:

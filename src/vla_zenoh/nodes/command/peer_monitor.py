@@ -202,7 +202,7 @@ class PeerMonitor:
             self._node.refuse(
                 "foreign_camera",
                 f"node {node!r} speaks for camera {camera!r}, which node {server!r} serves by the "
-                "profile (hosts.HOST.cameras; --name of `vla-zenoh camera`)",
+                "profile (hosts.HOST.cameras; --name of `vla-zenoh node camera`)",
                 node,
             )
             return

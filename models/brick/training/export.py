@@ -1,0 +1,116 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = [
+#   "vla-zenoh", "torch>=2.4", "safetensors>=0.4", "onnx", "onnxscript", "onnxruntime>=1.20",
+# ]
+# ///
+"""Makes of trained weights what the worker loads, and checks that both say the same.
+
+    python export.py RUN [--out FOLDER]
+
+Writes ``brick.onnx``, ``training/brick.safetensors`` and ``weights.json`` with the sha256 of both
+and the words the policy knows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from net import HAND, Policy
+from phrases import vocabulary
+from safetensors.torch import load_file
+from worker import FOLDER, FRONT, GRAPH, MANIFEST, MAX_WORDS, WRIST
+
+INPUTS = ("tokens", "front", "wrist", "hand")
+OUTPUTS = ("offset", "opened", "understood", "bricks", "box")
+TOLERANCE = 1e-4
+"""Between PyTorch and onnxruntime, in the outputs' own units (m, rad, probability)."""
+TRIALS = 20
+
+
+def inputs(random: np.random.Generator, words: int) -> dict[str, np.ndarray]:
+    """Any input of the right form."""
+    tokens = random.integers(1, words, (1, MAX_WORDS))
+    tokens[0, random.integers(1, MAX_WORDS) :] = 0
+    return {
+        "tokens": tokens.astype(np.int64),
+        "front": random.integers(0, 256, (1, FRONT[1], FRONT[0], 3), dtype=np.uint8),
+        "wrist": random.integers(0, 256, (1, WRIST[1], WRIST[0], 3), dtype=np.uint8),
+        "hand": random.normal(size=(1, HAND)).astype(np.float32),
+    }
+
+
+def strip(graph: Path) -> None:
+    """Leave out where each node came from: the exporter writes paths of this computer into it."""
+    model = onnx.load(str(graph))
+    for part in (
+        *model.graph.node,
+        *model.graph.value_info,
+        *model.graph.input,
+        *model.graph.output,
+    ):
+        del part.metadata_props[:]
+        part.doc_string = ""
+    del model.graph.metadata_props[:]
+    onnx.save(model, str(graph))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path, help="folder with policy.safetensors")
+    parser.add_argument("--out", type=Path, default=FOLDER)
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    words = vocabulary()
+    net = Policy(len(words) + 2)
+    net.load_state_dict(load_file(args.run / "policy.safetensors"))
+    net.eval()
+    random = np.random.default_rng(0)
+    example = {name: torch.from_numpy(v) for name, v in inputs(random, len(words) + 2).items()}
+    graph = args.out / GRAPH
+    torch.onnx.export(
+        net,
+        tuple(example.values()),
+        str(graph),
+        input_names=list(INPUTS),
+        output_names=list(OUTPUTS),
+        opset_version=18,
+        external_data=False,
+        dynamo=True,
+    )
+    strip(graph)
+    session = onnxruntime.InferenceSession(str(graph), providers=["CPUExecutionProvider"])
+    worst = 0.0
+    for _ in range(TRIALS):
+        feed = inputs(random, len(words) + 2)
+        with torch.no_grad():
+            wanted = net(*(torch.from_numpy(value) for value in feed.values()))
+        got = session.run(list(OUTPUTS), feed)
+        worst = max(
+            worst, *(float(np.abs(w.numpy() - g).max()) for w, g in zip(wanted, got, strict=True))
+        )
+    if worst > TOLERANCE:
+        raise SystemExit(f"the graph differs from PyTorch by {worst:.2g}, allowed: {TOLERANCE:g}")
+    weights = args.out / "training" / "brick.safetensors"
+    weights.parent.mkdir(exist_ok=True)
+    shutil.copyfile(args.run / "policy.safetensors", weights)
+    sha256 = {
+        str(p.relative_to(args.out)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in (graph, weights)
+    }
+    manifest = {"sha256": sha256, "words": words}
+    (args.out / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", "utf-8")
+    size = sum(p.stat().st_size for p in (graph, weights))
+    print(f"parity within {worst:.2g}; {size / 1e6:.2f} MB in {args.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""A flight recorder: what the simulator and the command node say, written down where they say it.
+
+Python imports this file at its start, where its folder is on PYTHONPATH. Between an arm and whoever
+watches it there is a network that may be down, and what is measured of a fault must not depend on
+it. So `state/pose` and `command/pose` are kept in files beside their writers, in the folder that
+FLIGHT_FOLDER names, with when each of the two last heard the other: one row of float64 a record,
+see `netns.flight_log`.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from typing import Any
+
+RECORDED = {"sim": "state/pose", "command": "command/pose"}
+
+
+def _note_commands(heard_s: list[float]) -> None:
+    """Of the simulator: whenever its guard takes a command."""
+    from vla_zenoh.guard.command_stream import CommandStream
+
+    take = CommandStream.take
+
+    def take_and_note(self: CommandStream[Any], command: Any) -> None:
+        heard_s[0] = time.monotonic()
+        take(self, command)
+
+    CommandStream.take = take_and_note
+
+
+def _note_states(heard_s: list[float]) -> None:
+    """Of the command node: whenever the arm's pose has come."""
+    from vla_zenoh.nodes.command.inputs import CommandInputs
+
+    take = CommandInputs.take
+
+    def take_and_note(self: CommandInputs, now_ns: int) -> Any:
+        inputs = take(self, now_ns)
+        if inputs.pose is not None:
+            heard_s[0] = time.monotonic()
+        return inputs
+
+    CommandInputs.take = take_and_note
+
+
+def _install(node: str, path: str) -> None:
+    import numpy as np
+
+    from vla_zenoh.bus.node import Stream
+
+    key_end, heard_s = RECORDED[node], [float("nan")]
+    (_note_commands if node == "sim" else _note_states)(heard_s)
+    put = Stream.put
+    file = open(path, "ab", buffering=0)  # noqa: SIM115  # as long as the process lives
+
+    def put_and_keep(self: Stream, record: Any, **named: Any) -> Any:
+        header = put(self, record, **named)
+        if self.key.endswith(key_end):
+            if key_end == RECORDED["sim"]:
+                reference = record.reference_position_m
+                parts, asked_ns = (record.position_m, record.twist, reference), None
+            else:
+                parts = (record.position_m, record.twist, record.acceleration[:3])
+                asked_ns = None if record.cause is None else record.cause.received_ns
+            # The computer's own clock, which nobody sets.
+            at_s, asked_s = (
+                np.nan if stamp_ns is None else (stamp_ns - self._clock.offset_ns) / 1e9
+                for stamp_ns in (header.stamp_wall_ns, asked_ns)
+            )
+            # By its age: a clock that is set in between does not make it older.
+            silent_s = time.monotonic() - heard_s[0]
+            file.write(np.concatenate([[at_s], *parts, [asked_s, at_s - silent_s]]).tobytes())
+        return header
+
+    Stream.put = put_and_keep
+
+
+_node = sys.orig_argv[4] if sys.orig_argv[1:4] == ["-m", "vla_zenoh", "node"] else ""
+_folder = os.environ.get("FLIGHT_FOLDER")
+if _folder and _node in RECORDED:
+    _install(_node, os.path.join(_folder, f"{_node}.flight"))

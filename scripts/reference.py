@@ -1,0 +1,252 @@
+"""Writes docs/reference/ from the code: profile fields, keys, commands, counters.
+
+python scripts/reference.py            # write
+python scripts/reference.py --check    # exit status 1 where a page differs from the code
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import re
+import sys
+import types
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+from typer.main import get_command
+
+import vla_zenoh
+from vla_zenoh.cli.main import app
+from vla_zenoh.keys import Keys
+from vla_zenoh.profile import Profile
+from vla_zenoh.security.roles import TABLE
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ROOT / "docs" / "reference"
+SOURCE = Path(vla_zenoh.__file__).parent
+MADE = "<!-- Made by scripts/reference.py from the code: do not edit. -->\n\n"
+
+
+# -- profile ------------------------------------------------------------------------------------
+def described(kind: type) -> dict[str, str]:
+    """Field -> text, from the ``Args:`` of a docstring."""
+    text = inspect.cleandoc(kind.__doc__ or "")
+    _, _, arguments = text.partition("Args:\n")
+    found: dict[str, str] = {}
+    name = ""
+    for line in arguments.splitlines():
+        start = re.match(r"    (\w+): ?(.*)", line)
+        if start:
+            name = start[1]
+            found[name] = start[2]
+        elif name and line.startswith("        "):
+            found[name] += " " + line.strip()
+        elif line.strip():
+            break
+    return found
+
+
+def first_paragraph(kind: Any) -> str:
+    """Of a docstring, as one line."""
+    text = inspect.cleandoc(kind.__doc__ or "")
+    return " ".join(text.partition("\n\n")[0].split())
+
+
+def type_text(kind: Any, paths: dict[type[BaseModel], str]) -> str:
+    """A type as a person writes it in YAML."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Annotated:
+        return type_text(arguments[0], paths)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(type_text(one, paths) for one in arguments if one is not type(None))
+    if origin is typing.Literal:
+        return " \\| ".join(f"`{one}`" for one in arguments)
+    if origin is tuple:
+        if len(arguments) == 2 and arguments[1] is Ellipsis:
+            return f"list of {type_text(arguments[0], paths)}"
+        return "[" + ", ".join(type_text(one, paths) for one in arguments) + "]"
+    if origin is dict:
+        return f"map to {type_text(arguments[1], paths)}"
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return f"[section](#{anchor(paths[kind])})"
+    names = {float: "number", int: "integer", str: "text", bool: "true or false"}
+    return names.get(kind, getattr(kind, "__name__", str(kind)))
+
+
+def sections_of(kind: type[BaseModel]) -> dict[type[BaseModel], str]:
+    """Section -> its path in the file, of all sections inside `kind`."""
+
+    def inner(one: Any, path: str) -> Iterator[tuple[type[BaseModel], str]]:
+        if isinstance(one, type) and issubclass(one, BaseModel):
+            yield one, path
+        if typing.get_origin(one) is dict:
+            path = f"{path}.NAME"
+        for argument in typing.get_args(one):
+            yield from inner(argument, path)
+
+    paths: dict[type[BaseModel], str] = {}
+    waiting = [(kind, "")]
+    while waiting:
+        section, path = waiting.pop(0)
+        if section not in paths:
+            paths[section] = path
+            inside: list[tuple[type[BaseModel], str]] = []
+            for name, field in section.model_fields.items():
+                inside += inner(field.annotation, f"{path}.{name}".lstrip("."))
+            waiting[:0] = inside
+    return paths
+
+
+def anchor(path: str) -> str:
+    """Of a section's heading."""
+    return path.lower().replace(".", "-").replace("_", "-") or "the-profile"
+
+
+def default_text(field: FieldInfo) -> str:
+    """What a field is where the profile does not say."""
+    if field.is_required():
+        return "**required**"
+    value = field.default if field.default is not PydanticUndefined else field.default_factory
+    if isinstance(value, BaseModel) or callable(value):
+        return ""
+    if isinstance(value, str):
+        return f"`{value}`" if value else ""
+    if isinstance(value, tuple):
+        return "`[" + ", ".join(str(one) for one in value) + "]`"
+    return "" if value is None else f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+def bounds_text(field: FieldInfo) -> str:
+    """The range a number must be in."""
+    signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
+    found = []
+    for item in field.metadata:
+        found += [f"{s} {getattr(item, n):g}" for n, s in signs.items() if hasattr(item, n)]
+    return ", ".join(found)
+
+
+def profile_page() -> str:
+    """Every section and field of a profile."""
+    out = ["# Profile fields", MADE.strip()]
+    out.append(
+        "A profile is one YAML file. `vla-zenoh profile show NAME` prints one with all defaults, "
+        "`vla-zenoh profile check FILE` names what is wrong in it."
+    )
+    paths = sections_of(Profile)
+    for section, path in paths.items():
+        title = f"`{path}`" if path else "The profile"
+        out.append(f"## {title} {{#{anchor(path)}}}\n\n{first_paragraph(section)}")
+        texts: dict[str, str] = {}
+        for base in reversed(section.__mro__):
+            texts |= described(base)
+        rows = ["| field | type | default | |", "|---|---|---|---|"]
+        for name, field in section.model_fields.items():
+            bounds = bounds_text(field)
+            kind = type_text(field.annotation, paths) + (f", {bounds}" if bounds else "")
+            text = texts.get(name, "").replace("|", "\\|")
+            rows.append(f"| `{name}` | {kind} | {default_text(field)} | {text} |")
+        out.append("\n".join(rows))
+    return "\n\n".join(out) + "\n"
+
+
+# -- keys ---------------------------------------------------------------------------------------
+def keys_page() -> str:
+    """Every key, who may write it and who may read it."""
+    out = ["# Keys", MADE.strip()]
+    out.append(
+        "All keys of a robot begin with `<root>/<robot>/`; the root is `vla` unless the profile "
+        "says otherwise. Roles are those of certificates ([security](../explanation/security.md)); "
+        "without certificates they are not checked."
+    )
+    rows = ["| key | payload | published by | read by |", "|---|---|---|---|"]
+    table = {row.member: row for row in TABLE}
+    for name, member in inspect.getmembers_static(Keys):
+        if name not in table:
+            continue
+        if isinstance(member, property):
+            text, doc = getattr(Keys("ROBOT", "ROOT"), name), member.__doc__
+        elif inspect.isfunction(member):
+            parameters = list(inspect.signature(member).parameters)[1:]
+            marks = [f"X{number}X" for number in range(len(parameters))]
+            text, doc = getattr(Keys("ROBOT", "ROOT"), name)(*marks), member.__doc__
+            for mark, parameter in zip(marks, parameters, strict=True):
+                text = text.replace(mark, f"<{parameter}>")
+        else:
+            continue
+        text = text.removeprefix("ROOT/ROBOT/")
+        row = table[name]
+        writers = sorted(r.value for r in (row.put | row.announce | row.answer))
+        readers = sorted(r.value for r in (row.subscribe | row.ask | row.watch))
+        about = " ".join((doc or "").split()).replace("|", "\\|")
+        rows.append(f"| `{text}` | {about} | {', '.join(writers)} | {', '.join(readers)} |")
+    return "\n\n".join([*out, "\n".join(rows)]) + "\n"
+
+
+# -- commands -----------------------------------------------------------------------------------
+def commands_of(command: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """A command and those under it."""
+    if hasattr(command, "commands"):
+        for name in command.commands:
+            found = command.commands[name]
+            if not found.hidden:
+                yield from commands_of(found, f"{path} {name}")
+    else:
+        yield path, command
+
+
+def option_row(parameter: Any) -> str:
+    """One option or argument."""
+    if parameter.param_type_name == "option":
+        names = ", ".join(f"`{name}`" for name in (*parameter.opts, *parameter.secondary_opts))
+        text = parameter.help or ""
+        default = parameter.default
+    else:
+        names, text, default = f"`{(parameter.name or '').upper()}`", "", None
+        text = getattr(parameter, "help", None) or ""
+    shown = "" if default in (None, (), [], False, "") or callable(default) else f"`{default}`"
+    text = " ".join(text.split()).replace("|", "\\|")
+    return f"| {names} | {shown} | {text} |"
+
+
+def cli_page() -> str:
+    """Every command with its options."""
+    out = ["# Commands", MADE.strip()]
+    for path, command in commands_of(get_command(app), "vla-zenoh"):
+        help_text = inspect.cleandoc(command.help or "").replace("\b\n", "")
+        out.append(f"## {path.removeprefix('vla-zenoh ')}\n\n{help_text}")
+        shown = [p for p in command.params if p.name != "help" and not getattr(p, "hidden", False)]
+        if shown:
+            rows = ["| option | default | |", "|---|---|---|", *map(option_row, shown)]
+            out.append("\n".join(rows))
+    return "\n\n".join(out) + "\n"
+
+
+PAGE_OF = {"profile.md": profile_page, "keys.md": keys_page, "cli.md": cli_page}
+
+
+def main() -> None:
+    """Write the pages, or compare them."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    options = parser.parse_args()
+    stale = []
+    for name, make in PAGE_OF.items():
+        path, text = PAGES / name, make()
+        if options.check:
+            if not path.is_file() or path.read_text("utf-8") != text:
+                stale.append(str(path.relative_to(ROOT)))
+        else:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, "utf-8")
+    if stale:
+        sys.exit(f"differ from the code: {', '.join(stale)}; run python scripts/reference.py")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,299 @@
+"""Runs a model on examples and says everything that is wrong with it, each fault by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vla_zenoh.control import chunk_plausibility as plausible
+from vla_zenoh.control import spec_fit as fit
+from vla_zenoh.control.finding import distinct, error, note
+from vla_zenoh.errors import SpecError
+from vla_zenoh.lab.check import judge
+from vla_zenoh.lab.check.examples import (
+    MAX_WIDTH_M,
+    PROMPTS,
+    ExampleMaker,
+    ImageStyle,
+    example_styles,
+    noise,
+)
+from vla_zenoh.lab.check.judge import Steps
+from vla_zenoh.lab.check.model_runner import Bench, ModelFailed, ModelHung
+from vla_zenoh.lab.check.report import CheckReport
+from vla_zenoh.policy import Policy, check_steps, reset_of
+from vla_zenoh.policy.chunk_prefix import ChunkPrefix
+from vla_zenoh.profile import Limits, Profile, Timing
+
+DEFAULT_RUNS = 100
+ENOUGH_RUNS = 12
+"""With fewer timed runs nothing is said of memory."""
+
+
+class Examination:
+    """See the module.
+
+    Args:
+        policy: made, not loaded.
+        worker: its name.
+        bench: where it runs.
+        profile: what it is held against; None: only against its own spec and default limits.
+        rate_hz: chunks per second that will be asked of it; None: as the profile says.
+        prompts: to try, the first one most; None: the model's `example_prompts`, or `PROMPTS`.
+        runs: timed inferences.
+        budget_s: no new example after this time; loading does not count.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        worker: str,
+        bench: Bench,
+        *,
+        profile: Profile | None = None,
+        rate_hz: float | None = None,
+        prompts: Sequence[str] | None = None,
+        runs: int = DEFAULT_RUNS,
+        budget_s: float = 30.0,
+    ) -> None:
+        self._policy, self._bench, self._profile = policy, bench, profile
+        self._rate_hz = rate_hz or (profile.task.rate_hz if profile else None)
+        self._limits = profile.limits if profile else Limits()
+        self._timing = profile.timing if profile else Timing()
+        self._width_m = profile.robot.gripper.max_width_m if profile else MAX_WIDTH_M
+        named = prompts or getattr(policy, "example_prompts", None)
+        self._looks = example_styles(tuple(named) if named else PROMPTS)
+        self._runs, self._budget_s = runs, budget_s
+        self._loaded_s = 0.0
+        self._maker, self._continuation = ExampleMaker(policy.spec, profile), ChunkPrefix(policy)
+        self._answers: list[tuple[ImageStyle, Steps]] = []
+        self._took_ms: list[float] = []
+        self.report = CheckReport(worker, policy.spec)
+
+    def run(self) -> CheckReport:
+        """Examine; never raises for what the model does."""
+        report = self.report
+        try:
+            self._run()
+            close = getattr(self._policy, "close", None)
+            if callable(close):
+                self._bench.call(close)
+        except ModelFailed as failed:
+            report.findings.append(error("close_failed", str(failed)))
+        except ModelHung as hung:
+            report.findings.append(error("hangs", str(hung)))
+        report.findings = distinct(report.findings)
+        return report
+
+    def _run(self) -> None:
+        report = self.report
+        if self._profile is not None:
+            report.findings += fit.findings(
+                self._profile, self._policy.spec, worker=report.worker, rate_hz=self._rate_hz
+            )
+        before_kib = self._bench.memory_kib()
+        if not (self._load() and self._first()):
+            return
+        loaded_kib = self._bench.memory_kib()
+        self._compare()
+        self._together()
+        for look in self._looks[1:]:
+            if not self._in_budget():
+                break
+            self._reset()
+            self._infer(look)
+        self._time_it()
+        report.memory_mib = (
+            before_kib / 1024,
+            loaded_kib / 1024,
+            self._bench.memory_kib() / 1024,
+        )
+        self._judge()
+
+    # -- stages -------------------------------------------------------------------------------
+    def _load(self) -> bool:
+        report, policy = self.report, self._policy
+        declared = policy.spec.hash
+        load = getattr(policy, "load", None)
+        if callable(load):
+            try:
+                _, report.load_s = self._bench.call(load)
+            except ModelFailed as failed:
+                report.findings.append(error("load_failed", str(failed)))
+                return False
+        self._loaded_s = self._bench.spent_s()
+        if policy.spec.hash != declared:
+            report.findings.append(
+                error(
+                    "spec_changed",
+                    "load() changed the spec, which was published before; declare it in __init__",
+                )
+            )
+        known = getattr(policy, "normalisation_keys", None)
+        key = policy.spec.action.normalisation
+        if known is not None and key not in known:
+            report.findings.append(
+                error(
+                    "normalisation",
+                    f"the spec says normalisation {key!r}, the weights came with: "
+                    f"{', '.join(sorted(map(str, known))) or 'none'}",
+                )
+            )
+        return True
+
+    def _first(self) -> bool:
+        """The first answer: what is wrong there is wrong everywhere."""
+        self._reset()
+        steps = self._infer(self._looks[0], again=True)
+        if steps is None:
+            return False
+        self.report.first_ms = self._took_ms.pop()
+        self.report.shape = (steps.shape[0], steps.shape[1])
+        return True
+
+    def _compare(self) -> None:
+        """Whether the answer is the same again, and whether it depends on what is seen."""
+        report, chart = self.report, self._looks[0]
+        cameras = bool(self._policy.spec.observation.cameras)
+        first, again = self._anew(chart), self._anew(chart)
+        if first is None or again is None:
+            return
+        report.deterministic = judge.alike(first, again)
+        if not report.deterministic:
+            report.findings.append(
+                note(
+                    "random",
+                    "answers to one observation differ after reset(); usual where noise "
+                    "is drawn, and then it is not known what the answer depends on",
+                )
+            )
+        trials = {
+            "pictures": ImageStyle(chart.name, picture=noise, prompt=chart.prompt)
+            if cameras
+            else None,
+            "colour order": ImageStyle(chart.name, prompt=chart.prompt, swapped=True)
+            if cameras
+            else None,
+            "prompt": ImageStyle(chart.name, prompt=self._another_prompt())
+            if self._policy.spec.observation.prompt
+            else None,
+        }
+        for name, look in trials.items():
+            if look is None or not report.deterministic or not self._in_budget():
+                continue
+            if name == "colour order" and report.depends_on.get("pictures") is False:
+                continue
+            other = self._anew(look)
+            report.depends_on[name] = None if other is None else not judge.alike(first, other)
+
+    def _together(self) -> None:
+        """Whether two observations that are asked about at once are answered as each alone."""
+        if not judge.takes_batches(self._policy) or not self.report.deterministic:
+            return
+        chart = self._looks[0]
+        pair = (chart, ImageStyle(chart.name, picture=noise, prompt=self._another_prompt()))
+        alone = [self._anew(look) for look in pair]
+        if any(steps is None for steps in alone):
+            return
+        self._reset()
+        seen = [self._maker.make(look, again=True) for look in pair]
+        try:
+            found, _ = self._bench.call(lambda: judge.ask_batch(self._policy, seen))
+        except ModelFailed as failed:
+            self.report.findings.append(error("batch", f"infer_batch: {failed}"))
+            return
+        self.report.findings += judge.batch_findings(self._policy.spec.action, found, alone)
+
+    def _another_prompt(self) -> str:
+        prompts = [look.prompt for look in self._looks if not look.strange]
+        return next((text for text in prompts if text != prompts[0]), PROMPTS[1])
+
+    def _time_it(self) -> None:
+        kib: list[float] = []
+        self._reset()
+        for index in range(self._runs):
+            if not self._in_budget():
+                break
+            if self._infer(self._looks[index % 2]) is None:
+                return
+            kib.append(self._bench.memory_kib())
+        report = self.report
+        if len(kib) < ENOUGH_RUNS:
+            return
+        report.growth_kib_per_run, leaks = judge.growth(kib)
+        report.findings += leaks
+
+    # -- one inference ------------------------------------------------------------------------
+    def _anew(self, look: ImageStyle) -> Steps | None:
+        self._reset()
+        return self._infer(look, again=True)
+
+    def _reset(self) -> None:
+        self._continuation = ChunkPrefix(self._policy)
+        reset = reset_of(self._policy)
+        if reset is None:
+            return
+        try:
+            self._bench.call(reset)
+        except ModelFailed as failed:
+            self.report.findings.append(error("reset_failed", str(failed)))
+
+    def _infer(self, look: ImageStyle, *, again: bool = False) -> Steps | None:
+        """A checked answer, None where there is none; what is wrong goes into the report."""
+        findings, action = self.report.findings, self._policy.spec.action
+        try:
+            observation = self._maker.make(look, again=again)
+        except SpecError as fault:
+            findings.append(error("picture_size", str(fault)))
+            return None
+        try:
+            answer, took_s = self._bench.call(lambda: self._continuation.infer(observation))
+        except ModelFailed as failed:
+            refused = look.strange and isinstance(failed.error, SpecError)
+            if not refused:
+                findings.append(error("inference_failed", f"{look.name}: {failed}"))
+            return None
+        self._took_ms.append(took_s * 1e3)
+        try:
+            steps = check_steps(action, answer.steps)
+        except SpecError as fault:
+            findings.append(error(fault.reason, f"{look.name}: {fault}"))
+            return None
+        findings += plausible.findings(action, steps, self._limits, self._width_m)
+        self._answers.append((look, steps))
+        # So that one that takes what is under way is given some at the next look.
+        arrival_ns = observation.stamp_wall_ns + round(took_s * 1e9)
+        self._continuation.published(observation, steps, arrival_ns, obeyed=look.active)
+        return steps
+
+    def _in_budget(self) -> bool:
+        if self._bench.spent_s() - self._loaded_s < self._budget_s:
+            return True
+        if not any(finding.name == "cut_short" for finding in self.report.findings):
+            self.report.findings.append(
+                note(
+                    "cut_short",
+                    f"not everything was tried in {self._budget_s:g} s; --budget gives more",
+                )
+            )
+        return False
+
+    # -- what it all means --------------------------------------------------------------------
+    def _judge(self) -> None:
+        report, action = self.report, self._policy.spec.action
+        report.runs = len(self._took_ms)
+        if self._took_ms:
+            p50, p95 = np.percentile(self._took_ms, (50, 95))
+            report.latency_ms = (float(p50), float(p95), max(self._took_ms))
+            report.findings += judge.slowness(
+                action,
+                float(p50) / 1e3,
+                float(p95) / 1e3,
+                oldest_s=self._timing.max_observation_age_s,
+                rate_hz=self._rate_hz,
+            )
+        numbers = np.concatenate([steps for _, steps in self._answers])
+        low, high = numbers.min(axis=0).tolist(), numbers.max(axis=0).tolist()
+        report.step_range = list(zip(low, high, strict=True))
+        report.findings += judge.behaviour(action, self._answers, report.depends_on)

@@ -1,0 +1,254 @@
+"""How far apart two workers are: what each asked for, seen at the same moment, after the same time.
+
+Chunks are paired by the time of their observation. Both are carried out in thought from the pose
+the arm then had, up to the end of the shorter one, so that workers of any spec can be compared:
+deltas with absolute poses, one step with fifty.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from vla_zenoh.control.actions import step_pose, step_width
+from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.so3 import Pose, between, log3, pose_of
+from vla_zenoh.policy import ActionSpec
+from vla_zenoh.types import ActionChunk, FloatArray, GripperState, PoseState
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+DEFAULT_TOLERANCE_S = 0.06
+"""Two pictures' time at 30 Hz: observations this near in time show the same."""
+MOVES_M = 1e-3
+"""A worker that asks for less has no direction."""
+GRIPPER_SHARE = 0.25
+"""Of the gripper's width: one that wants so much more open disagrees with the other."""
+
+
+class ArmState(NamedTuple):
+    """Where arm and gripper were."""
+
+    pose: Pose
+    width_m: float
+
+
+class ArmStateHistory:
+    """Where the arm was, by the stamps of its states; these are added in their order."""
+
+    def __init__(self) -> None:
+        self._poses: tuple[list[int], list[PoseState]] = ([], [])
+        self._grippers: tuple[list[int], list[GripperState]] = ([], [])
+
+    def add(self, stamp_ns: int, state: PoseState | GripperState) -> None:
+        """Take a state; one that is older than the last is left out."""
+        stamps, states = self._poses if isinstance(state, PoseState) else self._grippers
+        if not stamps or stamp_ns >= stamps[-1]:
+            stamps.append(stamp_ns)
+            states.append(state)  # pyright: ignore[reportArgumentType]
+
+    def at(self, stamp_ns: int) -> ArmState:
+        """The measured pose and width nearest to `stamp_ns`.
+
+        Raises:
+            RecordError: there is none.
+        """
+        if not self._poses[0] or not self._grippers[0]:
+            raise RecordError(
+                "where the arm was is not known: no state/pose or no state/gripper was heard"
+            )
+        pose = self._poses[1][_nearest(self._poses[0], stamp_ns)]
+        gripper = self._grippers[1][_nearest(self._grippers[0], stamp_ns)]
+        return ArmState(pose_of(pose), gripper.width_m)
+
+
+def _nearest(stamps: Sequence[int], stamp_ns: int) -> int:
+    right = min(bisect_left(stamps, stamp_ns), len(stamps) - 1)
+    left = max(right - 1, 0)
+    return min(left, right, key=lambda index: abs(stamps[index] - stamp_ns))
+
+
+class RequestedPath(NamedTuple):
+    """What a chunk asks for.
+
+    Args:
+        dt_s: between two waypoints.
+        poses: W_0, where the arm was, to W_H.
+        widths_m: likewise; None where the chunk says nothing of the gripper.
+    """
+
+    dt_s: float
+    poses: list[Pose]
+    widths_m: list[float] | None
+
+    @property
+    def end_s(self) -> float:
+        return self.dt_s * (len(self.poses) - 1)
+
+    def at(self, time_s: float) -> tuple[Pose, float | None]:
+        """Pose and width asked for `time_s` after the observation."""
+        index = min(int(time_s / self.dt_s + 1e-9), len(self.poses) - 2)
+        share = min(time_s / self.dt_s - index, 1.0)
+        pose = between(self.poses[index], self.poses[index + 1], share)
+        last = round(time_s / self.dt_s + 1e-9)
+        width_m = None if self.widths_m is None else self.widths_m[min(last, len(self.poses) - 1)]
+        return pose, width_m
+
+
+@dataclass(frozen=True, slots=True)
+class Disagreement:
+    """Between workers A and B, over all pairs.
+
+    Args:
+        pairs: chunks of both whose observations are near in time.
+        only_a: chunks of A without a partner.
+        only_b: likewise.
+        unreadable: pairs that one spec gives no meaning to.
+        apart_s: mean time between the observations of a pair.
+        after_s: mean time after which the ways are compared.
+        mean: (6,) mean of the absolute difference along `AXES`, m and rad.
+        p95: (6,) its 95th percentile.
+        bias: (6,) mean of B minus A.
+        distance_m: mean distance between the positions asked for.
+        angle_rad: mean angle between the orientations.
+        cosine: mean cosine between the directions, where both move; None: never.
+        moving: pairs in which both move.
+        gripper: share of pairs in which one wants it more open; None: not both say.
+    """
+
+    pairs: int
+    only_a: int
+    only_b: int
+    unreadable: int = 0
+    apart_s: float = 0.0
+    after_s: float = 0.0
+    mean: FloatArray | None = None
+    p95: FloatArray | None = None
+    bias: FloatArray | None = None
+    distance_m: float | None = None
+    angle_rad: float | None = None
+    cosine: float | None = None
+    moving: int = 0
+    gripper: float | None = None
+
+
+def requested_path(
+    spec: ActionSpec, chunk: ActionChunk, start: ArmState, max_width_m: float
+) -> RequestedPath:
+    """What `chunk` asks for from `start` on.
+
+    Raises:
+        RecordError: a number that its meaning cannot have.
+    """
+    poses, widths_m = [start.pose], [start.width_m]
+    for step in chunk.steps:
+        width_m = step_width(spec, step, widths_m[-1], max_width_m)
+        poses.append(step_pose(spec, step, poses[-1]))
+        widths_m.append(widths_m[-1] if width_m is None else width_m)
+    return RequestedPath(spec.dt_s, poses, None if spec.gripper == "none" else widths_m)
+
+
+def compare(
+    a: Sequence[ActionChunk],
+    b: Sequence[ActionChunk],
+    spec_a: ActionSpec,
+    spec_b: ActionSpec,
+    standing_at: Callable[[int], ArmState],
+    *,
+    max_width_m: float,
+    tolerance_s: float = DEFAULT_TOLERANCE_S,
+) -> Disagreement:
+    """How far B is from A.
+
+    Args:
+        a: chunks of one worker, in any order.
+        b: of the other.
+        spec_a: what the first one's steps mean.
+        spec_b: likewise.
+        standing_at: where the arm was at a wall time (ns).
+        max_width_m: of the gripper.
+        tolerance_s: observations further apart are not compared.
+    """
+    pairs = _pairs(a, b, round(tolerance_s * 1e9))
+    rows: list[_Row] = []
+    unreadable = 0
+    for one, other in pairs:
+        start = standing_at(one.observation_stamp_ns)
+        try:
+            rows.append(
+                _row(
+                    requested_path(spec_a, one, start, max_width_m),
+                    requested_path(spec_b, other, start, max_width_m),
+                    max_width_m,
+                )
+            )
+        except RecordError:
+            unreadable += 1
+    counts = (len(pairs), len(a) - len(pairs), len(b) - len(pairs), unreadable)
+    if not rows:
+        return Disagreement(*counts)
+    apart_s = [abs(p.observation_stamp_ns - q.observation_stamp_ns) / 1e9 for p, q in pairs]
+    differences = np.array([row.difference for row in rows])
+    cosines = [row.cosine for row in rows if row.cosine is not None]
+    grips = [row.gripper for row in rows if row.gripper is not None]
+    return Disagreement(
+        *counts,
+        apart_s=float(np.mean(apart_s)),
+        after_s=float(np.mean([row.after_s for row in rows])),
+        mean=np.abs(differences).mean(axis=0),
+        p95=np.percentile(np.abs(differences), 95, axis=0),
+        bias=differences.mean(axis=0),
+        distance_m=float(np.linalg.norm(differences[:, :3], axis=1).mean()),
+        angle_rad=float(np.linalg.norm(differences[:, 3:], axis=1).mean()),
+        cosine=float(np.mean(cosines)) if cosines else None,
+        moving=len(cosines),
+        gripper=float(np.mean(grips)) if grips else None,
+    )
+
+
+class _Row(NamedTuple):
+    after_s: float
+    difference: FloatArray
+    cosine: float | None
+    gripper: bool | None
+
+
+def _row(one: RequestedPath, other: RequestedPath, max_width_m: float) -> _Row:
+    after_s = min(one.end_s, other.end_s)
+    (pose_a, width_a), (pose_b, width_b) = one.at(after_s), other.at(after_s)
+    difference = np.concatenate(
+        [pose_b.position_m - pose_a.position_m, log3(pose_b.rotation @ pose_a.rotation.T)]
+    )
+    start = one.poses[0].position_m
+    moved_a, moved_b = pose_a.position_m - start, pose_b.position_m - start
+    length_a, length_b = float(np.linalg.norm(moved_a)), float(np.linalg.norm(moved_b))
+    cosine = None
+    if length_a > MOVES_M and length_b > MOVES_M:
+        cosine = float(moved_a @ moved_b) / (length_a * length_b)
+    gripper = None
+    if width_a is not None and width_b is not None:
+        gripper = abs(width_b - width_a) > GRIPPER_SHARE * max_width_m
+    return _Row(after_s, difference, cosine, gripper)
+
+
+def _pairs(
+    a: Sequence[ActionChunk], b: Sequence[ActionChunk], tolerance_ns: int
+) -> list[tuple[ActionChunk, ActionChunk]]:
+    """Nearest in time, every chunk once, in the order of A's observations."""
+    ordered = sorted(b, key=lambda chunk: chunk.observation_stamp_ns)
+    stamps = [chunk.observation_stamp_ns for chunk in ordered]
+    taken: set[int] = set()
+    out: list[tuple[ActionChunk, ActionChunk]] = []
+    for chunk in sorted(a, key=lambda chunk: chunk.observation_stamp_ns):
+        stamp_ns = chunk.observation_stamp_ns
+        low = bisect_left(stamps, stamp_ns - tolerance_ns)
+        high = bisect_left(stamps, stamp_ns + tolerance_ns + 1)
+        free = [index for index in range(low, high) if index not in taken]
+        if free:
+            best = min(free, key=lambda index: abs(stamps[index] - stamp_ns))
+            taken.add(best)
+            out.append((chunk, ordered[best]))
+    return out

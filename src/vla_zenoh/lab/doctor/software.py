@@ -1,0 +1,206 @@
+"""Python and the libraries: there, new enough, and able to load."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from importlib import metadata
+
+from vla_zenoh.errors import MissingExtraError, NodeError, VlaZenohError, how_to_install
+from vla_zenoh.lab.doctor.finding import HostFinding
+from vla_zenoh.lab.doctor.needs import Role
+from vla_zenoh.profile import Profile
+from vla_zenoh.simulation.backend import RAYCAST, VARIABLE, Backend, choose_backend
+
+OLDEST_PYTHON = (3, 11)
+LIMIT_S = 60
+
+MODULES: Mapping[Role, Mapping[str, str]] = {
+    # role: {module: distribution that brings it}
+    "base": {
+        "zenoh": "eclipse-zenoh",
+        "msgpack": "msgpack",
+        "numpy": "numpy",
+        "cv2": "opencv-python-headless",
+        "pydantic": "pydantic",
+        "yaml": "pyyaml",
+    },
+    "control": {"pinocchio": "pin", "ruckig": "ruckig"},
+    "sim": {"mujoco": "mujoco-core", "av": "av", "matplotlib": "matplotlib"},
+    "ros2": {"rosbags": "rosbags"},
+}
+PURPOSE: Mapping[Role, str] = {
+    "base": "cameras and workers",
+    "control": "command node",
+    "sim": "simulator",
+    "ros2": "node ros2",
+}
+VERSIONS: Mapping[str, tuple[tuple[int, ...], tuple[int, ...] | None]] = {
+    # distribution: oldest that works, first that is not known to work
+    "eclipse-zenoh": ((1, 10), (2,)),
+    "numpy": ((1, 26), None),
+    "mujoco-core": ((4,), (5,)),
+    "pin": ((4,), None),
+}
+SYSTEM_PACKAGES = {
+    # shared library a wheel did not bring: Debian and Ubuntu package
+    "libGL.so.1": "libgl1",
+    "libEGL.so.1": "libegl1",
+    "libglib-2.0.so.0": "libglib2.0-0",
+    "libgthread-2.0.so.0": "libglib2.0-0",
+    "libgomp.so.1": "libgomp1",
+    "libstdc++.so.6": "libstdc++6",
+    "libxcb.so.1": "libxcb1",
+}
+
+# One interpreter for a whole role, and not this one: a broken library may crash it.
+_PROBE = """
+import importlib, json, sys
+print(json.dumps(None), flush=True)
+for name in sys.argv[1:]:
+    try:
+        importlib.import_module(name)
+        error = None
+    except BaseException as caught:
+        error = f"{type(caught).__name__}: {caught}"
+    print(json.dumps([name, error]), flush=True)
+"""
+
+
+def python_version(version: tuple[int, ...] = tuple(sys.version_info[:3])) -> HostFinding:
+    """The interpreter is new enough."""
+    text = ".".join(map(str, version))
+    if version < OLDEST_PYTHON:
+        return HostFinding("Python", "fail", text, "install Python 3.11 or newer")
+    return HostFinding("Python", "ok", text)
+
+
+def load_errors(modules: list[str]) -> dict[str, str]:
+    """Modules that cannot be imported, with the reason, found out in another process."""
+    command = [sys.executable, "-c", _PROBE, *modules]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=LIMIT_S)
+        output, end = done.stdout, f"the interpreter ended with status {done.returncode}"
+    except subprocess.TimeoutExpired as error:
+        output = error.stdout.decode() if isinstance(error.stdout, bytes) else error.stdout or ""
+        end = f"not loaded within {LIMIT_S} s"
+    seen = dict(pair for pair in map(json.loads, output.splitlines()) if pair)
+    errors = {name: error for name, error in seen.items() if error is not None}
+    for name in modules:
+        if name not in seen:
+            errors[name] = end
+            break
+    return errors
+
+
+def version_fault(distribution: str, version: str) -> str:
+    """Why `version` will not do, or nothing."""
+    oldest, first_unknown = VERSIONS.get(distribution, ((), None))
+    numbers = tuple(int(part) for part in re.findall(r"\d+", version)[:3])
+    if numbers < oldest:
+        return f"{distribution} {version} is too old"
+    if first_unknown is not None and numbers >= first_unknown:
+        return f"{distribution} {version} is too new"
+    return ""
+
+
+def libraries(role: Role, *, required: bool) -> HostFinding:
+    """Everything a role of a host needs is installed, loads, and has a version that works."""
+    name = f"libraries: {PURPOSE[role]}"
+    level = "fail" if required else "warn"
+    install = how_to_install("" if role == "base" else role)
+    missing, wrong, versions = [], [], []
+    for module, distribution in MODULES[role].items():
+        try:
+            version = metadata.version(distribution)
+        except metadata.PackageNotFoundError:
+            missing.append(module)
+            continue
+        versions.append(f"{distribution} {version}")
+        wrong.append(version_fault(distribution, version))
+    errors = load_errors([module for module in MODULES[role] if module not in missing])
+    if missing:
+        return HostFinding(name, level, f"not installed: {', '.join(missing)}", install)
+    if errors:
+        text = "; ".join(f"{module} does not load ({error})" for module, error in errors.items())
+        packages = sorted({deb for so, deb in SYSTEM_PACKAGES.items() if so in text})
+        if packages:
+            return HostFinding(name, level, text, f"sudo apt install {' '.join(packages)}")
+        return HostFinding(name, level, text, f"{install} --force-reinstall")
+    if any(wrong):
+        text = "; ".join(fault for fault in wrong if fault)
+        return HostFinding(name, level, text, f"{install} --upgrade")
+    return HostFinding(name, "ok", ", ".join(versions))
+
+
+def msgpack_in_c() -> HostFinding:
+    """msgpack is the compiled one; the one in Python is some thirty times slower."""
+    import msgpack
+
+    if msgpack.Packer.__module__ == "msgpack._cmsgpack":
+        return HostFinding("msgpack", "ok", "compiled")
+    return HostFinding(
+        "msgpack",
+        "warn",
+        "the slow implementation in Python",
+        "unset MSGPACK_PUREPYTHON, or: pip install --force-reinstall --only-binary :all: msgpack",
+    )
+
+
+NAME = "pictures"
+
+
+def opengl(wanted: str | None = None) -> HostFinding:
+    """What the simulator will draw with.
+
+    Args:
+        wanted: ``auto`` or the way to draw that is asked for; None: as the environment says.
+    """
+    try:
+        return judge(choose_backend(wanted))
+    except NodeError as error:
+        advice = f"do what it says, or let the simulator choose: unset {VARIABLE}"
+        return HostFinding(NAME, "fail", str(error), advice)
+
+
+def judge(backend: Backend) -> HostFinding:
+    """What was chosen, in words."""
+    if backend.name != RAYCAST:
+        return HostFinding(NAME, "ok", f"drawn by OpenGL through {backend.name}")
+    if not backend.reason:
+        return HostFinding(NAME, "ok", "ray cast, as asked for")
+    return HostFinding(
+        NAME,
+        "warn",
+        f"ray cast, which is slower: no OpenGL without a screen ({backend.reason})",
+        f"sudo apt install {backend.install} (with an NVIDIA card also its driver's libnvidia-gl; "
+        "in a container with one: NVIDIA_DRIVER_CAPABILITIES=all)",
+    )
+
+
+def robot(profile: Profile, host: str | None = None) -> Iterator[HostFinding]:
+    """The robot's description, its meshes, and whether it has what the profile names.
+
+    Args:
+        profile: the lab.
+        host: which of its hosts this computer is; None: all of them. Nothing is said of one that
+            does not run the command node.
+    """
+    hosts = [profile.hosts[host]] if host is not None else list(profile.hosts.values())
+    if not any("command" in part.nodes for part in hosts):
+        return
+    try:
+        from vla_zenoh.control.profile_arm import make_shadow
+
+        make_shadow(profile)
+    except (MissingExtraError, ImportError):
+        return  # told with the libraries
+    except (VlaZenohError, ValueError) as error:  # the latter Pinocchio's, of what is no URDF
+        advice = "vla-zenoh profile check"
+        yield HostFinding("robot", "fail", f"{profile.robot.description}: {error}", advice)
+        return
+    joints = len(profile.robot.arm_joints)
+    yield HostFinding("robot", "ok", f"{joints} joints, with collision shapes")

@@ -1,0 +1,309 @@
+"""A recording of ours: what was asked, commanded and measured, and how long each stage took."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vla_zenoh.lab.evaluation import trajectory
+from vla_zenoh.lab.evaluation.activations import (
+    activations,
+    last_ns,
+    obeyed_chunks,
+    prompt_intervals,
+    until,
+)
+from vla_zenoh.lab.evaluation.filmstrip import filmstrip
+from vla_zenoh.lab.evaluation.result import Evaluation, PlotTrace
+from vla_zenoh.lab.evaluation.segments import segment
+from vla_zenoh.lab.recording.run import RecordedSample, Run, load_run
+from vla_zenoh.types import Cause, FloatArray, NodeStatus
+
+GAP_S = 0.05
+"""A stream that says nothing for longer was interrupted: nothing is derived across the gap."""
+
+
+class MeasuredMotion(NamedTuple):
+    """A stream of poses: stamps in s since the run began, (n, 3), (n, 4), (n, 6)."""
+
+    t_s: FloatArray
+    position_m: FloatArray
+    quat_xyzw: FloatArray
+    twist: FloatArray
+
+    def part(self, since_s: float, until_s: float) -> MeasuredMotion:
+        """What is stamped within."""
+        first, last = np.searchsorted(self.t_s, (since_s, until_s))
+        return MeasuredMotion(*(column[first:last] for column in self))
+
+
+def evaluate_run(path: Path, first: int | None = None, *, pictures: int = 0) -> Evaluation:
+    """Evaluate a recording; what cannot be read in it is in `Evaluation.problems`.
+
+    Args:
+        path: of the file.
+        first: only up to so many chunks of the obeyed worker.
+        pictures: how many moments to show of each camera.
+
+    Raises:
+        RecordingError: it cannot be opened, or is of another program.
+    """
+    run = load_run(path)
+    return evaluate_loaded(run, first, pictures=pictures)
+
+
+def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) -> Evaluation:
+    """`evaluate_run` of what is in memory already."""
+    zero_ns = run.began_ns
+    name = run.path.parent.name if run.path.stem == "run" else run.path.stem
+    out = Evaluation(name, "mcap", run.path, problems=list(run.problems))
+    if run.file.ended is None and not run.file.damage:
+        out.problems.append("its recorder was ended before it could finish the file")
+    if run.file.dropped:
+        out.problems.append(f"the recorder dropped {run.file.dropped} samples")
+    obeyed = obeyed_chunks(run)
+    causes = run.first_commands()
+    until_ns = last_ns(run) + 1
+    if first is not None:
+        if len(obeyed) < first:
+            out.problems.append(f"it has {len(obeyed)} chunks, fewer than the {first} asked for")
+        elif len(obeyed) > first:
+            until_ns = obeyed[first].header.stamp_wall_ns
+        obeyed = obeyed[:first]
+        wanted = {(entry.record.worker, entry.header.seq) for entry in obeyed}
+        causes = [each for each in causes if (each[0].worker, each[0].chunk_seq) in wanted]
+    _requests(out, obeyed, causes, zero_ns)
+    measured, commanded = _measured(run, zero_ns, until_ns), _commanded(run, zero_ns, until_ns)
+    _motion(out, measured, commanded, run)
+    _seams(out, until(run.commands, until_ns))
+    _joint_jerk(out, until(run.joint_commands, until_ns))
+    active = _active(run, until_ns, zero_ns)
+    _idle(out, active, measured)
+    out.refusals = _counted(run.first_statuses, run.statuses, "refused.")
+    out.skipped = _counted(run.first_statuses, run.statuses, "skipped.")
+    grippers = until(run.grippers, until_ns)
+    out.width_m = np.array([entry.record.width_m for entry in grippers])
+    out.width_t_s = np.array([(e.header.stamp_wall_ns - zero_ns) / 1e9 for e in grippers])
+    out.gripper_orders = len(until(run.gripper_commands, until_ns))
+    _segments(out, run, causes, measured, until_ns)
+    if pictures:
+        out.views = filmstrip(run, [entry.record for entry in obeyed], pictures)
+    return out
+
+
+# -- requests -------------------------------------------------------------------------------------
+def _requests(
+    out: Evaluation,
+    obeyed: Sequence[RecordedSample],
+    causes: Sequence[tuple[Cause, int]],
+    zero_ns: int,
+) -> None:
+    out.requests = len(obeyed)
+    carried_out = {(cause.worker, cause.chunk_seq) for cause, _ in causes}
+    out.succeeded = sum((entry.record.worker, entry.header.seq) in carried_out for entry in obeyed)
+    if obeyed:
+        first, last = obeyed[0].header, obeyed[-1].header
+        out.seconds = (last.stamp_wall_ns - first.stamp_wall_ns) / 1e9
+    stages = {
+        "end_to_end": [stamp - cause.observation_stamp_ns for cause, stamp in causes],
+        "outbound": [c.observed_ns - c.observation_stamp_ns for c, _ in causes],
+        "inference": [c.inference_end_ns - c.inference_start_ns for c, _ in causes],
+        "inbound": [stamp - cause.inference_end_ns for cause, stamp in causes],
+        "worker_to_command": [c.received_ns - c.inference_end_ns for c, _ in causes],
+        "command_to_pose": [stamp - cause.received_ns for cause, stamp in causes],
+    }
+    out.stages_ms = {stage: np.array(ns, np.float64) / 1e6 for stage, ns in stages.items()}
+    out.request_t_s = np.array([(stamp - zero_ns) / 1e9 for _, stamp in causes])
+
+
+# -- motion ---------------------------------------------------------------------------------------
+def _stream(entries: Iterable[Any], zero_ns: int) -> MeasuredMotion:
+    rows = [
+        ((stamp_ns - zero_ns) / 1e9, position, quat, twist)
+        for stamp_ns, position, quat, twist in entries
+    ]
+    if not rows:
+        return MeasuredMotion(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 6)))
+    t_s, position, quat, twist = (np.array(column) for column in zip(*rows, strict=True))
+    order = np.argsort(t_s, kind="stable")
+    return MeasuredMotion(t_s[order], position[order], quat[order], twist[order])
+
+
+def _measured(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
+    return _stream(
+        (
+            (e.header.stamp_wall_ns, e.record.position_m, e.record.quat_xyzw, e.record.twist)
+            for e in until(run.poses, until_ns)
+        ),
+        zero_ns,
+    )
+
+
+def _commanded(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
+    """Pose commands; where joints are commanded, the pose that the controller holds."""
+    if run.commands:
+        return _stream(
+            (
+                (e.header.stamp_wall_ns, e.record.position_m, e.record.quat_xyzw, e.record.twist)
+                for e in until(run.commands, until_ns)
+            ),
+            zero_ns,
+        )
+    poses = until(run.poses, until_ns)
+    return _stream(
+        (
+            (
+                e.header.stamp_wall_ns,
+                e.record.reference_position_m,
+                e.record.reference_quat_xyzw,
+                e.record.twist,
+            )
+            for e in poses
+            if e.record.reference_position_m is not None
+        ),
+        zero_ns,
+    )
+
+
+def _motion(out: Evaluation, measured: MeasuredMotion, commanded: MeasuredMotion, run: Run) -> None:
+    out.path_m = trajectory.path_m(measured.position_m)
+    out.path_rad = trajectory.turned_rad(measured.quat_xyzw)
+    out.command_path_m = trajectory.path_m(commanded.position_m)
+    out.command_path_rad = trajectory.turned_rad(commanded.quat_xyzw)
+    start = measured if len(measured.t_s) else commanded
+    for name, motion in (("measured", measured), ("commanded", commanded)):
+        if len(motion.t_s):
+            quats = np.vstack([start.quat_xyzw[:1], motion.quat_xyzw])
+            trace = PlotTrace(motion.t_s, motion.position_m, trajectory.rotvecs(quats)[1:])
+            setattr(out, name, trace)
+    if not (len(measured.t_s) and len(commanded.t_s) > 1):
+        return
+    later = np.clip(np.searchsorted(commanded.t_s, measured.t_s), 1, len(commanded.t_s) - 1)
+    before_s, after_s = commanded.t_s[later - 1], commanded.t_s[later]
+    within = (measured.t_s >= before_s) & (measured.t_s <= after_s) & (after_s - before_s < GAP_S)
+    share = (measured.t_s - before_s) / np.where(after_s > before_s, after_s - before_s, 1.0)
+    between = (
+        commanded.position_m[later - 1] * (1 - share[:, None])
+        + commanded.position_m[later] * share[:, None]
+    )
+    off = np.linalg.norm(between - measured.position_m, axis=1)
+    nearer = np.where(share < 0.5, later - 1, later)
+    turned = trajectory.angles_rad(commanded.quat_xyzw[nearer], measured.quat_xyzw)
+    out.tracking_mm, out.tracking_mrad = off[within] * 1e3, turned[within] * 1e3
+
+
+def _seams(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
+    """Jerk of the command stream, and what happens where one chunk takes over from another."""
+    jerk: list[float] = []
+    goal_mm: list[float] = []
+    velocity_mm_s: list[float] = []
+    for one, two in pairwise(commands):
+        apart_s = (two.header.stamp_wall_ns - one.header.stamp_wall_ns) / 1e9
+        if not 0 < apart_s < GAP_S:
+            continue
+        before, after = one.record, two.record
+        change = after.acceleration[:3] - before.acceleration[:3]
+        jerk.append(float(np.linalg.norm(change)) / apart_s)
+        if before.cause and after.cause and _chunk(before.cause) != _chunk(after.cause):
+            goal = after.goal_position_m - before.goal_position_m
+            goal_mm.append(float(np.linalg.norm(goal)) * 1e3)
+            # What acceleration explains is no step.
+            gained = (before.acceleration[:3] + after.acceleration[:3]) / 2 * apart_s
+            step = after.twist[:3] - before.twist[:3] - gained
+            velocity_mm_s.append(float(np.linalg.norm(step)) * 1e3)
+    out.jerk = np.array(jerk)
+    out.seam_goal_mm, out.seam_velocity_mm_s = np.array(goal_mm), np.array(velocity_mm_s)
+
+
+def _chunk(cause: Cause) -> tuple[str, int]:
+    return cause.worker, cause.chunk_seq
+
+
+def _joint_jerk(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
+    jerk: list[float] = []
+    for one, two in pairwise(commands):
+        apart_s = (two.header.stamp_wall_ns - one.header.stamp_wall_ns) / 1e9
+        if 0 < apart_s < GAP_S:
+            change = two.record.acceleration_rad_s2 - one.record.acceleration_rad_s2
+            jerk.append(float(np.abs(change).max()) / apart_s)
+    if jerk and not len(out.jerk):
+        out.jerk, out.jerk_unit = np.array(jerk), "rad_s3"
+
+
+# -- activity -------------------------------------------------------------------------------------
+def _active(run: Run, until_ns: int, zero_ns: int) -> list[tuple[float, float]]:
+    return [
+        ((since_ns - zero_ns) / 1e9, (min(end_ns, until_ns) - zero_ns) / 1e9)
+        for since_ns, end_ns, _ in activations(run)
+        if since_ns < until_ns
+    ]
+
+
+def _idle(out: Evaluation, active: Sequence[tuple[float, float]], measured: MeasuredMotion) -> None:
+    if not active:
+        return
+    out.active_s = sum(until_s - since_s for since_s, until_s in active)
+    out.idle_s = 0.0
+    for since_s, until_s in active:
+        part = measured.part(since_s, until_s)
+        if len(part.t_s) > 1:
+            speed = np.linalg.norm(part.twist[:-1, :3], axis=1)
+            turn = np.linalg.norm(part.twist[:-1, 3:], axis=1)
+            out.idle_s += trajectory.idle_s(part.t_s, speed, turn)
+
+
+def _counted(
+    first: Mapping[str, NodeStatus], last: Mapping[str, NodeStatus], prefix: str
+) -> Counter[str]:
+    """What nodes counted while it was recorded; of a node that was started anew, all."""
+    out: Counter[str] = Counter()
+    for node, status in last.items():
+        before = first[node]
+        same = before.started_wall_ns == status.started_wall_ns
+        for name, count in status.counters.items():
+            if name.startswith(prefix):
+                earlier = before.counters.get(name, 0) if same else 0
+                out[name.removeprefix(prefix)] += count - earlier
+    return +out
+
+
+# -- prompts --------------------------------------------------------------------------------------
+def _segments(
+    out: Evaluation,
+    run: Run,
+    causes: Sequence[tuple[Cause, int]],
+    measured: MeasuredMotion,
+    until_ns: int,
+) -> None:
+    """One for each prompt that was in force while the arm obeyed."""
+    zero_ns = run.began_ns
+    steps = {(e.record.worker, e.header.seq): len(e.record.steps) for e in run.chunks}
+    for since_ns, end_ns, prompt in prompt_intervals(run):
+        if since_ns >= until_ns:
+            break
+        end_ns = min(end_ns, until_ns)
+        out.prompts.append(prompt)
+        since_s, until_s = (since_ns - zero_ns) / 1e9, (end_ns - zero_ns) / 1e9
+        out.marks.append((since_s, prompt))
+        part = measured.part(since_s, until_s)
+        carried_out = sum(
+            steps.get(_chunk(cause), 1)
+            for cause, _ in causes
+            if since_ns <= cause.received_ns < end_ns
+        )
+        low, high = np.searchsorted(out.width_t_s, (since_s, until_s))
+        out.segments.append(
+            segment(
+                prompt,
+                carried_out,
+                until_s - since_s,
+                part.position_m,
+                part.quat_xyzw,
+                out.width_m[low:high],
+            )
+        )

@@ -1,0 +1,124 @@
+"""Statistics of values and lengths of paths."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vla_zenoh.types import FloatArray
+
+STILL_M_S, STILL_RAD_S = 0.002, 0.01
+"""An arm that is slower stands."""
+
+
+@dataclass(frozen=True, slots=True)
+class Distribution:
+    """How values are distributed; percentiles are interpolated linearly.
+
+    Args:
+        count: of the values.
+        mean: likewise.
+        std: of a sample (divisor n - 1), 0 for a single value.
+        min: smallest.
+        p50: median.
+        p95: likewise.
+        p99: likewise.
+        max: largest.
+    """
+
+    count: int
+    mean: float
+    std: float
+    min: float
+    p50: float
+    p95: float
+    p99: float
+    max: float
+
+
+def spread(values: ArrayLike) -> Distribution | None:
+    """The distribution of the finite ones among `values`, None when there are none."""
+    found = np.asarray(values, np.float64)
+    found = found[np.isfinite(found)]
+    if not found.size:
+        return None
+    p50, p95, p99 = np.percentile(found, (50, 95, 99))
+    return Distribution(
+        int(found.size),
+        float(found.mean()),
+        float(found.std(ddof=1)) if found.size > 1 else 0.0,
+        float(found.min()),
+        float(p50),
+        float(p95),
+        float(p99),
+        float(found.max()),
+    )
+
+
+def known(rows: FloatArray) -> FloatArray:
+    """The rows whose numbers are all finite."""
+    return rows[np.isfinite(rows).all(axis=1)] if len(rows) else rows
+
+
+def path_m(position_m: FloatArray) -> float | None:
+    """Length of the way through points (n, 3); incomplete points are left out."""
+    points = known(position_m)
+    if not len(points):
+        return None
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def angles_rad(quat_xyzw: FloatArray, other_xyzw: FloatArray) -> FloatArray:
+    """Angle of the shortest rotation between the orientations in each row, (n, 4) each."""
+    turned = relative(quat_xyzw, other_xyzw)
+    return 2.0 * np.arctan2(np.linalg.norm(turned[:, :3], axis=1), np.abs(turned[:, 3]))
+
+
+def turned_rad(quat_xyzw: FloatArray) -> float | None:
+    """Length of the way through orientations (n, 4), on geodesics; incomplete ones left out."""
+    turns = known(quat_xyzw)
+    if not len(turns):
+        return None
+    return float(angles_rad(turns[:-1], turns[1:]).sum())
+
+
+def relative(quat_xyzw: FloatArray, other_xyzw: FloatArray) -> FloatArray:
+    """In each row what turns the first orientation into the second, about axes of the base."""
+    v, w = -quat_xyzw[:, :3], quat_xyzw[:, 3:]
+    u, s = other_xyzw[:, :3], other_xyzw[:, 3:]
+    vector = s * v + w * u + np.cross(u, v)
+    return np.hstack([vector, w * s - np.sum(u * v, axis=1, keepdims=True)])
+
+
+def rotvecs(quat_xyzw: FloatArray) -> FloatArray:
+    """Rotation vectors (n, 3) in rad since the first orientation that is known, base axes."""
+    found = known(quat_xyzw)
+    if not len(found):
+        return np.full((len(quat_xyzw), 3), np.nan)
+    turned = relative(np.broadcast_to(found[:1], quat_xyzw.shape), quat_xyzw)
+    turned = np.where(turned[:, 3:] < 0, -turned, turned)
+    norm = np.linalg.norm(turned[:, :3], axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(norm, turned[:, 3:])
+    return turned[:, :3] * np.where(norm > 1e-12, angle / np.maximum(norm, 1e-300), 2.0)
+
+
+def with_w(vector_xyz: FloatArray) -> FloatArray:
+    """Unit quaternions (n, 4) of their x, y, z: w is the positive root of what is missing to 1."""
+    w = np.sqrt(np.clip(1.0 - np.sum(vector_xyz**2, axis=1, keepdims=True), 0.0, None))
+    full = np.hstack([vector_xyz, w])
+    norm = np.linalg.norm(full, axis=1, keepdims=True)
+    return full / np.where(norm > 0, norm, np.nan)
+
+
+def idle_s(t_s: FloatArray, speed_m_s: FloatArray, turn_rad_s: FloatArray) -> float:
+    """Time in which the arm stands; (n,) times and (n - 1,) speeds between them."""
+    still = (speed_m_s < STILL_M_S) & (turn_rad_s < STILL_RAD_S)
+    return float(np.diff(t_s)[still].sum())
+
+
+def concatenated(parts: Sequence[FloatArray]) -> FloatArray:
+    """All values in one array, empty when there are none."""
+    return np.concatenate(parts) if parts else np.zeros(0)

@@ -1,0 +1,78 @@
+"""Which record a key carries."""
+
+from __future__ import annotations
+
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.keys import Keys, last
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.types import (
+    ActionChunk,
+    Event,
+    GripperCommand,
+    GripperState,
+    JointCommand,
+    JointState,
+    NodeStatus,
+    ObjectPoses,
+    PoseCommand,
+    PoseState,
+    SceneState,
+    Seen,
+    Task,
+)
+
+RECORDS: tuple[type, ...] = (
+    JointState,
+    PoseState,
+    GripperState,
+    PoseCommand,
+    JointCommand,
+    GripperCommand,
+    Task,
+    ActionChunk,
+    ModelSpec,
+    NodeStatus,
+    Event,
+    SceneState,
+    ObjectPoses,
+    Seen,
+)
+"""Every record that has a key."""
+
+
+class RecordTypes:
+    """Answers for the keys of one robot; what it was asked it knows by heart."""
+
+    def __init__(self, keys: Keys) -> None:
+        self._keys = keys
+        self._known: dict[str, type | None] = {
+            keys.state_joint: JointState,
+            keys.state_pose: PoseState,
+            keys.state_gripper: GripperState,
+            keys.command_pose: PoseCommand,
+            keys.command_joint: JointCommand,
+            keys.command_gripper: GripperCommand,
+            keys.task: Task,
+            keys.sim_scene: SceneState,
+            keys.sim_objects: ObjectPoses,
+        }
+
+    def of(self, key: str) -> type | None:
+        """The record that travels on `key`; None where it is a picture, plain text or unknown."""
+        if key not in self._known:
+            self._known[key] = self._look_up(key)
+        return self._known[key]
+
+    def _look_up(self, key: str) -> type | None:
+        families = (
+            (self._keys.delta, ActionChunk),
+            (self._keys.spec, ModelSpec),
+            (self._keys.status, NodeStatus),
+            (self._keys.event, Event),
+            (self._keys.seen_record, Seen),
+        )
+        name = last(key)
+        try:
+            return next((kind for make, kind in families if make(name) == key), None)
+        except ProfileError:
+            return None

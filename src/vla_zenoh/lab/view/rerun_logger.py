@@ -1,0 +1,268 @@
+"""Samples of a robot, live or recorded, into a Rerun stream."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from vla_zenoh.codec import settings
+from vla_zenoh.errors import CodecError, RecordError
+from vla_zenoh.keys import Keys, last
+from vla_zenoh.lab.recording.record_types import RecordTypes
+from vla_zenoh.lab.recording.sample import JPEG, Sample
+from vla_zenoh.lab.view import paths
+from vla_zenoh.lab.view.charts import Charts
+from vla_zenoh.lab.view.layout import blueprint
+from vla_zenoh.lab.view.robot_model import load_robot_model
+from vla_zenoh.lab.view.scene import Scene, pose_of
+from vla_zenoh.lab.view.shown_sample import Live, ShownSample
+from vla_zenoh.lab.view.texts import TextPanels
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.profile import Profile, to_yaml
+from vla_zenoh.types import (
+    ActionChunk,
+    Event,
+    GripperCommand,
+    GripperState,
+    JointCommand,
+    JointState,
+    NodeStatus,
+    ObjectPoses,
+    PoseCommand,
+    PoseState,
+    SceneState,
+    Seen,
+    Task,
+)
+
+DRAW_NS = 33_000_000
+"""States and commands are drawn this often at most; none of their causes is overlooked."""
+APART_NS = 10_000_000_000
+"""A stamp that far from when it was heard is of another clock: the latter counts."""
+JPEG_BEGINS = b"\xff\xd8\xff"
+COMMAND_NODE = "command"
+APPLICATION = "vla-zenoh"
+
+
+class RerunLogger:
+    """Takes samples in the order heard and logs what they show.
+
+    What cannot be shown is counted in `refused`, and stands in the view itself.
+
+    Args:
+        profile: of the robot.
+        stream: a Rerun stream, with its sink.
+        keys: those the samples are on; the profile's own without it.
+        live: the view follows what comes in.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        stream: rr.RecordingStream,
+        *,
+        keys: Keys | None = None,
+        live: bool = False,
+    ) -> None:
+        self._stream, self._live = stream, live
+        self.keys = keys or profile.keys
+        self._kinds = RecordTypes(self.keys)
+        self._command_status = self.keys.status(COMMAND_NODE)
+        shapes, missing = load_robot_model(profile)
+        self._kinematics = shapes.kinematics if shapes is not None else None
+        stream.set_log_time_enabled(False)
+        stream.set_log_tick_enabled(False)
+        self._scene = Scene(stream, profile, shapes)
+        self._charts = Charts(stream, profile.robot.arm_joints)
+        self._words = TextPanels(stream, to_yaml(profile), missing)
+        self._drawn_ns: dict[str, int] = {}
+        self._specs: dict[str, ModelSpec] = {}
+        self._obeyed = profile.task.worker
+        self._commanded: PoseCommand | None = None
+        self._widest_mm = profile.robot.gripper.max_width_m * 1e3
+        self._cameras: set[str] = set()
+        self._seen: defaultdict[str, set[str]] = defaultdict(set)
+        self._layout()
+        self.shown: Counter[str] = Counter()
+        """Samples that came and could be read, by key."""
+        self.refused: Counter[str] = Counter()
+        """Samples that cannot be shown, by key and reason."""
+        self.dropped = 0
+        """Samples that whoever feeds this had to leave out."""
+        self._take: dict[type, Callable[[ShownSample, int, Any], None]] = {
+            PoseState: self._pose_state,
+            JointState: self._joint_state,
+            GripperState: self._gripper_state,
+            PoseCommand: self._pose_command,
+            JointCommand: self._joint_command,
+            GripperCommand: self._gripper_command,
+            ObjectPoses: self._objects,
+            ActionChunk: self._chunk,
+            ModelSpec: self._spec,
+            Task: self._on_task,
+            NodeStatus: self._status,
+            Event: self._event,
+            Seen: self._on_seen,
+        }
+        self._often = (PoseState, JointState, GripperState, ObjectPoses)
+
+    def _layout(self) -> None:
+        self._stream.send_blueprint(
+            blueprint(self._cameras, self._seen, widest_mm=self._widest_mm, live=self._live)
+        )
+
+    # -- in -----------------------------------------------------------------------------------
+    def hear(self, sample: Sample) -> None:
+        """Take a sample off the wire."""
+        self.take(Live(sample, self._kinds.of(sample.key)))
+
+    def take(self, said: ShownSample) -> None:
+        """Take a sample; whatever it is, nothing is raised."""
+        group = self.keys.group(said.key)
+        if not group or said.kind is SceneState:
+            return
+        stamp_ns = self._stamp_ns(said)
+        if not self.shown:
+            self._scene.robot_moved()  # at home, until its joints are known
+        try:
+            if said.kind is not None:
+                self._record(said, stamp_ns)
+            elif group in (paths.CAMERA, paths.SEEN):
+                self._picture(said, group)
+            else:
+                self._setting(said)
+            self.shown[said.key] += 1
+        except CodecError as error:
+            self.refused[f"{self.keys.short(said.key)}: {error.reason}"] += 1
+        except RecordError:
+            self.refused[f"{self.keys.short(said.key)}: does not fit its spec"] += 1
+
+    def _stamp_ns(self, said: ShownSample) -> int:
+        stamp_ns = said.received_ns
+        if said.header is not None and abs(said.header.stamp_wall_ns - stamp_ns) < APART_NS:
+            stamp_ns = said.header.stamp_wall_ns
+        self._stream.set_time(paths.TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
+        return stamp_ns
+
+    def _due(self, key: str, stamp_ns: int) -> bool:
+        if 0 <= stamp_ns - self._drawn_ns.get(key, 0) < DRAW_NS:
+            return False
+        self._drawn_ns[key] = stamp_ns
+        return True
+
+    def _record(self, said: ShownSample, stamp_ns: int) -> None:
+        if said.header is None and said.kind is not ModelSpec:  # an answer to a question has none
+            raise CodecError("no_header", f"{said.key} has no header")
+        if said.kind in self._often and not self._due(said.key, stamp_ns):
+            return
+        record = said.record()
+        take = self._take.get(type(record))
+        if take is not None:
+            take(said, stamp_ns, record)
+
+    # -- pictures and settings ----------------------------------------------------------------
+    def _picture(self, said: ShownSample, group: str) -> None:
+        _, first, *rest = self.keys.short(said.key).split("/", 2)
+        second = rest[0] if rest else ""
+        if group == paths.CAMERA and second != "jpeg":
+            return
+        if not second or said.encoding != JPEG or not said.data.startswith(JPEG_BEGINS):
+            raise CodecError("malformed", "it is no JPEG")
+        if group == paths.CAMERA:
+            path, known, name = paths.picture(first), self._cameras, first
+        else:
+            path, known, name = paths.seen(first, second), self._seen[first], second
+        if name not in known:
+            known.add(name)
+            self._layout()
+        self._stream.log(path, rr.EncodedImage(contents=said.data, media_type=JPEG))
+
+    def _setting(self, said: ShownSample) -> None:
+        if said.header is not None or "/" in self.keys.short(said.key):
+            raise CodecError("malformed", "bytes that are no record")
+        self._words.setting(self.keys.short(said.key), settings.decode_text(said.data))
+
+    # -- the robot ----------------------------------------------------------------------------
+    def _pose_state(self, _: ShownSample, stamp_ns: int, state: PoseState) -> None:
+        self._scene.pose(paths.MEASURED, stamp_ns, pose_of(state.position_m, state.quat_xyzw))
+        self._charts.speed(paths.MEASURED, state.twist)
+        commanded_m = state.reference_position_m
+        if commanded_m is None and self._commanded is not None:
+            commanded_m = self._commanded.position_m
+        if commanded_m is not None:
+            self._charts.tracking(float(np.linalg.norm(commanded_m - state.position_m)))
+
+    def _joint_state(self, _: ShownSample, stamp_ns: int, state: JointState) -> None:
+        self._scene.joints(state.names, state.position_rad)
+        self._charts.joints(state.names, state.position_rad)
+
+    def _gripper_state(self, _: ShownSample, stamp_ns: int, state: GripperState) -> None:
+        self._scene.gripper(max(state.width_m, 0.0))
+        self._charts.gripper(paths.MEASURED, state.width_m)
+
+    def _objects(self, _: ShownSample, stamp_ns: int, objects: ObjectPoses) -> None:
+        self._scene.objects(objects)
+
+    # -- commands -----------------------------------------------------------------------------
+    def _pose_command(self, said: ShownSample, stamp_ns: int, command: PoseCommand) -> None:
+        goal = pose_of(command.goal_position_m, command.goal_quat_xyzw)
+        self._scene.goal(stamp_ns, goal)
+        self._charts.command(stamp_ns, command.cause)
+        self._commanded = command
+        if self._due(said.key, stamp_ns):
+            pose = pose_of(command.position_m, command.quat_xyzw)
+            self._scene.pose(paths.COMMANDED, stamp_ns, pose)
+            self._scene.pose(paths.GOAL, stamp_ns, goal)
+            self._charts.speed(paths.COMMANDED, command.twist)
+
+    def _joint_command(self, said: ShownSample, stamp_ns: int, command: JointCommand) -> None:
+        self._charts.command(stamp_ns, command.cause)
+        arm = self._kinematics
+        if arm is None or not self._due(said.key, stamp_ns):
+            return
+        joints_rad = arm.ordered(command.names, command.position_rad)
+        velocity = arm.ordered(command.names, command.velocity_rad_s)
+        pose, jacobian = arm.pose_and_jacobian(joints_rad)
+        self._scene.pose(paths.COMMANDED, stamp_ns, pose)
+        self._charts.speed(paths.COMMANDED, jacobian @ velocity)
+
+    def _gripper_command(self, _: ShownSample, stamp_ns: int, command: GripperCommand) -> None:
+        self._charts.gripper(paths.COMMANDED, command.width_m)
+
+    # -- models -------------------------------------------------------------------------------
+    def _spec(self, _: ShownSample, stamp_ns: int, spec: ModelSpec) -> None:
+        self._specs[spec.hash] = spec
+
+    def _chunk(self, _: ShownSample, stamp_ns: int, chunk: ActionChunk) -> None:
+        spec = self._specs.get(chunk.spec_hash)
+        if spec is None:
+            raise CodecError("no_spec", "no spec says what its numbers mean")
+        obeyed = chunk.worker == self._obeyed
+        self._scene.chunk(stamp_ns, chunk, spec, obeyed)
+        if not obeyed:
+            self._charts.shadow(chunk)
+
+    def _on_seen(self, _: ShownSample, stamp_ns: int, seen: Seen) -> None:
+        if seen.worker not in self._seen:
+            self._seen[seen.worker] = set()
+            self._layout()
+        self._words.answer(seen)
+
+    # -- words --------------------------------------------------------------------------------
+    def _on_task(self, _: ShownSample, stamp_ns: int, task: Task) -> None:
+        self._obeyed = task.worker
+        self._words.task(task)
+        self._words.now(stamp_ns, self.refused, self.dropped)
+
+    def _status(self, said: ShownSample, stamp_ns: int, status: NodeStatus) -> None:
+        if said.key == self._command_status:
+            self._charts.status(status)
+            self._words.status(status)
+        self._words.now(stamp_ns, self.refused, self.dropped)
+
+    def _event(self, said: ShownSample, stamp_ns: int, event: Event) -> None:
+        self._words.event(last(said.key), stamp_ns, event)

@@ -1,0 +1,147 @@
+"""What is said in words: the task and state of now, events, what models answer."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import rerun as rr
+
+from vla_zenoh.lab.view import paths
+from vla_zenoh.types import Event, NodeStatus, Seen, Task
+
+LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
+BOUND_NS = 1_000_000_000
+"""A bound counts as acting for so long after the last event of it."""
+MAX_RAW = 600
+
+
+class TextPanels:
+    """Logs texts at the time the stream is set to.
+
+    Args:
+        stream: to log into.
+        profile_yaml: the profile in force.
+        missing: why the robot itself is not shown; empty when it is.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, profile_yaml: str, missing: str = "") -> None:
+        self._stream, self._missing = stream, missing
+        self._task: Task | None = None
+        self._status: NodeStatus | None = None
+        self._bounds: dict[str, tuple[int, str]] = {}
+        self._now = ""
+        text = f"```yaml\n{profile_yaml}\n```"
+        self._document(paths.PROFILE, text, static=True)
+
+    def _document(self, path: str, text: str, *, static: bool = False) -> None:
+        document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+        self._stream.log(path, document, static=static)
+
+    # -- now ----------------------------------------------------------------------------------
+    def task(self, task: Task) -> None:
+        """The settings as the command node agreed to them."""
+        self._task = task
+
+    def status(self, status: NodeStatus) -> None:
+        """What the command node says of itself."""
+        self._status = status
+
+    def now(self, stamp_ns: int, refused: Counter[str], dropped: int) -> None:
+        """Write what holds now, where it is something else than before.
+
+        Args:
+            stamp_ns: now.
+            refused: samples that cannot be shown, by reason.
+            dropped: samples that came faster than they were shown.
+        """
+        lines = [*self._of_task(), "", *self._of_bounds(stamp_ns), *self._of_refusals()]
+        if self._missing:
+            lines.append(f"- The robot itself is not shown: {plain(self._missing)}")
+        if refused:
+            named = ", ".join(f"{plain(why)} ({count})" for why, count in refused.most_common(5))
+            lines.append(f"- **Not shown here:** {named}")
+        if dropped:
+            lines.append(f"- **Left out here, too slow:** {dropped} samples")
+        text = "\n".join(lines)
+        if text != self._now:
+            self._now = text
+            self._document(paths.NOW, text)
+
+    def _of_task(self) -> list[str]:
+        task = self._task
+        if task is None:
+            return ["No command node has spoken."]
+        state = self._status.state if self._status is not None else ""
+        why = str(self._status.detail.get("why", "")) if self._status is not None else ""
+        return [
+            f"## {plain(task.prompt) or '(no prompt)'}",
+            "",
+            f"**{plain(state) or 'unknown'}**{f', {plain(why)}' if why else ''}",
+            "",
+            f"{plain(task.worker)} at {task.rate_hz:g} Hz, episode {task.episode}, "
+            f"{'active' if task.active else 'not active'}"
+            f"{f', speed {task.speed_percent:g} %' if task.speed_percent < 100 else ''}",
+        ]
+
+    def _of_bounds(self, stamp_ns: int) -> list[str]:
+        acting = [text for since, text in self._bounds.values() if 0 <= stamp_ns - since < BOUND_NS]
+        return [f"- Bounds acting: {', '.join(acting) or 'none'}"]
+
+    def _of_refusals(self) -> list[str]:
+        counters = self._status.counters if self._status is not None else {}
+        refused = [
+            f"{plain(name.removeprefix('refused.'))} {count}"
+            for name, count in sorted(counters.items())
+            if name.startswith("refused.") and count
+        ]
+        return [f"- Refused by the command node: {', '.join(refused)}"] if refused else []
+
+    # -- log ----------------------------------------------------------------------------------
+    def event(self, node: str, stamp_ns: int, event: Event) -> None:
+        """Something happened."""
+        if event.kind == "limit":
+            self._bounds[event.what] = (stamp_ns, plain(f"{event.what} {event.why}".strip()))
+        parts = [f"{node}: {event.what}"]
+        if event.why:
+            parts.append(event.why)
+        if event.value is not None:
+            limit = f", limit {event.limit:.4g}" if event.limit is not None else ""
+            parts.append(f"({event.value:.4g}{limit})")
+        if event.count > 1:
+            parts.append(f"x{event.count}")
+        level = LEVELS[event.level]
+        self._stream.log(paths.below(paths.EVENTS, node), rr.TextLog(" ".join(parts), level=level))
+
+    def setting(self, name: str, text: str) -> None:
+        """Somebody put a setting."""
+        said = f"{name}: {text}" if text else name
+        self._stream.log(f"{paths.EVENTS}/settings", rr.TextLog(said, level="INFO"))
+
+    def answer(self, seen: Seen) -> None:
+        """What a model was asked, and what it answered."""
+        first = " ".join(f"{value:+.4f}" for value in seen.steps[0]) if len(seen.steps) else ""
+        lines = [
+            f"**{plain(seen.prompt)}**",
+            "",
+            f"chunk {seen.chunk_seq}, {seen.inference_ms:.1f} ms, {len(seen.steps)} steps"
+            + (", the last ones" if seen.done else ""),
+            "",
+            f"first step `{first}`",
+            *_raw(seen.raw),
+        ]
+        self._document(paths.said(seen.worker), "\n".join(lines))
+
+
+def _raw(raw: Mapping[str, Any]) -> list[str]:
+    if not raw:
+        return []
+    text = json.dumps(raw)
+    return ["", f"raw `{text if len(text) <= MAX_RAW else f'{text[:MAX_RAW]}...'}`"]
+
+
+def plain(text: str) -> str:
+    """Anybody's text without what Markdown would make of it."""
+    return "".join(f"\\{c}" if c in "\\`*_{}[]<>()#+!|~" else c for c in " ".join(text.split()))
