@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.codec import message
-from vla_zenoh.control.profile_arm import make_shadow
-from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.control.reachability import ReachabilityFilter, make_reachability_filter
 from vla_zenoh.guard.command_stream import BRAKE_MARGIN
 from vla_zenoh.lab.lockstep import Lockstep, Message, Tamper
 from vla_zenoh.policy import (
@@ -27,8 +26,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.robots.sim.node import build_world
-from vla_zenoh.simulation.world import World
+from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import ActionChunk, FloatArray, PoseCommand
 
 RATE_HZ = 10.0
@@ -85,7 +83,7 @@ def _world() -> World:
 
 @cache
 def _shadow() -> ReachabilityFilter:
-    return make_shadow(shipped())
+    return make_reachability_filter(shipped())
 
 
 def begin(

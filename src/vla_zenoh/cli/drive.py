@@ -10,7 +10,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.liveliness import robots_alive
+from vla_zenoh.bus.liveliness import alive_robots
 from vla_zenoh.cli.options import options
 from vla_zenoh.cli.output import complain, console, errors, fail, styled
 from vla_zenoh.cli.target import RobotTarget
@@ -53,7 +53,7 @@ def activate(
     """Let the worker move the arm. Rejected with every reason while something is not ready."""
     with target.operator("activate") as client:
         stop = stop_on_signals() if held else None
-        task = client.activate() if stop is None else client.activate_while_here("person")
+        task = client.activate() if stop is None else client.activate_with_deadman("person")
         _show(
             target,
             client,
@@ -157,7 +157,7 @@ def stop(
 ) -> None:
     """Emergency stop: brake now and stay stopped until `vla-zenoh reset`."""
     with target.client(stop=True) as client:
-        client.put(client.keys.stop, "stop")
+        client.publish(client.keys.stop, "stop")
         if every:
             _stop_all(target, client)
             return
@@ -173,7 +173,7 @@ def stop(
 def reset(target: RobotTarget) -> None:
     """Clear an emergency stop or a fault. The arm stays inactive."""
     with target.operator("reset") as client:
-        client.put(client.keys.reset, "reset")
+        client.publish(client.keys.reset, "reset")
         if not _reaches(client, lambda: _state(client) not in ("", "stopped", "fault")):
             status = client.status("command")
             if status is None or "command" not in client.alive:
@@ -218,15 +218,15 @@ def _stop_all(target: RobotTarget, own: Client) -> None:
     robots: list[str] = []
     give_up = time.monotonic() + DISCOVERY_S
     while time.monotonic() < give_up:
-        for robot in robots_alive(own.session, own.keys):
+        for robot in alive_robots(own.session, own.keys):
             if robot not in robots:
-                own.put(Keys(robot, own.keys.root).stop, "stop")
+                own.publish(Keys(robot, own.keys.root).stop, "stop")
                 robots.append(robot)
         time.sleep(POLL_S)
     if not robots:
         why = target.not_operator(own.profile, "stop")
         fail(f"no robot is visible on this router. {why}".rstrip(". "))
-    clients = [Client(as_robot(own.profile, robot), own.session).follow() for robot in robots]
+    clients = [Client(as_robot(own.profile, robot), own.session).subscribe() for robot in robots]
     done = [_stops(client) for client in clients]
     for client, stopped in zip(clients, done, strict=True):
         if stopped:

@@ -24,7 +24,7 @@ from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, fail, print_json, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec import message
-from vla_zenoh.codec.image import MAX_PICTURE_BYTES
+from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.keys import Keys
 from vla_zenoh.sanitize import one_line
@@ -126,9 +126,9 @@ def _listen(robot: Client, seconds: float, images: bool) -> list[KeyTraffic]:
 
 def _expressions(robot: Client, images: bool) -> Iterable[str]:
     if images:
-        return [robot.keys.everything]
+        return [robot.keys.all_keys]
     # One expression per group, without images: a subscription makes cameras encode and send.
-    below = robot.keys.everything.removesuffix("**")
+    below = robot.keys.all_keys.removesuffix("**")
     groups = ("state/*", "command/*", "delta/*", "spec/*", "status/*", "event/*", "sim/*", "task")
     return [below + group for group in groups]
 
@@ -179,7 +179,7 @@ def echo(
     profile = target.load()
     below = f"{profile.root}/{profile.robot.name}"
     whole = key if key.startswith(f"{profile.root}/") else f"{below}/{key}"
-    inbox, printed = CallbackRing(256, MAX_PICTURE_BYTES), 0
+    inbox, printed = CallbackRing(256, MAX_IMAGE_BYTES), 0
     with open_session(profile.session) as session:
         try:
             subscriber = session.declare_subscriber(
@@ -189,7 +189,7 @@ def echo(
             fail(f"{whole!r} is not a key expression: {error}", 2)
         end = time.monotonic() + seconds if seconds is not None else None
         while (count is None or printed < count) and (end is None or time.monotonic() < end):
-            for arrival in inbox.take_all():
+            for arrival in inbox.drain():
                 _print_sample(arrival.sample, as_json)
                 printed += 1
                 if count is not None and printed >= count:

@@ -12,14 +12,8 @@ from vla_zenoh.cli.bridge_config import bridge_config
 from vla_zenoh.cli.options import HostOption, JsonOption
 from vla_zenoh.cli.output import console, errors, fail, print_json, styled
 from vla_zenoh.errors import MissingExtraError, ProfileError, RecordError, ResourceError
-from vla_zenoh.profile import (
-    Profile,
-    advice,
-    load_profile,
-    profile_file,
-    profile_names,
-    to_yaml,
-)
+from vla_zenoh.profile import Profile, load_profile, profile_file, profile_names, to_yaml
+from vla_zenoh.profile.advice import advice
 
 profile_app = typer.Typer(help="List, show and check profiles.", no_args_is_help=True)
 profile_app.command("bridge-config")(bridge_config)
@@ -106,9 +100,9 @@ def _check_arm(profile: Profile, name: str, host: str | None) -> list[str]:
     """
     needed = _runs_command(profile, name, host)
     try:
-        from vla_zenoh.control.profile_arm import make_shadow
+        from vla_zenoh.control.reachability import make_reachability_filter
 
-        make_shadow(profile)
+        make_reachability_filter(profile)
     except ResourceError as error:
         if needed:
             raise ProfileError(f"{profile_file(name)}: robot.description: {error}") from error
@@ -130,10 +124,10 @@ def _check_brake(profile: Profile) -> list[str]:
     if profile.robot.driver == "sim":
         return []
     try:
-        from vla_zenoh.guard.braking_time import longest_brake_s
+        from vla_zenoh.guard.braking_time import max_braking_time_s
     except ImportError:
         return []  # `_check_arm` has already said so
-    brake_s = longest_brake_s(profile)
+    brake_s = max_braking_time_s(profile)
     if brake_s <= LONG_BRAKE_S:
         return []
     return [

@@ -13,7 +13,7 @@ import typer
 import zenoh
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.liveliness import robots_alive
+from vla_zenoh.bus.liveliness import alive_robots
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
@@ -26,8 +26,8 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import errors, styled
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.profile import Profile, as_robot
-from vla_zenoh.security.identity import Role, person
-from vla_zenoh.security.operator_identity import people_hosts, role_here
+from vla_zenoh.security.identity import Role, operator_role
+from vla_zenoh.security.operator_identity import local_role, operator_hosts
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class RobotTarget:
         profile = effective_profile(self.profile, self.connect, host=self.host)
         if self.robot is not None:
             profile = as_robot(profile, self.robot)
-        hosts = people_hosts(profile, stop=stop)
+        hosts = operator_hosts(profile, stop=stop)
         return [_with_host(profile, host) for host in hosts] or [profile]
 
     # -- sessions -----------------------------------------------------------------------------
@@ -98,7 +98,7 @@ class RobotTarget:
         """
         profile, session = _first(self._choices(stop=stop)[: None if stop else 1])
         with session:
-            yield Client(profile, session).follow()
+            yield Client(profile, session).subscribe()
 
     @contextmanager
     def operator(self, *command: str) -> Iterator[Client]:
@@ -143,20 +143,20 @@ class RobotTarget:
     def others(self, client: Client) -> list[str]:
         """Other robots whose command node is alive."""
         return [
-            name for name in robots_alive(client.session, client.keys) if name != client.keys.robot
+            name for name in alive_robots(client.session, client.keys) if name != client.keys.robot
         ]
 
     def not_operator(self, profile: Profile, *command: str) -> str:
         """Why the certificate here may not drive, with what to type; empty where it may."""
-        role = role_here(profile)
+        role = local_role(profile)
         if role is None or role is Role.OPERATOR:
             return ""
         assert profile.session.security is not None
         who = f"{role.value}@{profile.session.security.host}"
         able = [
             host
-            for host in people_hosts(_with_host(profile, None), stop=True)
-            if person(profile, host) is Role.OPERATOR
+            for host in operator_hosts(_with_host(profile, None), stop=True)
+            if operator_role(profile, host) is Role.OPERATOR
         ]
         what = (
             f"this computer also has an operator's: `{self.typed(*command, host=able[0])}`"

@@ -17,14 +17,21 @@ import numpy as np
 
 from vla_zenoh.control.actions import rotation_of, step_pose, step_width
 from vla_zenoh.control.chunk_validation import Rejection
-from vla_zenoh.control.limits import LimitHit, bound_step
+from vla_zenoh.control.limits import (
+    APPROACH,
+    LEAST,
+    LimitHit,
+    Slowdown,
+    bound_step,
+    full_speed_s,
+    going_on,
+)
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.control.reachability import Bounded, ReachabilityFilter
-from vla_zenoh.control.slowdown import APPROACH, LEAST, Slowdown, full_speed_s, going_on
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.so3 import Pose, between, distance
+from vla_zenoh.kinematics.so3 import Pose, interpolate, pose_distance
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec
-from vla_zenoh.profile import REFUSE_FACTOR, Profile
+from vla_zenoh.profile import REJECT_FACTOR, Profile
 from vla_zenoh.types import (
     QUATERNION_NORM_TOLERANCE,
     ActionChunk,
@@ -157,7 +164,7 @@ class ChunkPlanner:
         done = record.done and count == len(record.steps)
         observed_ns = record.observation_stamp_ns
         standing_on = timeline.in_force(observed_ns)
-        before = standing_on.asked_until(observed_ns)
+        before = standing_on.goal_at(observed_ns)
         steps = np.asarray(record.steps[:count], np.float64)
         refusal = self._mistake(action, steps, before)
         if refusal is not None:
@@ -185,9 +192,9 @@ class ChunkPlanner:
         if isinstance(standing_on, ChunkPlan) and standing_on.approaches:
             # What goes on is not told again, nor faster the more often a model is asked.
             plan.announced = True
-            plan.first_ns = min(plan.dt_ns, max(standing_on.lasted_ns(observed_ns), 0))
+            plan.first_ns = min(plan.dt_ns, max(standing_on.elapsed_ns(observed_ns), 0))
         if standing_on.episode == record.episode:
-            plan.begun = standing_on.steps_asked_until(observed_ns)
+            plan.begun = standing_on.steps_until(observed_ns)
             if done and standing_on.done:  # it only says the last of its steps again
                 plan.most = min(standing_on.begun + len(standing_on.goals), standing_on.most)
         return plan
@@ -199,7 +206,7 @@ class ChunkPlanner:
             whether it may come in force; where the profile says that what is out of bounds is to
             be refused, all of it is made before that is known.
         """
-        until = len(plan.goals) if self._refusing else plan.due_at(now_ns) + 1
+        until = len(plan.goals) if self._refusing else plan.due_index(now_ns) + 1
         while plan.bounded < until:
             acted = self._make_step(plan)
             if acted is None:
@@ -220,7 +227,7 @@ class ChunkPlanner:
         chunks = [plan for plan in reversed(plans) if isinstance(plan, ChunkPlan)]
         for ahead in (0, LOOK_AHEAD):
             for plan in chunks:
-                due = plan.due_at(now_ns)
+                due = plan.due_index(now_ns)
                 if plan.action.kind == "absolute" and plan.bounded > due:
                     plan.made = plan.bounded  # the leash moves no pose that is named
                 until = min(due + 1 + ahead, len(plan.goals))
@@ -247,7 +254,7 @@ class ChunkPlanner:
         index, pose, hits, slower, joints_rad = plan.bounded, step.pose, step.hits, None, None
         if found is not None:
             pose, joints_rad, slower = found.pose, found.joints_rad, found.slowdown
-            cut = sum(distance(pose, step.pose)) if found.hits else 0.0
+            cut = sum(pose_distance(pose, step.pose)) if found.hits else 0.0
             # What cuts most is told first.
             hits = [*found.hits, *hits] if cut > step.cut else [*hits, *found.hits]
             plan.made = index + 1 if found.hits else max(plan.made, index + 1)
@@ -275,7 +282,7 @@ class ChunkPlanner:
                 asked, slower = self._approach(plan, start.pose, asked)
             width_m = step_width(plan.action, numbers, start.width_m, self._max_width_m)
             pose, acted = bound_step(self._limits, start.pose, asked)
-            cut = sum(distance(pose, asked)) if acted else 0.0
+            cut = sum(pose_distance(pose, asked)) if acted else 0.0
             width_m = start.width_m if width_m is None else width_m
             step = _Step(start, None, pose, width_m, acted, cut, slower)
         if self._reach is not None:
@@ -287,7 +294,7 @@ class ChunkPlanner:
     def _approach(self, plan: ChunkPlan, start: Pose, target: Pose) -> tuple[Pose, Slowdown | None]:
         """How far a step goes to `target`, and how fast: straight and slowly while it is far."""
         limits = self._limits
-        far_m, far_rad = distance(start, target)
+        far_m, far_rad = pose_distance(start, target)
         steps = max(far_m / limits.step_m, far_rad / limits.step_rad)
         if steps <= 1 + ROUNDING:
             return target, None
@@ -302,7 +309,7 @@ class ChunkPlanner:
         share = min(max(full_s / needed_s, LEAST), 1.0)
         has_ns = plan.dt_ns if plan.bounded or plan.first_ns < 0 else plan.first_ns
         part = min(has_ns / 1e9 / needed_s, 1 / steps)
-        return between(start, target, part), Slowdown(APPROACH, share, far, step, "", BEHIND_S)
+        return interpolate(start, target, part), Slowdown(APPROACH, share, far, step, "", BEHIND_S)
 
     # -- the whole chunk ----------------------------------------------------------------------
     def _mistake(self, action: ActionSpec, steps: FloatArray, before: Goal) -> Rejection | None:
@@ -324,15 +331,15 @@ class ChunkPlanner:
             most_rad = 2.0 * np.arccos(np.clip(np.abs(turns[:, 3]) - ROUNDING, 0.0, 1.0))
         else:  # three turns, or one: together at most as far as this
             most_rad = np.abs(turns).sum(axis=1)
-        far = np.linalg.norm(ways_m, axis=1) > limits.step_m * REFUSE_FACTOR * (1 - ROUNDING)
-        far |= most_rad > limits.step_rad * REFUSE_FACTOR * (1 - ROUNDING)
+        far = np.linalg.norm(ways_m, axis=1) > limits.step_m * REJECT_FACTOR * (1 - ROUNDING)
+        far |= most_rad > limits.step_rad * REJECT_FACTOR * (1 - ROUNDING)
         for index in far.nonzero()[0]:
             asked = step_pose(action, steps[index], before.pose)
             for hit in bound_step(limits, before.pose, asked)[1]:
                 if hit.fatal:
                     return Rejection(
                         hit.name,
-                        f"a step of {hit.value:.4g} is over {REFUSE_FACTOR:g} times its "
+                        f"a step of {hit.value:.4g} is over {REJECT_FACTOR:g} times its "
                         "limit; is its unit right?",
                         hit.value,
                         hit.limit,
@@ -341,7 +348,7 @@ class ChunkPlanner:
 
     def _out_of_the_world(self, positions_m: FloatArray) -> Rejection | None:
         """Why absolute targets are no targets of this arm."""
-        box, most_m = self._limits.workspace, REFUSE_FACTOR * self._limits.step_m
+        box, most_m = self._limits.workspace, REJECT_FACTOR * self._limits.step_m
         low, high = np.array([box.x_m, box.y_m, box.z_m]).T
         away_m = np.linalg.norm(positions_m - np.clip(positions_m, low, high), axis=1)
         for index in (away_m > most_m).nonzero()[0]:

@@ -11,22 +11,28 @@ from vla_zenoh.control.chunk_planner import ChunkPlanner
 from vla_zenoh.control.commander_io import Outputs
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
-from vla_zenoh.control.limits import into_workspace, leash, workspace_corners
+from vla_zenoh.control.limits import (
+    APPROACH,
+    Slowdown,
+    into_workspace,
+    leash,
+    slowest,
+    workspace_corners,
+)
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.control.pose_to_joint import PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.retreat import Retreat
-from vla_zenoh.control.slowdown import APPROACH, Slowdown, slowest
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother, motion_limits
 from vla_zenoh.control.states import OBEYING, State
 from vla_zenoh.control.step_timing import StepTiming
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.so3 import (
     Pose,
-    distance,
     exp3,
     held_pose,
     log3,
+    pose_distance,
     pose_of,
     quat_from_rotation,
 )
@@ -66,12 +72,12 @@ class MotionPipeline:
     """
 
     def __init__(
-        self, profile: Profile, reach: ReachabilityFilter | None, composer: ChunkPlanner
+        self, profile: Profile, reach: ReachabilityFilter | None, planner: ChunkPlanner
     ) -> None:
         self._limits = profile.limits
         self._dt_s = 1.0 / profile.timing.command_hz
         self._max_width_m = profile.robot.gripper.max_width_m
-        self._reach, self._composer = reach, composer
+        self._reach, self._planner = reach, planner
         self._aggregator = PlanAggregator(profile.composition)
         self._joints: PoseToJoint | None = None
         if profile.robot.command == "joint":
@@ -161,7 +167,7 @@ class MotionPipeline:
             self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits), inside)
             self._timing = StepTiming(self._smoother.box)
         elif standing and not (
-            self.streaming and self._near(*distance(self._smoother.motion.pose, start))
+            self.streaming and self._near(*pose_distance(self._smoother.motion.pose, start))
         ):
             self._smoother.reset(start)
         if self._joints is not None and joint is not None:
@@ -189,7 +195,7 @@ class MotionPipeline:
             self._stands = None
             return
         held = held_pose(measured)
-        if self._stands is None or max(distance(held, self._stands[0])) > SETTLED:
+        if self._stands is None or max(pose_distance(held, self._stands[0])) > SETTLED:
             self._stands = held, now_ns
 
     def unsettled(self, now_ns: int) -> list[str]:
@@ -200,7 +206,7 @@ class MotionPipeline:
         if self._stands is None or self._smoother is None:
             return []
         held, since_ns = self._stands
-        apart_m, apart_rad = distance(self._smoother.motion.pose, held)
+        apart_m, apart_rad = pose_distance(self._smoother.motion.pose, held)
         if self._near(apart_m, apart_rad) or now_ns - since_ns > SETTLED_NS:
             return []
         return [
@@ -303,7 +309,7 @@ class MotionPipeline:
         out: Outputs,
     ) -> Cause | None:
         plans = self._aggregator.plans(timeline, now_ns)
-        out.shortened(self._composer.bound_until(plans, now_ns))
+        out.shortened(self._planner.bound_until(plans, now_ns))
         goal = self._aggregator.goal(plans, now_ns)
         if self._override == 0.0:
             self._stand(smoother)

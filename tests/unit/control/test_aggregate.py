@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from vla_zenoh.control.aggregate import PlanAggregator, mean_pose
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
-from vla_zenoh.kinematics.so3 import Pose, angle_between, between, exp3
+from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, interpolate
 from vla_zenoh.profile import Composition
 from vla_zenoh.types import Cause
 
@@ -90,7 +90,7 @@ def test_a_blend_moves_over_smoothly_within_its_window_and_takes_the_new_width_a
     assert {one.width_m for one in followed} == {0.06}
     for one in followed:
         share = (height(one) - 0.3) / 0.04
-        exact = between(at(0.3).pose, at(0.34, 0.4).pose, share).rotation
+        exact = interpolate(at(0.3).pose, at(0.34, 0.4).pose, share).rotation
         assert angle_between(one.pose.rotation, exact) < ATOL_RAD
 
 
@@ -171,13 +171,13 @@ def test_steps_are_counted_as_the_way_is(horizon: int, requests: list[tuple[int,
         observed_ns = now_ns + wait_ms * MS
         made = plan(observed_ns // MS, rising(timeline.at(observed_ns), horizon))
         before = timeline.in_force(observed_ns)
-        made.begun = before.steps_asked_until(observed_ns) if before.cause else 0.0
+        made.begun = before.steps_until(observed_ns) if before.cause else 0.0
         now_ns = observed_ns + latency_ms * MS
         made.effective_ns = now_ns
         timeline.add(made, now_ns)
         for t_ns in (now_ns, now_ns + 70 * MS, now_ns + 999 * MS):
-            asked = timeline.plan.steps_asked_until(t_ns)
-            assert height(timeline.plan.asked_until(t_ns)) == pytest.approx(asked * STEP_M)
+            asked = timeline.plan.steps_until(t_ns)
+            assert height(timeline.plan.goal_at(t_ns)) == pytest.approx(asked * STEP_M)
             assert asked - ATOL_M <= timeline.plan.steps_in_force(t_ns) <= asked + 1 + ATOL_M
     end_ns = timeline.plan.end_ns
-    assert timeline.plan.steps_in_force(end_ns) == timeline.plan.steps_asked_until(end_ns)
+    assert timeline.plan.steps_in_force(end_ns) == timeline.plan.steps_until(end_ns)

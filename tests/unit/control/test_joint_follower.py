@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 
 from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.pose_to_joint import FAR, NEAR_M, NEAR_RAD, PoseToJoint
-from vla_zenoh.control.profile_arm import make_kinematics, make_shadow
+from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.control.smoothing import Smoother, motion_limits
 from vla_zenoh.guard.joint_guard import joint_motion_limits
-from vla_zenoh.kinematics.so3 import Pose, distance, exp3
+from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.kinematics.so3 import Pose, exp3, pose_distance
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import FloatArray
 
@@ -52,7 +53,7 @@ class Arm:
         """One step of a chunk, and the time it has."""
         here = self.smoother.motion
         goal = Pose(self.goal.position_m + way_m, exp3(turn_rad) @ self.goal.rotation)
-        if distance(here.pose, goal)[0] < BASE.limits.lead_m:
+        if pose_distance(here.pose, goal)[0] < BASE.limits.lead_m:
             self.goal = goal
         self.smoother.target(self.goal, self.stage.shares(here, self.goal, self.smoother.box))
         for _ in range(ticks):
@@ -72,7 +73,7 @@ class Arm:
         self.acceleration = told.acceleration_rad_s2
 
     def lag(self) -> tuple[float, float]:
-        return distance(KINEMATICS.forward(self.joints_rad), self.smoother.motion.pose)
+        return pose_distance(KINEMATICS.forward(self.joints_rad), self.smoother.motion.pose)
 
     def speed_m_s(self) -> float:
         return float(np.linalg.norm((KINEMATICS.jacobian(self.joints_rad) @ self.rate_rad_s)[:3]))
@@ -161,7 +162,7 @@ def test_a_stop_of_the_joints_that_is_called_off_goes_on_from_where_they_are(tic
     furthest_m = 0.0
     for _ in range(500):
         arm.tick()
-        furthest_m = max(furthest_m, distance(arm.smoother.motion.pose, arm.goal)[0])
+        furthest_m = max(furthest_m, pose_distance(arm.smoother.motion.pose, arm.goal)[0])
     assert furthest_m < OVERSHOOT_M
     assert arm.smoother.at_rest
 
@@ -236,7 +237,7 @@ def test_commanded_joints_stop_before_the_arm_touches_itself_or_the_table(
     """Whoever bounds the goals: here nobody does."""
     low = override(BASE, {"limits": {"workspace": {"z_m": [-0.3, 0.9], "x_m": [-0.3, 0.75]}}})
     of = override(low, {"robot": {"command": "joint"}})
-    barriers = make_shadow(of, KINEMATICS).barriers
+    barriers = make_reachability_filter(of, KINEMATICS).barriers
     arm = Arm(of)
     arm.stage = PoseToJoint(of, KINEMATICS, barriers)
     arm.stage.restart(HOME_RAD)
@@ -251,14 +252,14 @@ def test_commanded_joints_stop_before_the_arm_touches_itself_or_the_table(
 
 
 def test_slopes_of_distances_are_those_of_small_steps() -> None:
-    collisions = make_shadow(BASE, KINEMATICS).barriers.collisions
+    collisions = make_reachability_filter(BASE, KINEMATICS).barriers.collisions
     random, compared = np.random.default_rng(0), 0
     for _ in range(40):
         joints_rad = np.clip(
             HOME_RAD + 0.4 * random.normal(size=7), KINEMATICS.lower_rad, KINEMATICS.upper_rad
         )
         near = np.flatnonzero(np.abs(collisions.distances(joints_rad) - 0.05) < 0.04)
-        slopes = collisions.slopes(joints_rad, near)
+        slopes = collisions.gradients(joints_rad, near)
         for joint, unit in enumerate(np.eye(7) * 1e-5):
             apart = collisions.distances(joints_rad + unit) - collisions.distances(
                 joints_rad - unit

@@ -8,8 +8,9 @@ from command_rig import Rig, profile
 
 from vla_zenoh.control.joint_monitor import JointMonitor
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.profile_arm import make_kinematics, make_shadow
-from vla_zenoh.kinematics.so3 import Pose, distance, quat_from_rotation
+from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.kinematics.so3 import Pose, pose_distance, quat_from_rotation
 from vla_zenoh.types import FloatArray
 
 PROFILE = profile()
@@ -25,7 +26,7 @@ class Watching:
     """A watch of the shipped arm, told its joints at every tick."""
 
     def __init__(self, start_rad: FloatArray = HOME_RAD, commanded_rad: FloatArray | None = None):
-        shadow = make_shadow(PROFILE, KINEMATICS)
+        shadow = make_reachability_filter(PROFILE, KINEMATICS)
         shadow.reset(start_rad)
         self.watch, self.commanded_rad = JointMonitor(PROFILE, shadow), commanded_rad
         self.now_ns = 0
@@ -121,7 +122,7 @@ def test_an_elbow_that_goes_astray_slows_the_arm_and_then_brakes_it(commands_joi
         slower = watching.watch.slowdown
         shares.append(slower.share if slower else 1.0)
         assert slower is None or slower.name == "elbow_rad"
-    assert distance(KINEMATICS.forward(joints_rad), here)[0] < 0.02
+    assert pose_distance(KINEMATICS.forward(joints_rad), here)[0] < 0.02
     assert hit is not None
     assert hit.name == "elbow_rad"
     assert hit.limit == 2 * LIMITS.elbow_rad
@@ -134,7 +135,7 @@ class Arm(Rig):
     """Poses are commanded; the joints are where a test says."""
 
     def __init__(self) -> None:
-        super().__init__(PROFILE, reach=make_shadow(PROFILE, KINEMATICS))
+        super().__init__(PROFILE, reach=make_reachability_filter(PROFILE, KINEMATICS))
         self.joints_rad, self.joints_of_shadow = HOME_RAD, False
         self.place(KINEMATICS.forward(HOME_RAD))
 

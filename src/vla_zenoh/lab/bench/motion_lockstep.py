@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.bench.motion import (
@@ -30,12 +30,12 @@ from vla_zenoh.lab.bench.motion import (
     make_row,
     path_length,
 )
-from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, judge, make_segment
+from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, judge_segment, make_segment
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import Profile
-from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.runtime.process import die_with_parent
+from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import PoseCommand
 
 CAMERA_S, WIRE_S = 0.015, 0.0005
@@ -115,7 +115,7 @@ def _row(profile: Profile, trial: MotionCase, conditions: Conditions) -> Row:
         build_world(profile),
         make_policy(find_model("scripted"), options),
         delays=Delays(conditions.delay_ms / 1e3, conditions.jitter, CAMERA_S, wire_s=WIRE_S),
-        reach=make_shadow(profile),
+        reach=make_reachability_filter(profile),
     )
     loop.put("rate", PREPARATION_HZ)
     loop.run(WARM_UP_S)
@@ -127,7 +127,7 @@ def _row(profile: Profile, trial: MotionCase, conditions: Conditions) -> Row:
     loop.run(1.0 / PREPARATION_HZ)
     before, since = _standing(loop), len(loop.trace.time_ns)
     steps_done = _carry_out(loop, trial.segment, conditions.rate_hz)
-    outcome = judge(
+    outcome = judge_segment(
         trial.segment,
         before,
         _standing(loop),

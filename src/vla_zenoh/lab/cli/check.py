@@ -20,7 +20,7 @@ from vla_zenoh.cli.options import (
     options,
 )
 from vla_zenoh.cli.output import console, print_json, styled
-from vla_zenoh.control.finding import Finding, error
+from vla_zenoh.control.policy_check import Finding, error
 from vla_zenoh.errors import WorkerError
 from vla_zenoh.lab.check.examination import DEFAULT_RUNS, Examination
 from vla_zenoh.lab.check.model_runner import ModelRunner
