@@ -16,9 +16,8 @@ import zenoh
 from rich.pretty import pretty_repr
 from rich.table import Table
 
-from vla_zenoh.bus.buffers import CallbackRing
+from vla_zenoh.bus.buffers import CallbackRing, bytes_of, header_of
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.payload_limits import bytes_of, header_of
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, fail, print_json, styled

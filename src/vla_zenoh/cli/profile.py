@@ -124,7 +124,7 @@ def _check_brake(profile: Profile) -> list[str]:
     if profile.robot.driver == "sim":
         return []
     try:
-        from vla_zenoh.guard.braking_time import max_braking_time_s
+        from vla_zenoh.guard.arm_guard import max_braking_time_s
     except ImportError:
         return []  # `_check_arm` has already said so
     brake_s = max_braking_time_s(profile)

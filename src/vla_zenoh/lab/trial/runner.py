@@ -16,9 +16,8 @@ from typing import Protocol
 import numpy as np
 import zenoh
 
-from vla_zenoh.bus.buffers import LatestSample
+from vla_zenoh.bus.buffers import LatestSample, bytes_of
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.payload_limits import bytes_of
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.keys import worker_node

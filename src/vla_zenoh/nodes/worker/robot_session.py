@@ -13,11 +13,9 @@ from typing import Any, Literal
 
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing, LatestSample
+from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.payload_limits import bytes_of
-from vla_zenoh.bus.writer_filter import SingleWriterFilter
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
@@ -43,6 +41,7 @@ from vla_zenoh.types import (
     Stamped,
     Task,
 )
+from vla_zenoh.types.stream import SingleWriterFilter
 
 SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5
