@@ -87,10 +87,10 @@ def trial(
         _warn_of_peeking(plan, found)
     else:
         asked = plan_options.asked(target.load().robot.name)
-        with folder.alone():
+        with folder.lock():
             plan = _plan(folder, asked)
             found = folder.episodes()
-            if folder.torn:
+            if folder.truncated:
                 text = "the last line of trials.jsonl was cut off; its episode is repeated"
                 errors().print(text, style="yellow", markup=False)
             if plan.next_due(found) is not None:
@@ -122,7 +122,7 @@ def _plan(folder: TrialFolder, asked: dict[str, Any]) -> TrialPlan:
     """The plan of the folder, or a new one from `asked`."""
     plan = folder.plan()
     if plan is not None:
-        if others := plan.other_than(asked):
+        if others := plan.differences(asked):
             fail(
                 f"{folder.path} has another plan: {'; '.join(others)}. Leave that out to continue "
                 "it, or give another --out"

@@ -158,7 +158,7 @@ def _live(profile: Profile, output: ViewOutput, seconds: float | None) -> None:
                 if end_s is not None and time.monotonic() >= end_s:
                     break
                 for sample in listener.take():
-                    logger.hear(sample)
+                    logger.log(sample)
                 logger.dropped = listener.dropped.total()
                 stop.wait(POLL_S)
             listener.close()
@@ -182,10 +182,10 @@ def _recorded(path: Path, profile_name: str, output: ViewOutput) -> None:
     output.check(profile)
     with output.open(path.stem) as (stream, viewer):
         logger = RerunLogger(profile, stream, keys=file.keys)
-        for entry in file.entries(lambda key: not key.endswith("/raw")):
+        for sample in file.entries(lambda key: not key.endswith("/raw")):
             if stop.is_set() or (viewer is not None and viewer.closed):
                 break
-            logger.take(entry)
+            logger.log(sample)
         _summarise(logger, output.save)
         if file.damage:
             errors().print(f"{path} is {file.damage}", style="yellow")
