@@ -25,9 +25,9 @@ from vla_zenoh.lab.doctor.access_check import check_access
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
-from vla_zenoh.policy.observation import form_for, form_of, prepare
+from vla_zenoh.policy.observation import host_variant, prepare_image, size_variant
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.profile.schema import CameraProfile, HostProfile, PicturesProfile
+from vla_zenoh.profile.schema import CameraProfile, HostImagesProfile, HostProfile
 from vla_zenoh.profile.session import second_link
 from vla_zenoh.security.roles import Act
 from vla_zenoh.security.rules import access_control
@@ -65,9 +65,9 @@ def set_ahead(node: Node, by_ns: int) -> None:
 def asked(node: Node, other: str) -> Any:
     def known() -> Any:
         node.clocks.tick()
-        return node.clocks.known().get(other)
+        return node.clocks.offsets().get(other)
 
-    node.clocks.follow(other)
+    node.clocks.track(other)
     return until(f"the clock of {other}", known)
 
 
@@ -84,18 +84,18 @@ def test_a_clock_that_is_ahead_is_measured_within_its_uncertainty() -> None:
 def test_stamps_of_another_host_are_read_on_the_own_clock() -> None:
     with two_nodes() as (near, far):
         set_ahead(far, AHEAD_NS)
-        slot = near.listen(near.keys.task, LatestSample())
+        slot = near.subscribe(near.keys.task, LatestSample())
         asked(near, "sim")
-        out = far.stream(far.keys.task, Kind.ORDER)
-        until("a listener", lambda: out.wanted)
+        out = far.declare_publisher(far.keys.task, Kind.ORDER)
+        until("a listener", lambda: out.has_subscribers)
 
         def exchange() -> Stamped[Task] | None:
-            out.put(Task(0, False, "hold", "scripted", 5.0))
+            out.publish(Task(0, False, "hold", "scripted", 5.0))
             assert slot.wait(1.0)
-            arrival = slot.take()
+            arrival = slot.pop()
             assert arrival is not None
             near.clocks.tick()
-            stamped = near.read(Task, arrival)
+            stamped = near.decode(Task, arrival)
             assert stamped is not None
             late_s = (stamped.received_ns - stamped.header.stamp_wall_ns) / 1e9
             return stamped if abs(late_s) < STAMP_TOLERANCE_S else None
@@ -107,7 +107,7 @@ def test_a_clock_beyond_the_bound_is_told_and_its_stamps_stay() -> None:
     with two_nodes() as (near, far):
         set_ahead(far, 2_000_000_000)
         found = asked(near, "sim")
-        peers = PeerSnapshot(frozenset({"sim"}), clocks=near.clocks.known())
+        peers = PeerSnapshot(frozenset({"sim"}), clocks=near.clocks.offsets())
         reasons = reasons_not_to_activate(
             near.profile, "scripted", "hold", peers, None, None, None, time.time_ns()
         )
@@ -120,11 +120,11 @@ def test_a_clock_beyond_the_bound_is_told_and_its_stamps_stay() -> None:
 def test_a_source_that_cannot_be_a_node_is_not_asked() -> None:
     with two_nodes() as (near, _):
         for name in ("", "a/b", "**", "x" * 100, "\n", "sim/../..", "command"):
-            near.clocks.here(Header(0, 0, f"{name}#1"), None)
+            near.clocks.to_local_clock(Header(0, 0, f"{name}#1"), None)
         near.clocks.tick()
         assert near.clocks._peers == {}
         for number in range(500):
-            near.clocks.here(Header(0, 0, f"stranger{number}#1"), None)
+            near.clocks.to_local_clock(Header(0, 0, f"stranger{number}#1"), None)
         assert len(near.clocks._peers) == MAX_HEARD
 
 
@@ -140,13 +140,13 @@ def test_commands_and_pictures_travel_on_links_of_their_own() -> None:
         open_session(profile.session) as here,
     ):
         camera, worker = Node("camera", profile, there), Node("worker-far", profile, here)
-        pictures = camera.stream(profile.keys.camera_jpeg("front"), Kind.FRAME)
-        news = camera.stream(profile.keys.state_pose, Kind.STATE)
-        seen = worker.listen(pictures.key, LatestSample(), Kind.FRAME)
-        heard = worker.listen(news.key, LatestSample())
-        until("a reader of both", lambda: pictures.wanted and news.wanted)
+        pictures = camera.declare_publisher(profile.keys.camera_jpeg("front"), Kind.FRAME)
+        news = camera.declare_publisher(profile.keys.state_pose, Kind.STATE)
+        seen = worker.subscribe(pictures.key, LatestSample(), Kind.FRAME)
+        heard = worker.subscribe(news.key, LatestSample())
+        until("a reader of both", lambda: pictures.has_subscribers and news.has_subscribers)
         for stream, slot in ((pictures, seen), (news, heard)):
-            stream.put(b"something")
+            stream.publish(b"something")
             assert slot.wait(2.0)
         port, own = endpoint.removeprefix("tcp/"), second_link(endpoint).removeprefix("tcp/")
         for node in (camera, worker):
@@ -188,12 +188,12 @@ def test_each_host_gets_pictures_as_its_link_bears(tmp_path: Path) -> None:
     hosts = {
         "near": HostProfile(nodes=("worker",)),
         "far": HostProfile(
-            nodes=("worker",), pictures=PicturesProfile(quality=30, rate_hz=5, width=160)
+            nodes=("worker",), pictures=HostImagesProfile(quality=30, rate_hz=5, width=160)
         ),
     }
     with camera_rig({"front": camera}, hosts=hosts) as rig:
         jpegs, _jpeg = rig.listen(rig.profile.keys.camera_jpeg("front"))
-        fars, _far = rig.listen(rig.profile.keys.camera_fitted("front", form_for("far")))
+        fars, _far = rig.listen(rig.profile.keys.camera_fitted("front", host_variant("far")))
         until("pictures of both", lambda: len(fars) >= 6 and len(jpegs) >= 30)
         stamps = [frame.header.stamp_wall_ns for frame in fars]
         assert (len(stamps) - 1) / ((stamps[-1] - stamps[0]) / 1e9) < 6.0  # of 50
@@ -217,14 +217,14 @@ def test_a_worker_listens_to_what_travels_to_its_host() -> None:
     ):
         out = {
             form: camera.declare_publisher(profile.keys.camera_fitted("front", form))
-            for form in (form_for("gpu"), form_for("robot"))
+            for form in (host_variant("gpu"), host_variant("robot"))
         }
         policy = make_policy(find_model("scripted"), {})
         worker = WorkerNode(profile, session, policy, "scripted", images="jpeg", host="gpu")
-        heard = out[form_for("gpu")]
+        heard = out[host_variant("gpu")]
         until("a worker that listens", lambda: listened_to(heard))
-        assert not listened_to(out[form_for("robot")])
-        for seat in worker.seats:
+        assert not listened_to(out[host_variant("robot")])
+        for seat in worker.sessions:
             seat.close()
 
 
@@ -237,21 +237,21 @@ def test_a_model_on_another_host_gets_pictures_in_its_own_size(tmp_path: Path) -
     )
     camera = CameraProfile(source=f"file:{chart(tmp_path)}", rate_hz=50, fit_for_workers=True)
     with camera_rig({"front": camera}) as rig:
-        form = form_of(wanted)
+        form = size_variant(wanted)
         assert form == "224x224-pad"
         whole, _whole = rig.listen(rig.profile.keys.camera_jpeg("front"))
         fitted, _fitted = rig.listen(rig.profile.keys.camera_fitted("front", form))
         node = Node("worker-far", rig.profile, rig.watcher)
-        out = node.stream(node.keys.spec("far"), Kind.NEWS)
-        until("the camera node", lambda: out.wanted)
-        out.put(spec)
+        out = node.declare_publisher(node.keys.spec("far"), Kind.TELEMETRY)
+        until("the camera node", lambda: out.has_subscribers)
+        out.publish(spec)
         until("fitted pictures", lambda: len(fitted) > 5 and len(whole) > 5)
         node.close()
         image = decode_jpeg(fitted[-1].payload)
         assert image.rgb.shape == (224, 224, 3)
         # What the worker makes of it is what it would have made of the whole picture.
-        from_whole = prepare(decode_jpeg(whole[-1].payload), wanted)
-        from_fitted = prepare(Image(image.rgb), wanted)
+        from_whole = prepare_image(decode_jpeg(whole[-1].payload), wanted)
+        from_fitted = prepare_image(Image(image.rgb), wanted)
         assert np.median(np.abs(from_whole.astype(int) - from_fitted)) < JPEG_TOLERANCE
         assert len(fitted[-1].payload) < len(whole[-1].payload)
 

@@ -29,8 +29,8 @@ from generate import labelled
 from states import Situation
 from worker import HORIZON, Brick, Hand, Waypoints
 
-from vla_zenoh.lab.bench.statistics import wilson_95
 from vla_zenoh.lab.lockstep import Delays, Lockstep
+from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.tasks import (
     COLOURS,
     FAMILIES,
@@ -45,11 +45,10 @@ from vla_zenoh.lab.tasks import (
 )
 from vla_zenoh.policy import Observation
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.simulation.appearance import VARIATIONS
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.world import World
+from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses
 
 PROFILE = "panda_bricks"
@@ -203,7 +202,7 @@ def run(stage: Stage, args: argparse.Namespace, seed: int, family: str) -> Outco
         loop.run(LOOK_S)
         time_s = (loop.now_ns - begin_ns) / 1e9
         width_m = world.gripper_state().width_m
-        verdict = judge.see(poses_of(world), width_m, time_s, world.tcp()[0])
+        verdict = judge.update(poses_of(world), width_m, time_s, world.tcp()[0])
     return Outcome(episode, verdict or judge.end(), policy if isinstance(policy, Watched) else None)
 
 

@@ -42,7 +42,7 @@ from vla_zenoh.control.limits import (
 )
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.control.reachability import BoundedStep, ReachabilityFilter
-from vla_zenoh.kinematics.so3 import Pose, between, distance
+from vla_zenoh.kinematics.so3 import Pose, interpolate, pose_distance
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, Cause, FloatArray, Stamped, Task
@@ -363,7 +363,7 @@ class ChunkPlanner:
         index, pose, hits, slower, joints_rad = plan.bounded, step.target, step.hits, None, None
         if found is not None:
             pose, joints_rad, slower = found.pose, found.joints_rad, found.slowdown
-            cut = sum(distance(pose, step.target)) if found.hits else 0.0
+            cut = sum(pose_distance(pose, step.target)) if found.hits else 0.0
             # The limit that cuts most comes first.
             hits = [*found.hits, *hits] if cut > step.cut else [*hits, *found.hits]
             plan.computed = index + 1 if found.hits else max(plan.computed, index + 1)
@@ -393,7 +393,7 @@ class ChunkPlanner:
                 asked, slower = self._approach(plan, start.pose, asked)
             width_m = step_width(plan.action, numbers, start.width_m, self._max_width_m)
             pose, acted = bound_step(self._limits, start.pose, asked)
-            cut = sum(distance(pose, asked)) if acted else 0.0
+            cut = sum(pose_distance(pose, asked)) if acted else 0.0
             width_m = start.width_m if width_m is None else width_m
             step = _StepBounding(start, None, pose, width_m, acted, cut, slower)
         if self._reach is not None:
@@ -407,7 +407,7 @@ class ChunkPlanner:
     def _approach(self, plan: ChunkPlan, start: Pose, target: Pose) -> tuple[Pose, Slowdown | None]:
         """The end of a step to an absolute target, and its slowdown: a far target is approached."""
         limits = self._limits
-        far_m, far_rad = distance(start, target)
+        far_m, far_rad = pose_distance(start, target)
         steps = max(far_m / limits.step_m, far_rad / limits.step_rad)
         if steps <= 1 + ROUNDING:
             return target, None
@@ -422,7 +422,7 @@ class ChunkPlanner:
         share = min(max(full_s / needed_s, LEAST), 1.0)
         has_ns = plan.dt_ns if plan.bounded or plan.first_step_ns < 0 else plan.first_step_ns
         part = min(has_ns / 1e9 / needed_s, 1 / steps)
-        return between(start, target, part), Slowdown(APPROACH, share, far, step, "", BEHIND_S)
+        return interpolate(start, target, part), Slowdown(APPROACH, share, far, step, "", BEHIND_S)
 
 
 OVERTAKEN = Rejection("overtaken", "a newer chunk came before it was planned", quiet=True)

@@ -12,7 +12,7 @@ from vla_zenoh.control.limits import bound_step, workspace_corners
 from vla_zenoh.control.plan_timeline import Goal
 from vla_zenoh.errors import RecordError, SpecError
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec, check_steps
-from vla_zenoh.profile import REFUSE_FACTOR, Limits
+from vla_zenoh.profile import REJECT_FACTOR, Limits
 from vla_zenoh.types import QUATERNION_NORM_TOLERANCE, ActionChunk, FloatArray, Stamped, Task
 
 FUTURE_TOLERANCE_NS = 50_000_000
@@ -178,15 +178,15 @@ def validate_steps(
         most_rad = 2.0 * np.arccos(np.clip(np.abs(rotations[:, 3]) - ROUNDING, 0.0, 1.0))
     else:  # three angles, or one: together at most as large as this
         most_rad = np.abs(rotations).sum(axis=1)
-    suspect = np.linalg.norm(lengths_m, axis=1) > limits.step_m * REFUSE_FACTOR * (1 - ROUNDING)
-    suspect |= most_rad > limits.step_rad * REFUSE_FACTOR * (1 - ROUNDING)
+    suspect = np.linalg.norm(lengths_m, axis=1) > limits.step_m * REJECT_FACTOR * (1 - ROUNDING)
+    suspect |= most_rad > limits.step_rad * REJECT_FACTOR * (1 - ROUNDING)
     for index in suspect.nonzero()[0]:
         asked = step_pose(action, steps[index], start.pose)
         for hit in bound_step(limits, start.pose, asked)[1]:
             if hit.fatal:
                 return Rejection(
                     hit.name,
-                    f"a step of {hit.value:.4g} is over {REFUSE_FACTOR:g} times its "
+                    f"a step of {hit.value:.4g} is over {REJECT_FACTOR:g} times its "
                     "limit; is its unit right?",
                     hit.value,
                     hit.limit,
@@ -196,7 +196,7 @@ def validate_steps(
 
 def _validate_targets(positions_m: FloatArray, limits: Limits) -> Rejection | None:
     """Why absolute targets (n, 3) are too far outside the workspace box to be meant."""
-    box, most_m = limits.workspace, REFUSE_FACTOR * limits.step_m
+    box, most_m = limits.workspace, REJECT_FACTOR * limits.step_m
     away_m = np.linalg.norm(positions_m - np.clip(positions_m, *workspace_corners(limits)), axis=1)
     for index in (away_m > most_m).nonzero()[0]:
         at = ", ".join(f"{value:.4g}" for value in positions_m[index])

@@ -27,7 +27,7 @@ from pydantic import (
 )
 
 from vla_zenoh.errors import SpecError
-from vla_zenoh.pydantic_errors import in_words
+from vla_zenoh.pydantic_errors import describe_fault
 from vla_zenoh.types import GripperState, JointState, PoseState, Task
 
 StatePart = Literal["joint", "pose", "gripper"]
@@ -35,7 +35,7 @@ Resize = Literal["none", "stretch", "pad", "crop"]
 Frame = Literal["base", "tcp"]
 Rotation = Literal["rpy", "rotvec", "quaternion"]
 MotionKind = Literal["delta", "absolute"]
-GripperMeaning = Literal["none", "delta_m", "absolute_m", "open_fraction", "binary"]
+GripperSemantics = Literal["none", "delta_m", "absolute_m", "open_fraction", "binary"]
 
 ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
 
@@ -138,7 +138,7 @@ class ActionSpec(_Spec):
     frame: Frame = "base"
     rotation: Rotation = "rpy"
     position_scale_m: float = Field(default=1.0, gt=0, le=10)
-    gripper: GripperMeaning = "absolute_m"
+    gripper: GripperSemantics = "absolute_m"
     gripper_open_is_high: bool = True
     # Adding zero makes -0.0 zero: they mean the same, and must have the same hash.
     gripper_threshold: Annotated[float, AfterValidator(lambda value: value + 0.0)] = 0.5
@@ -184,7 +184,7 @@ class ModelSpec(_Spec):
             return ModelSpec.model_validate(data)
         except ValidationError as error:
             faults = "; ".join(
-                f"{'.'.join(map(str, fault['loc'])) or 'spec'}: {in_words(fault)}"[:300]
+                f"{'.'.join(map(str, fault['loc'])) or 'spec'}: {describe_fault(fault)}"[:300]
                 for fault in error.errors(include_url=False)[:MAX_FAULTS]
             )
             raise SpecError(f"not a valid model spec: {faults}") from error

@@ -11,7 +11,6 @@ from enum import Enum
 from vla_zenoh.errors import ProfileError, SecurityError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.fit import cameras_of, node_name, workers_of
 
 
 class Role(Enum):
@@ -76,7 +75,7 @@ class Identity:
         return f"{self.node}@{self.host}"
 
 
-def person(profile: Profile, host: str) -> Role | None:
+def operator_role(profile: Profile, host: str) -> Role | None:
     """What a person at `host` may do; None: the profile does not know that computer."""
     security = profile.session.security
     if security is not None and host in security.people:
@@ -94,7 +93,7 @@ def identities_of(profile: Profile, host: str) -> list[Identity]:
         ProfileError: neither hosts nor session.security.people know it.
         SecurityError: a kind of node has no role.
     """
-    role = person(profile, host)
+    role = operator_role(profile, host)
     if role is None:
         known = ", ".join(sorted({*profile.hosts, *_people(profile)}))
         raise ProfileError(
@@ -103,10 +102,10 @@ def identities_of(profile: Profile, host: str) -> list[Identity]:
         )
     found = [*_nodes(profile, host)] if host in profile.hosts else []
     names = {identity.node for identity in found}
-    return [*found, *(one for one in people_at(host, role) if one.node not in names)]
+    return [*found, *(one for one in operator_identities(host, role) if one.node not in names)]
 
 
-def people_at(host: str, role: Role) -> list[Identity]:
+def operator_identities(host: str, role: Role) -> list[Identity]:
     """Who people at a computer are: themselves, and an operator the worker that drives by hand."""
     people = Identity(role, role.value, host)
     if role is not Role.OPERATOR:
@@ -142,14 +141,14 @@ def _nodes(profile: Profile, host: str) -> list[Identity]:
         if role is Role.WORKER:
             found += [
                 Identity(role, worker_node(worker), host, worker=worker)
-                for worker in workers_of(profile, part)
+                for worker in profile.workers_of(part)
             ]
             continue
         cameras = {
-            Role.CAMERA: tuple(c for c in cameras_of(profile, part) if c not in from_ros2),
+            Role.CAMERA: tuple(c for c in profile.cameras_of(part) if c not in from_ros2),
             Role.ROBOT: from_ros2 if kind == "ros2" else (),
         }
-        name = node_name(profile, host, kind)
+        name = profile.node_name(host, kind)
         offers = kind == "ros2" and profile.ros2 is not None and profile.ros2.services is not None
         people = (Role.OPERATOR,) if offers else ()
         found.append(Identity(role, name, host, cameras=cameras.get(role, ()), speaks_for=people))

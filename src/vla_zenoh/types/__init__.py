@@ -19,16 +19,23 @@ from vla_zenoh.types.checks import (
     vector,
 )
 from vla_zenoh.types.chunk import ActionChunk
-from vla_zenoh.types.commands import Cause, GripperCommand, JointCommand, PoseCommand
+from vla_zenoh.types.commands import (
+    LATENCY_STAGES,
+    Cause,
+    GripperCommand,
+    JointCommand,
+    PoseCommand,
+)
 from vla_zenoh.types.image import Image
 from vla_zenoh.types.reports import Event, NodeStatus
 from vla_zenoh.types.scene import ObjectPoses, SceneState
-from vla_zenoh.types.seen import Seen
+from vla_zenoh.types.seen import InferenceDebug
 from vla_zenoh.types.stamped import Header, Stamped
 from vla_zenoh.types.states import GripperState, JointState, PoseState
 from vla_zenoh.types.task import Task
 
 __all__ = [
+    "LATENCY_STAGES",
     "MAX_NAMES",
     "MAX_TEXT",
     "QUATERNION_NORM_TOLERANCE",
@@ -40,6 +47,7 @@ __all__ = [
     "GripperState",
     "Header",
     "Image",
+    "InferenceDebug",
     "JointCommand",
     "JointState",
     "NodeStatus",
@@ -47,7 +55,6 @@ __all__ = [
     "PoseCommand",
     "PoseState",
     "SceneState",
-    "Seen",
     "Stamped",
     "Task",
     "shown",

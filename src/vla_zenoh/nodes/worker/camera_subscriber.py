@@ -9,10 +9,10 @@ from typing import NamedTuple
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.writer_filter import SingleWriterFilter
-from vla_zenoh.codec.image import MAX_PICTURE_BYTES
+from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.keys import Kind
 from vla_zenoh.policy import CameraSpec
-from vla_zenoh.policy.observation import form_for, form_of
+from vla_zenoh.policy.observation import host_variant, size_variant
 from vla_zenoh.types import Event
 
 STREAM_PATIENCE_S = 0.5
@@ -35,7 +35,7 @@ class _Ear(NamedTuple):
     speaker: SingleWriterFilter
 
 
-class CameraInput:
+class CameraSubscriber:
     """See the module. While what was asked for comes, nothing else travels.
 
     Args:
@@ -69,11 +69,11 @@ class CameraInput:
     @property
     def full(self) -> bool:
         """Whether a picture is there that was not taken."""
-        return self._asked.slot.full or (self._plain is not None and self._plain.slot.full)
+        return self._asked.slot.has_new or (self._plain is not None and self._plain.slot.has_new)
 
     def take(self) -> ReceivedImage | None:
         """The newest picture, once."""
-        arrival = self._asked.slot.take()
+        arrival = self._asked.slot.pop()
         if arrival is not None:
             self._heard_s = time.monotonic()
             self._ask_no_more()
@@ -81,7 +81,7 @@ class CameraInput:
         if self._plain is None:
             self._fall_back()
             return None
-        arrival = self._plain.slot.take()
+        arrival = self._plain.slot.pop()
         return None if arrival is None else ReceivedImage(arrival, self._plain.speaker)
 
     def _fall_back(self) -> None:
@@ -90,24 +90,24 @@ class CameraInput:
         self._plain = self._listen(self._plain_key)
         asked, plain = (self._node.keys.short(one.key) for one in (self._asked, self._plain))
         why = f"no picture on {asked} for {self._patience_s:g} s; {plain} is listened to as well"
-        self._node.tell(Event("warning", "notice", f"{self._camera}:plain_pictures", why))
+        self._node.emit(Event("warning", "notice", f"{self._camera}:plain_pictures", why))
 
     def _ask_no_more(self) -> None:
         if self._plain is None:
             return
-        self._node.unlisten(self._plain.slot)
+        self._node.unsubscribe(self._plain.slot)
         self._plain = None
         why = f"there are pictures on {self._node.keys.short(self._asked.key)} again"
-        self._node.tell(Event("info", "notice", f"{self._camera}:own_pictures", why))
+        self._node.emit(Event("info", "notice", f"{self._camera}:own_pictures", why))
 
     def _listen(self, key: str) -> _Ear:
-        slot = self._node.listen(key, LatestSample(MAX_PICTURE_BYTES, self._changed), Kind.FRAME)
+        slot = self._node.subscribe(key, LatestSample(MAX_IMAGE_BYTES, self._changed), Kind.FRAME)
         return _Ear(key, slot, SingleWriterFilter(STREAM_PATIENCE_S))
 
 
-def listen_to(
+def subscribe_to_camera(
     camera: CameraSpec, node: Node, *, jpeg: bool, host: str | None, changed: threading.Condition
-) -> CameraInput:
+) -> CameraSubscriber:
     """Listen where the pictures are that a model wants.
 
     Args:
@@ -125,12 +125,12 @@ def listen_to(
     key, plain, rates_hz = keys.camera_raw(name), None, [settings.rate_hz if settings else None]
     if jpeg:
         key = keys.camera_jpeg(name)
-        size = form_of(camera) if settings is not None and settings.fit_for_workers else None
+        size = size_variant(camera) if settings is not None and settings.fit_for_workers else None
         rates_hz.append(settings.jpeg_rate_hz if settings else None)
         if host is not None and part is not None and part.pictures is not None:
-            key, rates_hz[1] = keys.camera_fitted(name, form_for(host)), part.pictures.rate_hz
-            size = None if size is None else form_for(host, size)
+            key, rates_hz[1] = keys.camera_fitted(name, host_variant(host)), part.pictures.rate_hz
+            size = None if size is None else host_variant(host, size)
         if size is not None:
             key, plain = keys.camera_fitted(name, size), key
     patience_s = max([PATIENCE_S, *(PERIODS / rate for rate in rates_hz if rate)])
-    return CameraInput(node, name, key, plain, patience_s=patience_s, changed=changed)
+    return CameraSubscriber(node, name, key, plain, patience_s=patience_s, changed=changed)

@@ -14,9 +14,9 @@ from vla_zenoh.bus.client import Client
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.ros2 import table
+from vla_zenoh.interop.ros2.activation_filter import QUIET_S, ActivationFilter
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.services import ACTIVE_TOPIC, PROMPT_TOPIC
-from vla_zenoh.interop.ros2.switch import QUIET_S, Switch
 from vla_zenoh.interop.ros2.topics import plain
 from vla_zenoh.robots.ros2.estop_order import EstopOrder
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
@@ -56,7 +56,7 @@ class RosTopics:
         self._prefix = prefix
         self._prompts = link.read(f"{prefix}/{PROMPT_TOPIC}", plain.TEXT, CallbackRing(WAITING))
         self._switches = link.read(f"{prefix}/{ACTIVE_TOPIC}", plain.TRUTH, CallbackRing(WAITING))
-        self._switch = Switch(time.monotonic_ns())
+        self._switch = ActivationFilter(time.monotonic_ns())
         self._put_ns = 0
         self._told = False
         self._prompt: str | None = None
@@ -71,7 +71,7 @@ class RosTopics:
         came = [
             (arrival.mono_ns, obey, arrival)
             for slot, obey in ((self._prompts, self._wish), (self._switches, self._turn))
-            for arrival in slot.take_all()
+            for arrival in slot.drain()
         ]
         for _, obey, arrival in sorted(came, key=lambda each: each[0]):
             obey(arrival)
@@ -88,7 +88,7 @@ class RosTopics:
         self._prompt = prompt
         task = self._client.task
         if changed or task is None or task.prompt != prompt:
-            self._client.put(self._client.keys.prompt, prompt)
+            self._client.publish(self._client.keys.prompt, prompt)
 
     def _turn(self, arrival: ReceivedSample) -> None:
         topic = f"{self._prefix}/{ACTIVE_TOPIC}"
@@ -103,7 +103,7 @@ class RosTopics:
                 self._refuse("stopped", f"{topic}: true, and then an emergency stop", ACTIVE_TOPIC)
                 return
             self._put_ns, self._told = arrival.mono_ns, False
-            self._client.put(self._client.keys.active, settings.encode_bool(wanted).decode())
+            self._client.publish(self._client.keys.active, settings.encode_bool(wanted).decode())
             return
         task = self._client.task
         if task is not None and task.active:

@@ -13,13 +13,13 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.joint_reading import JointReading
 from vla_zenoh.interop.ros2 import table
-from vla_zenoh.interop.ros2.frames import Frames
 from vla_zenoh.interop.ros2.graph import TF, TF_STATIC
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.qos import SENSOR, STATIC_TRANSFORMS
 from vla_zenoh.interop.ros2.robot_clock import RobotClock
 from vla_zenoh.interop.ros2.samples import Wrench
 from vla_zenoh.interop.ros2.topics import joint_state, transforms, wrench
+from vla_zenoh.interop.ros2.transform_buffer import TransformBuffer
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile.ros2 import Ros2Profile
@@ -60,7 +60,7 @@ class StateSubscriber:
         self.rate = RateMeter()
         self._heard_ns: int | None = None
         self._wrench: Wrench | None = None
-        self._frames = Frames() if ros2.tcp == "tf" else None
+        self._frames = TransformBuffer() if ros2.tcp == "tf" else None
         topics = dict.fromkeys((ros2.joint_states, ros2.finger_states or ros2.joint_states))
         self._joint_slots = [
             link.read(topic, joint_state.TYPE, CallbackRing(INBOX), SENSOR) for topic in topics
@@ -103,7 +103,7 @@ class StateSubscriber:
 
     # -- topics -------------------------------------------------------------------------------
     def _refuse(self, topic: str, error: CodecError) -> None:
-        self._node.refuse(error.reason, f"{topic}: {error}", topic)
+        self._node.reject(error.reason, f"{topic}: {error}", topic)
 
     def _read(self, kind: str, arrival: ReceivedSample) -> Any:
         return table.read(self._messages, kind, arrival.sample.payload.to_bytes())
@@ -111,11 +111,11 @@ class StateSubscriber:
     def _take_joints(self) -> bool:
         fresh = False
         for slot in self._joint_slots:
-            for arrival in slot.take_all():
+            for arrival in slot.drain():
                 topic = str(arrival.sample.key_expr)
                 try:
                     joints = self._read(joint_state.TYPE, arrival)
-                    arrived_ns = self._node.wall_of(arrival)
+                    arrived_ns = self._node.arrival_wall_ns(arrival)
                     if self.state.take(joints, joints.stamp_ns or arrived_ns) is None:
                         continue  # of the fingers alone, or another robot's
                 except CodecError as error:
@@ -129,7 +129,7 @@ class StateSubscriber:
 
     def _take_transforms(self) -> None:
         for slot, static in self._tf_slots:
-            for arrival in slot.take_all():
+            for arrival in slot.drain():
                 assert self._frames is not None
                 try:
                     self._frames.take(self._read(transforms.TYPE, arrival), static=static)
@@ -140,7 +140,7 @@ class StateSubscriber:
         if self._wrench_slot is None or self._ros2.wrench is None:
             return
         frame = self._ros2.wrench.frame or self._node.profile.robot.base_frame
-        for arrival in self._wrench_slot.take_all():
+        for arrival in self._wrench_slot.drain():
             try:
                 found: Wrench = self._read(wrench.TYPE, arrival)
                 if found.frame != frame:
@@ -150,10 +150,10 @@ class StateSubscriber:
             except CodecError as error:
                 self._refuse(self._ros2.wrench.topic, error)
             else:
-                stamp_ns = found.stamp_ns or self._node.wall_of(arrival)
+                stamp_ns = found.stamp_ns or self._node.arrival_wall_ns(arrival)
                 self._wrench = found._replace(stamp_ns=stamp_ns)
 
-    def _tcp_of(self, frames: Frames, stamp_ns: int) -> Pose | None:
+    def _tcp_of(self, frames: TransformBuffer, stamp_ns: int) -> Pose | None:
         profile = self._node.profile
         found = frames.find(profile.robot.base_frame, profile.robot.tcp_frame)
         if found is None:

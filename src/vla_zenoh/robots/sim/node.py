@@ -30,10 +30,7 @@ from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.sim.inputs import SimInputs
 from vla_zenoh.runtime.scheduling import realtime_thread
-from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
-from vla_zenoh.simulation.joint_impedance import JointGains
-from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.world import STEP_NS, World
+from vla_zenoh.simulation.world import STEP_NS, World, build_world
 from vla_zenoh.types import Event, ObjectPoses, SceneState
 from vla_zenoh.types.references import JointReference
 
@@ -42,30 +39,6 @@ SCENE_HZ, OBJECTS_HZ, WATCH_HZ = 60.0, 10.0, 4.0
 MAX_LOCKSTEP_NS = 60_000_000_000
 MAX_STEP_BYTES = 1024
 SWITCH_INTERVAL_S = 1e-4
-
-
-def build_world(profile: Profile) -> World:
-    """The world a profile describes.
-
-    Raises:
-        ResourceError: scene or robot description are not there.
-    """
-    robot = RobotModel(
-        description=profile.robot.description,
-        arm_joints=profile.robot.arm_joints,
-        tcp_link=profile.robot.tcp_frame,
-    )
-    stiff = profile.sim.gains == "stiff"
-    return World(
-        profile.sim.scene,
-        robot,
-        home_rad=profile.robot.home_rad,
-        gains=ImpedanceGains.stiff() if stiff else ImpedanceGains.compliant(),
-        joint_gains=JointGains.stiff() if stiff else JointGains.compliant(),
-        joint_friction_nm=profile.sim.joint_friction_nm,
-        seed=profile.sim.seed,
-        vary=profile.sim.vary,
-    )
 
 
 def build_guard(profile: Profile, world: World) -> ArmGuard:
@@ -89,11 +62,11 @@ class SimNode:
         keys = node.keys
         self._inputs = SimInputs(node, self.world, self.guard, self._reset, lockstep=lockstep)
         self._braking = False
-        self._joint = node.stream(keys.state_joint, Kind.STATE)
-        self._pose = node.stream(keys.state_pose, Kind.STATE)
-        self._gripper = node.stream(keys.state_gripper, Kind.STATE)
-        self._scene = node.stream(keys.sim_scene, Kind.STATE)
-        self._objects = node.stream(keys.sim_objects, Kind.NEWS)
+        self._joint = node.declare_publisher(keys.state_joint, Kind.STATE)
+        self._pose = node.declare_publisher(keys.state_pose, Kind.STATE)
+        self._gripper = node.declare_publisher(keys.state_gripper, Kind.STATE)
+        self._scene = node.declare_publisher(keys.sim_scene, Kind.STATE)
+        self._objects = node.declare_publisher(keys.sim_objects, Kind.TELEMETRY)
         self._reference = self.guard.reference
         self._base_ns = 0
         self._ticks = 0
@@ -125,7 +98,7 @@ class SimNode:
             gc.freeze()
             with realtime_thread() as self._realtime:
                 self._run_in_real_time(stop)
-        self.node.report("stopped", now=True)
+        self.node.publish_status("stopped", now=True)
         self.node.close()
 
     def _run_in_real_time(self, stop: threading.Event) -> None:
@@ -146,7 +119,7 @@ class SimNode:
     def _run_lockstep(self, stop: threading.Event) -> None:
         self._base_ns = 0
         self._publish_state(0)
-        self.node.answer(self.node.keys.sim_step, self._answer_step)
+        self.node.serve(self.node.keys.sim_step, self._answer_step)
         while not stop.wait(0.2):
             with self._step_lock:
                 self._watch()
@@ -162,7 +135,7 @@ class SimNode:
             if not 0 < duration_ns <= MAX_LOCKSTEP_NS or duration_ns % STEP_NS:
                 raise CodecError("invalid", f"ns: wanted a multiple of {STEP_NS}, at most 60 s")
         except CodecError as error:
-            self.node.refuse(error.reason, f"sim/step: {error}")
+            self.node.reject(error.reason, f"sim/step: {error}")
             query.reply_err(str(error).encode())
             return
         with self._step_lock:
@@ -191,12 +164,12 @@ class SimNode:
                     self.world.tick(self._reference)
             except NodeError as error:
                 self._blown_up = str(error)
-                self.node.refuse("simulation_fault", str(error))
+                self.node.reject("simulation_fault", str(error))
         self._rate.tick()
         if self._ticks % self._every["state"] == 0:
             self._publish_state(now_ns)
         if self._ticks % self._every["scene"] == 0 and self._scene_wanted:
-            self._scene.put(
+            self._scene.publish(
                 SceneState(self.node.profile.sim.scene, self.world.qpos(), self.world.seed),
                 stamp_wall_ns=now_ns,
             )
@@ -218,19 +191,21 @@ class SimNode:
             if self._braking
             else Event("info", "transition", "braking->standing", "nobody is followed")
         )
-        self.node.tell(event)
-        self.node.report("braking" if self._braking else "running", detail=self._detail(), now=True)
+        self.node.emit(event)
+        self.node.publish_status(
+            "braking" if self._braking else "running", detail=self._detail(), now=True
+        )
 
     def _reset(self, seed: int | None) -> None:
         if self.guard.following and not self._blown_up:
             why = "sim/reset: the arm is being commanded; deactivate first"
-            self.node.refuse("reset_refused", why)
+            self.node.reject("reset_refused", why)
             return
         self.world.reset(self.node.profile.sim.seed if seed is None else seed)
-        self.guard.restart()
+        self.guard.reset()
         self._blown_up = ""
         self.node.counters["sim.resets"] += 1
-        self.node.report("running", detail=self._detail(), now=True)
+        self.node.publish_status("running", detail=self._detail(), now=True)
 
     # -- what is published --------------------------------------------------------------------
     def _publish_state(self, now_ns: int) -> None:
@@ -243,13 +218,13 @@ class SimNode:
                 mode=state if state in ("braking", "unheeded") else gripper.mode,
                 faults=(self._blown_up,) if self._blown_up else (),
             )
-        self._joint.put(self.world.joint_state(), stamp_wall_ns=now_ns, seq=seq)
-        self._pose.put(self.world.pose_state(self._reference), stamp_wall_ns=now_ns, seq=seq)
-        self._gripper.put(gripper, stamp_wall_ns=now_ns, seq=seq)
+        self._joint.publish(self.world.joint_state(), stamp_wall_ns=now_ns, seq=seq)
+        self._pose.publish(self.world.pose_state(self._reference), stamp_wall_ns=now_ns, seq=seq)
+        self._gripper.publish(gripper, stamp_wall_ns=now_ns, seq=seq)
 
     def _publish_objects(self, now_ns: int) -> None:
         objects = self.world.objects()
-        self._objects.put(
+        self._objects.publish(
             ObjectPoses(
                 tuple(objects),
                 np.array([place[0] for place in objects.values()]).reshape(-1, 3),
@@ -259,9 +234,12 @@ class SimNode:
         )
 
     def _watch(self) -> None:
-        self._scene_wanted, self._objects_wanted = self._scene.wanted, self._objects.wanted
-        self.node.follow_clock()
-        self.node.report(
+        self._scene_wanted, self._objects_wanted = (
+            self._scene.has_subscribers,
+            self._objects.has_subscribers,
+        )
+        self.node.adopt_system_time()
+        self.node.publish_status(
             self._state,
             detail=self._detail(),
             rates_hz={"control": self._rate.rate_hz},
