@@ -28,7 +28,7 @@ from vla_zenoh.cli import seen as cli_seen
 from vla_zenoh.cli import status as cli_status
 from vla_zenoh.cli.options import model_options, number_list
 from vla_zenoh.cli.output import Screen, plain_types
-from vla_zenoh.codec import header, image, message, records, settings
+from vla_zenoh.codec import image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
 from vla_zenoh.interop import groot, npy, openpi, openvla_rest, origami
 from vla_zenoh.interop.ros2 import attachment, table
@@ -37,7 +37,7 @@ from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.evaluation.csv_file import evaluate_csv
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
-from vla_zenoh.lab.recording import cdr
+from vla_zenoh.lab.recording.record_json import record_from_json, record_to_json
 from vla_zenoh.lab.recording.record_types import RECORDS
 from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.nodes.worker.inference_debug import InferenceView
@@ -241,12 +241,9 @@ def _cdr_seed(kind: str) -> list[bytes]:
     return [every.encode(every.new(kind, **fields.get(kind.rsplit("/", 1)[-1], {})))]
 
 
-def _bag_seed(kind: type) -> list[bytes]:
-    try:
-        fields = cdr.fields_in(kind, records.encode(examples()[kind]))
-        return [cdr.write_record(kind, fields, 10**18, "base")]
-    except CodecError:
-        return []
+def _recorded_seed(kind: type) -> list[bytes]:
+    text, _ = record_to_json(kind, records.encode(examples()[kind]))
+    return [text.encode()]
 
 
 def _recording() -> list[bytes]:
@@ -323,7 +320,7 @@ def _targets() -> Iterator[Target]:
         lambda: [message.pack({"a": [1, 2.5, None, "x", b"y"], "b": np.arange(3.0)})],
     )
     head = _header_bytes
-    yield Target("header", header.decode, codec, lambda: [head()])
+    yield Target("header", records.decode_header, codec, lambda: [head()])
     for kind in RECORDS:
         yield Target(
             f"record-{kind.__name__}",
@@ -406,10 +403,10 @@ def _targets() -> Iterator[Target]:
     # -- files
     for kind in RECORDS:
         yield Target(
-            f"bag-{kind.__name__}",
-            partial(cdr.read_record, kind),
+            f"recorded-{kind.__name__}",
+            lambda data, kind=kind: record_from_json(kind, _text(data)),
             codec,
-            lambda kind=kind: _bag_seed(kind),
+            lambda kind=kind: _recorded_seed(kind),
         )
     own = (VlaZenohError,)
     yield Target("recording", partial(_in_file, ".mcap", evaluate_run), own, _recording)
@@ -464,7 +461,7 @@ def _targets() -> Iterator[Target]:
 def _header_bytes() -> bytes:
     from vla_zenoh.types import Header
 
-    return header.encode(Header(1, 2, "sim#1"))
+    return records.encode_header(Header(1, 2, "sim#1"))
 
 
 TARGETS = {target.name: target for target in _targets()}
