@@ -78,7 +78,7 @@ def seen(
                     break
                 if not told and waited_s > PATIENCE_S:
                     break
-                for sight in listener.take()[: None if count is None else count - told]:
+                for sight in listener.poll()[: None if count is None else count - told]:
                     told += 1
                     newest[sight.record.worker] = sight
                     if out is not None:

@@ -1,8 +1,4 @@
-"""One robot's side of a worker: what is heard of it, and what is said to it.
-
-A worker has a seat for every robot it serves. Each has its own node on the robot's keys, and its
-own prompt, episode, activation and rate.
-"""
+"""One robot's subscriptions and publishers of a worker."""
 
 from __future__ import annotations
 
@@ -58,16 +54,16 @@ STATE_KINDS: dict[str, type[Any]] = {
 
 
 class RobotSession:
-    """See the module.
+    """One robot's side of a worker: its own node, prompt, episode, activation and rate.
 
     Args:
-        profile: the robot's: its name, cameras, timing.
+        profile: of the robot: its name, cameras, timing.
         session: open session.
-        policy: the model, not loaded yet; several seats may share it.
+        policy: the model, not loaded yet; several sessions may share it.
         name: of the worker.
-        images: which form of pictures to listen to.
-        host: of the profile, on which this runs: some have a say in what travels there.
-        changed: is notified when a picture arrives.
+        images: image streams to subscribe to.
+        host: of the profile, on which this runs; it may have streams of its own.
+        changed: notified when an image arrives.
     """
 
     def __init__(
@@ -84,32 +80,39 @@ class RobotSession:
         self.robot = profile.robot.name
         node = self.node = Node(worker_node(name), profile, session, host=host)
         self.policy, self.name, self.spec = policy, name, policy.spec
-        self.continuation = ChunkPrefix(policy)
+        self.prefix = ChunkPrefix(policy)
         keys = node.keys
-        self._chunk_out = node.stream(keys.delta(name), Kind.ORDER)
-        self._spec_out = node.stream(keys.spec(name), Kind.NEWS)
-        self._seen = InferenceDebugPublisher(node, name, self.spec)
+        self._chunks = node.stream(keys.delta(name), Kind.ORDER)
+        self._specs = node.stream(keys.spec(name), Kind.NEWS)
+        self._debug = InferenceDebugPublisher(node, name, self.spec)
         node.answer(
             keys.spec(name),
             lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
         )
-        self._task_slot = node.listen(keys.task, LatestSample(SMALL_BYTES))
+        self._tasks = node.listen(keys.task, LatestSample(SMALL_BYTES))
         self._jpeg = images == "jpeg"
         self._cameras = {
             one.camera: subscribe_to_camera(one, node, jpeg=self._jpeg, host=host, changed=changed)
             for one in self.spec.observation.cameras
         }
-        self._state_slots = {
-            part: node.listen(self._state_key(part), CallbackRing(256, SMALL_BYTES))
+        state_keys = {
+            "joint": keys.state_joint,
+            "pose": keys.state_pose,
+            "gripper": keys.state_gripper,
+        }
+        self._state_buffers = {
+            part: node.listen(state_keys[part], CallbackRing(256, SMALL_BYTES))
             for part in self.spec.observation.state
         }
-        self._task_speaker = SingleWriterFilter(TASK_PATIENCE_S)
-        self._speakers = {part: SingleWriterFilter(STREAM_PATIENCE_S) for part in self._state_slots}
+        self._task_writer = SingleWriterFilter(TASK_PATIENCE_S)
+        self._state_writers = {
+            part: SingleWriterFilter(STREAM_PATIENCE_S) for part in self._state_buffers
+        }
         self._images: dict[str, Stamped[Image]] = {}
-        self._pictures_s: dict[str, float] = {}
+        self._images_s: dict[str, float] = {}
         self._states = {part: History() for part in self.spec.observation.state}
         self.task: Task | None = None
-        self._task_heard_s = -1e9
+        self._task_received_s = -1e9
         self._episode = -1
         self._not_before_ns = 0
         self._rate = RateMeter(window_s=10.0)
@@ -117,58 +120,53 @@ class RobotSession:
         self._batch = 0
         self._last_spec_s = -1e9
         self.complaint = "loading"
+        """Why there is no inference; empty if there is."""
         self.due_s = 0.0
-        """When the next inference is wanted, monotonic clock."""
+        """When the next inference is due, monotonic clock."""
 
-    def _state_key(self, part: str) -> str:
-        keys = self.node.keys
-        return {"joint": keys.state_joint, "pose": keys.state_pose, "gripper": keys.state_gripper}[
-            part
-        ]
-
-    # -- in -----------------------------------------------------------------------------------
+    # -- observation --------------------------------------------------------------------------
     @property
-    def news(self) -> bool:
-        """Whether the slowest input has something that was not looked at."""
-        slowest = next(iter(self._cameras.values()), None)
-        return slowest is not None and slowest.full
+    def has_image(self) -> bool:
+        """Whether the first camera has an image that was not polled yet."""
+        first = next(iter(self._cameras.values()), None)
+        return first is not None and first.full
 
     @property
-    def sees(self) -> bool:
-        """Whether the model wants pictures."""
+    def needs_images(self) -> bool:
+        """Whether the model observes any camera."""
         return bool(self._cameras)
 
-    def listen(self) -> None:
-        """Take in what came."""
-        arrival = self._task_slot.take()
+    def poll(self) -> None:
+        """Decode what was received since the last call."""
+        arrival = self._tasks.take()
         if arrival is not None:
-            task = self.node.read(Task, arrival, self._task_speaker)
+            task = self.node.read(Task, arrival, self._task_writer)
             if task is not None:
-                self._take_task(task)
+                self._set_task(task)
         for name, camera in self._cameras.items():
-            heard = camera.take()
-            image = self._read_image(name, heard) if heard is not None else None
-            if heard is not None and image is not None:
+            received = camera.take()
+            image = self._decode_image(name, received) if received is not None else None
+            if received is not None and image is not None:
                 self._images[name] = image
-                self._pictures_s[name] = heard.arrival.mono_ns / 1e9
-        self.listen_to_states()
+                self._images_s[name] = received.arrival.mono_ns / 1e9
+        self.poll_states()
 
-    def listen_to_states(self) -> None:
-        """Take in states; while nothing else is to do it costs no time afterwards."""
-        for part, inbox in self._state_slots.items():
-            for arrival in inbox.take_all():
-                state = self.node.read(STATE_KINDS[part], arrival, self._speakers[part])
+    def poll_states(self) -> None:
+        """Decode the states received since the last call."""
+        for part, buffer in self._state_buffers.items():
+            for arrival in buffer.take_all():
+                state = self.node.read(STATE_KINDS[part], arrival, self._state_writers[part])
                 if state is not None:
                     self._states[part].add(state)
 
-    def _take_task(self, task: Stamped[Task]) -> None:
-        before, self.task, self._task_heard_s = self.task, task.record, time.monotonic()
+    def _set_task(self, task: Stamped[Task]) -> None:
+        before, self.task, self._task_received_s = self.task, task.record, time.monotonic()
         if before is not None and before.asked_hz != self.task.asked_hz:
-            self.due_s = min(self.due_s, self._task_heard_s)
+            self.due_s = min(self.due_s, self._task_received_s)
         if task.record.episode == self._episode:
             return
         self._episode = task.record.episode
-        # What was seen before the episode began does not belong to it.
+        # An observation from before the episode does not belong to it.
         self._not_before_ns = task.header.stamp_wall_ns
         reset = reset_of(self.policy, self.robot)
         if reset is not None:
@@ -177,12 +175,12 @@ class RobotSession:
             except Exception as error:
                 self.failed(error, "reset_failed")
 
-    def _read_image(self, camera: str, heard: ReceivedImage) -> Stamped[Image] | None:
-        arrival, speaker = heard
+    def _decode_image(self, camera: str, received: ReceivedImage) -> Stamped[Image] | None:
+        arrival, writer = received
         sample = arrival.sample
         try:
             header = self.node.header(arrival)
-            speaker.check(header, arrival.mono_ns)
+            writer.check(header, arrival.mono_ns)
             payload = bytes_of(sample.payload, MAX_PICTURE_BYTES)
             if self._jpeg:
                 image = image_codec.decode_jpeg(payload)
@@ -192,23 +190,23 @@ class RobotSession:
         except CodecError as error:
             self.node.refuse(error.reason, f"camera {camera}: {error}")
             return None
-        speaker.heard(header, arrival.mono_ns)
+        writer.heard(header, arrival.mono_ns)
         self.node.traffic.heard(str(sample.key_expr), header, arrival.nth)
         header, image = self.node.clocks.here(header, image)
         return Stamped(header, image, self.node.wall_of(arrival))
 
     def observe(self) -> Observation | None:
-        """An observation, None when there is none yet.
+        """Poll and assemble an observation; None if there is none yet.
 
-        A picture that arrives after the request is due is worth a little patience: the one at hand
-        is already half a camera period old on average, and all that time would be latency.
+        Once an inference is due, an image that is about to arrive is worth a short wait: the one at
+        hand is half a camera period old on average, which would all be latency.
         """
-        self.listen()
+        self.poll()
         self.node.clock.follow()
         if self.task is not None and self.task.asked_hz <= 0.0:
             return None
-        if self.task is None or time.monotonic() - self._task_heard_s > TASK_PATIENCE_S:
-            self.complaint = "no command node is heard"
+        if self.task is None or time.monotonic() - self._task_received_s > TASK_PATIENCE_S:
+            self.complaint = "no task received: is the command node running?"
             return None
         try:
             observation = assemble(
@@ -228,48 +226,45 @@ class RobotSession:
                 self.complaint = observation.why
             return None
         self.complaint = ""
-        if self._pictures_s and time.monotonic() - self.due_s < FRESH_PATIENCE_S:
+        if self._images_s and time.monotonic() - self.due_s < FRESH_PATIENCE_S:
             tolerance_s = min(FRESH_TOLERANCE_S, 0.25 / observation.rate_hz)
-            if min(self._pictures_s.values()) < self.due_s - tolerance_s:
+            if min(self._images_s.values()) < self.due_s - tolerance_s:
                 return None
         return observation
 
-    # -- out ----------------------------------------------------------------------------------
+    # -- action chunks ------------------------------------------------------------------------
     def publish(
         self,
         observation: Observation,
         answer: ActionSteps,
-        observed_ns: int,
-        start_ns: int,
-        end_ns: int,
+        times_ns: tuple[int, int, int],
         batch: int,
     ) -> bool:
-        """Check an answer and send it.
+        """Validate an answer and publish it as a chunk; False if it was rejected.
 
         Args:
-            observation: what it was made of.
-            answer: the model's.
-            observed_ns: when the observation was at hand, wall clock.
-            start_ns: when inference began.
-            end_ns: when it ended.
-            batch: robots that were answered together.
+            observation: it was inferred from.
+            answer: of the model.
+            times_ns: observation complete, inference started, inference ended; wall clock.
+            batch: number of robots in this inference.
         """
         try:
             steps, done = check_steps(self.spec.action, answer.steps), bool(answer.done)
         except Exception as error:
             return self.failed(error)
+        observed_ns, start_ns, end_ns = times_ns
         self._batch = batch
         self._inference_ms.add((end_ns - start_ns) / 1e6)
         horizon_ns = int(len(steps) * self.spec.action.dt_s * 1e9)
-        patience_ns = int(self.node.profile.timing.max_observation_age_s * 1e9)
-        header = self._chunk_out.put(
+        max_age_ns = int(self.node.profile.timing.max_observation_age_s * 1e9)
+        header = self._chunks.put(
             ActionChunk(
                 worker=self.name,
                 spec_hash=self.spec.hash,
                 episode=observation.task.episode,
                 observation_stamp_ns=observation.stamp_wall_ns,
                 observation_seq=observation.seq,
-                valid_until_ns=observation.stamp_wall_ns + horizon_ns + patience_ns,
+                valid_until_ns=observation.stamp_wall_ns + horizon_ns + max_age_ns,
                 steps=steps,
                 observed_ns=observed_ns,
                 inference_start_ns=start_ns,
@@ -280,16 +275,16 @@ class RobotSession:
         self._not_before_ns = header.stamp_wall_ns
         self._rate.tick()
         obeyed = observation.task.active and observation.task.worker == self.name
-        self.continuation.published(observation, steps, header.stamp_wall_ns, obeyed=obeyed)
-        self._seen.show(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
+        self.prefix.published(observation, steps, header.stamp_wall_ns, obeyed=obeyed)
+        self._debug.publish(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
         return True
 
     def failed(self, error: Exception, reason: str = "") -> Literal[False]:
-        """Count and tell that the model gave no answer, and ask it again a little later."""
+        """Count and report an inference that failed; the next one is due a little later."""
         if not reason:
             if isinstance(error, SpecError):
                 reason = "contract"
-            else:  # a PeerError says by itself what it is
+            else:
                 reason = error.reason if isinstance(error, PeerError) else "inference_failed"
         expected = isinstance(error, (SpecError, PeerError))
         why = str(error) if expected else f"{type(error).__name__}: {error}"
@@ -298,11 +293,12 @@ class RobotSession:
         self.due_s = time.monotonic() + AFTER_A_FAILURE_S
         return False
 
+    # -- status -------------------------------------------------------------------------------
     def report(self, *, now: bool = False) -> None:
-        """Tell spec and status when it is time, or `now`."""
+        """Publish spec and status when they are due, or `now`."""
         if now or time.monotonic() - self._last_spec_s > SPEC_PERIOD_S:
             self._last_spec_s = time.monotonic()
-            self._spec_out.put(self.spec)
+            self._specs.put(self.spec)
         state = "waiting" if self.complaint else "inferring"
         if not now and not self.node.report_due(state):
             return
@@ -325,6 +321,6 @@ class RobotSession:
         )
 
     def close(self) -> None:
-        """Say goodbye to the robot."""
+        """Report ``stopped`` and close the node."""
         self.node.report("stopped", now=True)
         self.node.close()
