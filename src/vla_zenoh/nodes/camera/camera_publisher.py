@@ -59,8 +59,8 @@ class CameraPublisher:
         self._check = ImageCheck(name, profile.check, same_s)
         self.counts: Counter[str] = Counter()
         self._shown, self._clock, self._emit = shown[:_SOURCE_LIMIT], node.clock, emit
-        self._raw = node.stream(node.keys.camera_raw(name), Kind.FRAME)
-        self._jpeg = node.stream(node.keys.camera_jpeg(name), Kind.FRAME)
+        self._raw = node.declare_publisher(node.keys.camera_raw(name), Kind.FRAME)
+        self._jpeg = node.declare_publisher(node.keys.camera_jpeg(name), Kind.FRAME)
         self.fitted = FittedStreams(name, profile, node, emit)
         self._limiter = RateLimiter(profile.rate_hz)
         self._jpeg_limiter = RateLimiter(profile.jpeg_rate_hz)
@@ -133,9 +133,9 @@ class CameraPublisher:
 
     # -- images -------------------------------------------------------------------------------
     @property
-    def wanted(self) -> bool:
+    def has_subscribers(self) -> bool:
         """Whether any stream has a subscriber."""
-        return self._raw.wanted or self._jpeg.wanted or self.fitted.wanted
+        return any(one.has_subscribers for one in (self._raw, self._jpeg, self.fitted))
 
     def publish(self, image: Pixels, mono_ns: int) -> None:
         """Publish an image of OpenCV, captured at `mono_ns`, in the profile's size.
@@ -151,21 +151,21 @@ class CameraPublisher:
 
     def publish_rgb(self, rgb: NDArray[np.uint8], mono_ns: int, stamp_wall_ns: int) -> None:
         """Publish (H, W, 3) RGB of the profile's size on every stream that has subscribers."""
-        raw = self._raw.wanted
+        raw = self._raw.has_subscribers
         fitted = self.fitted.due(mono_ns)
-        jpeg = self._jpeg.wanted and self._jpeg_limiter.due(mono_ns)
+        jpeg = self._jpeg.has_subscribers and self._jpeg_limiter.due(mono_ns)
         if not (raw or jpeg or fitted):
             return
         image = Image(rgb)
         if raw:
             schema = zenoh.Encoding.ZENOH_BYTES.with_schema(raw_schema(image))
-            self._raw.put(
+            self._raw.publish(
                 encode_raw(image), stamp_wall_ns=stamp_wall_ns, seq=self._seq, encoding=schema
             )
         if jpeg:
             # A thinned stream numbers its own images.
             thinned = self.profile.jpeg_rate_hz is not None
-            self._jpeg.put(
+            self._jpeg.publish(
                 encode_jpeg(shrink(image, self.profile.jpeg_width), self.profile.jpeg_quality),
                 stamp_wall_ns=stamp_wall_ns,
                 seq=None if thinned else self._seq,

@@ -108,7 +108,7 @@ class Grabber:
             # The current time, not that of capture: a backlog must not come out in a burst.
             if not publisher.due(time.monotonic_ns()):
                 continue
-            wanted = publisher.wanted or not proved
+            wanted = publisher.has_subscribers or not proved
             if not wanted and now - looked < LOOK_S:
                 last_good = now
                 continue

@@ -156,7 +156,7 @@ class SimCameras:
                     for _, publisher in views:
                         publisher.lose(why)
                 continue
-            arrival = self._buffer.take()
+            arrival = self._buffer.pop()
             stamped = None if arrival is None else self._decode(arrival)
             if arrival is not None and stamped is not None and self._show(renderer, stamped.record):
                 self._received_ns = arrival.mono_ns
@@ -191,7 +191,7 @@ class SimCameras:
             # By the time of the world, which in lockstep is not that of any clock here.
             due = publisher.due(stamp_ns)
             proof_due = mono_ns - self._drawn_ns[publisher.name] > IDLE_PERIOD_S * 1e9
-            if due if publisher.wanted else proof_due:
+            if due if publisher.has_subscribers else proof_due:
                 rgb = self._render(renderer, camera, publisher)
                 publisher.check(rgb, mono_ns)
                 publisher.publish_rgb(rgb, mono_ns, stamp_ns)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.writer_filter import SingleWriterFilter
-from vla_zenoh.codec.image import MAX_PICTURE_BYTES
+from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.keys import Kind
 from vla_zenoh.policy import CameraSpec
 from vla_zenoh.policy.observation import host_variant, size_variant
@@ -67,15 +67,15 @@ class CameraSubscriber:
         self._received_s = time.monotonic()
 
     @property
-    def full(self) -> bool:
+    def has_new(self) -> bool:
         """Whether there is an image that was not taken yet."""
-        return self._preferred.buffer.full or (
-            self._fallback is not None and self._fallback.buffer.full
+        return self._preferred.buffer.has_new or (
+            self._fallback is not None and self._fallback.buffer.has_new
         )
 
-    def take(self) -> ReceivedImage | None:
+    def pop(self) -> ReceivedImage | None:
         """The newest image, once."""
-        arrival = self._preferred.buffer.take()
+        arrival = self._preferred.buffer.pop()
         if arrival is not None:
             self._received_s = time.monotonic()
             self._drop_fallback()
@@ -83,7 +83,7 @@ class CameraSubscriber:
         if self._fallback is None:
             self._fall_back()
             return None
-        arrival = self._fallback.buffer.take()
+        arrival = self._fallback.buffer.pop()
         return None if arrival is None else ReceivedImage(arrival, self._fallback.writer)
 
     def _fall_back(self) -> None:
@@ -95,19 +95,19 @@ class CameraSubscriber:
             self._node.keys.short(one.key) for one in (self._preferred, self._fallback)
         )
         why = f"no image on {preferred} for {self._patience_s:g} s; subscribing to {common} as well"
-        self._node.tell(Event("warning", "notice", f"{self._camera}:plain_pictures", why))
+        self._node.emit(Event("warning", "notice", f"{self._camera}:plain_pictures", why))
 
     def _drop_fallback(self) -> None:
         if self._fallback is None:
             return
-        self._node.unlisten(self._fallback.buffer)
+        self._node.unsubscribe(self._fallback.buffer)
         self._fallback = None
         why = f"there are images on {self._node.keys.short(self._preferred.key)} again"
-        self._node.tell(Event("info", "notice", f"{self._camera}:own_pictures", why))
+        self._node.emit(Event("info", "notice", f"{self._camera}:own_pictures", why))
 
     def _subscribe(self, key: str) -> _Stream:
-        buffer = LatestSample(MAX_PICTURE_BYTES, self._changed)
-        self._node.listen(key, buffer, Kind.FRAME)
+        buffer = LatestSample(MAX_IMAGE_BYTES, self._changed)
+        self._node.subscribe(key, buffer, Kind.FRAME)
         return _Stream(key, buffer, SingleWriterFilter(STREAM_PATIENCE_S))
 
 

@@ -115,7 +115,7 @@ class WorkerNode:
         took_s = time.monotonic() - began
         for robot in self.sessions:
             if callable(getattr(self.policy, "load", None)):
-                robot.node.tell(Event("info", "notice", "loaded", f"in {took_s:.1f} s"))
+                robot.node.emit(Event("info", "notice", "loaded", f"in {took_s:.1f} s"))
             robot.complaint, robot.due_s = "", time.monotonic()
         while not stop.is_set():
             self._step(stop)
@@ -180,7 +180,7 @@ class WorkerNode:
         if self._delay_s:
             time.sleep(self._delay_s)
         for (robot, observation, observed_ns), answer in zip(ready, answers, strict=True):
-            robot.due_s = max(robot.due_s + 1.0 / observation.task.asked_hz, began_s)
+            robot.due_s = max(robot.due_s + 1.0 / observation.task.requested_hz, began_s)
             if isinstance(answer, Exception):
                 robot.failed(answer)
                 continue

@@ -16,7 +16,7 @@ from vla_zenoh.bus.payload_limits import bytes_of
 from vla_zenoh.bus.writer_filter import SingleWriterFilter
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
-from vla_zenoh.codec.image import MAX_PICTURE_BYTES
+from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError
 from vla_zenoh.keys import Kind, worker_node
@@ -82,14 +82,14 @@ class RobotSession:
         self.policy, self.name, self.spec = policy, name, policy.spec
         self.prefix = ChunkPrefix(policy)
         keys = node.keys
-        self._chunks = node.stream(keys.delta(name), Kind.ORDER)
-        self._specs = node.stream(keys.spec(name), Kind.NEWS)
+        self._chunks = node.declare_publisher(keys.delta(name), Kind.ORDER)
+        self._specs = node.declare_publisher(keys.spec(name), Kind.TELEMETRY)
         self._debug = InferenceDebugPublisher(node, name, self.spec)
-        node.answer(
+        node.serve(
             keys.spec(name),
             lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
         )
-        self._tasks = node.listen(keys.task, LatestSample(SMALL_BYTES))
+        self._tasks = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
         self._jpeg = images == "jpeg"
         self._cameras = {
             one.camera: subscribe_to_camera(one, node, jpeg=self._jpeg, host=host, changed=changed)
@@ -101,7 +101,7 @@ class RobotSession:
             "gripper": keys.state_gripper,
         }
         self._state_buffers = {
-            part: node.listen(state_keys[part], CallbackRing(256, SMALL_BYTES))
+            part: node.subscribe(state_keys[part], CallbackRing(256, SMALL_BYTES))
             for part in self.spec.observation.state
         }
         self._task_writer = SingleWriterFilter(TASK_PATIENCE_S)
@@ -129,7 +129,7 @@ class RobotSession:
     def has_image(self) -> bool:
         """Whether the first camera has an image that was not polled yet."""
         first = next(iter(self._cameras.values()), None)
-        return first is not None and first.full
+        return first is not None and first.has_new
 
     @property
     def needs_images(self) -> bool:
@@ -138,13 +138,13 @@ class RobotSession:
 
     def poll(self) -> None:
         """Decode what was received since the last call."""
-        arrival = self._tasks.take()
+        arrival = self._tasks.pop()
         if arrival is not None:
-            task = self.node.read(Task, arrival, self._task_writer)
+            task = self.node.decode(Task, arrival, self._task_writer)
             if task is not None:
                 self._set_task(task)
         for name, camera in self._cameras.items():
-            received = camera.take()
+            received = camera.pop()
             image = self._decode_image(name, received) if received is not None else None
             if received is not None and image is not None:
                 self._images[name] = image
@@ -154,14 +154,14 @@ class RobotSession:
     def poll_states(self) -> None:
         """Decode the states received since the last call."""
         for part, buffer in self._state_buffers.items():
-            for arrival in buffer.take_all():
-                state = self.node.read(STATE_KINDS[part], arrival, self._state_writers[part])
+            for arrival in buffer.drain():
+                state = self.node.decode(STATE_KINDS[part], arrival, self._state_writers[part])
                 if state is not None:
                     self._states[part].add(state)
 
     def _set_task(self, task: Stamped[Task]) -> None:
         before, self.task, self._task_received_s = self.task, task.record, time.monotonic()
-        if before is not None and before.asked_hz != self.task.asked_hz:
+        if before is not None and before.requested_hz != self.task.requested_hz:
             self.due_s = min(self.due_s, self._task_received_s)
         if task.record.episode == self._episode:
             return
@@ -181,19 +181,19 @@ class RobotSession:
         try:
             header = self.node.header(arrival)
             writer.check(header, arrival.mono_ns)
-            payload = bytes_of(sample.payload, MAX_PICTURE_BYTES)
+            payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
             if self._jpeg:
                 image = image_codec.decode_jpeg(payload)
             else:
                 _, _, schema = str(sample.encoding).partition(";")
                 image = image_codec.decode_raw(payload, schema)
         except CodecError as error:
-            self.node.refuse(error.reason, f"camera {camera}: {error}")
+            self.node.reject(error.reason, f"camera {camera}: {error}")
             return None
         writer.heard(header, arrival.mono_ns)
-        self.node.traffic.heard(str(sample.key_expr), header, arrival.nth)
-        header, image = self.node.clocks.here(header, image)
-        return Stamped(header, image, self.node.wall_of(arrival))
+        self.node.traffic.received(str(sample.key_expr), header, arrival.nth)
+        header, image = self.node.clocks.to_local_clock(header, image)
+        return Stamped(header, image, self.node.arrival_wall_ns(arrival))
 
     def observe(self) -> Observation | None:
         """Poll and assemble an observation; None if there is none yet.
@@ -202,8 +202,8 @@ class RobotSession:
         hand is half a camera period old on average, which would all be latency.
         """
         self.poll()
-        self.node.clock.follow()
-        if self.task is not None and self.task.asked_hz <= 0.0:
+        self.node.clock.adopt_system_time()
+        if self.task is not None and self.task.requested_hz <= 0.0:
             return None
         if self.task is None or time.monotonic() - self._task_received_s > TASK_PATIENCE_S:
             self.complaint = "no task received: is the command node running?"
@@ -257,7 +257,7 @@ class RobotSession:
         self._inference_ms.add((end_ns - start_ns) / 1e6)
         horizon_ns = int(len(steps) * self.spec.action.dt_s * 1e9)
         max_age_ns = int(self.node.profile.timing.max_observation_age_s * 1e9)
-        header = self._chunks.put(
+        header = self._chunks.publish(
             ActionChunk(
                 worker=self.name,
                 spec_hash=self.spec.hash,
@@ -289,7 +289,7 @@ class RobotSession:
         expected = isinstance(error, (SpecError, PeerError))
         why = str(error) if expected else f"{type(error).__name__}: {error}"
         self.complaint = f"{reason}: {why}"
-        self.node.refuse(reason, why)
+        self.node.reject(reason, why)
         self.due_s = time.monotonic() + AFTER_A_FAILURE_S
         return False
 
@@ -298,9 +298,9 @@ class RobotSession:
         """Publish spec and status when they are due, or `now`."""
         if now or time.monotonic() - self._last_spec_s > SPEC_PERIOD_S:
             self._last_spec_s = time.monotonic()
-            self._specs.put(self.spec)
+            self._specs.publish(self.spec)
         state = "waiting" if self.complaint else "inferring"
-        if not now and not self.node.report_due(state):
+        if not now and not self.node.status_due(state):
             return
         task = self.task
         inference = self._inference_ms.summary()
@@ -312,7 +312,7 @@ class RobotSession:
             "obeyed": bool(task and task.active and task.worker == self.name),
             "batch": self._batch,
         }
-        self.node.report(
+        self.node.publish_status(
             state,
             detail=detail,
             rates_hz={"chunks": self._rate.rate_hz},
@@ -322,5 +322,5 @@ class RobotSession:
 
     def close(self) -> None:
         """Report ``stopped`` and close the node."""
-        self.node.report("stopped", now=True)
+        self.node.publish_status("stopped", now=True)
         self.node.close()

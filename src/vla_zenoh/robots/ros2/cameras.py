@@ -65,7 +65,7 @@ class Camera:
         last_s = time.monotonic()
         while not stop.is_set():
             if self._slot.wait(WAIT_S):
-                arrival = self._slot.take()
+                arrival = self._slot.pop()
                 if arrival is not None and self._take(arrival):
                     last_s = time.monotonic()
             silent_s = time.monotonic() - last_s
@@ -76,7 +76,7 @@ class Camera:
         """Whether it was a picture."""
         outlet, now_s = self.outlet, time.monotonic()
         due = outlet.due(arrival.mono_ns)
-        if not (due and outlet.wanted) and now_s - self._looked_s < LOOK_S:
+        if not (due and outlet.has_subscribers) and now_s - self._looked_s < LOOK_S:
             if outlet.state == OK:
                 outlet.captured(arrival.mono_ns)
             return outlet.state == OK
@@ -93,7 +93,7 @@ class Camera:
             return False
         outlet.captured(arrival.mono_ns)
         outlet.set_state(OK)
-        if due and outlet.wanted:
+        if due and outlet.has_subscribers:
             settings = outlet.profile
             rgb = resize(picture.rgb, settings.width, settings.height)
             stamp_ns = picture.stamp_ns or self._node.clock.wall_at(arrival.mono_ns)
