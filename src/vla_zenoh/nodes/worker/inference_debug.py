@@ -139,7 +139,9 @@ class PendingImages:
         """
         kept = self._kept.setdefault((worker, seq), {})
         if camera not in kept and len(kept) >= MAX_CAMERAS:
-            raise CodecError("cameras", f"{worker} publishes over {MAX_CAMERAS} images at once")
+            raise CodecError(
+                "cameras", f"{worker} publishes more than {MAX_CAMERAS} images at once"
+            )
         self._bytes += len(jpeg) - len(kept.get(camera, b""))
         kept[camera] = jpeg
         while len(self._kept) > MAX_WAITING or self._bytes > self._limit:
