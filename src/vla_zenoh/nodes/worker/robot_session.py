@@ -9,11 +9,9 @@ from typing import Any, Literal
 
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing, LatestSample
+from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.payload_limits import bytes_of
-from vla_zenoh.bus.writer_filter import SingleWriterFilter
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
@@ -28,10 +26,9 @@ from vla_zenoh.nodes.worker.camera_subscriber import (
 from vla_zenoh.nodes.worker.inference_debug import InferenceDebugPublisher
 from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
-from vla_zenoh.policy.observation import History, NotReady, assemble
+from vla_zenoh.policy.observation import History, NotReady, assemble, make_chunk
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
-    ActionChunk,
     GripperState,
     Image,
     JointState,
@@ -39,6 +36,7 @@ from vla_zenoh.types import (
     Stamped,
     Task,
 )
+from vla_zenoh.types.stream import SingleWriterFilter
 
 SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5
@@ -255,23 +253,17 @@ class RobotSession:
         observed_ns, start_ns, end_ns = times_ns
         self._batch = batch
         self._inference_ms.add((end_ns - start_ns) / 1e6)
-        horizon_ns = int(len(steps) * self.spec.action.dt_s * 1e9)
-        max_age_ns = int(self.node.profile.timing.max_observation_age_s * 1e9)
-        header = self._chunks.publish(
-            ActionChunk(
-                worker=self.name,
-                spec_hash=self.spec.hash,
-                episode=observation.task.episode,
-                observation_stamp_ns=observation.stamp_wall_ns,
-                observation_seq=observation.seq,
-                valid_until_ns=observation.stamp_wall_ns + horizon_ns + max_age_ns,
-                steps=steps,
-                observed_ns=observed_ns,
-                inference_start_ns=start_ns,
-                inference_end_ns=end_ns,
-                done=done,
-            )
+        chunk = make_chunk(
+            self.name,
+            self.spec,
+            observation,
+            ActionSteps(steps, done),
+            patience_s=self.node.profile.timing.max_observation_age_s,
+            observed_ns=observed_ns,
+            start_ns=start_ns,
+            end_ns=end_ns,
         )
+        header = self._chunks.publish(chunk)
         self._not_before_ns = header.stamp_wall_ns
         self._rate.tick()
         obeyed = observation.task.active and observation.task.worker == self.name
