@@ -10,7 +10,7 @@ import typer
 
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.evaluation.files import MCAP
+from vla_zenoh.lab.evaluation.evaluate import MCAP
 
 dataset_app = typer.Typer(
     name="dataset", help="Recorded runs as data to train on.", no_args_is_help=True

@@ -10,7 +10,7 @@ from typing import Any
 from vla_zenoh import __version__
 from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.lab.evaluation import plots
-from vla_zenoh.lab.evaluation.combined import overall
+from vla_zenoh.lab.evaluation.evaluate import combined
 from vla_zenoh.lab.evaluation.result import STAGES, CameraView, Evaluation
 from vla_zenoh.lab.evaluation.tables import LATENCY_COLUMNS, figures, latency_rows, segment_rows
 
@@ -30,7 +30,7 @@ def page(runs: Sequence[Evaluation], faults: Mapping[str, str]) -> str:
         raise MissingExtraError("jinja2", "record") from error
     text = files("vla_zenoh.lab.evaluation").joinpath(TEMPLATE).read_text("utf-8")
     template = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(text)
-    shown = [overall(runs), *runs] if len(runs) > 1 else list(runs)
+    shown = [combined(runs), *runs] if len(runs) > 1 else list(runs)
     return template.render(
         version=__version__,
         library=Markup(plots.library()),

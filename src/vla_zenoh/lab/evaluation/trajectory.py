@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from vla_zenoh.types import FloatArray
@@ -71,8 +69,3 @@ def idle_s(t_s: FloatArray, speed_m_s: FloatArray, turn_rad_s: FloatArray) -> fl
     """Time in which the arm stands; (n,) times and (n - 1,) speeds between them."""
     still = (speed_m_s < STILL_M_S) & (turn_rad_s < STILL_RAD_S)
     return float(np.diff(t_s)[still].sum())
-
-
-def concatenated(parts: Sequence[FloatArray]) -> FloatArray:
-    """All values in one array, empty when there are none."""
-    return np.concatenate(parts) if parts else np.zeros(0)
