@@ -40,7 +40,7 @@ def spoken() -> SingleWriterFilter:
     """Number 7 of ``robot#1`` was heard at time 0."""
     speaker = SingleWriterFilter(SILENCE_NS / 1e9)
     speaker.check(Header(0, 7, "robot#1"), 0)
-    speaker.heard(Header(0, 7, "robot#1"), 0)
+    speaker.accept(Header(0, 7, "robot#1"), 0)
     return speaker
 
 

@@ -342,7 +342,7 @@ class Node:
             self.reject(error.reason, f"{key}: {error}", key)
             return None
         if writer_filter is not None:
-            writer_filter.heard(header, arrival.mono_ns)
+            writer_filter.accept(header, arrival.mono_ns)
         self.traffic.received(str(sample.key_expr), header, arrival.nth)
         return Stamped(here, record, self.arrival_wall_ns(arrival))
 

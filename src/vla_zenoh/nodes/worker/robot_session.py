@@ -191,7 +191,7 @@ class RobotSession:
         except CodecError as error:
             self.node.reject(error.reason, f"camera {camera}: {error}")
             return None
-        speaker.heard(header, arrival.mono_ns)
+        speaker.accept(header, arrival.mono_ns)
         self.node.traffic.received(str(sample.key_expr), header, arrival.nth)
         header, image = self.node.clocks.to_local_clock(header, image)
         return Stamped(header, image, self.node.arrival_wall_ns(arrival))
