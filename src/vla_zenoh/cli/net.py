@@ -104,7 +104,7 @@ def net(
         while time.monotonic() < end_s:
             for node in tuple(client.alive):
                 clocks.track(node)
-            clocks.tick()
+            clocks.poll()
             time.sleep(POLL_S)
         statuses = {name: found for name, (found, _, alive) in client.snapshot().items() if alive}
         own_links = tuple(sorted(str(link.dst) for link in client.session.info.links()))

@@ -146,7 +146,7 @@ def stop(
     """Emergency stop: brake now, and stay stopped until `vla-zenoh reset`."""
     aim = RobotTarget(profile, connect, host, robot)
     with aim.client(stop=True) as client:
-        client.publish(client.keys.stop, "stop")
+        client.stop()
         if every:
             _stop_all(aim, client)
             return
@@ -167,7 +167,7 @@ def reset(
     """Clear an emergency stop or a fault. The arm stays inactive."""
     aim = RobotTarget(profile, connect, host, robot)
     with aim.driver("reset") as client:
-        client.publish(client.keys.reset, "reset")
+        client.reset()
         if not _heeded(client, lambda: _state(client) not in ("", "stopped", "fault")):
             status = client.status("command")
             if status is None or "command" not in client.alive:

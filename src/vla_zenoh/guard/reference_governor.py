@@ -140,7 +140,7 @@ class ReferenceGovernor(Generic[Reference]):
 
     Attributes:
         motion: the reference now.
-        told: where it goes: the last commanded set-point, or where it stands.
+        target: where it goes: the last commanded set-point, or where it stands.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class ReferenceGovernor(Generic[Reference]):
         limits = np.array(brake[:3])
         self._brake = limits * brake.axis
         self._own = limits / BRAKE_MARGIN
-        jerk = self._told_jerk = ORDINARY * self._own[2]
+        jerk = self._target_jerk = ORDINARY * self._own[2]
         self._reach = np.stack([jerk * dt_s, jerk * dt_s**2, jerk * (dt_s**3 / 2)])
         self._axis = brake.beside
         velocity, acceleration, jerk = self._own
@@ -167,7 +167,7 @@ class ReferenceGovernor(Generic[Reference]):
 
     def put(self, motion: Reference) -> None:
         """Hold the place of `motion` at once."""
-        self.told = self.motion = self._space.rest(motion)
+        self.target = self.motion = self._space.rest(motion)
         self._way: GovernedPath | None = None
         self._cramped: NDArray[np.bool_] | None = None
         self._planned = self._stopping = False
@@ -175,77 +175,79 @@ class ReferenceGovernor(Generic[Reference]):
     @property
     def moving(self) -> bool:
         """The reference is not yet where it goes, or that moves."""
-        return self._way is not None or bool(self._space.speed(self.told).rate.any())
+        return self._way is not None or bool(self._space.speed(self.target).rate.any())
 
-    def follow(self, told: Reference, *, steady: bool) -> None:
+    def follow(self, target: Reference, *, steady: bool) -> None:
         """Advance by a tick along the commanded path.
 
         Args:
-            told: commanded set-point of this tick.
+            target: commanded set-point of this tick.
             steady: it is known to continue the one of the last tick.
         """
-        space, goes_on, on = self._space, steady, told
+        space, goes_on, on = self._space, steady, target
         if self._stopping:
             self._advance()
-            goes_on, on = False, self.told
+            goes_on, on = False, self.target
         elif not steady or self._cramped is not None:
-            on, share = self._went_on(told)
-            goes_on = self._cramped is None and self._could(space.apart(told, on), share)
-            self._advance(told, share)
+            on, share = self._went_on(target)
+            goes_on = self._cramped is None and self._could(space.apart(target, on), share)
+            self._advance(target, share)
         elif self._way is not None:
-            change = space.speed(told).change
-            changed = np.array([change, (change - space.speed(self.told).change) / self._dt_s])
+            change = space.speed(target).change
+            changed = np.array([change, (change - space.speed(self.target).change) / self._dt_s])
             if self._planned and (np.abs(changed) <= self._known).all():
                 self._advance()
             else:
-                self._advance(told, self._share_of(told))
+                self._advance(target, self._share_of(target))
         if not goes_on:
             at = on if self._way is None else space.beside(on, self._way)
-            self._way, self._planned, self._stopping = space.apart(at, told), False, False
-        self.told = told
-        self.motion = told if self._way is None else space.beside(told, self._way)
+            self._way, self._planned, self._stopping = space.apart(at, target), False, False
+        self.target = target
+        self.motion = target if self._way is None else space.beside(target, self._way)
 
     def rest(self) -> None:
         """Advance by a tick without a command: to the last set-point, or to the end of a stop."""
         if not self._stopping:
-            moved = self._space.speed(self.told).rate.any()
-            self.follow(self._space.rest(self.told), steady=not moved)
+            moved = self._space.speed(self.target).rate.any()
+            self.follow(self._space.rest(self.target), steady=not moved)
             return
         self._advance()
-        self.motion = self.told if self._way is None else self._space.beside(self.told, self._way)
+        self.motion = (
+            self.target if self._way is None else self._space.beside(self.target, self._way)
+        )
 
     def stop(self) -> None:
         """Brake to rest as fast as the limits allow, each axis by itself."""
         self._way, self._cramped = self._space.speed(self.motion), None
-        self.told = self._space.rest(self.motion)
+        self.target = self._space.rest(self.motion)
         self._stopping = True
         self._plan(self._way, self._brake, ControlInterface.Velocity)
         if not self._planned:  # nothing to stop, or no plan: stand at once
             self.put(self.motion)
 
     # -- commanded path -----------------------------------------------------------------------
-    def _share_of(self, told: Reference) -> FloatArray:
-        """The jerk (n,) that leads to `told`, as shares of its limit, at most 1."""
-        change = self._space.speed(told).change - self._space.speed(self.told).change
+    def _share_of(self, target: Reference) -> FloatArray:
+        """The jerk (n,) that leads to `target`, as shares of its limit, at most 1."""
+        change = self._space.speed(target).change - self._space.speed(self.target).change
         share = change / self._reach[0]
         share = share / np.maximum(self._space.sizes(share), 1.0)
         return share if self._cramped is None else np.where(self._cramped, 0.0, share)
 
-    def _went_on(self, told: Reference) -> tuple[Reference, FloatArray]:
-        """The set-point of the last tick, continued with the jerk that brings it nearest to `told`.
+    def _went_on(self, target: Reference) -> tuple[Reference, FloatArray]:
+        """The set-point of the last tick, continued with the jerk that leads nearest to `target`.
 
         Returns:
             The continued set-point, and the jerk (n,) as shares of its limit.
         """
-        space, dt_s, share = self._space, self._dt_s, self._share_of(told)
-        _, rate, change = space.speed(self.told)
-        jerk = self._told_jerk * share
+        space, dt_s, share = self._space, self._dt_s, self._share_of(target)
+        _, rate, change = space.speed(self.target)
+        jerk = self._target_jerk * share
         gone = GovernedPath(
             (rate + (change + jerk * (dt_s / 3)) * (dt_s / 2)) * dt_s,
             rate + (change + jerk * (dt_s / 2)) * dt_s,
             change + jerk * dt_s,
         )
-        return space.beside(space.rest(self.told), gone), share
+        return space.beside(space.rest(self.target), gone), share
 
     def _could(self, away: GovernedPath, share: FloatArray) -> bool:
         """Whether a jerk within its limit leads this far away from where this share of it leads."""
@@ -253,18 +255,20 @@ class ReferenceGovernor(Generic[Reference]):
         return float(self._space.sizes(_TESTS @ moments).max()) <= 1.0
 
     # -- the difference -----------------------------------------------------------------------
-    def _advance(self, told: Reference | None = None, share: FloatArray | None = None) -> None:
+    def _advance(self, target: Reference | None = None, share: FloatArray | None = None) -> None:
         """Advance the difference by a tick.
 
         Args:
-            told: commanded set-point at its end; None: there is none.
+            target: commanded set-point at its end; None: there is none.
             share: (n,) of the jerk that the commanded path uses meanwhile.
         """
         if self._way is None:
             return
-        if told is not None and share is not None:
-            _, rate, change = self._space.speed(told)
-            taken = self._space.sizes(np.array([rate, change, self._told_jerk * share]) / self._own)
+        if target is not None and share is not None:
+            _, rate, change = self._space.speed(target)
+            taken = self._space.sizes(
+                np.array([rate, change, self._target_jerk * share]) / self._own
+            )
             if not self._planned or (taken > self._taken).any():
                 self._settle(self._way, taken)
         if self._way is None:
@@ -281,11 +285,11 @@ class ReferenceGovernor(Generic[Reference]):
         )
         if self._time_s >= self._trajectory.duration * UNIT_S:
             if self._stopping:
-                self.put(self._space.beside(self.told, self._way))
+                self.put(self._space.beside(self.target, self._way))
             self._way, self._planned, self._cramped = None, False, None
 
     def _settle(self, way: GovernedPath, taken: FloatArray) -> None:
-        """Plan the difference to zero, within the limits that the path leaves it, `taken` (3, n)."""
+        """Plan the difference to zero, beside a path that takes these shares (3, n)."""
         needed = _jerk(way, SETTLE_S)
         self._taken = taken + self._slack
         self._known = self._taken[1:] * self._own[1:]

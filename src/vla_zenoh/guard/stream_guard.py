@@ -259,7 +259,7 @@ class StreamGuard(Generic[Reference]):
     @property
     def _expected(self) -> Reference:
         """Where the next command should be: on the stream's path, or where the robot stands."""
-        return self._governor.told if self.following else self.motion
+        return self._governor.target if self.following else self.motion
 
     def hold(self) -> None:
         """Follow no stream and hold the reference: the arm stopped there by itself."""
@@ -315,7 +315,7 @@ class StreamGuard(Generic[Reference]):
             return governor.motion
         if self._stream.newest is not None:
             self._stream.end()
-            if float(np.abs(self._space.speed(governor.told).rate).max()) >= STILL:
+            if float(np.abs(self._space.speed(governor.target).rate).max()) >= STILL:
                 self.silences += 1
                 self.braking = True
                 governor.stop()

@@ -116,7 +116,7 @@ class Teleop:
         elif client is None:
             self._news.append("these keys need the certificate of an operator on this computer")
         elif order == STOP:
-            client.publish(client.keys.stop, "stop")
+            client.stop()
         elif order == ACTIVATE:
             active = client.task is not None and client.task.active
             client.publish(client.keys.active, "false" if active else "true")
