@@ -191,9 +191,9 @@ def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
         return SessionError(
             f"no Zenoh router answers at {where}, or it rejects the certificate "
             f"{tls['connect_certificate']}. Check that with `vla-zenoh secure show`; "
-            "start a router with `vla-zenoh router` or `vla-zenoh up`"
+            "start a router with `vla-zenoh node router` or `vla-zenoh up`"
         )
     return SessionError(
-        f"no Zenoh router answers at {where}. Start one with `vla-zenoh router`, or everything "
-        "with `vla-zenoh up`; set another address with --connect or session.connect"
+        f"no Zenoh router answers at {where}. Start one with `vla-zenoh node router`, or all "
+        "nodes with `vla-zenoh up`; set another address with --connect or session.connect"
     )
