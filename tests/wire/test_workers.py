@@ -203,7 +203,7 @@ def test_what_a_model_sees_is_shown_with_its_prompt_raw_output_and_steps(
         sights: list[InferenceView] = []
 
         def shown() -> bool:
-            sights.extend(listener.take())
+            sights.extend(listener.poll())
             return len([sight for sight in sights if sight.jpegs]) >= 3
 
         chain.until("it is shown", shown)

@@ -67,7 +67,7 @@ def inspect(
                     break
                 if not received and waited_s > PATIENCE_S:
                     break
-                for view in subscriber.take()[: None if count is None else count - received]:
+                for view in subscriber.poll()[: None if count is None else count - received]:
                     received += 1
                     newest[view.record.worker] = view
                     if out is not None:
