@@ -12,13 +12,14 @@ from vla_zenoh.runtime.process import run_node
 
 
 def arm(profile: ProfileOption = DEFAULT_PROFILE, connect: ConnectOption = None) -> None:
-    """Drive an arm by the Python file that the profile names in `arm.file`."""
-    from vla_zenoh.robots.python.node import ArmNode  # loads kinematics; other commands do not wait
+    """Drive an arm through the Python class that the profile names in `arm.file`."""
+    from vla_zenoh.robots.node import RobotNode  # loads kinematics; other commands do not wait
+    from vla_zenoh.robots.python_driver import PythonDriver
 
     loaded = effective_profile(profile, connect)
     run_node(
         loaded,
-        lambda session, stop: ArmNode(loaded, session).run(stop),
+        lambda session, stop: RobotNode(PythonDriver(loaded), session).run(stop),
         identity="arm",
         preferred=True,
     )

@@ -33,13 +33,14 @@ def ros2(
             if source is not None and source.name == "COMMANDLINE":
                 raise typer.BadParameter(f"give --{name} behind {context.invoked_subcommand}")
         return
-    from vla_zenoh.robots.ros2.node import Ros2Node  # loads kinematics; other commands do not wait
+    from vla_zenoh.robots.node import RobotNode  # loads kinematics; other commands do not wait
+    from vla_zenoh.robots.ros2.driver import Ros2Driver
     from vla_zenoh.runtime.process import run_node
 
     loaded = effective_profile(profile, connect)
     run_node(
         loaded,
-        lambda session, stop: Ros2Node(loaded, session).run(stop),
+        lambda session, stop: RobotNode(Ros2Driver(loaded), session).run(stop),
         identity="ros2",
         preferred=True,
     )

@@ -21,19 +21,18 @@ def sim(
     lockstep: Annotated[
         bool,
         typer.Option(
-            "--lockstep", help="Time stands still until somebody queries the key sim/step."
+            "--lockstep", help="Simulated time advances only by queries on the key sim/step."
         ),
     ] = False,
 ) -> None:
-    """Run the simulated robot: takes command keys, gives state keys."""
-    from vla_zenoh.robots.sim.node import (
-        SimNode,  # MuJoCo takes a while; other commands need not wait
-    )
+    """Run the simulated robot: subscribes to command keys, publishes state keys."""
+    from vla_zenoh.robots.node import RobotNode  # MuJoCo loads slowly; other commands must not wait
+    from vla_zenoh.robots.sim_driver import SimDriver
 
     loaded = effective_profile(profile, connect)
     run_node(
         loaded,
-        lambda session, stop: SimNode(loaded, session, lockstep=lockstep).run(stop),
+        lambda session, stop: RobotNode(SimDriver(loaded, lockstep=lockstep), session).run(stop),
         identity="sim",
         preferred=True,
     )
