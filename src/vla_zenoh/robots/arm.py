@@ -37,9 +37,7 @@ class Arm:
         self._node, self._driver = node, driver
         self.follower = CommandFollower(node, driver)
         keys, gripper = node.keys, node.profile.robot.gripper
-        self._gripper_commands = node.subscribe(
-            keys.command_gripper, CallbackRing(16, SMALL_BYTES)
-        )
+        self._gripper_commands = node.subscribe(keys.command_gripper, CallbackRing(16, SMALL_BYTES))
         self._gripper_guard = GripperGuard(gripper)
         self._joint_out = node.declare_publisher(keys.state_joint, Kind.STATE)
         self._pose_out = node.declare_publisher(keys.state_pose, Kind.STATE)

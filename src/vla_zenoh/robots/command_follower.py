@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Protocol
 
 from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample
 from vla_zenoh.bus.node import Node
@@ -15,7 +16,6 @@ from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.guard.arm_guard import ArmGuard, Measured, make_arm_guard
 from vla_zenoh.guard.held_reference import SETTLE_NS, HeldReference
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.robots.driver import RobotDriver
 from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
 from vla_zenoh.types.references import JointReference, PoseReference
 
@@ -23,6 +23,21 @@ BUFFER = 64
 STALLED_NS = 500_000_000
 """After a stall commands are rejected and the robot is not ready for this long: what was sent
 during the stall is still arriving, and its writer has to notice and brake."""
+
+
+class FollowingRobot(Protocol):
+    """The part of a `vla_zenoh.robots.driver.RobotDriver` that a follower uses."""
+
+    modes: tuple[str, ...]
+    period_s: float
+    simulated: bool
+    lockstep: bool
+
+    @property
+    def joint_range_rad(self) -> tuple[FloatArray, FloatArray]: ...
+    def state_now(self) -> Measured | None: ...
+    def forward(self, position_rad: FloatArray) -> Pose: ...
+    def move(self, reference: PoseReference | JointReference, now_ns: int) -> None: ...
 
 
 class CommandFollower:
@@ -38,7 +53,7 @@ class CommandFollower:
         accepting: False after `stop_accepting`.
     """
 
-    def __init__(self, node: Node, driver: RobotDriver) -> None:
+    def __init__(self, node: Node, driver: FollowingRobot) -> None:
         self._node, self._driver = node, driver
         keys = node.keys
         subscribed = {"pose": keys.command_pose, "joint": keys.command_joint}

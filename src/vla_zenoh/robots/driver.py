@@ -8,9 +8,11 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from vla_zenoh.bus.clock import FixedRate, Tick
+from vla_zenoh.bus.node import Node
 from vla_zenoh.guard.arm_guard import Measured
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
 from vla_zenoh.profile import Profile
+from vla_zenoh.robots.command_follower import CommandFollower
 from vla_zenoh.types import (
     FloatArray,
     GripperCommand,
@@ -23,10 +25,7 @@ from vla_zenoh.types import (
 from vla_zenoh.types.references import JointReference, PoseReference
 
 if TYPE_CHECKING:
-    from vla_zenoh.bus.node import Node
     from vla_zenoh.kinematics.kinematics import Kinematics
-    from vla_zenoh.robots.command_follower import CommandFollower
-    from vla_zenoh.robots.node import RobotNode
 
 STREAMING = "streaming"
 """State in the commands that a driver sends: the guard has already judged that of the writer."""
@@ -57,6 +56,22 @@ class DriverStatus(NamedTuple):
     ages_s: Mapping[str, float] = {}
     rates_hz: Mapping[str, float] = {}
     latency_ms: Mapping[str, tuple[float, float]] = {}
+
+
+class SteppedNode(Protocol):
+    """The node as a driver runs it in lockstep."""
+
+    def publish_state(self, measurement: Measurement, mono_ns: int) -> None:
+        """Publish a measurement."""
+        ...
+
+    def step(self, tick: Tick) -> None:
+        """Run one tick."""
+        ...
+
+    def watch(self) -> None:
+        """Publish the status when it is due."""
+        ...
 
 
 class Pace(Protocol):
@@ -143,7 +158,7 @@ class RobotDriver:
         """Whether the status should be published before it is due."""
         return False
 
-    def serve_lockstep(self, node: RobotNode, stop: threading.Event) -> None:
+    def serve_lockstep(self, node: SteppedNode, stop: threading.Event) -> None:
         """Run the node's ticks when simulated time advances, until `stop` is set."""
         raise NotImplementedError
 

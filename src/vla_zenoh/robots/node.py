@@ -20,7 +20,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.braking_time import max_braking_time_s
 from vla_zenoh.robots.arm import Arm
-from vla_zenoh.robots.driver import Pace, RobotDriver
+from vla_zenoh.robots.driver import Measurement, Pace, RobotDriver
 from vla_zenoh.runtime.scheduling import realtime_thread
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event
@@ -102,6 +102,11 @@ class RobotNode:
                 why = f"{one_line(repr(error), MAX_REASON)}: {how}"
                 self.node.emit(Event("error", "fault", "broken", why))
             raise
+
+    def publish_state(self, measurement: Measurement, mono_ns: int) -> None:
+        """Publish a measurement."""
+        if self.arm is not None:
+            self.arm.publish(measurement, mono_ns)
 
     def step(self, tick: Tick) -> None:
         """Run one tick."""

@@ -25,8 +25,7 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.command_follower import CommandFollower
-from vla_zenoh.robots.driver import DriverStatus, Measurement, Pace, RobotDriver
-from vla_zenoh.robots.node import RobotNode
+from vla_zenoh.robots.driver import DriverStatus, Measurement, Pace, RobotDriver, SteppedNode
 from vla_zenoh.simulation.world import STEP_NS, build_world
 from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
 from vla_zenoh.types.references import JointReference, PoseReference
@@ -178,17 +177,16 @@ class SimDriver(RobotDriver):
         """Ticks of 1 ms that keep to the clock."""
         return RealTimePace(self._node)
 
-    def serve_lockstep(self, node: RobotNode, stop: threading.Event) -> None:
+    def serve_lockstep(self, node: SteppedNode, stop: threading.Event) -> None:
         """Publish the first state, and answer ``sim/step`` until `stop` is set."""
-        assert node.arm is not None
         self.measured_ns = 0
-        node.arm.publish(self._measure(0), 0)
-        node.node.serve(self._node.keys.sim_step, lambda query: self._answer_step(node, query))
+        node.publish_state(self._measure(0), 0)
+        self._node.serve(self._node.keys.sim_step, lambda query: self._answer_step(node, query))
         while not stop.wait(WATCH_S):
             with self._step_lock:
                 node.watch()
 
-    def _answer_step(self, node: RobotNode, query: zenoh.Query) -> None:
+    def _answer_step(self, node: SteppedNode, query: zenoh.Query) -> None:
         """Advance by a msgpack map ``{"ns": ..}``; the reply is the state after it."""
         payload = query.payload
         try:

@@ -55,7 +55,9 @@ class Camera:
         self.publisher.backend = topic.type
         self._stamps = StampFilter()
         self._decoded_s = -LOOK_S
-        self._image = graph.subscribe(topic.topic, topic.type, LatestSample(MAX_PICTURE_BYTES), SENSOR)
+        self._image = graph.subscribe(
+            topic.topic, topic.type, LatestSample(MAX_PICTURE_BYTES), SENSOR
+        )
 
     def run(self, stop: threading.Event) -> None:
         """Publish images until `stop` is set."""

@@ -1,4 +1,4 @@
-"""The gripper of a ROS 2 robot: driven by an action, one goal at a time, or by a topic of numbers."""
+"""The gripper of a ROS 2 robot: by an action, one goal at a time, or by a topic of numbers."""
 
 from __future__ import annotations
 

@@ -56,7 +56,9 @@ class RosPublisher:
 class ServiceClient:
     """Client of one service."""
 
-    def __init__(self, session: zenoh.Session, key: str, gid: bytes | None, timeout_s: float) -> None:
+    def __init__(
+        self, session: zenoh.Session, key: str, gid: bytes | None, timeout_s: float
+    ) -> None:
         self._session, self._key, self._gid, self._timeout_s = session, key, gid, timeout_s
         self._seq = itertools.count(1)
 

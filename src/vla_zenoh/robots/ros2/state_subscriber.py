@@ -62,7 +62,8 @@ class StateSubscriber:
         self._wrench: Wrench | None = None
         topics = dict.fromkeys((ros2.joint_states, ros2.finger_states or ros2.joint_states))
         self._joint_states = [
-            graph.subscribe(topic, joint_state.TYPE, CallbackRing(BUFFER), SENSOR) for topic in topics
+            graph.subscribe(topic, joint_state.TYPE, CallbackRing(BUFFER), SENSOR)
+            for topic in topics
         ]
         self._transforms = TransformBuffer()
         self._tf = []
@@ -70,13 +71,17 @@ class StateSubscriber:
             self._tf = [
                 (graph.subscribe(TF, transforms.TYPE, CallbackRing(BUFFER), SENSOR), False),
                 (
-                    graph.subscribe(TF_STATIC, transforms.TYPE, CallbackRing(BUFFER), STATIC_TRANSFORMS),
+                    graph.subscribe(
+                        TF_STATIC, transforms.TYPE, CallbackRing(BUFFER), STATIC_TRANSFORMS
+                    ),
                     True,
                 ),
             ]
         self._wrenches = None
         if ros2.wrench is not None:
-            self._wrenches = graph.subscribe(ros2.wrench.topic, wrench.TYPE, CallbackRing(4), SENSOR)
+            self._wrenches = graph.subscribe(
+                ros2.wrench.topic, wrench.TYPE, CallbackRing(4), SENSOR
+            )
 
     def update(self) -> bool:
         """Process the messages that arrived; whether there is a new state of the arm's joints."""
