@@ -36,16 +36,15 @@ class Arm:
     def __init__(self, node: Node, driver: RobotDriver) -> None:
         self._node, self._driver = node, driver
         self.follower = CommandFollower(node, driver)
-        keys, gripper = node.keys, node.profile.robot.gripper
-        self._gripper_commands = node.subscribe(keys.command_gripper, CallbackRing(16, SMALL_BYTES))
-        self._gripper_guard = GripperGuard(gripper)
+        self._gripper_commands = GripperCommands(node, driver)
+        keys = node.keys
         self._joint_out = node.declare_publisher(keys.state_joint, Kind.STATE)
         self._pose_out = node.declare_publisher(keys.state_pose, Kind.STATE)
         self._gripper_out = node.declare_publisher(keys.state_gripper, Kind.STATE)
         # A little less than the period: readings come at multiples of another one.
         self._period_ns = 0.9e9 / node.profile.timing.state_hz
         self._seq = self._published_ns = self._mono_ns = 0
-        self._gripper = GripperState(gripper.max_width_m, False, False)
+        self._gripper = GripperState(node.profile.robot.gripper.max_width_m, False, False)
         self._published_fault = self._was = ""
 
     # -- one tick -----------------------------------------------------------------------------
@@ -63,7 +62,8 @@ class Arm:
         if not simulated:
             self._read(mono_ns)
         self._follow(now_ns, mono_ns)
-        self._grip(now_ns)
+        if self.follower.accepting:
+            self._gripper_commands.update(now_ns, self.follower)
         if simulated:
             self._read(mono_ns)
 
@@ -84,30 +84,6 @@ class Arm:
                 Measured(measurement.tcp, joints.position_rad, joints.velocity_rad_s)
             )
         self.publish(measurement, mono_ns)
-
-    def _grip(self, now_ns: int) -> None:
-        if not self.follower.accepting:
-            return
-        for arrival in self._gripper_commands.drain():
-            command = self._node.decode(GripperCommand, arrival)
-            if command is None:
-                continue
-            if self._driver.no_gripper:
-                self._node.reject("no_gripper", f"command/gripper: {self._driver.no_gripper}")
-                continue
-            follower = self.follower
-            try:
-                allowed = self._gripper_guard.accept(
-                    command,
-                    follower.writer,
-                    0 if self._driver.lockstep else now_ns,  # in lockstep a command has no age
-                    writer_active=follower.writer_active,
-                )
-            except CodecError as error:
-                self._node.reject(error.reason, f"command/gripper {error}")
-                continue
-            self._node.counters["gripper_bounded"] = self._gripper_guard.bounded
-            self._driver.grip(allowed, now_ns)
 
     # -- states out ---------------------------------------------------------------------------
     def publish(self, measurement: Measurement | None, mono_ns: int) -> None:
@@ -156,7 +132,7 @@ class Arm:
 
     @property
     def _silent(self) -> bool:
-        age_s = self.age_s
+        age_s = None if self._driver.simulated else self.age_s
         return age_s is not None and age_s > self._node.profile.timing.state_timeout_s
 
     @property
@@ -176,6 +152,8 @@ class Arm:
 
     def changed(self) -> bool:
         """Whether the state changed since the last call; a transition is emitted as an event."""
+        if self._driver.simulated and self._published_ns != self._mono_ns:
+            return False  # ticks are many: looked at whenever a state is published
         state, was = self.state, self._was
         if state == was:
             return False
@@ -199,3 +177,45 @@ class Arm:
             "unheeded": "command stream rejected: its first set-point does not match the arm's "
             "current pose, or its beginning was lost",
         }.get(state, "")
+
+
+class GripperCommands:
+    """Gripper commands of the arm's writer, from the bus to the driver.
+
+    Args:
+        node: on the bus; its counters get the rejections.
+        driver: of the robot.
+    """
+
+    def __init__(self, node: Node, driver: RobotDriver) -> None:
+        self._node, self._driver = node, driver
+        key = node.keys.command_gripper
+        self._commands = node.subscribe(key, CallbackRing(16, SMALL_BYTES))
+        self._guard = GripperGuard(node.profile.robot.gripper)
+
+    def update(self, now_ns: int, follower: CommandFollower) -> None:
+        """Accept or reject the commands that arrived.
+
+        Args:
+            now_ns: wall clock, for their age.
+            follower: of the arm; a gripper command of another writer is rejected.
+        """
+        for arrival in self._commands.drain():
+            command = self._node.decode(GripperCommand, arrival)
+            if command is None:
+                continue
+            if self._driver.no_gripper:
+                self._node.reject("no_gripper", f"command/gripper: {self._driver.no_gripper}")
+                continue
+            try:
+                accepted = self._guard.accept(
+                    command,
+                    follower.writer,
+                    0 if self._driver.lockstep else now_ns,  # in lockstep a command has no age
+                    writer_active=follower.writer_active,
+                )
+            except CodecError as error:
+                self._node.reject(error.reason, f"command/gripper {error}")
+                continue
+            self._node.counters["gripper_bounded"] = self._guard.bounded
+            self._driver.grip(accepted, now_ns)

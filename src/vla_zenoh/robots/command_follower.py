@@ -64,6 +64,7 @@ class CommandFollower:
         self._guard: ArmGuard | None = None
         self._measured: Measured | None = None
         self._hold = HeldReference()
+        self._timeout_s = node.profile.timing.command_timeout_s
         self._stalled_until_ns = 0
         self.stall_s, self.stalls = 0.0, 0
         self.accepting = True
@@ -93,7 +94,7 @@ class CommandFollower:
             stall_s: how late the tick is. The robot stopped at its last set-point: after a long
                 stall motion resumes from there, at rest.
         """
-        if stall_s <= self._node.profile.timing.command_timeout_s:
+        if stall_s <= self._timeout_s:
             if mono_ns >= self._stalled_until_ns:
                 self._stalled_until_ns = 0
             return
@@ -160,11 +161,15 @@ class CommandFollower:
     def _lead(
         self, guard: ArmGuard, measured: Measured, now_ns: int, mono_ns: int, away: str
     ) -> None:
-        if away and guard.moving:
-            guard.anchor()  # the next stream must not begin where the arm never went
+        if self._driver.simulated:
+            self._driver.move(guard.tick(mono_ns), now_ns)
+            return
         was_moving = guard.moving
+        if away and was_moving:
+            guard.anchor()  # the next stream must not begin where the arm never went
+            was_moving = guard.moving
         reference = guard.tick(mono_ns)
-        if guard.moving or was_moving or self._driver.simulated:
+        if was_moving or guard.moving:
             self._hold.on_sent(mono_ns)
             self._driver.move(reference, now_ns)
         else:
@@ -237,12 +242,12 @@ class CommandFollower:
         return None if self._guard is None else self._guard.reference
 
     def held(self) -> tuple[Pose | None, FloatArray | None]:
-        """Set-point that the robot's controller holds: TCP pose, and (n,) joints in joint mode.
+        """Set-point that a real robot's controller holds: TCP pose, (n,) joints in joint mode.
 
         None where it is unknown: nothing was sent, or the arm was moved by other means.
         """
         reference = self.reference
-        if reference is None or not self.holds:
+        if reference is None or not self._hold.held or self._driver.simulated:
             return None, None
         if isinstance(reference, JointReference):
             return self._driver.forward(reference.position_rad), reference.position_rad

@@ -38,7 +38,7 @@ class Measurement(NamedTuple):
         stamp_ns: wall clock.
         joints: of the arm.
         tcp: pose of the TCP in the base frame.
-        pose: the same with twist and wrench, without a reference.
+        pose: the same with twist and wrench; a simulation adds its reference.
         gripper: its mode and faults are set by the node; None: unknown.
     """
 

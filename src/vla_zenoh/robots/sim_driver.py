@@ -59,7 +59,7 @@ class SimDriver(RobotDriver):
         self.world = build_world(profile)
         self.lockstep = lockstep
         self.modes, self.period_s = ("pose", "joint"), STEP_NS / 1e9
-        self._ticks = 0
+        self._ticks = self._stamp_ns = 0
         self._scene_wanted = self._objects_wanted = self._was_reset = False
         self._newest: Measurement | None = None
         self._step_lock = threading.Lock()
@@ -87,8 +87,8 @@ class SimDriver(RobotDriver):
                 self._reset(seed.value)
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
-        """Set the reference of the next step."""
-        self._reference = reference
+        """Set the reference and the stamp of the next step."""
+        self._reference, self._stamp_ns = reference, now_ns
 
     def grip(self, command: GripperCommand, now_ns: int) -> None:
         """Open or close."""
@@ -108,9 +108,8 @@ class SimDriver(RobotDriver):
             except NodeError as error:
                 self.fault = str(error)
                 self._node.reject("simulation_fault", self.fault)
-        stamp_ns = mono_ns if self.lockstep else self._node.clock.wall_at(mono_ns)
-        self._publish_scene(stamp_ns)
-        return None if self._ticks % self._state_every else self._measure(stamp_ns)
+        self._publish_scene(self._stamp_ns)
+        return None if self._ticks % self._state_every else self._measure(self._stamp_ns)
 
     def _measure(self, stamp_ns: int) -> Measurement:
         if self.fault and self._newest is not None:  # a diverged state may not be finite
@@ -120,7 +119,7 @@ class SimDriver(RobotDriver):
             stamp_ns,
             world.joint_state(),
             Pose(*world.tcp()),
-            world.pose_state(),
+            world.pose_state(self._reference),
             world.gripper_state(),
         )
         return self._newest
@@ -167,10 +166,6 @@ class SimDriver(RobotDriver):
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
         """Joint limits of the world's robot."""
         return self.world.joint_range_rad
-
-    def forward(self, position_rad: FloatArray) -> Pose:
-        """TCP pose by MuJoCo."""
-        return Pose(*self.world.tcp_at(position_rad))
 
     # -- time ---------------------------------------------------------------------------------
     def pace(self) -> Pace:

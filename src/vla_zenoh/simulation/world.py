@@ -202,20 +202,15 @@ class World:
         self._refresh()
         return self._arm.tcp_position_m.copy(), self._arm.tcp_rotation.copy()
 
-    def tcp_at(self, position_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """TCP position (3,) in m and rotation (3, 3) with the joints at `position_rad` (n,)."""
-        return self._arm.tcp_at(position_rad)
-
-    def pose_state(self, reference: PoseReference | JointReference | None = None) -> PoseState:
+    def pose_state(self, reference: PoseReference | JointReference) -> PoseState:
         """Measured TCP pose, twist and wrench, with `reference`.
 
         The wrench is `wrench` behind a first-order low-pass of `WRENCH_FILTER_S`.
         """
         position, rotation = self.tcp()
-        held_m, held_rotation = None, None
         if isinstance(reference, JointReference):
             held_m, held_rotation = self._arm.tcp_at(reference.position_rad)
-        elif reference is not None:
+        else:
             held_m, held_rotation = reference.position_m, reference.rotation
         return PoseState(
             position_m=position,
@@ -223,7 +218,7 @@ class World:
             twist=self._arm.jacobian() @ self._arm.velocity_rad_s,
             wrench=self._filtered_wrench.copy(),
             reference_position_m=held_m,
-            reference_quat_xyzw=None if held_rotation is None else _quat_xyzw(held_rotation),
+            reference_quat_xyzw=_quat_xyzw(held_rotation),
         )
 
     def gripper_state(self) -> GripperState:
