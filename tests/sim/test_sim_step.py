@@ -17,7 +17,6 @@ from camera_rig import until
 from chain import READY_PATIENCE_S, write_profile
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import message, records
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import Header, PoseCommand, PoseState
@@ -34,7 +33,7 @@ STILL_TWIST = 0.005
 def lockstep_sim(folder: Path) -> Iterator[tuple[zenoh.Session, Profile]]:
     path = write_profile(folder)
     profile = load_profile(str(path))
-    words = [sys.executable, "-m", "vla_zenoh", "sim", "--lockstep", "--profile", str(path)]
+    words = [sys.executable, "-m", "vla_zenoh", "node", "sim", "--lockstep", "--profile", str(path)]
     with open_session(profile.session, mode="router"), open_session(profile.session) as session:
         process = subprocess.Popen(words)
         try:
@@ -80,7 +79,7 @@ def rise(session: zenoh.Session, profile: Profile) -> list[dict[str, Any]]:
         session.put(
             profile.keys.command_pose,
             records.encode(command),
-            attachment=header_codec.encode(header),
+            attachment=records.encode_header(header),
         )
         states.append(step(session, profile))
     return states

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from vla_zenoh import keys
-from vla_zenoh.errors import ProfileError
+from vla_zenoh.errors import ProfileError, nearest
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import ArmProfile, Options, RobotProfile
@@ -31,7 +31,6 @@ from vla_zenoh.profile.session import (
     endpoint_faults,
     is_loopback,
 )
-from vla_zenoh.pydantic_errors import nearest
 from vla_zenoh.resources import is_path
 
 ONLY_ONE = {
@@ -138,7 +137,7 @@ class Profile(Section):
     def camera_servers(self) -> dict[str, str]:
         """Camera -> name of the node that serves it.
 
-        A camera that no host runs belongs to a ``vla-zenoh camera`` started by hand.
+        A camera that no host runs belongs to a ``vla-zenoh node camera`` started by hand.
         """
         servers = dict.fromkeys(self.cameras, "camera")
         for host, part in self.hosts.items():

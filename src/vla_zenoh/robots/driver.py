@@ -22,7 +22,7 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
 )
-from vla_zenoh.types.references import JointReference, PoseReference
+from vla_zenoh.types.commands import JointReference, PoseReference
 
 if TYPE_CHECKING:
     from vla_zenoh.kinematics.kinematics import Kinematics

@@ -18,7 +18,7 @@ from vla_zenoh.bus.clock import Tick
 from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import NodeError
-from vla_zenoh.guard.braking_time import max_braking_time_s
+from vla_zenoh.guard.arm_guard import max_braking_time_s
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import Measurement, Pace, RobotDriver
 from vla_zenoh.runtime.scheduling import realtime_thread

@@ -20,7 +20,7 @@ from vla_zenoh.robots.command_follower import CommandFollower
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, GripperCommand
-from vla_zenoh.types.references import JointReference, PoseReference
+from vla_zenoh.types.commands import JointReference, PoseReference
 
 CONNECTING_S = 0.2
 FUTURE_NS = 100_000_000

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing
+from vla_zenoh.bus.buffers import CallbackRing, bytes_of
 from vla_zenoh.bus.clock import Tick
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.payload_limits import bytes_of
 from vla_zenoh.codec import message, records, settings
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.guard.arm_guard import Measured
@@ -28,7 +27,7 @@ from vla_zenoh.robots.command_follower import CommandFollower
 from vla_zenoh.robots.driver import DriverStatus, Measurement, Pace, RobotDriver, SteppedNode
 from vla_zenoh.simulation.world import STEP_NS, build_world
 from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
-from vla_zenoh.types.references import JointReference, PoseReference
+from vla_zenoh.types.commands import JointReference, PoseReference
 
 CATCH_UP_NS = 50_000_000
 SCENE_HZ, OBJECTS_HZ, SUBSCRIBERS_HZ = 60.0, 10.0, 4.0

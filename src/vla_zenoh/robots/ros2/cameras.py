@@ -74,15 +74,15 @@ class Camera:
     def _handle(self, arrival: ReceivedSample) -> bool:
         """Publish an image, or check it now and then; whether it is a valid one."""
         publisher, now_s = self.publisher, time.monotonic()
-        due = publisher.in_time(arrival.mono_ns)
-        if not (due and publisher.wanted) and now_s - self._decoded_s < LOOK_S:
+        due = publisher.due(arrival.mono_ns)
+        if not (due and publisher.has_subscribers) and now_s - self._decoded_s < LOOK_S:
             if publisher.state == OK:
-                publisher.seen(arrival.mono_ns)
+                publisher.captured(arrival.mono_ns)
             return publisher.state == OK
         self._decoded_s = now_s
         try:
             image = self._decode(arrival)
-            publisher.look(image.rgb, arrival.mono_ns, image.stamp_ns or None)
+            publisher.check(image.rgb, arrival.mono_ns, image.stamp_ns or None)
             if image.stamp_ns:
                 self._stamps.check(image.stamp_ns)
         except CodecError as error:
@@ -90,13 +90,13 @@ class Camera:
             if error.reason in ("encoding", "frame"):  # of all further images as well
                 publisher.lose(str(error))
             return False
-        publisher.seen(arrival.mono_ns)
-        publisher.change(OK)
-        if due and publisher.wanted:
+        publisher.captured(arrival.mono_ns)
+        publisher.set_state(OK)
+        if due and publisher.has_subscribers:
             settings = publisher.profile
             rgb = resize(image.rgb, settings.width, settings.height)
             stamp_ns = image.stamp_ns or self._node.clock.wall_at(arrival.mono_ns)
-            publisher.put_rgb(rgb, arrival.mono_ns, stamp_ns)
+            publisher.publish_rgb(rgb, arrival.mono_ns, stamp_ns)
         return True
 
     def _decode(self, arrival: ReceivedSample) -> RosImage:

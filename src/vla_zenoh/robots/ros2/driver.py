@@ -37,7 +37,7 @@ from vla_zenoh.robots.ros2.ros_services import RosServices
 from vla_zenoh.robots.ros2.state_subscriber import StateSubscriber
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 from vla_zenoh.types import Event, GripperCommand, GripperState
-from vla_zenoh.types.references import JointReference, PoseReference
+from vla_zenoh.types.commands import JointReference, PoseReference
 
 NAME = "ros2"
 JOIN_S = 0.3
@@ -268,7 +268,7 @@ class Ros2Driver(RobotDriver):
 
     def status_changed(self) -> bool:
         """Whether a camera went bad or recovered."""
-        bad = tuple(camera.publisher.bad is not None for camera in self._cameras)
+        bad = tuple(camera.publisher.fault is not None for camera in self._cameras)
         changed, self._bad_cameras = bad != self._bad_cameras, bad
         return changed
 
