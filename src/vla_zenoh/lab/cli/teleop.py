@@ -49,7 +49,7 @@ def teleop(
 
         def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
             people = _people(loaded, stack)
-            Teleop(loaded, session, people, name, stick=stick, frame=frame, level=speed - 1).run(
+            Teleop(loaded, session, people, name, device=stick, frame=frame, level=speed - 1).run(
                 stop
             )
 
