@@ -21,10 +21,9 @@ import numpy as np
 import typer
 
 from vla_zenoh.bus.clock_sync import decode_stamps
-from vla_zenoh.cli import decode as cli_decode
+from vla_zenoh.cli import inspect as cli_inspect
 from vla_zenoh.cli import keys as cli_keys
 from vla_zenoh.cli import net as cli_net
-from vla_zenoh.cli import seen as cli_seen
 from vla_zenoh.cli import status as cli_status
 from vla_zenoh.cli.options import model_options, number_list
 from vla_zenoh.cli.output import Screen, plain_types
@@ -37,7 +36,7 @@ from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.evaluation.csv_file import evaluate_csv
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
-from vla_zenoh.lab.recording import cdr
+from vla_zenoh.lab.recording.record_json import record_from_json, record_to_json
 from vla_zenoh.lab.recording.record_types import RECORDS
 from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.nodes.worker.inference_debug import InferenceView
@@ -112,7 +111,7 @@ def _in_file(suffix: str, read: Callable[[Path], Any], data: bytes) -> Any:
 def _cli(data: bytes) -> None:
     """What ``echo`` and ``keys`` do with anybody's payload, for people and for programs."""
     words, _, payload = data.partition(b"\n")
-    found = cli_decode.read(payload, _text(words))
+    found = cli_keys.decode(payload, _text(words))
     json.dumps(found)
     json.dumps(plain_types(found))
     _display(str(found))
@@ -135,21 +134,21 @@ def _told(data: bytes) -> None:
     other = replace(found, host="elsewhere")
     nodes = {"command": found, "a\x1b[2J[/b]": other}
     heard = {name: (status, 0.1, True) for name, status in nodes.items()}
-    assert _display(cli_status.picture("panda", heard, [])) < MAX_SHOWN
+    assert _display(cli_status.render("panda", heard, [])) < MAX_SHOWN
     pairs, lines = cli_net.pairs_of(nodes, []), cli_net.lines_of(nodes)
     _display(*cli_net.tables("panda", pairs, lines, 100.0))
-    _display(cli_keys.table(cli_keys.pictures_of(Keys("panda"), heard)))
+    _display(cli_keys.table(cli_keys.image_keys(Keys("panda"), heard)))
 
 
 def _event_told(data: bytes) -> None:
     event = records.decode(Event, data)
     happened = [("a\x1b[2J", Header(1, 2, "sim#1"), event)] * 9
-    assert _display(cli_status.picture("panda", {}, happened)) < MAX_SHOWN
+    assert _display(cli_status.render("panda", {}, happened)) < MAX_SHOWN
 
 
 def _sight(data: bytes) -> None:
     sight = InferenceView(records.decode(InferenceDebug, data), {"front": data})
-    assert _display(cli_seen.table({"w": sight})) < MAX_SHOWN
+    assert _display(cli_inspect.table({"w": sight})) < MAX_SHOWN
 
 
 def _options(data: bytes) -> None:
@@ -241,12 +240,9 @@ def _cdr_seed(kind: str) -> list[bytes]:
     return [every.encode(every.new(kind, **fields.get(kind.rsplit("/", 1)[-1], {})))]
 
 
-def _bag_seed(kind: type) -> list[bytes]:
-    try:
-        fields = cdr.fields_in(kind, records.encode(examples()[kind]))
-        return [cdr.write_record(kind, fields, 10**18, "base")]
-    except CodecError:
-        return []
+def _recorded_seed(kind: type) -> list[bytes]:
+    text, _ = record_to_json(kind, records.encode(examples()[kind]))
+    return [text.encode()]
 
 
 def _recording() -> list[bytes]:
@@ -406,10 +402,10 @@ def _targets() -> Iterator[Target]:
     # -- files
     for kind in RECORDS:
         yield Target(
-            f"bag-{kind.__name__}",
-            partial(cdr.read_record, kind),
+            f"recorded-{kind.__name__}",
+            lambda data, kind=kind: record_from_json(kind, _text(data)),
             codec,
-            lambda kind=kind: _bag_seed(kind),
+            lambda kind=kind: _recorded_seed(kind),
         )
     own = (VlaZenohError,)
     yield Target("recording", partial(_in_file, ".mcap", evaluate_run), own, _recording)

@@ -108,7 +108,7 @@ def rules(verdict: AccessVerdict) -> HostFinding:
         name,
         "fail",
         "\n".join(shown),
-        "regenerate the router's rules: vla-zenoh router --config > FILE",
+        "regenerate the router's rules: vla-zenoh node router --config > FILE",
     )
 
 
