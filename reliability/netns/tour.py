@@ -13,7 +13,7 @@ from chain import READY_PATIENCE_S
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.lab.demo.runner import DemoRun
+from vla_zenoh.lab.demo.runner import DemoRunner
 from vla_zenoh.lab.demo.segments import tour
 from vla_zenoh.lab.recording.stream_listener import StreamListener
 from vla_zenoh.profile import load_profile
@@ -26,7 +26,7 @@ def main(name: str) -> None:
     with open_session(profile.session, wait_s=READY_PATIENCE_S) as session:
         client = Client(profile, session).follow()
         listener = StreamListener(session, profile.keys, profile.task.worker, keep=4096)
-        run = DemoRun(client, listener, threading.Event(), lambda: None, lambda *_: None)
+        run = DemoRunner(client, listener, threading.Event(), lambda: None, lambda *_: None)
         try:
             result = run.run(tour(), RATE_HZ, None)
         finally:

@@ -17,10 +17,10 @@ from vla_zenoh import resources
 from vla_zenoh.control import chunk_plausibility as plausible
 from vla_zenoh.control import spec_fit as fit
 from vla_zenoh.control.finding import MEANINGS
-from vla_zenoh.lab.check.examine import Examination
-from vla_zenoh.lab.check.examples import chart, looks
-from vla_zenoh.lab.check.own_process import CheckBench
-from vla_zenoh.lab.check.report import Report
+from vla_zenoh.lab.check.examination import Examination
+from vla_zenoh.lab.check.examples import chart, example_styles
+from vla_zenoh.lab.check.model_runner import ModelRunner
+from vla_zenoh.lab.check.report import CheckReport
 from vla_zenoh.policy import (
     ActionSpec,
     CameraSpec,
@@ -70,18 +70,18 @@ WARNINGS = {
 NEEDS_A_PROFILE = ("camera", "size")
 
 
-def examined(fault: str, *, against: str | None = None, **more: Any) -> Report:
+def examined(fault: str, *, against: str | None = None, **more: Any) -> CheckReport:
     return Examination(
         make_policy(find_model(str(BROKEN)), {"fault": fault}),
         "broken",
-        CheckBench(more.pop("patience_s", PATIENCE_S)),
+        ModelRunner(more.pop("patience_s", PATIENCE_S)),
         profile=load_profile(against) if against else None,
         runs=RUNS,
         **more,
     ).run()
 
 
-def names(report: Report, *levels: str) -> set[str]:
+def names(report: CheckReport, *levels: str) -> set[str]:
     return {finding.name for finding in report.findings if finding.level in levels}
 
 
@@ -112,7 +112,7 @@ def test_a_worker_too_slow_for_the_command_node_is_told_so_before_its_patience_e
     assert names(report, "note") == {"cut_short"}
 
 
-class SlowToLoad(CheckBench):
+class SlowToLoad(ModelRunner):
     """As if the first thing that is asked of a model, to load, had taken a minute."""
 
     asked = 0
@@ -158,7 +158,7 @@ def test_inference_longer_than_a_period_is_named(asked_hz: float) -> None:
     report = Examination(
         make_policy(find_model("scripted"), {"delay_ms": "100", "dt_s": "1"}),
         "scripted",
-        CheckBench(PATIENCE_S),
+        ModelRunner(PATIENCE_S),
         rate_hz=asked_hz,
         runs=3,
     ).run()
@@ -181,11 +181,11 @@ def test_every_shipped_worker_is_checked() -> None:
     assert here | IN_ENVIRONMENTS_OF_THEIR_OWN == set(resources.names("models"))
 
 
-def passes(model: str, **options: str) -> Report:
+def passes(model: str, **options: str) -> CheckReport:
     report = Examination(
         make_policy(find_model(model), options),
         model,
-        CheckBench(PATIENCE_S),
+        ModelRunner(PATIENCE_S),
         profile=load_profile("panda_sim"),
         runs=RUNS,
     ).run()
@@ -224,7 +224,7 @@ def test_an_adapter_keeps_its_contract_with_its_server(name: str) -> None:
 def test_an_adapter_without_its_server_is_said_to_fail_at_loading_or_inference() -> None:
     settings = KINDS["openpi"].settings(free_port())
     report = Examination(
-        make_policy(find_model("openpi"), settings), "openpi", CheckBench(PATIENCE_S), runs=3
+        make_policy(find_model("openpi"), settings), "openpi", ModelRunner(PATIENCE_S), runs=3
     ).run()
     assert names(report, "error") <= {"load_failed", "inference_failed"}
     assert not report.ok
@@ -364,7 +364,7 @@ def test_the_chart_differs_from_all_its_mirror_images_and_channel_orders() -> No
     others = [picture[::-1], picture[:, ::-1], picture[::-1, ::-1], picture[..., ::-1]]
     for other in others:
         assert np.abs(picture.astype(int) - other).mean() > 10
-    assert looks()[0].picture is chart
+    assert example_styles()[0].picture is chart
 
 
 # -- the command ----------------------------------------------------------------------------------

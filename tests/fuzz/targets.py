@@ -39,7 +39,7 @@ from vla_zenoh.lab.evaluation.csv_file import evaluate_csv
 from vla_zenoh.lab.evaluation.run_file import evaluate_run
 from vla_zenoh.lab.recording import cdr
 from vla_zenoh.lab.recording.kinds import RECORDS
-from vla_zenoh.lab.tasks.understand import understand
+from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.nodes.worker.inference_debug import InferenceView
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
@@ -163,7 +163,7 @@ def _prompt(data: bytes) -> None:
     words = settings.decode_text(data)
     with suppress(SpecError):
         parse_hard(words)
-    understand(words)
+    parse_prompt(words)
 
 
 def _peer_actions(data: bytes) -> None:

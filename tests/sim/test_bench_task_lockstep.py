@@ -9,7 +9,7 @@ import pytest
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.bench import task_lockstep
-from vla_zenoh.lab.bench.task import BASELINES, Ended, TaskPlan
+from vla_zenoh.lab.bench.task import BASELINES, TaskOutcome, TaskPlan
 from vla_zenoh.lab.bench.task_lockstep import run_in_lockstep
 from vla_zenoh.lab.cli.bench_task import _with_bricks
 from vla_zenoh.profile import load_profile, override
@@ -38,7 +38,7 @@ class Nod:
 
 def outcomes(
     plan: TaskPlan, path: str = "", options: dict[str, str] | None = None, processes: int = 1
-) -> list[Ended]:
+) -> list[TaskOutcome]:
     profile = _with_bricks(load_profile("panda_sim"), plan.worker, [], path)
     small = {
         name: {**camera.model_dump(mode="json"), "width": 64, "height": 48}

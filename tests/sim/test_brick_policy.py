@@ -20,12 +20,12 @@ from vla_zenoh.lab.tasks import (
     HELD_OUT,
     NONSENSE,
     TRAINING,
-    Judge,
     Order,
     TaskEpisode,
+    TaskJudge,
     Verdict,
     draw_episode,
-    say,
+    phrase,
 )
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, example_observation
 from vla_zenoh.policy.loader import find_model, make_policy
@@ -88,7 +88,7 @@ def carry_out(stage: Stage, episode: TaskEpisode, limit_s: float = LIMIT_S) -> V
     loop.put("active", True)
     loop.run(0.02)
     assert loop.commander.state.value == "active", loop.commander.why
-    judge = Judge(episode.order, stage.objects(), stage.world.tcp()[0])
+    judge = TaskJudge(episode.order, stage.objects(), stage.world.tcp()[0])
     begin_ns = loop.now_ns
     while (time_s := (loop.now_ns - begin_ns) / 1e9) < limit_s:
         loop.run(0.1)
@@ -162,7 +162,7 @@ def test_every_wording_is_understood(policy: Policy, wordings: dict) -> None:
         sentence
         for family, order in orders.items()
         for choice in range(len(wordings[family]))
-        if not understood(policy, sentence := say(order, choice, held_out=wordings is HELD_OUT))
+        if not understood(policy, sentence := phrase(order, choice, held_out=wordings is HELD_OUT))
     ]
     assert missed == []
 

@@ -21,7 +21,7 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_not_to_activate
 from vla_zenoh.keys import Kind
-from vla_zenoh.lab.doctor.rehearsal import rehearse
+from vla_zenoh.lab.doctor.access_check import check_access
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
@@ -272,7 +272,7 @@ def lab() -> Profile:
 
 
 def test_every_role_does_its_part_and_nothing_else_with_real_sessions(lab: Profile) -> None:
-    verdicts = rehearse(lab)
+    verdicts = check_access(lab)
     assert {one.identity.node for one in verdicts} == {
         "sim",
         "camera",
@@ -304,7 +304,7 @@ def test_a_rule_that_lets_a_viewer_delete_is_named(lab: Profile) -> None:
     for policy in rules["policies"]:
         if policy["subjects"] == ["viewer@wall"]:
             policy["rules"].append("too much")
-    faults = {one.identity.node: one.faults for one in rehearse(lab, rules)}
+    faults = {one.identity.node: one.faults for one in check_access(lab, rules)}
     assert faults.pop("viewer") == (
         f"viewer@wall can delete {reset} and must not: rule 'too much' allows it",
     )
@@ -321,14 +321,14 @@ def test_everybody_of_every_robot_of_a_router_tries_the_keys_of_all(lab: Profile
             "session": {"security": {"people": {"wall": "operator"}}},
         },
     )
-    verdicts = rehearse(lab, also=[other])
+    verdicts = check_access(lab, also=[other])
     named = {one.identity.common_name: one for one in verdicts}
     assert {"viewer@wall", "operator@wall", "sim@here"} <= set(named)
     assert [fault for one in verdicts for fault in one.faults] == []
-    alone = {one.identity.common_name: one for one in rehearse(lab)}
+    alone = {one.identity.common_name: one for one in check_access(lab)}
     assert named["viewer@wall"].must == alone["viewer@wall"].must  # of its own robot alone
     assert named["viewer@wall"].must_not > 2 * alone["viewer@wall"].must_not
-    missing = rehearse(lab, access_control([lab]), also=[other])
+    missing = check_access(lab, access_control([lab]), also=[other])
     faults = {one.identity.common_name: one.faults for one in missing}
     assert any("vla/second/" in fault and "no rule allows" in fault for fault in faults["sim@here"])
 
@@ -345,7 +345,7 @@ def test_a_missing_rule_and_one_too_much_are_named(lab: Profile) -> None:
             "put",
         ):
             rule["key_exprs"].append(lab.keys.camera_jpeg("front"))
-    faults = {one.identity.node: one.faults for one in rehearse(lab, rules)}
+    faults = {one.identity.node: one.faults for one in check_access(lab, rules)}
     key = lab.keys.delta("scripted")
     assert (
         f"worker-scripted@here cannot {Act.PUT.value} {key}: no rule allows egress "

@@ -10,7 +10,7 @@ from chain import READY_PATIENCE_S, Chain, command_line
 from teleop_rig import Screen, teleop
 
 from vla_zenoh.codec import records
-from vla_zenoh.lab.teleop.keystrokes import END
+from vla_zenoh.lab.teleop.keyboard import END
 from vla_zenoh.types import GripperState
 
 MOVED_M = 0.03

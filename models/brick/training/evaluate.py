@@ -35,9 +35,9 @@ from vla_zenoh.lab.tasks import (
     COLOURS,
     FAMILIES,
     LIMIT_S,
-    Judge,
     Order,
     TaskEpisode,
+    TaskJudge,
     Verdict,
     brick,
     draw_episode,
@@ -196,7 +196,7 @@ def run(stage: Stage, args: argparse.Namespace, seed: int, family: str) -> Outco
     loop.run(0.02)
     if loop.commander.state.value != "active":
         raise SystemExit(f"not active: {loop.commander.why}")
-    judge = Judge(episode.order, before, world.tcp()[0])
+    judge = TaskJudge(episode.order, before, world.tcp()[0])
     begin_ns, verdict = loop.now_ns, None
     limit_s = 5.0 if family == "stay" else args.limit
     while verdict is None and loop.now_ns - begin_ns < limit_s * 1e9:

@@ -6,8 +6,8 @@ import numpy as np
 from states import draw_order
 from worker import MAX_WORDS, UNKNOWN, words_of
 
-from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, TRAINING, Order, say
-from vla_zenoh.lab.tasks.words import WAYS
+from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, TRAINING, Order, phrase
+from vla_zenoh.lab.tasks.wording import DIRECTION_PHRASES
 
 KINDS = ("put", "stack", *DIRECTIONS)
 NO_TASK = len(KINDS)
@@ -34,12 +34,12 @@ def vocabulary() -> list[str]:
     """Every word a sentence may have, sorted."""
     words: set[str] = {*COLOURS, *POLITE, *NEGATIVE, *ARTICLES, *FILLERS}
     words.update(word for group in SAME for word in group)
-    for phrase in ASK:
-        words.update(phrase.split())
+    for request in ASK:
+        words.update(request.split())
     for wordings in TRAINING.values():
         for wording in wordings:
             words.update(words_of(wording.format(x="", y="", d="")))
-    for ways in WAYS.values():
+    for ways in DIRECTION_PHRASES.values():
         words.update(word for way in ways for word in way.split())
     return sorted(words)
 
@@ -58,7 +58,7 @@ class Phrases:
     def draw(self, random: np.random.Generator) -> tuple[list[int], int, int, int]:
         """Tokens, kind (`NO_TASK`: none), target and onto (-1: none)."""
         order = draw_order(random)
-        words = words_of(say(order, int(random.integers(1 << 30))))
+        words = words_of(phrase(order, int(random.integers(1 << 30))))
         words = self._vary(words, random)
         if random.uniform() < 0.62:
             kind = order.direction if order.family == "push" else order.family

@@ -12,10 +12,10 @@ from vla_zenoh.lab.bench.motion import (
     MeasuredStream,
     failed_row,
     make_row,
-    way_of,
+    path_length,
 )
 from vla_zenoh.lab.bench.motion_report import motion_table, thesis_table
-from vla_zenoh.lab.demo.analysis import SegmentOutcome
+from vla_zenoh.lab.demo.segments import SegmentOutcome
 from vla_zenoh.profile import load_profile
 
 PROFILE = load_profile("panda_sim")
@@ -115,7 +115,7 @@ def test_a_way_there_and_back_counts_twice() -> None:
         Pose(np.array([0.0, 0.0, height]), exp3(np.array([0.0, 0.0, turn])))
         for height, turn in ((0.0, 0.0), (0.1, 0.3), (0.0, 0.0))
     ]
-    assert way_of(poses) == (pytest.approx(0.2), pytest.approx(0.6))
+    assert path_length(poses) == (pytest.approx(0.2), pytest.approx(0.6))
 
 
 def test_the_tables_hold_what_was_measured_and_what_was_not() -> None:

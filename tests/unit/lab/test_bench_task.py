@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.bench.statistics import wilson_95
-from vla_zenoh.lab.bench.task import BASELINES, Ended, TaskAsked, TaskPlan, TaskScore
+from vla_zenoh.lab.bench.task import BASELINES, TaskOutcome, TaskPlan, TaskRequest, TaskScore
 from vla_zenoh.lab.bench.task_sheet import TEXT_HEIGHT, TILE_HEIGHT, TILE_WIDTH, failure_sheet
 from vla_zenoh.lab.cli.bench_file import LAST_LINES, up_with_last_lines
 from vla_zenoh.lab.cli.bench_task import _named, _varied, _with_bricks, task
@@ -101,7 +101,7 @@ CROWDED = ObjectPoses(
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_task_is_of_the_family_and_about_the_brick_asked_for(family: str) -> None:
     for target in COLOURS:
-        episode = TaskAsked(SEED, family, target).draw(OBJECTS, held_out=False)
+        episode = TaskRequest(SEED, family, target).draw(OBJECTS, held_out=False)
         assert episode.order.family == family
         if family != "push":
             assert episode.order.target == target
@@ -110,36 +110,36 @@ def test_the_task_is_of_the_family_and_about_the_brick_asked_for(family: str) ->
 def test_where_nothing_can_be_pushed_another_task_is_asked_instead_of_leaving_the_layout_out() -> (
     None
 ):
-    episode = TaskAsked(SEED, "push").draw(CROWDED, held_out=False)
+    episode = TaskRequest(SEED, "push").draw(CROWDED, held_out=False)
     assert episode.order.family != "push"
     assert episode.seed == SEED
 
 
 def test_a_baseline_runs_a_shipped_worker_with_its_own_prompt() -> None:
-    episode = TaskAsked(SEED, "put").draw(OBJECTS, held_out=False)
+    episode = TaskRequest(SEED, "put").draw(OBJECTS, held_out=False)
     for name, (worker, prompt) in BASELINES.items():
         plan = TaskPlan(name, 1, SEED)
         assert plan.worker == worker
-        assert plan.spoken(episode) == prompt
+        assert plan.prompt_for(episode) == prompt
     assert TaskPlan("brick", 1, SEED).worker == "brick"
-    assert TaskPlan("brick", 1, SEED).spoken(episode) == episode.prompt
-    assert TaskPlan("brick", 1, SEED, prompt="hold").spoken(episode) == "hold"
+    assert TaskPlan("brick", 1, SEED).prompt_for(episode) == episode.prompt
+    assert TaskPlan("brick", 1, SEED, prompt="hold").prompt_for(episode) == "hold"
 
 
 # -- what it adds up to ---------------------------------------------------------------------------
 
 
-def ended(family: str, failure: str = "", time_s: float = 8.0) -> Ended:
+def ended(family: str, failure: str = "", time_s: float = 8.0) -> TaskOutcome:
     order = {
         "put": Order("put", "red"),
         "stack": Order("stack", "red", onto="blue"),
         "push": Order("push", "red", direction="left"),
     }[family]
     verdict = Verdict(not failure, failure, time_s)
-    return Ended.by(verdict, TaskEpisode(SEED, order, "do it"), "do it", (PICTURE, PICTURE))
+    return TaskOutcome.by(verdict, TaskEpisode(SEED, order, "do it"), "do it", (PICTURE, PICTURE))
 
 
-def score(*outcomes: Ended, **plan: Any) -> dict[str, Any]:
+def score(*outcomes: TaskOutcome, **plan: Any) -> dict[str, Any]:
     made = TaskScore(TaskPlan("m", len(outcomes), SEED, **plan), "lockstep", "p")
     made.ended += outcomes
     return json.loads(json.dumps(made.to_dict(), allow_nan=False))

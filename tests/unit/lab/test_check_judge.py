@@ -14,8 +14,8 @@ STEP = 0.02
 
 def found(rotation: Rotation, step: list[float]) -> set[str]:
     action = ActionSpec(horizon=1, dt_s=0.1, rotation=rotation, gripper="none")
-    looks = [(ImageStyle("chart", picture=chart), np.array([step], np.float32))]
-    return {finding.name for finding in judge.behaviour(action, looks, {})}
+    example_styles = [(ImageStyle("chart", picture=chart), np.array([step], np.float32))]
+    return {finding.name for finding in judge.behaviour(action, example_styles, {})}
 
 
 @pytest.mark.parametrize(

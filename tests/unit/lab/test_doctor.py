@@ -19,23 +19,33 @@ from vla_zenoh.errors import ProfileError, how_to_install
 from vla_zenoh.lab.cli.doctor import doctor as doctor_command
 from vla_zenoh.lab.cli.doctor import try_zenoh
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
-from vla_zenoh.lab.doctor.libraries import (
+from vla_zenoh.lab.doctor.access import router
+from vla_zenoh.lab.doctor.computer import (
+    SHARED_MEMORY,
+    TIME_ERROR,
+    disk,
+    governor,
+    judge,
+    kernel_state,
+    left_segments,
+    niceness,
+    processors,
+    real_time_priority,
+    shared_memory,
+    terminal,
+    video_devices,
+)
+from vla_zenoh.lab.doctor.software import (
     MODULES,
     libraries,
     load_errors,
     msgpack_in_c,
+    opengl,
     python_version,
+    robot,
     version_fault,
 )
-from vla_zenoh.lab.doctor.opengl import judge as judge_backend
-from vla_zenoh.lab.doctor.opengl import opengl
-from vla_zenoh.lab.doctor.realtime import governor, niceness, processors, real_time_priority
-from vla_zenoh.lab.doctor.robot import robot
-from vla_zenoh.lab.doctor.router import router
-from vla_zenoh.lab.doctor.storage import SHARED_MEMORY, disk, left_segments, shared_memory
-from vla_zenoh.lab.doctor.terminal import terminal
-from vla_zenoh.lab.doctor.video import video_devices
-from vla_zenoh.lab.doctor.wallclock import TIME_ERROR, judge, kernel_state
+from vla_zenoh.lab.doctor.software import judge as judge_backend
 from vla_zenoh.profile import SessionProfile, load_profile
 from vla_zenoh.simulation.backend import Backend
 

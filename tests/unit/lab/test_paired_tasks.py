@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from vla_zenoh.errors import RecordError, ResourceError
 from vla_zenoh.lab.bench.paired_tasks import CONDITIONS, TaskResultFile, compare, read_run
-from vla_zenoh.lab.bench.task import Ended, TaskPlan, TaskScore
+from vla_zenoh.lab.bench.task import TaskOutcome, TaskPlan, TaskScore
 from vla_zenoh.lab.cli.bench_compare import B_IS_WORSE
 from vla_zenoh.lab.cli.bench_compare import compare as command
 from vla_zenoh.lab.tasks import Order, TaskEpisode
@@ -42,7 +42,7 @@ def written(
     orders: Callable[[int], Order] = plan.pop("orders", lambda i: ORDERS[FAMILIES[i % 3]])
     score = TaskScore(TaskPlan(model, len(done), seed, **plan), mode, "p", vary, options=options)
     score.ended += [
-        Ended(
+        TaskOutcome(
             TaskEpisode(seed + i, orders(i), "do it"),
             "do it",
             success,
@@ -199,57 +199,57 @@ APP.command()(command)
 
 
 @pytest.fixture
-def say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+def phrase(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     monkeypatch.chdir(tmp_path)
 
-    def say(a: bytes, b: bytes, *words: str) -> Any:
+    def phrase(a: bytes, b: bytes, *words: str) -> Any:
         Path("a.json").write_bytes(a)
         Path("b.json").write_bytes(b)
         return CliRunner().invoke(APP, ["a.json", "b.json", *words])
 
-    return say
+    return phrase
 
 
-def test_no_difference_is_no_failure_and_is_said(say: Callable[..., Any]) -> None:
-    found = say(written(A), written(B))
+def test_no_difference_is_no_failure_and_is_said(phrase: Callable[..., Any]) -> None:
+    found = phrase(written(A), written(B))
     assert found.exit_code == 0
     assert "No difference is shown: p = 1" in found.stdout
     assert "1000001, stack red on blue: done by A alone, the other: dropped" in found.stdout
 
 
-def test_the_exit_code_says_whether_b_is_worse(say: Callable[..., Any]) -> None:
+def test_the_exit_code_says_whether_b_is_worse(phrase: Callable[..., Any]) -> None:
     good, bad = written([True] * 9), written([False] * 9)
-    worse = say(good, bad)
+    worse = phrase(good, bad)
     assert worse.exit_code == B_IS_WORSE
     assert "B does fewer of the same tasks than A: p = 0.0039." in worse.stdout
-    better = say(bad, good)
+    better = phrase(bad, good)
     assert better.exit_code == 0
     assert "B does more of the same tasks than A" in better.stdout
     # Five of five are not enough: p is 2/32.
-    assert say(written([True] * 5), written([False] * 5)).exit_code == 0
+    assert phrase(written([True] * 5), written([False] * 5)).exit_code == 0
 
 
-def test_a_script_gets_json_and_the_same_exit_code(say: Callable[..., Any]) -> None:
-    found = say(written([True] * 9), written([False] * 9), "--json")
+def test_a_script_gets_json_and_the_same_exit_code(phrase: Callable[..., Any]) -> None:
+    found = phrase(written([True] * 9), written([False] * 9), "--json")
     assert found.exit_code == B_IS_WORSE
     assert json.loads(found.stdout)["only_a"] == 9
 
 
-def test_a_narrow_screen_loses_no_figure(say: Callable[..., Any]) -> None:
-    found = say(written([True] * 300), written([False] * 300), "--tasks")
+def test_a_narrow_screen_loses_no_figure(phrase: Callable[..., Any]) -> None:
+    found = phrase(written([True] * 300), written([False] * 300), "--tasks")
     assert "…" not in found.stdout
     assert "-100.0%" in found.stdout
 
 
-def test_tasks_have_rows_when_they_are_asked_for(say: Callable[..., Any]) -> None:
-    assert "push red left" not in say(written(A), written(A)).stdout
-    assert "push red left" in say(written(A), written(A), "--tasks").stdout
+def test_tasks_have_rows_when_they_are_asked_for(phrase: Callable[..., Any]) -> None:
+    assert "push red left" not in phrase(written(A), written(A)).stdout
+    assert "push red left" in phrase(written(A), written(A), "--tasks").stdout
 
 
-def test_what_cannot_be_compared_is_an_error(say: Callable[..., Any]) -> None:
-    assert isinstance(say(written(A), written(B, delay_ms=9.0)).exception, RecordError)
-    assert say(written(A), written(B, delay_ms=9.0), "--differ", "delay_ms").exit_code == 0
-    assert say(written(A), written(B), "--differ", "delay").exit_code == 2
+def test_what_cannot_be_compared_is_an_error(phrase: Callable[..., Any]) -> None:
+    assert isinstance(phrase(written(A), written(B, delay_ms=9.0)).exception, RecordError)
+    assert phrase(written(A), written(B, delay_ms=9.0), "--differ", "delay_ms").exit_code == 0
+    assert phrase(written(A), written(B), "--differ", "delay").exit_code == 2
     Path("b.json").unlink()
     missing = CliRunner().invoke(APP, ["a.json", "b.json"])
     assert isinstance(missing.exception, ResourceError)

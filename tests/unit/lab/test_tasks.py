@@ -16,12 +16,12 @@ from vla_zenoh.lab.tasks import (
     LIMIT_S,
     NONSENSE,
     TRAINING,
-    Judge,
     Order,
+    TaskJudge,
     brick,
     draw_episode,
     draw_stay,
-    say,
+    phrase,
 )
 from vla_zenoh.types import ObjectPoses
 
@@ -46,7 +46,7 @@ def objects(**moved: tuple[float, float, float]) -> ObjectPoses:
     return ObjectPoses(tuple(names), np.array(places), np.tile([0.0, 0.0, 0.0, 1.0], (5, 1)))
 
 
-def watch(judge: Judge, scenes: list[tuple[ObjectPoses, float]], linger: int = 8):
+def watch(judge: TaskJudge, scenes: list[tuple[ObjectPoses, float]], linger: int = 8):
     """Show scenes one after the other, the last for a while; gives the verdict."""
     for index, (scene, width_m) in enumerate(scenes + [scenes[-1]] * linger):
         verdict = judge.see(scene, width_m, index * PERIOD_S)
@@ -68,21 +68,21 @@ PUSH = Order("push", "red", direction="away")
 
 
 def test_a_brick_let_go_of_in_the_box_is_a_success() -> None:
-    verdict = watch(Judge(PUT, objects()), [(IN_THE_AIR, HELD_M), (IN_BOX, OPEN_M)])
+    verdict = watch(TaskJudge(PUT, objects()), [(IN_THE_AIR, HELD_M), (IN_BOX, OPEN_M)])
     assert verdict.success
     assert verdict.failure == ""
 
 
 def test_a_brick_in_the_box_that_is_still_held_is_none_yet() -> None:
-    verdict = watch(Judge(PUT, objects()), [(IN_THE_AIR, HELD_M), (IN_BOX, HELD_M)])
+    verdict = watch(TaskJudge(PUT, objects()), [(IN_THE_AIR, HELD_M), (IN_BOX, HELD_M)])
     assert not verdict.success
 
 
 def test_a_brick_on_the_other_is_a_success_and_one_beside_it_was_dropped() -> None:
     air = (IN_THE_AIR, HELD_M)
-    assert watch(Judge(STACK, objects()), [air, (ON_GREEN, OPEN_M)]).success
+    assert watch(TaskJudge(STACK, objects()), [air, (ON_GREEN, OPEN_M)]).success
     beside = objects(red=(0.47, 0.05, REST_M))
-    assert watch(Judge(STACK, objects()), [air, (beside, OPEN_M)]).failure == "dropped"
+    assert watch(TaskJudge(STACK, objects()), [air, (beside, OPEN_M)]).failure == "dropped"
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
@@ -90,7 +90,7 @@ def test_a_push_counts_in_its_own_direction_only(direction: str) -> None:
     along = np.array(DIRECTIONS[direction]) * 0.07
     scene = moved("green", *along)
     for asked in DIRECTIONS:
-        judge = Judge(Order("push", "green", direction=asked), objects())
+        judge = TaskJudge(Order("push", "green", direction=asked), objects())
         assert watch(judge, [(scene, SHUT_M)]).success == (asked == direction)
 
 
@@ -111,13 +111,13 @@ def test_a_push_counts_in_its_own_direction_only(direction: str) -> None:
     ],
 )
 def test_every_failure_has_its_name(order: Order, scenes: list, failure: str) -> None:
-    verdict = watch(Judge(order, objects()), scenes)
+    verdict = watch(TaskJudge(order, objects()), scenes)
     assert (verdict.success, verdict.failure) == (False, failure)
 
 
 def test_who_is_to_stay_succeeds_by_standing_still_until_the_end() -> None:
     home_m = np.array([0.43, 0.0, 0.16])
-    judge = Judge(Order("stay"), objects(), home_m)
+    judge = TaskJudge(Order("stay"), objects(), home_m)
     assert judge.see(objects(), OPEN_M, 0.0, home_m) is None
     assert judge.end().success
     judge.see(objects(), OPEN_M, 1.0, home_m + [0.0, 0.0, 0.05])
@@ -128,7 +128,7 @@ def test_who_is_to_stay_succeeds_by_standing_still_until_the_end() -> None:
 def test_a_scene_without_bricks_is_refused_by_name() -> None:
     other = ObjectPoses(("brick", "box"), np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1)))
     with pytest.raises(RecordError, match=r"red_brick.*scene 'bricks'"):
-        Judge(PUT, other)
+        TaskJudge(PUT, other)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_nonsense_names_its_order() -> None:
 def test_what_is_said_differs_from_other_orders(choice: int) -> None:
     orders = [Order("put", x) for x in COLOURS]
     orders += [Order("push", "red", direction=d) for d in DIRECTIONS]
-    assert len({say(order, choice) for order in orders}) == len(orders)
+    assert len({phrase(order, choice) for order in orders}) == len(orders)
 
 
 def test_time_is_long_enough_for_the_whole_way() -> None:

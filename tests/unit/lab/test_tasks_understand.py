@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, NONSENSE, Order, say
+from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, NONSENSE, Order, phrase
 from vla_zenoh.lab.tasks.order import PUSH, PUT, STACK
-from vla_zenoh.lab.tasks.understand import makes_no_sense, understand
+from vla_zenoh.lab.tasks.wording import is_nonsense, parse_prompt
 
 ORDERS = [
     *(Order(PUT, x) for x in COLOURS),
@@ -19,16 +19,16 @@ ORDERS = [
 @pytest.mark.parametrize("order", ORDERS, ids=str)
 def test_every_wording_of_an_order_is_understood(order: Order, held_out: bool) -> None:
     for choice in range(200):
-        prompt = say(order, choice, held_out=held_out)
-        assert understand(prompt) == order, prompt
-        assert understand(f"  {prompt.capitalize()}!") == order
+        prompt = phrase(order, choice, held_out=held_out)
+        assert parse_prompt(prompt) == order, prompt
+        assert parse_prompt(f"  {prompt.capitalize()}!") == order
 
 
 @pytest.mark.parametrize("prompt", [*NONSENSE, "", "HARD: go up", "put the red brick"])
 def test_what_asks_for_nothing_is_no_order(prompt: str) -> None:
-    assert understand(prompt) is None
+    assert parse_prompt(prompt) is None
 
 
 def test_nonsense_is_known_as_such() -> None:
-    assert all(makes_no_sense(prompt.upper()) for prompt in NONSENSE)
-    assert not makes_no_sense("put the red brick in the box")
+    assert all(is_nonsense(prompt.upper()) for prompt in NONSENSE)
+    assert not is_nonsense("put the red brick in the box")

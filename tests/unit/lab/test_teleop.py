@@ -12,10 +12,29 @@ from hypothesis import strategies as st
 from vla_zenoh.control.actions import step_pose, step_width
 from vla_zenoh.errors import MissingExtraError, NodeError
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.lab.teleop.keyboard import GIVE, HOLD_S, MOVES, QUIT, STOP, SWITCH, Keyboard
-from vla_zenoh.lab.teleop.keystrokes import How, KeystrokeParser, Stroke
-from vla_zenoh.lab.teleop.operator_input import DEAD_ZONE, STILL, OperatorInput, joined, of_stick
-from vla_zenoh.lab.teleop.policy import DT_S, HORIZON, OPENING_M_S, TeleopPolicy
+from vla_zenoh.lab.teleop.keyboard import (
+    ACTIVATE,
+    HOLD_S,
+    MOVES,
+    QUIT,
+    STOP,
+    TAKE_OVER,
+    Keyboard,
+    KeyEvent,
+    Keystroke,
+    KeystrokeParser,
+)
+from vla_zenoh.lab.teleop.policy import (
+    DEAD_ZONE,
+    DT_S,
+    HORIZON,
+    OPENING_M_S,
+    STILL,
+    OperatorInput,
+    TeleopPolicy,
+    combined,
+    without_dead_zone,
+)
 from vla_zenoh.lab.teleop.sticks import Gamepad, SpaceMouse
 from vla_zenoh.policy import Observation, check_steps, example_observation
 from vla_zenoh.profile import load_profile
@@ -29,7 +48,7 @@ MAX_M = 0.08
 # -- bytes to strokes ---------------------------------------------------------------------------
 def test_plain_letters_are_typed_whatever_their_case() -> None:
     assert KeystrokeParser().read(b"wW \r\t") == [
-        Stroke(name, How.TYPED) for name in ("w", "w", "space", "enter", "tab")
+        Keystroke(name, KeyEvent.TYPED) for name in ("w", "w", "space", "enter", "tab")
     ]
 
 
@@ -38,12 +57,12 @@ def test_a_terminal_with_releases_tells_them() -> None:
         b"\x1b[?11u\x1b[119u\x1b[119;1:2u\x1b[119;1:3u\x1b[99;5u\x1b[O"
     )
     assert strokes == [
-        Stroke("releases", How.TYPED),
-        Stroke("w", How.PRESSED),
-        Stroke("w", How.HELD),
-        Stroke("w", How.RELEASED),
-        Stroke("ctrl+c", How.PRESSED),
-        Stroke("unfocused", How.TYPED),
+        Keystroke("releases", KeyEvent.TYPED),
+        Keystroke("w", KeyEvent.PRESSED),
+        Keystroke("w", KeyEvent.HELD),
+        Keystroke("w", KeyEvent.RELEASED),
+        Keystroke("ctrl+c", KeyEvent.PRESSED),
+        Keystroke("unfocused", KeyEvent.TYPED),
     ]
 
 
@@ -62,54 +81,56 @@ def test_no_bytes_stop_the_keyboard(data: bytes) -> None:
     typed = KeystrokeParser()
     typed.read(data)
     typed.read(b" " * 40)  # ends whatever had begun
-    assert typed.read(b"x")[-1] == Stroke("x", How.TYPED)
+    assert typed.read(b"x")[-1] == Keystroke("x", KeyEvent.TYPED)
 
 
 def test_the_escape_key_does_not_swallow_the_stop_after_it() -> None:
     typed = KeystrokeParser()
     assert typed.read(b"\x1b") == []
-    assert typed.read(b"x") == [Stroke("x", How.TYPED)]
+    assert typed.read(b"x") == [Keystroke("x", KeyEvent.TYPED)]
 
 
 # -- strokes to wishes ---------------------------------------------------------------------------
-def typed(keyboard: Keyboard, keys: str, now_s: float, how: How = How.TYPED) -> list[str | None]:
-    return [keyboard.take(Stroke(key, how), now_s) for key in keys]
+def typed(
+    keyboard: Keyboard, keys: str, now_s: float, how: KeyEvent = KeyEvent.TYPED
+) -> list[str | None]:
+    return [keyboard.take(Keystroke(key, how), now_s) for key in keys]
 
 
 def test_a_repeating_key_moves_until_the_repeats_end() -> None:
     keyboard = Keyboard()
     for now_s in np.arange(0.0, 1.0, 0.04):
         typed(keyboard, "w", now_s)
-        assert keyboard.wish(now_s + 0.02).twist == (1, 0, 0, 0, 0, 0)
-    assert keyboard.wish(1.0 + HOLD_S).twist == STILL
+        assert keyboard.read(now_s + 0.02).twist == (1, 0, 0, 0, 0, 0)
+    assert keyboard.read(1.0 + HOLD_S).twist == STILL
 
 
 def test_a_tap_between_two_looks_counts_once() -> None:
     keyboard = Keyboard()
     typed(keyboard, "r", 0.0)
-    assert keyboard.wish(5.0).twist == (0, 0, 1, 0, 0, 0)
-    assert keyboard.wish(5.1).twist == STILL
+    assert keyboard.read(5.0).twist == (0, 0, 1, 0, 0, 0)
+    assert keyboard.read(5.1).twist == STILL
 
 
 def test_a_released_key_stops_at_once() -> None:
     keyboard = Keyboard()
-    typed(keyboard, "a", 0.0, How.PRESSED)
-    assert keyboard.wish(60.0).twist == (0, 1, 0, 0, 0, 0)
-    typed(keyboard, "a", 60.0, How.RELEASED)
-    assert keyboard.wish(60.0).twist == STILL
+    typed(keyboard, "a", 0.0, KeyEvent.PRESSED)
+    assert keyboard.read(60.0).twist == (0, 1, 0, 0, 0, 0)
+    typed(keyboard, "a", 60.0, KeyEvent.RELEASED)
+    assert keyboard.read(60.0).twist == STILL
 
 
 def test_keys_are_let_go_with_the_window() -> None:
     keyboard = Keyboard()
-    typed(keyboard, "wi.", 0.0, How.PRESSED)
-    keyboard.take(Stroke("unfocused", How.TYPED), 0.1)
-    assert keyboard.wish(0.1) == OperatorInput()
+    typed(keyboard, "wi.", 0.0, KeyEvent.PRESSED)
+    keyboard.take(Keystroke("unfocused", KeyEvent.TYPED), 0.1)
+    assert keyboard.read(0.1) == OperatorInput()
 
 
 def test_opposite_keys_cancel_and_others_add() -> None:
     keyboard = Keyboard()
-    typed(keyboard, "wsadru", 0.0, How.PRESSED)
-    assert keyboard.wish(0.0).twist == (0, 0, 1, 0, 0, 1)
+    typed(keyboard, "wsadru", 0.0, KeyEvent.PRESSED)
+    assert keyboard.read(0.0).twist == (0, 0, 1, 0, 0, 1)
 
 
 def test_every_axis_has_both_directions() -> None:
@@ -118,25 +139,28 @@ def test_every_axis_has_both_directions() -> None:
 
 def test_orders_levels_and_toggles() -> None:
     keyboard = Keyboard()
-    given = [keyboard.take(Stroke(key, How.TYPED), 0.0) for key in ("q", "x", "enter", "tab", "5")]
-    assert given == [QUIT, STOP, SWITCH, GIVE, None]
+    given = [
+        keyboard.take(Keystroke(key, KeyEvent.TYPED), 0.0)
+        for key in ("q", "x", "enter", "tab", "5")
+    ]
+    assert given == [QUIT, STOP, ACTIVATE, TAKE_OVER, None]
     assert keyboard.level == 4
-    for how in (How.PRESSED, How.HELD, How.RELEASED):
-        keyboard.take(Stroke("space", how), 0.0)
-    assert keyboard.wish(0.0).toggles == 1
+    for how in (KeyEvent.PRESSED, KeyEvent.HELD, KeyEvent.RELEASED):
+        keyboard.take(Keystroke("space", how), 0.0)
+    assert keyboard.read(0.0).toggles == 1
 
 
 @given(st.floats(allow_nan=True, allow_infinity=True))
 def test_a_stick_is_zero_in_its_middle_and_never_beyond_its_end(value: float) -> None:
-    out = of_stick(value)
+    out = without_dead_zone(value)
     assert -1 <= out <= 1
     if abs(value) <= DEAD_ZONE:
         assert out == 0
-    assert abs(of_stick(1.0)) == 1
+    assert abs(without_dead_zone(1.0)) == 1
 
 
 def test_two_hands_together_are_not_faster_than_one() -> None:
-    both = joined(
+    both = combined(
         OperatorInput((1, 0, 0, 0, 0, 0), 1, 2), OperatorInput((1, -0.5, 0, 0, 0, 0), 0, 1)
     )
     assert both == OperatorInput((1, -0.5, 0, 0, 0, 0), 1, 3)
@@ -147,10 +171,10 @@ class Person:
     """Says what it is told to."""
 
     def __init__(self, frame: str = "base") -> None:
-        self.wish, self.level = OperatorInput(), 2
+        self.read, self.level = OperatorInput(), 2
         profile = load_profile("panda_sim")
         self.policy = TeleopPolicy(
-            profile, "teleop", lambda: self.wish, lambda: self.level, frame=frame
+            profile, "teleop", lambda: self.read, lambda: self.level, frame=frame
         )
 
     def steps(
@@ -173,7 +197,7 @@ class Person:
 def test_a_held_key_moves_at_the_speed_of_its_level(level: int) -> None:
     person = Person()
     person.level = level
-    person.wish = OperatorInput((0, 0, -1, 0, 0, 1))
+    person.read = OperatorInput((0, 0, -1, 0, 0, 1))
     steps, speed = person.steps(), person.policy.speeds[level]
     spec = person.policy.spec.action
     pose = Pose(np.array([0.4, 0.0, 0.3]), np.eye(3))
@@ -205,8 +229,8 @@ def test_steps_stay_below_the_limits_of_the_profile() -> None:
     profile = load_profile("panda_sim")
     limits = profile.limits.model_copy(update={"step_m": 0.004, "step_rad": 0.02})
     tight = profile.model_copy(update={"limits": limits})
-    wish = OperatorInput((1, 1, 1, -1, 1, 1))
-    policy = TeleopPolicy(tight, "teleop", lambda: wish, lambda: 4)
+    read = OperatorInput((1, 1, 1, -1, 1, 1))
+    policy = TeleopPolicy(tight, "teleop", lambda: read, lambda: 4)
     steps = np.asarray(policy.infer(example_observation(policy.spec)).steps, np.float32)
     assert np.linalg.norm(steps[:, :3].astype(float), axis=1).max() <= 0.004
     assert np.linalg.norm(steps[:, 3:6].astype(float), axis=1).max() <= 0.02
@@ -214,20 +238,20 @@ def test_steps_stay_below_the_limits_of_the_profile() -> None:
 
 def test_the_gripper_is_toggled_and_moved_only_while_obeyed() -> None:
     person = Person()
-    person.wish = OperatorInput(toggles=1, opening=-1)
+    person.read = OperatorInput(toggles=1, opening=-1)
     np.testing.assert_allclose(person.steps(active=False)[:, 6], MAX_M, atol=ATOL)
-    person.wish = OperatorInput(toggles=1)
+    person.read = OperatorInput(toggles=1)
     np.testing.assert_allclose(person.steps()[:, 6], MAX_M, atol=ATOL)
-    person.wish = OperatorInput(toggles=2)
+    person.read = OperatorInput(toggles=2)
     np.testing.assert_array_equal(person.steps()[:, 6], 0)
     np.testing.assert_array_equal(person.steps(width_m=0.04)[:, 6], 0)
-    person.wish = OperatorInput(toggles=3)
+    person.read = OperatorInput(toggles=3)
     np.testing.assert_allclose(person.steps(width_m=0.0)[:, 6], MAX_M, atol=ATOL)
 
 
 def test_a_held_key_opens_at_its_own_speed_until_the_end() -> None:
     person = Person()
-    person.wish = OperatorInput(opening=-1)
+    person.read = OperatorInput(opening=-1)
     widths = [person.steps(rate_hz=10.0)[0, 6] for _ in range(30)]
     np.testing.assert_allclose(np.diff(widths[:10]), -OPENING_M_S / 10, atol=ATOL)
     assert widths[-1] == 0
@@ -239,7 +263,7 @@ def test_taking_over_keeps_what_is_held() -> None:
         person.steps(worker="other", width_m=0.032, holding=True)[:, 6], 0
     )
     np.testing.assert_array_equal(person.steps(width_m=0.032, holding=True)[:, 6], 0)
-    person.wish = OperatorInput(toggles=1)
+    person.read = OperatorInput(toggles=1)
     opened = person.steps(width_m=0.032, holding=True)[:, 6]
     np.testing.assert_allclose(opened, MAX_M, atol=ATOL)
 
@@ -248,7 +272,7 @@ def test_taking_over_keeps_what_is_held() -> None:
 def test_every_chunk_fits_what_is_declared(frame: str) -> None:
     person = Person(frame)
     assert person.policy.spec.action.frame == frame
-    person.wish = OperatorInput((1, -1, 0.5, 0, 0, -1), 1, 5)
+    person.read = OperatorInput((1, -1, 0.5, 0, 0, -1), 1, 5)
     for step in person.steps():
         assert step_width(person.policy.spec.action, step, 0.0, MAX_M) is not None
 

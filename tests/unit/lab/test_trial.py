@@ -15,18 +15,18 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import RecordError, RecordingError
 from vla_zenoh.lab.evaluation.paired import Paired
-from vla_zenoh.lab.trial.episode_fsm import DONE_S, EpisodeFsm, Phase, TrialView
+from vla_zenoh.lab.trial.episode_fsm import DONE_S, EpisodeFsm, EpisodeView, Phase
 from vla_zenoh.lab.trial.folder import PLAN, TRIALS, TrialFolder
-from vla_zenoh.lab.trial.judged import EpisodeVerdict, Verdict, read_verdict, verdict_in
-from vla_zenoh.lab.trial.plan import HIDDEN, Due, TrialPlan
+from vla_zenoh.lab.trial.plan import HIDDEN, DueEpisode, TrialPlan
 from vla_zenoh.lab.trial.score import score
+from vla_zenoh.lab.trial.verdict import EpisodeVerdict, Verdict, read_verdict, verdict_in
 
 SECONDS = 20.0
 FIRST_SHARE = 0.1
 """Of 400 setups: a fair coin is further than this from one half once in 16,000 trials."""
 
 PLAN_AB = TrialPlan("panda", ("a", "b"), "put the brick away", ("", "", ""), SECONDS, 7, True)
-DUE = Due(1, 1, "a")
+DUE = DueEpisode(1, 1, "a")
 
 
 def judged(setup: int, worker: str, verdict: Verdict = "success", **more: Any) -> EpisodeVerdict:
@@ -122,12 +122,12 @@ def test_an_episode_from_setup_to_verdict() -> None:
     assert conduct.typed("")
     assert conduct.phase is Phase.GIVE
     conduct.given(100.0, 5, (0.4, 0.0, 0.3))
-    conduct.look(TrialView(chunks=3), 100.5)
-    conduct.look(TrialView(chunks=90, holds=1, state="holding"), 109.0)
+    conduct.look(EpisodeView(chunks=3), 100.5)
+    conduct.look(EpisodeView(chunks=90, holds=1, state="holding"), 109.0)
     assert conduct.phase is Phase.RUN
     assert conduct.typed("")
     assert conduct.phase is Phase.BRAKE, "first the arm stands"
-    conduct.braked(TrialView(False, chunks=91, holds=1))
+    conduct.braked(EpisodeView(False, chunks=91, holds=1))
     assert conduct.phase is Phase.JUDGE
     assert not conduct.typed("")
     assert not conduct.typed("perhaps")
@@ -159,7 +159,7 @@ def test_whatever_is_typed_while_the_arm_moves_makes_it_stand() -> None:
         conduct = running()
         assert conduct.typed(line)
         assert conduct.phase is Phase.BRAKE
-        conduct.braked(TrialView(False))
+        conduct.braked(EpisodeView(False))
         assert conduct.phase is phase
 
 
@@ -167,24 +167,31 @@ def test_whatever_is_typed_while_the_arm_moves_makes_it_stand() -> None:
     ("look", "later", "end", "brakes"),
     [
         (
-            TrialView(False, why="node gone"),
-            TrialView(False, state="inactive", why="node gone"),
+            EpisodeView(False, why="node gone"),
+            EpisodeView(False, state="inactive", why="node gone"),
             "lost",
             1,
         ),
-        (TrialView(False), TrialView(False, state="fault", why="the robot reports"), "lost", 1),
-        (TrialView(False), TrialView(False, state="stopped", why="emergency stop"), "stopped", 0),
-        (TrialView(False), TrialView(False, deactivated=True, why="deactivated"), "taken", 0),
-        (TrialView(ours=False), TrialView(False, why="worker is 'c'"), "taken", 0),
+        (EpisodeView(False), EpisodeView(False, state="fault", why="the robot reports"), "lost", 1),
         (
-            TrialView(recording="disk is full"),
-            TrialView(False, recording="disk is full"),
+            EpisodeView(False),
+            EpisodeView(False, state="stopped", why="emergency stop"),
+            "stopped",
+            0,
+        ),
+        (EpisodeView(False), EpisodeView(False, deactivated=True, why="deactivated"), "taken", 0),
+        (EpisodeView(ours=False), EpisodeView(False, why="worker is 'c'"), "taken", 0),
+        (
+            EpisodeView(recording="disk is full"),
+            EpisodeView(False, recording="disk is full"),
             "recording",
             0,
         ),
     ],
 )
-def test_what_ended_it_is_told(look: TrialView, later: TrialView, end: str, brakes: int) -> None:
+def test_what_ended_it_is_told(
+    look: EpisodeView, later: EpisodeView, end: str, brakes: int
+) -> None:
     conduct = running()
     conduct.look(look, 101.0)
     assert conduct.phase is Phase.BRAKE
@@ -196,22 +203,22 @@ def test_what_ended_it_is_told(look: TrialView, later: TrialView, end: str, brak
 
 def test_it_ends_when_the_policy_says_so_for_a_while_and_when_the_time_is_over() -> None:
     conduct = running()
-    conduct.look(TrialView(done=True), 101.0)
-    conduct.look(TrialView(done=False), 101.0 + DONE_S / 2)
-    conduct.look(TrialView(done=True), 101.0 + DONE_S)
-    conduct.look(TrialView(done=True), 101.0 + 1.9 * DONE_S)
+    conduct.look(EpisodeView(done=True), 101.0)
+    conduct.look(EpisodeView(done=False), 101.0 + DONE_S / 2)
+    conduct.look(EpisodeView(done=True), 101.0 + DONE_S)
+    conduct.look(EpisodeView(done=True), 101.0 + 1.9 * DONE_S)
     assert conduct.phase is Phase.RUN, "it went on meanwhile"
-    conduct.look(TrialView(done=True), 101.0 + 2 * DONE_S)
+    conduct.look(EpisodeView(done=True), 101.0 + 2 * DONE_S)
     assert (conduct.phase, conduct.end) == (Phase.BRAKE, "policy")
     conduct = running()
-    conduct.look(TrialView(), 100.0 + SECONDS - 0.01)
+    conduct.look(EpisodeView(), 100.0 + SECONDS - 0.01)
     assert conduct.phase is Phase.RUN
-    conduct.look(TrialView(), 100.0 + SECONDS)
+    conduct.look(EpisodeView(), 100.0 + SECONDS)
     assert (conduct.phase, conduct.end) == (Phase.BRAKE, "time")
 
 
 LOOKS = st.builds(
-    TrialView,
+    EpisodeView,
     active=st.booleans(),
     ours=st.booleans(),
     state=st.sampled_from(["active", "holding", "inactive", "stopped", "fault"]),
@@ -223,7 +230,7 @@ LOOKS = st.builds(
 
 @given(st.lists(st.one_of(st.sampled_from(["", "y", "n", "x note", "what"]), LOOKS)), st.data())
 def test_the_arm_is_braked_before_an_episode_that_moved_it_is_over(
-    inputs: list[str | TrialView], data: st.DataObject
+    inputs: list[str | EpisodeView], data: st.DataObject
 ) -> None:
     conduct, now_s, moved, braked = EpisodeFsm(DUE, SECONDS), 0.0, False, False
     for given_input in inputs:
@@ -235,7 +242,7 @@ def test_the_arm_is_braked_before_an_episode_that_moved_it_is_over(
                 conduct.given(now_s, 1, None)
                 moved = True
         elif conduct.phase is Phase.BRAKE:
-            conduct.braked(TrialView(False))
+            conduct.braked(EpisodeView(False))
             braked = True
         elif isinstance(given_input, str):
             conduct.typed(given_input)

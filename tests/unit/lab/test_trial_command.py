@@ -17,11 +17,11 @@ from typer.testing import CliRunner
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.cli.trial import trial
 from vla_zenoh.lab.cli.trial_person import Lines, TrialPerson
-from vla_zenoh.lab.demo.runner import Interrupted
-from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, TrialView
+from vla_zenoh.lab.episode import Interrupted
+from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, EpisodeView
 from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.judged import End, EpisodeVerdict
-from vla_zenoh.lab.trial.plan import Due, TrialPlan
+from vla_zenoh.lab.trial.plan import DueEpisode, TrialPlan
+from vla_zenoh.lab.trial.verdict import End, EpisodeVerdict
 
 PLAN = TrialPlan("panda", ("ann", "bob"), "wave", ("left", "right"), 20.0, 7, True)
 SOON_S = 0.05
@@ -39,7 +39,7 @@ def person(fd: int, *, plan: TrialPlan = PLAN, lays: bool = False) -> TrialPerso
 
 
 def laid() -> EpisodeFsm:
-    return EpisodeFsm(Due(1, 1, "ann"), 20.0)
+    return EpisodeFsm(DueEpisode(1, 1, "ann"), 20.0)
 
 
 def running() -> EpisodeFsm:
@@ -74,8 +74,8 @@ def test_while_an_episode_runs_a_script_ends_it_by_an_empty_line_alone(
     os.write(write, b"\n")
     assert someone.typed() is None
     conduct = running()
-    conduct.look(TrialView(), 30.0)
-    conduct.braked(TrialView())
+    conduct.look(EpisodeView(), 30.0)
+    conduct.braked(EpisodeView())
     assert someone.ask(conduct) == "y well done"
     assert someone.typed() == ""
     assert someone.typed() is None
@@ -112,11 +112,11 @@ def test_after_an_episode_that_was_taken_away_a_person_is_asked_whatever_was_sai
 ) -> None:
     read, write = pipe
     os.write(write, b"\n")
-    assert person(read, lays=True).ask(EpisodeFsm(Due(1, 2, "bob"), 20.0, end)) == ""
+    assert person(read, lays=True).ask(EpisodeFsm(DueEpisode(1, 2, "bob"), 20.0, end)) == ""
     assert "the arm was taken away" in capsys.readouterr().err
     os.close(write)
     with pytest.raises(NodeError, match="has ended before the trial"):
-        person(read, lays=True).ask(EpisodeFsm(Due(1, 2, "bob"), 20.0, end))
+        person(read, lays=True).ask(EpisodeFsm(DueEpisode(1, 2, "bob"), 20.0, end))
 
 
 def test_ctrl_c_ends_a_question(pipe: tuple[int, int]) -> None:
@@ -159,8 +159,8 @@ def test_who_is_at_work_is_told_in_an_open_trial_alone(
 ) -> None:
     read, write = pipe
     conduct = running()
-    conduct.look(TrialView(False), 1.0)
-    conduct.braked(TrialView(False, why="node 'worker-ann' is gone"))
+    conduct.look(EpisodeView(False), 1.0)
+    conduct.braked(EpisodeView(False, why="node 'worker-ann' is gone"))
     for is_blind in (True, False):
         plan = TrialPlan("panda", ("ann", "bob"), "wave", ("left",), 20.0, 7, is_blind)
         someone = person(read, plan=plan, lays=True)

@@ -14,7 +14,7 @@ from vla_zenoh.lab.cli.dataset import dataset_app
 from vla_zenoh.lab.dataset.episodes import episodes_of
 from vla_zenoh.lab.dataset.success import succeeded
 from vla_zenoh.lab.recording.run import load_run
-from vla_zenoh.lab.trial.judged import FACT, EpisodeVerdict, Verdict
+from vla_zenoh.lab.trial.verdict import FACT, EpisodeVerdict, Verdict
 
 
 def fact(verdict: Verdict, worker: str = "teacher") -> dict[str, object]:

@@ -12,7 +12,8 @@ from typing import Any
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.bench.cpu_time import cpu_s
-from vla_zenoh.lab.demo.runner import DemoRun, Interrupted
+from vla_zenoh.lab.demo.runner import DemoRunner
+from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.recording.stream_listener import StreamListener
 from vla_zenoh.nodes.command.status import SPREAD_S
 from vla_zenoh.profile import Profile, override
@@ -56,7 +57,7 @@ def measure_command(
                 raise NodeError("a node dies again and again")
 
         listener = StreamListener(host.session, profile.keys, profile.task.worker)
-        run = DemoRun(client, listener, stop, watch, lambda *_: None)
+        run = DemoRunner(client, listener, stop, watch, lambda *_: None)
         run.wait_until_ready()
         run.activate(RATE_HZ)
         listener.close()  # what it hears costs time that is not the command node's

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.kinematics.so3 import Pose, log3, norm3
-from vla_zenoh.lab.demo.analysis import SegmentOutcome
-from vla_zenoh.lab.demo.segments import DemoSegment, make_segment
+from vla_zenoh.lab.demo.segments import DemoSegment, SegmentOutcome, make_segment
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
 
@@ -32,7 +31,7 @@ VELOCITY_STEP_SLACK = 1.02
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class MotionCase:
     """One prompt of the protocol.
 
     Args:
@@ -54,17 +53,17 @@ class Trial:
         return make_segment(self.prompt, STEPS)
 
 
-PROTOCOL: tuple[Trial, ...] = (
-    Trial("HARD: go up"),
-    Trial("HARD: go down", "HARD: go up x50"),
-    Trial("HARD: roll left within 0.9", "HARD: go up x20"),
-    Trial("HARD: roll right within 0.9", "HARD: go up x20"),
-    Trial("HARD: pitch up within 0.9", "HARD: go up x20"),
-    Trial("HARD: pitch down within 0.9", "HARD: go up x20"),
-    Trial("HARD: yaw left", "HARD: go up x20"),
-    Trial("HARD: yaw right within 2.0", "HARD: go up x20"),
-    Trial("HARD: close gripper within 0.08"),
-    Trial("HARD: open gripper within 0.08"),
+PROTOCOL: tuple[MotionCase, ...] = (
+    MotionCase("HARD: go up"),
+    MotionCase("HARD: go down", "HARD: go up x50"),
+    MotionCase("HARD: roll left within 0.9", "HARD: go up x20"),
+    MotionCase("HARD: roll right within 0.9", "HARD: go up x20"),
+    MotionCase("HARD: pitch up within 0.9", "HARD: go up x20"),
+    MotionCase("HARD: pitch down within 0.9", "HARD: go up x20"),
+    MotionCase("HARD: yaw left", "HARD: go up x20"),
+    MotionCase("HARD: yaw right within 2.0", "HARD: go up x20"),
+    MotionCase("HARD: close gripper within 0.08"),
+    MotionCase("HARD: open gripper within 0.08"),
 )
 
 
@@ -119,13 +118,13 @@ class MeasuredStream:
     outbound_ms: Sequence[float]
 
 
-def failed_row(trial: Trial, conditions: Conditions, why: str) -> dict[str, Any]:
+def failed_row(trial: MotionCase, conditions: Conditions, why: str) -> dict[str, Any]:
     """The row of a prompt that was not carried out to its end; it has no figures."""
     return {"prompt": trial.name, **asdict(conditions), "faults": [why], "ok": False}
 
 
 def make_row(
-    trial: Trial,
+    trial: MotionCase,
     conditions: Conditions,
     profile: Profile,
     outcome: SegmentOutcome,
@@ -218,7 +217,7 @@ def faults_of(row: dict[str, Any], outcome: SegmentOutcome) -> list[str]:
     return out
 
 
-def way_of(poses: Sequence[Pose]) -> tuple[float, float]:
+def path_length(poses: Sequence[Pose]) -> tuple[float, float]:
     """Length of the way through `poses`: metres, and radians of the angles between them."""
     pairs = list(pairwise(poses))
     return (

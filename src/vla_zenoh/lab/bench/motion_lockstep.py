@@ -25,13 +25,12 @@ from vla_zenoh.lab.bench.motion import (
     WAY_HZ,
     Conditions,
     MeasuredStream,
-    Trial,
+    MotionCase,
     failed_row,
     make_row,
-    way_of,
+    path_length,
 )
-from vla_zenoh.lab.demo.analysis import RestPose, judge
-from vla_zenoh.lab.demo.segments import DemoSegment, make_segment
+from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, judge, make_segment
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import Profile
@@ -50,7 +49,7 @@ Row = dict[str, Any]
 
 def run_in_lockstep(
     profile: Profile,
-    trials: Sequence[Trial],
+    trials: Sequence[MotionCase],
     conditions: Sequence[Conditions],
     stop: threading.Event,
     done: Callable[[Row], None],
@@ -100,7 +99,7 @@ def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends us
 
 
-def lockstep_row(profile: Profile, trial: Trial, conditions: Conditions) -> Row:
+def lockstep_row(profile: Profile, trial: MotionCase, conditions: Conditions) -> Row:
     """Carry one prompt out; one that does not end is a row that says so."""
     try:
         return _row(profile, trial, conditions)
@@ -108,7 +107,7 @@ def lockstep_row(profile: Profile, trial: Trial, conditions: Conditions) -> Row:
         return failed_row(trial, conditions, str(error))
 
 
-def _row(profile: Profile, trial: Trial, conditions: Conditions) -> Row:
+def _row(profile: Profile, trial: MotionCase, conditions: Conditions) -> Row:
     dt_s = 0.1
     options = {"horizon": str(conditions.horizon), "dt_s": str(dt_s)}
     loop = Lockstep(
@@ -191,7 +190,7 @@ def _stream(loop: Lockstep, since: int) -> MeasuredStream:
         np.array([command.twist for _, command in sent]).reshape(-1, 6),
         np.array([command.acceleration for _, command in sent]).reshape(-1, 6),
         np.array([command.cause.chunk_seq if command.cause else -1 for _, command in sent]),
-        *way_of([Pose(*place) for place in places]),
+        *path_length([Pose(*place) for place in places]),
         tracking_m,
         [end_to_end for end_to_end, _ in first.values()],
         [outbound for _, outbound in first.values()],

@@ -17,12 +17,12 @@ from vla_zenoh.lab.bench.motion import (
     WAY_HZ,
     Conditions,
     MeasuredStream,
-    Trial,
+    MotionCase,
     failed_row,
     make_row,
-    way_of,
+    path_length,
 )
-from vla_zenoh.lab.demo.runner import DemoRun
+from vla_zenoh.lab.demo.runner import DemoRunner
 from vla_zenoh.lab.demo.segments import make_segment
 from vla_zenoh.lab.recording.run import first_commands
 from vla_zenoh.lab.recording.stream_listener import StreamListener, Streams
@@ -34,10 +34,10 @@ HOME_TOLERANCE_M = 0.002
 
 def run_in_real_time(
     host: Host,
-    trials: Sequence[Trial],
+    trials: Sequence[MotionCase],
     conditions: Sequence[Conditions],
     stop: threading.Event,
-    progress: Callable[[Trial, Conditions, int], None],
+    progress: Callable[[MotionCase, Conditions, int], None],
 ) -> Iterator[tuple[dict[str, Any], Streams]]:
     """One row after the other, with what was recorded for it.
 
@@ -57,7 +57,7 @@ def run_in_real_time(
     for each in conditions:
         for trial in trials:
             listener = StreamListener(host.session, profile.keys, profile.task.worker)
-            run = DemoRun(
+            run = DemoRunner(
                 host.client,
                 listener,
                 stop,
@@ -69,13 +69,15 @@ def run_in_real_time(
             run.activate(PREPARATION_HZ)
             try:
                 if trial.preparation:
-                    prepared = run.carry_out(0, make_segment(trial.preparation, 1), PREPARATION_HZ)
+                    prepared = run.run_segment(
+                        0, make_segment(trial.preparation, 1), PREPARATION_HZ
+                    )
                     if prepared.faults():
                         raise NodeError(f"{trial.preparation}: {'; '.join(prepared.faults())}")
                 host.client.set_rate(each.rate_hz)
                 before = _refusals(host)
                 since_ns = time.time_ns()
-                outcome = run.carry_out(0, trial.segment, each.rate_hz)
+                outcome = run.run_segment(0, trial.segment, each.rate_hz)
             except NodeError as error:
                 # The arm stands, as it should; the other prompts can still be measured.
                 yield failed_row(trial, each, str(error)), listener.close()
@@ -142,7 +144,7 @@ def stream_of(
         np.array([entry.record.twist for entry in commands]).reshape(-1, 6),
         np.array([entry.record.acceleration for entry in commands]).reshape(-1, 6),
         np.array([cause.chunk_seq if cause else -1 for cause in causes]),
-        *way_of([pose_of(pose) for pose in poses[:: round(state_hz / WAY_HZ)]]),
+        *path_length([pose_of(pose) for pose in poses[:: round(state_hz / WAY_HZ)]]),
         tracking_m,
         [(stamp_ns - cause.observation_stamp_ns) / 1e6 for cause, stamp_ns in mine],
         [(cause.received_ns - cause.observation_stamp_ns) / 1e6 for cause, _ in mine],

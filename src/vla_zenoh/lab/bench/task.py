@@ -15,11 +15,13 @@ from vla_zenoh.lab.tasks import (
     COLOURS,
     FAMILIES,
     LIMIT_S,
+    Order,
     TaskEpisode,
     Verdict,
     draw_episode,
     draw_stay,
 )
+from vla_zenoh.lab.tasks.wording import is_nonsense, parse_prompt
 from vla_zenoh.policy.model_options import shown
 from vla_zenoh.types import ObjectPoses
 
@@ -77,24 +79,24 @@ class TaskPlan:
         """The worker that runs."""
         return BASELINES.get(self.model, (self.model, ""))[0]
 
-    def asked(self) -> Iterator[TaskAsked]:
+    def asked(self) -> Iterator[TaskRequest]:
         """Every episode, before its layout is known."""
         families = (self.family,) if self.family else FAMILIES
         for index in range(self.episodes):
             layout = index // 2 if self.pairs else index
-            yield TaskAsked(
+            yield TaskRequest(
                 self.seed + layout,
                 families[layout % len(families)],
                 COLOURS[(layout + index % 2) % len(COLOURS)] if self.pairs else None,
             )
 
-    def spoken(self, episode: TaskEpisode) -> str:
+    def prompt_for(self, episode: TaskEpisode) -> str:
         """The prompt that is put for `episode`."""
         return self.prompt or BASELINES.get(self.model, ("", episode.prompt))[1]
 
 
 @dataclass(frozen=True, slots=True)
-class TaskAsked:
+class TaskRequest:
     """One episode to run.
 
     Args:
@@ -127,7 +129,7 @@ class TaskAsked:
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class TaskOutcome:
     """How one episode ended.
 
     Args:
@@ -151,9 +153,9 @@ class Ended:
     @staticmethod
     def by(
         verdict: Verdict, episode: TaskEpisode, prompt: str, pictures: tuple[bytes, bytes] | None
-    ) -> Ended:
+    ) -> TaskOutcome:
         """As the judge says."""
-        return Ended(
+        return TaskOutcome(
             episode,
             prompt,
             verdict.success,
@@ -195,7 +197,7 @@ class TaskScore:
     mode: str
     profile: str
     vary: Sequence[str] = ()
-    ended: list[Ended] = field(default_factory=list)
+    ended: list[TaskOutcome] = field(default_factory=list)
     latency_ms: dict[str, tuple[float, float]] = field(default_factory=dict)
     wall_s: float = 0.0
     options: Mapping[str, str] = field(default_factory=dict)
@@ -233,7 +235,7 @@ class TaskScore:
         return out
 
 
-def _figures(ended: Sequence[Ended]) -> dict[str, Any]:
+def _figures(ended: Sequence[TaskOutcome]) -> dict[str, Any]:
     successes = sum(each.success for each in ended)
     times_s = [each.time_s for each in ended if each.success]
     kinds = Counter(each.failure for each in ended if not each.success)
@@ -250,3 +252,47 @@ def _figures(ended: Sequence[Ended]) -> dict[str, Any]:
         if times_s
         else None,
     }
+
+
+STAY = "stay"
+FIRST_SEED = 1
+"""The layout where nobody asks for another."""
+
+
+@dataclass(frozen=True, slots=True)
+class PromptedTask(TaskRequest):
+    """An episode with a prompt that somebody thought of.
+
+    Args:
+        prompt: as put.
+    """
+
+    prompt: str = ""
+
+    def draw(self, objects: ObjectPoses, *, held_out: bool) -> TaskEpisode:
+        """What the prompt asks for; the arm is to stay where it asks for nothing."""
+        return TaskEpisode(self.seed, parse_prompt(self.prompt) or Order(STAY), self.prompt)
+
+
+@dataclass(frozen=True, slots=True)
+class DemoPlan(TaskPlan):
+    """Some prompts, or one task of every family, each in the same layout.
+
+    Args:
+        prompts: to be put one after the other; empty: one of every family, drawn.
+    """
+
+    prompts: tuple[str, ...] = ()
+
+    def asked(self) -> Iterator[TaskRequest]:
+        """Every episode."""
+        for prompt in self.prompts:
+            yield PromptedTask(self.seed, STAY, None, prompt)
+        if not self.prompts:
+            for family in FAMILIES:
+                yield TaskRequest(self.seed, family)
+
+
+def is_judged(prompt: str) -> bool:
+    """Whether it is known here what `prompt` asks for."""
+    return parse_prompt(prompt) is not None or is_nonsense(prompt)

@@ -26,12 +26,12 @@ from vla_zenoh.lab.bench.task import (
     ARM_LOST,
     NOT_OBEYED,
     SAY_IT_IS_OVER_S,
-    Ended,
-    TaskAsked,
+    TaskOutcome,
     TaskPlan,
+    TaskRequest,
 )
 from vla_zenoh.lab.lockstep import Delays, Lockstep
-from vla_zenoh.lab.tasks import Judge
+from vla_zenoh.lab.tasks import TaskJudge
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_of
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile
@@ -59,7 +59,7 @@ def run_in_lockstep(
     processes: int,
     *,
     named: str | None = None,
-) -> Iterator[tuple[Ended, dict[str, tuple[float, float]]]]:
+) -> Iterator[tuple[TaskOutcome, dict[str, tuple[float, float]]]]:
     """One outcome after the other, each with what an inference took in its process.
 
     Args:
@@ -178,7 +178,7 @@ def _begin(
         _bench = _Bench(profile, plan, camera, world, renderer, policy)
 
 
-def _one(asked: TaskAsked) -> tuple[Ended, dict[str, tuple[float, float]]]:
+def _one(asked: TaskRequest) -> tuple[TaskOutcome, dict[str, tuple[float, float]]]:
     if isinstance(_bench, NodeError):
         raise _bench
     assert _bench is not None
@@ -187,14 +187,14 @@ def _one(asked: TaskAsked) -> tuple[Ended, dict[str, tuple[float, float]]]:
     return ended, {f"worker-{_bench.plan.worker}.inference": (float(p50), float(p95))}
 
 
-def _episode(bench: _Bench, asked: TaskAsked) -> Ended:
+def _episode(bench: _Bench, asked: TaskRequest) -> TaskOutcome:
     plan, world = bench.plan, bench.world
     world.reset(asked.seed)
     if bench.profile.sim.vary:
         bench.renderer.vary(asked.seed, bench.profile.sim.vary)
     objects = _objects(world)
     episode = asked.draw(objects, held_out=plan.held_out)
-    prompt = plan.spoken(episode)
+    prompt = plan.prompt_for(episode)
     loop = Lockstep(
         bench.profile,
         world,
@@ -212,8 +212,8 @@ def _episode(bench: _Bench, asked: TaskAsked) -> Ended:
         refused = _activate(loop)
         if refused:
             pictures = _pictures(bench, beginning)
-            return Ended(episode, prompt, False, NOT_OBEYED, 0.0, refused, pictures)
-        judge = Judge(episode.order, _objects(world), world.tcp()[0])
+            return TaskOutcome(episode, prompt, False, NOT_OBEYED, 0.0, refused, pictures)
+        judge = TaskJudge(episode.order, _objects(world), world.tcp()[0])
         began_ns, over_since_s = loop.now_ns, 0.0
         while True:
             loop.run(LOOK_S)
@@ -223,7 +223,9 @@ def _episode(bench: _Bench, asked: TaskAsked) -> Ended:
             commander = loop.commander
             if verdict is None and not commander.task.active:
                 pictures = _pictures(bench, beginning)
-                return Ended(episode, prompt, False, ARM_LOST, time_s, commander.why, pictures)
+                return TaskOutcome(
+                    episode, prompt, False, ARM_LOST, time_s, commander.why, pictures
+                )
             over = commander.progress.done and commander.at_rest
             over_since_s = (over_since_s or time_s) if over else 0.0
             too_long = bool(over_since_s) and time_s - over_since_s > SAY_IT_IS_OVER_S
@@ -231,9 +233,9 @@ def _episode(bench: _Bench, asked: TaskAsked) -> Ended:
                 verdict = judge.end()
             if verdict is not None:
                 pictures = None if verdict.success else _pictures(bench, beginning)
-                return Ended.by(verdict, episode, prompt, pictures)
+                return TaskOutcome.by(verdict, episode, prompt, pictures)
     except (SpecError, WorkerError) as error:
-        return Ended(episode, prompt, False, NOT_OBEYED, 0.0, str(error))
+        return TaskOutcome(episode, prompt, False, NOT_OBEYED, 0.0, str(error))
 
 
 def _activate(loop: Lockstep) -> str:

@@ -24,12 +24,12 @@ from vla_zenoh.lab.bench.task import (
     NO_STATE,
     NOT_OBEYED,
     SAY_IT_IS_OVER_S,
-    Ended,
-    TaskAsked,
+    TaskOutcome,
     TaskPlan,
+    TaskRequest,
 )
-from vla_zenoh.lab.demo.runner import Interrupted
-from vla_zenoh.lab.tasks import Judge, TaskEpisode
+from vla_zenoh.lab.episode import Interrupted
+from vla_zenoh.lab.tasks import TaskEpisode, TaskJudge
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.types import GripperState, Header, ObjectPoses, PoseState
 
@@ -47,7 +47,7 @@ FRESH_PICTURES_S = 0.2
 Record = TypeVar("Record")
 
 
-class TaskRun:
+class TaskRunner:
     """See the module.
 
     Args:
@@ -80,7 +80,7 @@ class TaskRun:
             for key, slot in listening
         ]
 
-    def run(self) -> Iterator[Ended]:
+    def run(self) -> Iterator[TaskOutcome]:
         """One outcome after the other.
 
         Raises:
@@ -105,14 +105,14 @@ class TaskRun:
         return out
 
     # -- one episode --------------------------------------------------------------------------
-    def _episode(self, asked: TaskAsked) -> Ended:
+    def _episode(self, asked: TaskRequest) -> TaskOutcome:
         objects = self._lay_out(asked.seed)
         episode = asked.draw(objects, held_out=self._plan.held_out)
-        prompt = self._plan.spoken(episode)
+        prompt = self._plan.prompt_for(episode)
         refused = self._give_the_arm(prompt)
         if refused:
             self._end_if_somebody_did()
-            return Ended(episode, prompt, False, NOT_OBEYED, 0.0, refused, self._pictures())
+            return TaskOutcome(episode, prompt, False, NOT_OBEYED, 0.0, refused, self._pictures())
         return self._watch_it(episode, prompt)
 
     def _lay_out(self, seed: int) -> ObjectPoses:
@@ -164,9 +164,9 @@ class TaskRun:
         if self._client.latched() or why == DEACTIVATED:
             raise NodeError(f"ended by somebody else: {why}")
 
-    def _watch_it(self, episode: TaskEpisode, prompt: str) -> Ended:
+    def _watch_it(self, episode: TaskEpisode, prompt: str) -> TaskOutcome:
         first, objects = self._newest(ObjectPoses)
-        judge = Judge(episode.order, objects, self._newest(PoseState)[1].position_m)
+        judge = TaskJudge(episode.order, objects, self._newest(PoseState)[1].position_m)
         beginning = self._picture.payload()
         began_s = time.monotonic()
         seen_ns, over_since_s = first.stamp_wall_ns, 0.0
@@ -185,16 +185,16 @@ class TaskRun:
             over_since_s = (over_since_s or time_s) if self._says_it_is_over() else 0.0
             if verdict is None and lost:
                 self._end_if_somebody_did()
-                return Ended(episode, prompt, False, ARM_LOST, time_s, lost, ended[2])
+                return TaskOutcome(episode, prompt, False, ARM_LOST, time_s, lost, ended[2])
             silent_s = time.monotonic() - self._heard[ObjectPoses].mono_s
             if verdict is None and silent_s > HEARD_PATIENCE_S:
                 why = f"sim/objects is silent for {silent_s:.1f} s"
-                return Ended(episode, prompt, False, NO_STATE, time_s, why, ended[2])
+                return TaskOutcome(episode, prompt, False, NO_STATE, time_s, why, ended[2])
             over = over_since_s and time_s - over_since_s > SAY_IT_IS_OVER_S
             if verdict is None and (over or time_s > self._plan.limit_s):
                 verdict = judge.end()
             if verdict is not None:
-                return Ended.by(verdict, *ended)
+                return TaskOutcome.by(verdict, *ended)
 
     def _pictures(self) -> tuple[bytes, bytes]:
         return self._picture.payload(), self._picture.payload()

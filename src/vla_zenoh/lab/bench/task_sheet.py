@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
-from vla_zenoh.lab.bench.task import Ended
+from vla_zenoh.lab.bench.task import TaskOutcome
 from vla_zenoh.types import Image
 
 TILE_WIDTH, TILE_HEIGHT, TEXT_HEIGHT = 240, 180, 60
@@ -20,12 +20,12 @@ LETTERS = 76
 Picture = NDArray[np.uint8]
 
 
-def failure_sheet(ended: Sequence[Ended]) -> bytes | None:
+def failure_sheet(ended: Sequence[TaskOutcome]) -> bytes | None:
     """A JPEG file with the first failures that have pictures; None where there is none."""
     return sheet([each for each in ended if not each.success])
 
 
-def sheet(ended: Sequence[Ended]) -> bytes | None:
+def sheet(ended: Sequence[TaskOutcome]) -> bytes | None:
     """A JPEG file with the first outcomes that have pictures; None where there is none."""
     shown = [each for each in ended if each.pictures is not None][:MAX_TILES]
     if not shown:
@@ -37,7 +37,7 @@ def sheet(ended: Sequence[Ended]) -> bytes | None:
     return encode_jpeg(Image(np.ascontiguousarray(np.vstack(rows))))
 
 
-def _tile(ended: Ended) -> Picture:
+def _tile(ended: TaskOutcome) -> Picture:
     assert ended.pictures is not None
     tile = np.full((TILE_HEIGHT + TEXT_HEIGHT, 2 * TILE_WIDTH, 3), 255, np.uint8)
     for index, jpeg in enumerate(ended.pictures):

@@ -88,7 +88,7 @@ class ImageStyle:
     strange: bool = False
 
 
-def looks(prompts: Sequence[str] = PROMPTS) -> list[ImageStyle]:
+def example_styles(prompts: Sequence[str] = PROMPTS) -> list[ImageStyle]:
     """Everything that is tried, the most telling first."""
     first = prompts[0]
     return [
@@ -106,7 +106,7 @@ def looks(prompts: Sequence[str] = PROMPTS) -> list[ImageStyle]:
 
 
 @dataclass(slots=True)
-class Maker:
+class ExampleMaker:
     """Makes observations one after the other, each a period later than the last.
 
     Args:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.control import chunk_plausibility as plausible
 from vla_zenoh.control.finding import Finding, error, note, warning
+from vla_zenoh.errors import SpecError
 from vla_zenoh.lab.check.examples import MAX_WIDTH_M, ImageStyle
-from vla_zenoh.policy import ActionSpec
+from vla_zenoh.policy import ActionSpec, ActionSteps, Observation, Policy, check_steps
 
 GROWTH_KIB, GROWTH_TOTAL_KIB = 32.0, 4096.0
 """Memory that every inference keeps, and in all, before it is taken for a leak."""
@@ -123,3 +125,48 @@ def _polarity(action: ActionSpec, answers: Answers) -> list[Finding]:
             f"gripper_open_is_high: {action.gripper_open_is_high} right?",
         )
     ]
+
+
+NEAR = 1e-3
+"""Of the largest number of an answer: a batch is summed up in another order."""
+
+
+def takes_batches(policy: Policy) -> bool:
+    """Whether the model takes several observations at once."""
+    return callable(getattr(policy, "infer_batch", None))
+
+
+def ask_batch(policy: Policy, observations: Sequence[Observation]) -> list[Any]:
+    """What it answers, nothing of it being under way."""
+    infer_batch: Any = getattr(policy, "infer_batch", None)
+    committed = getattr(policy, "takes_committed", False)
+    extra = {"committed": [None] * len(observations)} if committed else {}
+    return list(infer_batch(list(observations), **extra))
+
+
+def batch_findings(action: ActionSpec, found: Sequence[Any], alone: Sequence[Any]) -> list[Finding]:
+    """What differs.
+
+    Args:
+        action: of the spec.
+        found: answers of ``infer_batch``.
+        alone: (H, D) of ``infer`` for the same observations, in their order.
+    """
+    if len(found) != len(alone):
+        said = f"infer_batch gave {len(found)} answers to {len(alone)} observations"
+        return [error("batch", said)]
+    out: list[Finding] = []
+    for number, (answer, wanted) in enumerate(zip(found, alone, strict=True), 1):
+        steps = answer.steps if isinstance(answer, ActionSteps) else answer
+        try:
+            given: Steps = check_steps(action, steps)
+        except SpecError as fault:
+            out.append(error("batch", f"answer {number} of infer_batch: {fault}"))
+            continue
+        if given.shape != wanted.shape or np.abs(given - wanted).max() > NEAR * _size(wanted):
+            out.append(error("batch", f"answer {number} of infer_batch is not that of infer"))
+    return out
+
+
+def _size(steps: Steps) -> float:
+    return max(float(np.abs(steps).max()), 1e-6)

@@ -10,7 +10,7 @@ from vla_zenoh.policy import ModelSpec
 
 
 @dataclass(slots=True)
-class Report:
+class CheckReport:
     """See the module.
 
     Args:

@@ -46,7 +46,7 @@ def kept_rows(json_file: Path | None) -> Iterator[Rows]:
     Raises:
         typer.Exit: somebody ended it.
     """
-    from vla_zenoh.lab.demo.runner import Interrupted
+    from vla_zenoh.lab.episode import Interrupted
 
     rows = Rows()
     try:
@@ -68,7 +68,7 @@ def up_with_last_lines(host: Host, lines: Collection[str]) -> Iterator[Host]:
         host: not up yet.
         lines: what its nodes write, growing.
     """
-    from vla_zenoh.lab.demo.runner import Interrupted
+    from vla_zenoh.lab.episode import Interrupted
 
     failed_at: list[str] = []
     try:

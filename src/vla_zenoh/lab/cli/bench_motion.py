@@ -19,7 +19,7 @@ from rich.progress import (
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
 from vla_zenoh.cli.output import console, errors
-from vla_zenoh.lab.bench.motion import PROTOCOL, STEPS, Conditions, Trial
+from vla_zenoh.lab.bench.motion import PROTOCOL, STEPS, Conditions, MotionCase
 from vla_zenoh.lab.cli.bench_file import JsonFileOption, up_with_last_lines, write_json
 from vla_zenoh.profile import Profile
 
@@ -96,7 +96,7 @@ def motion(
 
 def _lockstep(
     profile: Profile,
-    trials: Sequence[Trial],
+    trials: Sequence[MotionCase],
     conditions: Sequence[Conditions],
     stop: threading.Event,
     bars: Progress,
@@ -112,7 +112,7 @@ def _lockstep(
 
 def _real_time(
     profile: Profile,
-    trials: Sequence[Trial],
+    trials: Sequence[MotionCase],
     conditions: Sequence[Conditions],
     stop: threading.Event,
     bars: Progress,
@@ -120,7 +120,7 @@ def _real_time(
     out: Path | None,
 ) -> None:
     from vla_zenoh.cli.free_endpoint import own_address
-    from vla_zenoh.lab.demo.runner import Interrupted
+    from vla_zenoh.lab.episode import Interrupted
     from vla_zenoh.runtime.process import die_with_parent
 
     die_with_parent()
@@ -138,7 +138,7 @@ def _real_time(
 
 def _with_one_worker(
     profile: Profile,
-    trials: Sequence[Trial],
+    trials: Sequence[MotionCase],
     conditions: Sequence[Conditions],
     stop: threading.Event,
     bars: Progress,
@@ -153,7 +153,7 @@ def _with_one_worker(
     everything, current = tasks
     lines: list[str] = []
 
-    def progress(trial: Trial, each: Conditions, done: int) -> None:
+    def progress(trial: MotionCase, each: Conditions, done: int) -> None:
         bars.update(current, description=f"{trial.name} at {each.name}", completed=done)
 
     def log(node: str, line: str) -> None:
@@ -190,7 +190,7 @@ def _with_one_worker(
                 )
 
 
-def _trials(prompts: str) -> list[Trial]:
+def _trials(prompts: str) -> list[MotionCase]:
     names = [trial.name for trial in PROTOCOL]
     wanted = names if prompts == "all" else [part.strip() for part in prompts.split(",")]
     unknown = [name for name in wanted if name not in names]

@@ -249,8 +249,8 @@ def _real_time(
     advance: Callable[[TaskScore], None],
 ) -> None:
     from vla_zenoh.cli.free_endpoint import own_address
-    from vla_zenoh.lab.bench.task_runner import TaskRun
-    from vla_zenoh.lab.demo.runner import Interrupted
+    from vla_zenoh.lab.bench.task_runner import TaskRunner
+    from vla_zenoh.lab.episode import Interrupted
     from vla_zenoh.runtime.launch import Host
     from vla_zenoh.runtime.process import die_with_parent
 
@@ -279,7 +279,7 @@ def _real_time(
         )
         try:
             with up_with_last_lines(host, last) as running:
-                run = TaskRun(running, plan, stop, camera)
+                run = TaskRunner(running, plan, stop, camera)
                 for ended in run.run():
                     score.ended.append(ended)
                     score.latency_ms = run.latency_ms()

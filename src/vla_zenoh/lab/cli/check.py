@@ -16,9 +16,9 @@ from vla_zenoh.cli.output import console, print_json, styled
 from vla_zenoh.cli.worker_choice import Chosen, chosen_worker
 from vla_zenoh.control.finding import Finding, error
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.lab.check.examine import DEFAULT_RUNS, Examination
-from vla_zenoh.lab.check.own_process import CheckBench
-from vla_zenoh.lab.check.report import Report
+from vla_zenoh.lab.check.examination import DEFAULT_RUNS, Examination
+from vla_zenoh.lab.check.model_runner import ModelRunner
+from vla_zenoh.lab.check.report import CheckReport
 from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.runtime.environments import run_in_own_environment
@@ -106,15 +106,15 @@ def _examine(
     runs: int,
     budget_s: float,
     patience_s: float,
-) -> Report:
+) -> CheckReport:
     try:
         policy = make_policy(chosen.model, chosen.options, profile=named)
     except WorkerError as fault:
-        return Report(chosen.name, findings=[error("cannot_be_made", str(fault))])
+        return CheckReport(chosen.name, findings=[error("cannot_be_made", str(fault))])
     return Examination(
         policy,
         chosen.name,
-        CheckBench(patience_s),
+        ModelRunner(patience_s),
         profile=profile,
         rate_hz=rate_hz,
         prompts=prompts,
@@ -123,11 +123,11 @@ def _examine(
     ).run()
 
 
-def _of(report: Report, level: str) -> list[Finding]:
+def _of(report: CheckReport, level: str) -> list[Finding]:
     return [finding for finding in report.findings if finding.level == level]
 
 
-def _print(report: Report) -> None:
+def _print(report: CheckReport) -> None:
     out = console()
     table = Table(show_header=False, title=f"worker {report.worker}", title_justify="left")
     for what, said in _lines(report):
@@ -146,7 +146,7 @@ def _print(report: Report) -> None:
         out.print(Text.assemble(("breaks its contract", "bold red"), said))
 
 
-def _lines(report: Report) -> list[tuple[str, str]]:
+def _lines(report: CheckReport) -> list[tuple[str, str]]:
     spec = report.spec
     if spec is None:
         return []

@@ -70,8 +70,8 @@ def demo(
         segments = all_motions() if prompt is None else [make_segment(prompt, steps)]
         run_demo(segments, rate, seconds, profile or DEFAULT_PROFILE, json_file, out)
         return
+    from vla_zenoh.lab.bench.task import FIRST_SEED
     from vla_zenoh.lab.cli.demo_tasks import run_task_demo
-    from vla_zenoh.lab.demo.tasks import FIRST_SEED
 
     run_task_demo(
         [prompt] if prompt else [],

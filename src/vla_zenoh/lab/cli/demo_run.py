@@ -11,10 +11,9 @@ from rich.table import Table
 
 from vla_zenoh.cli.output import console, styled
 from vla_zenoh.lab.cli.demo_stage import Stage, prepare, refusals
-from vla_zenoh.lab.demo.analysis import SegmentOutcome, latencies
 from vla_zenoh.lab.demo.plot import plot_run
-from vla_zenoh.lab.demo.runner import DemoResult, DemoRun
-from vla_zenoh.lab.demo.segments import DemoSegment
+from vla_zenoh.lab.demo.runner import DemoResult, DemoRunner
+from vla_zenoh.lab.demo.segments import DemoSegment, SegmentOutcome, latencies
 from vla_zenoh.lab.demo.tables import write_chunks, write_commands, write_poses
 from vla_zenoh.lab.recording.run import Run
 from vla_zenoh.lab.recording.stream_listener import StreamListener
@@ -66,7 +65,7 @@ def _run(
 
         listener = StreamListener(running.session, profile.keys, profile.task.worker, keep=KEPT)
         try:
-            run = DemoRun(running.client, listener, stop, watch, progress)
+            run = DemoRunner(running.client, listener, stop, watch, progress)
             result = run.run(segments, rate_hz, seconds)
         finally:
             listener.close()

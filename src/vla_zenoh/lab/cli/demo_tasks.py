@@ -11,13 +11,12 @@ from rich.table import Table
 from rich.text import Text
 
 from vla_zenoh.cli.output import console, styled
-from vla_zenoh.lab.bench.task import Ended
-from vla_zenoh.lab.bench.task_runner import TaskRun
+from vla_zenoh.lab.bench.task import DemoPlan, TaskOutcome, is_judged
+from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
 from vla_zenoh.lab.cli.demo_stage import Stage, prepare, refusals
-from vla_zenoh.lab.demo.analysis import latencies
-from vla_zenoh.lab.demo.runner import Interrupted
-from vla_zenoh.lab.demo.tasks import Tour, judged
+from vla_zenoh.lab.demo.segments import latencies
+from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.tasks import FAILURES, LIMIT_S
 from vla_zenoh.sanitize import one_line, printable
 
@@ -37,7 +36,7 @@ def run_task_demo(
     """See ``vla-zenoh demo``."""
     stage = prepare(profile, out)
     loaded, folder = stage.profile, stage.folder
-    plan = Tour(
+    plan = DemoPlan(
         loaded.task.worker,
         len(prompts) or ROUNDS,
         seed,
@@ -54,7 +53,7 @@ def run_task_demo(
         "model": plan.model,
         "rate_hz": rate,
         "seed": seed,
-        "tasks": [each.to_dict() | {"judged": judged(each.prompt)} for each in ended],
+        "tasks": [each.to_dict() | {"judged": is_judged(each.prompt)} for each in ended],
         "latency_ms": latencies(run.first_commands()),
         "refusals": refused,
     }
@@ -71,14 +70,14 @@ def run_task_demo(
         raise typer.Exit(1)
 
 
-def _run(stage: Stage, plan: Tour) -> tuple[list[Ended], dict[str, int]]:
-    ended: list[Ended] = []
+def _run(stage: Stage, plan: DemoPlan) -> tuple[list[TaskOutcome], dict[str, int]]:
+    ended: list[TaskOutcome] = []
     with stage.nodes("{task.description:<52}") as (running, bars):
         assert running.client is not None
         client = running.client
         bar = bars.add_task("waiting for the first task", total=plan.episodes)
         try:
-            for each in TaskRun(running, plan, stage.stop, stage.camera).run():
+            for each in TaskRunner(running, plan, stage.stop, stage.camera).run():
                 ended.append(each)
                 said = f"{one_line(each.prompt, 40)}: {_word(each)}"
                 bars.update(bar, completed=len(ended), description=said)
@@ -90,27 +89,27 @@ def _run(stage: Stage, plan: Tour) -> tuple[list[Ended], dict[str, int]]:
     return ended, counted
 
 
-def _well(ended: Ended) -> bool | None:
+def _well(ended: TaskOutcome) -> bool | None:
     """Whether it was done; None: nobody here knows what was asked, and the chain was well."""
-    if judged(ended.prompt):
+    if is_judged(ended.prompt):
         return ended.success
     return None if ended.success or ended.failure in FAILURES else False
 
 
-def _word(ended: Ended) -> str:
+def _word(ended: TaskOutcome) -> str:
     done = _well(ended)
     if done is None:
         return "not judged: a wording that only the policy may know"
     return f"done in {ended.time_s:.1f} s" if done else ended.failure
 
 
-def _show(ended: list[Ended], summary: dict[str, Any], folder: Path) -> None:
+def _show(ended: list[TaskOutcome], summary: dict[str, Any], folder: Path) -> None:
     table = Table(title="asked by prompt, judged by the true poses", title_justify="left")
     table.add_column("prompt")
     table.add_column("")
     for each in ended:
         colour = {True: "green", False: "red", None: "yellow"}[_well(each)]
-        known = judged(each.prompt) and each.failure in FAILURES
+        known = is_judged(each.prompt) and each.failure in FAILURES
         why = FAILURES[each.failure] if known else each.why
         said = Text.assemble(styled(_word(each), colour), printable(f": {why}") if why else "")
         table.add_row(each.prompt, said)

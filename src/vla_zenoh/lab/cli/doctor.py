@@ -24,8 +24,8 @@ from vla_zenoh.cli.output import console, errors, print_json, styled
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
 from vla_zenoh.lab.doctor.access import access
-from vla_zenoh.lab.doctor.rehearsal import AccessVerdict, read_access, rehearse, try_identity
-from vla_zenoh.lab.doctor.robot import robot
+from vla_zenoh.lab.doctor.access_check import AccessVerdict, check_access, read_access, try_identity
+from vla_zenoh.lab.doctor.software import robot
 from vla_zenoh.profile import Profile, SessionProfile
 
 COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
@@ -97,7 +97,7 @@ def doctor(
 
 def _rehearse(profile: Profile, rules: Path | None, also: Sequence[str]) -> list[AccessVerdict]:
     others = [effective_profile(name) for name in also]
-    return rehearse(profile, None if rules is None else read_access(rules), others)
+    return check_access(profile, None if rules is None else read_access(rules), others)
 
 
 def show(findings: list[HostFinding]) -> None:

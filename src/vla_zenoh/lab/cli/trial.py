@@ -24,9 +24,9 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import console, errors, fail, print_json, printable
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.judged import EpisodeVerdict
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.score import TrialScore, score
+from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 
 EPISODES, SECONDS = 20, 60.0
 
@@ -153,8 +153,8 @@ def _run(
     yes_setup: bool,
 ) -> list[EpisodeVerdict]:
     from vla_zenoh.lab.cli.trial_person import TrialPerson
-    from vla_zenoh.lab.demo.runner import Interrupted
-    from vla_zenoh.lab.trial.runner import TrialRun
+    from vla_zenoh.lab.episode import Interrupted
+    from vla_zenoh.lab.trial.runner import TrialRunner
     from vla_zenoh.runtime.process import stop_on_signals
 
     stop = stop_on_signals()
@@ -168,7 +168,7 @@ def _run(
     person = TrialPerson(plan, sys.stdin.fileno(), stop, lays=yes_setup)
     try:
         with aim.driver("trial", "--out", str(folder.path)) as client:
-            return TrialRun(client, plan, folder, person, stop).run()
+            return TrialRunner(client, plan, folder, person, stop).run()
     except Interrupted:
         done = score(plan, folder.episodes()).done
         errors().print(f"{done} of {plan.episodes} done; the same command goes on", markup=False)

@@ -19,10 +19,10 @@ from rich.text import Text
 
 from vla_zenoh.cli.output import errors, printable
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.demo.runner import Interrupted
+from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, Phase
-from vla_zenoh.lab.trial.judged import END_WORDS
 from vla_zenoh.lab.trial.plan import TrialPlan
+from vla_zenoh.lab.trial.verdict import END_WORDS
 
 WAIT_S = 0.1
 REFRESH_S = 0.2
@@ -100,14 +100,14 @@ class TrialPerson:
 
     # -- questions ----------------------------------------------------------------------------
     def ask(self, conduct: EpisodeFsm) -> str:
-        """See `vla_zenoh.lab.trial.person`."""
+        """See `vla_zenoh.lab.trial.runner`."""
         phase = conduct.phase
         if phase is Phase.LAY:
             self._say(self._setup(conduct), style="bold")
-            if self._lays and not conduct.needs_a_person:
+            if self._lays and not conduct.needs_confirmation:
                 return ""
             question = "lay it, then press Enter:"
-            if conduct.needs_a_person:
+            if conduct.needs_confirmation:
                 question = (
                     "the arm was taken away before: lay it, see that it may move, then Enter:"
                 )
@@ -140,7 +140,7 @@ class TrialPerson:
         return line
 
     def misunderstood(self, line: str, phase: Phase) -> None:
-        """See `vla_zenoh.lab.trial.person`.
+        """See `vla_zenoh.lab.trial.runner`.
 
         Raises:
             NodeError: it is a line of a script.
@@ -152,7 +152,7 @@ class TrialPerson:
 
     # -- while the arm moves ------------------------------------------------------------------
     def typed(self) -> str | None:
-        """See `vla_zenoh.lab.trial.person`.
+        """See `vla_zenoh.lab.trial.runner`.
 
         Raises:
             NodeError: a script has ended, so nobody would judge.
@@ -170,7 +170,7 @@ class TrialPerson:
         return None
 
     def watch(self, conduct: EpisodeFsm) -> None:
-        """See `vla_zenoh.lab.trial.person`."""
+        """See `vla_zenoh.lab.trial.runner`."""
         if not (self._terminal and self._screen.is_terminal):
             return
         if self._live is None:
@@ -187,7 +187,7 @@ class TrialPerson:
             )
 
     def ended(self, conduct: EpisodeFsm) -> None:
-        """See `vla_zenoh.lab.trial.person`."""
+        """See `vla_zenoh.lab.trial.runner`."""
         self._calm()
         assert conduct.end is not None
         why = self._plan.hide(conduct.why)
@@ -195,7 +195,7 @@ class TrialPerson:
         self._say(f"{said}; {conduct.time_s:.1f} s, {conduct.seen.chunks} chunks")
 
     def tell(self, text: str) -> None:
-        """See `vla_zenoh.lab.trial.person`."""
+        """See `vla_zenoh.lab.trial.runner`."""
         self._calm()
         self._say(text, style="yellow")
 

@@ -7,9 +7,9 @@ from bisect import bisect_right
 from vla_zenoh.errors import RecordError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
 from vla_zenoh.lab.recording.run import RecordedSample
-from vla_zenoh.lab.tasks.judge import SETTLED_S, Judge
-from vla_zenoh.lab.tasks.understand import understand
-from vla_zenoh.lab.trial.judged import verdict_in
+from vla_zenoh.lab.tasks.judge import SETTLED_S, TaskJudge
+from vla_zenoh.lab.tasks.wording import parse_prompt
+from vla_zenoh.lab.trial.verdict import verdict_in
 
 AFTER_NS = int(1.2 * SETTLED_S * 1e9)
 """A brick that was just let go is looked at for so long after the end."""
@@ -25,14 +25,14 @@ def succeeded(episode: RecordedEpisode) -> bool | None:
     if said is not None:
         return None if said == "void" else said == "success"
     prompts = {frame.prompt for frame in episode.frames}
-    order = understand(prompts.pop()) if len(prompts) == 1 else None
+    order = parse_prompt(prompts.pop()) if len(prompts) == 1 else None
     run = episode.run
     before = _newest(run.objects, episode.since_ns)
     pose = _newest(run.poses, episode.since_ns)
     if order is None or before is None or pose is None:
         return None
     try:
-        judge = Judge(order, before.record, pose.record.position_m)
+        judge = TaskJudge(order, before.record, pose.record.position_m)
     except RecordError:
         return None
     verdict = None

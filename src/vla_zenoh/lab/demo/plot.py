@@ -33,7 +33,7 @@ def plot_run(
         poses: measured, as heard.
         commands: as heard.
         marks: (wall ns, prompt).
-        first_commands: see `vla_zenoh.lab.demo.analysis.latencies`.
+        first_commands: see `vla_zenoh.lab.demo.segments.latencies`.
 
     Raises:
         MissingExtraError: matplotlib is not installed.

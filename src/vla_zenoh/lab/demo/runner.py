@@ -14,8 +14,8 @@ from vla_zenoh.bus.client import Client
 from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, rotation_from_quat
-from vla_zenoh.lab.demo.analysis import RestPose, SegmentOutcome, judge
-from vla_zenoh.lab.demo.segments import DemoSegment
+from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, SegmentOutcome, judge
+from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.recording.stream_listener import StreamListener
 from vla_zenoh.types import NodeStatus
 
@@ -27,10 +27,6 @@ SETTLE_S = 0.8
 """The commanded motion has ended; the arm itself and its integral action come to rest after it."""
 STAND_WINDOW_NS = 150_000_000
 SLACK_S = 15.0
-
-
-class Interrupted(Exception):
-    """Ctrl-C: brake and write what there is."""
 
 
 @dataclass(slots=True)
@@ -48,7 +44,7 @@ class DemoResult:
     interrupted: bool = False
 
 
-class DemoRun:
+class DemoRunner:
     """See the module.
 
     Args:
@@ -84,7 +80,7 @@ class DemoRun:
             self.wait_until_ready()
             self.activate(rate_hz)
             for index, segment in enumerate(segments):
-                result.outcomes.append(self.carry_out(index, segment, rate_hz, seconds))
+                result.outcomes.append(self.run_segment(index, segment, rate_hz, seconds))
         except Interrupted:
             result.interrupted = True
         result.statuses = {name: found[0] for name, found in self._client.snapshot().items()}
@@ -129,7 +125,7 @@ class DemoRun:
                     raise
                 self._pause(0.3)
 
-    def carry_out(
+    def run_segment(
         self, index: int, segment: DemoSegment, rate_hz: float, seconds: float | None = None
     ) -> SegmentOutcome:
         """Put a prompt, wait until it has been carried out and the arm stands, and judge.

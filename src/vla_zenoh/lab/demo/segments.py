@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from vla_zenoh.kinematics.so3 import Pose, log3
 from vla_zenoh.policy.scripted_motions import HardMotion, HardPrompt, parse_hard
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import Cause, FloatArray
 
 TOUR: tuple[tuple[str, int], ...] = (
     ("HARD: go up", 15),
@@ -98,3 +101,166 @@ def make_segment(prompt: str, steps: int) -> DemoSegment:
 def tour() -> list[DemoSegment]:
     """The default demo."""
     return [make_segment(prompt, steps) for prompt, steps in TOUR]
+
+
+TOLERANCE_M = 0.002
+TOLERANCE_RAD = 0.005
+DRIFT_MM = 1.0
+TOLERANCE_WIDTH_M = 0.002
+
+
+@dataclass(frozen=True, slots=True)
+class RestPose:
+    """Where the arm stood, at rest."""
+
+    pose: Pose
+    width_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentOutcome:
+    """What became of one segment. Drift is what the arm did that nobody asked for, at rest.
+
+    Args:
+        segment: what was asked.
+        reached_m: translation along the asked direction (its whole length where none was asked).
+        reached_rad: rotation about the asked axis (its whole angle where none was asked).
+        drift_mm: translation off the asked direction.
+        drift_rad: rotation off the asked axis.
+        asked_width_m: gripper width after the segment.
+        reached_width_m: likewise, measured.
+        steps_done: steps the command node carried out.
+        duration_s: from the prompt until the arm stood.
+    """
+
+    segment: DemoSegment
+    reached_m: float
+    reached_rad: float
+    drift_mm: float
+    drift_rad: float
+    asked_width_m: float
+    reached_width_m: float
+    steps_done: int
+    duration_s: float
+
+    @property
+    def asked_m(self) -> float:
+        return float(np.linalg.norm(self.segment.translation_m))
+
+    @property
+    def asked_rad(self) -> float:
+        return float(np.linalg.norm(self.segment.rotation_rad))
+
+    def faults(self) -> list[str]:
+        """In which way the arm did not do what was asked; empty when it did."""
+        checks = (
+            ("translation", abs(self.reached_m - self.asked_m) * 1e3, TOLERANCE_M * 1e3, "mm"),
+            ("rotation", abs(self.reached_rad - self.asked_rad), TOLERANCE_RAD, "rad"),
+            ("drift", self.drift_mm, DRIFT_MM, "mm"),
+            ("rotation drift", self.drift_rad, TOLERANCE_RAD, "rad"),
+            (
+                "gripper",
+                abs(self.reached_width_m - self.asked_width_m) * 1e3,
+                TOLERANCE_WIDTH_M * 1e3,
+                "mm",
+            ),
+        )
+        out = [
+            f"{name} off by {value:.4g} {unit} (allowed {limit:g})"
+            for name, value, limit, unit in checks
+            if not value <= limit
+        ]
+        if self.steps_done != self.segment.steps:
+            out.append(f"{self.steps_done} of {self.segment.steps} steps were carried out")
+        return out
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers for JSON."""
+        return {
+            "prompt": self.segment.prompt,
+            "steps": self.segment.steps,
+            "steps_done": self.steps_done,
+            "asked": {
+                "translation_m": self.asked_m,
+                "rotation_rad": self.asked_rad,
+                "gripper_width_m": self.asked_width_m,
+            },
+            "reached": {
+                "translation_m": self.reached_m,
+                "rotation_rad": self.reached_rad,
+                "gripper_width_m": self.reached_width_m,
+            },
+            "drift_mm": self.drift_mm,
+            "rotation_drift_rad": self.drift_rad,
+            "duration_s": self.duration_s,
+            "ok": not self.faults(),
+            "faults": self.faults(),
+        }
+
+
+def judge(
+    segment: DemoSegment,
+    before: RestPose,
+    after: RestPose,
+    *,
+    max_width_m: float,
+    steps_done: int,
+    duration_s: float,
+) -> SegmentOutcome:
+    """Compare where the arm stands now with where it should."""
+    moved = after.pose.position_m - before.pose.position_m
+    turned = log3(after.pose.rotation @ before.pose.rotation.T)
+    along_m, off_m = _split(moved, segment.translation_m)
+    about_rad, off_rad = _split(turned, segment.rotation_rad)
+    asked_m = float(np.linalg.norm(segment.translation_m))
+    asked_rad = float(np.linalg.norm(segment.rotation_rad))
+    return SegmentOutcome(
+        segment,
+        along_m if asked_m else 0.0,
+        about_rad if asked_rad else 0.0,
+        off_m * 1e3,
+        off_rad,
+        segment.width_after_m(before.width_m, max_width_m),
+        after.width_m,
+        steps_done,
+        duration_s,
+    )
+
+
+def _split(vector: FloatArray, asked: FloatArray) -> tuple[float, float]:
+    """Length of `vector` along `asked`, and of the rest; all is rest where nothing was asked."""
+    norm = float(np.linalg.norm(asked))
+    if norm == 0.0:
+        return 0.0, float(np.linalg.norm(vector))
+    along = float(vector @ asked) / norm
+    return along, float(np.linalg.norm(vector - along * asked / norm))
+
+
+def percentiles(values: Sequence[float]) -> dict[str, float]:
+    """p50, p95 and max; empty without values."""
+    if not values:
+        return {}
+    p50, p95, top = np.percentile(np.asarray(values), [50, 95, 100])
+    return {"p50": round(float(p50), 3), "p95": round(float(p95), 3), "max": round(float(top), 3)}
+
+
+def latencies(first_commands: Sequence[tuple[Cause, int]]) -> dict[str, Any]:
+    """Latency from the camera's stamp to the pose command that first carries a chunk out, in ms.
+
+    Args:
+        first_commands: for each chunk, its cause and that command's stamp (wall ns).
+    """
+    stages: dict[str, list[float]] = {
+        "camera_to_worker": [c.observed_ns - c.observation_stamp_ns for c, _ in first_commands],
+        "inference": [c.inference_end_ns - c.inference_start_ns for c, _ in first_commands],
+        "worker_to_command": [c.received_ns - c.inference_end_ns for c, _ in first_commands],
+        "command_to_pose": [stamp - c.received_ns for c, stamp in first_commands],
+    }
+    total = [stamp - c.observation_stamp_ns for c, stamp in first_commands]
+    return {
+        **percentiles([ns / 1e6 for ns in total]),
+        "chunks": len(total),
+        "stages": {
+            name: percentiles([ns / 1e6 for ns in values]) for name, values in stages.items()
+        },
+    }

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from vla_zenoh.lab.doctor.access import router
+from vla_zenoh.lab.doctor.computer import (
+    disk,
+    governor,
+    left_segments,
+    niceness,
+    processors,
+    real_time_priority,
+    shared_memory,
+    terminal,
+    video_devices,
+    wall_clock,
+)
 from vla_zenoh.lab.doctor.finding import HostFinding, Level
-from vla_zenoh.lab.doctor.libraries import libraries, msgpack_in_c, python_version
 from vla_zenoh.lab.doctor.needs import Needs, Role, needs_of
-from vla_zenoh.lab.doctor.opengl import opengl
-from vla_zenoh.lab.doctor.realtime import governor, niceness, processors, real_time_priority
-from vla_zenoh.lab.doctor.router import router
-from vla_zenoh.lab.doctor.storage import disk, left_segments, shared_memory
-from vla_zenoh.lab.doctor.terminal import terminal
-from vla_zenoh.lab.doctor.video import video_devices
-from vla_zenoh.lab.doctor.wallclock import wall_clock
+from vla_zenoh.lab.doctor.software import libraries, msgpack_in_c, opengl, python_version
 
 __all__ = ["HostFinding", "Level", "Needs", "Role", "examine", "needs_of"]
 

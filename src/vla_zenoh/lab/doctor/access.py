@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime as dt
+import re
+import socket
 from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
@@ -36,7 +38,7 @@ class Tried(Protocol):
 def access(
     profile: Profile,
     now: dt.datetime,
-    rehearse: Callable[[], Sequence[Tried]],
+    check_access: Callable[[], Sequence[Tried]],
     try_identity: Callable[[str], str],
 ) -> Iterator[HostFinding]:
     """The certificates of this computer, the rules of the profile, and what the router makes of it.
@@ -63,7 +65,7 @@ def access(
     for path, why in stale(profile, entries).items():
         yield HostFinding(f"certificate {path.name}", "warn", why)
     try:
-        yield from map(rules, rehearse())
+        yield from map(rules, check_access())
     except VlaZenohError as error:
         yield HostFinding("access", "fail", f"the rules could not be tried: {error}")
     for entry in entries:
@@ -124,4 +126,58 @@ def _without(profile: Profile) -> HostFinding:
         "warn",
         "everybody on the network can command this robot",
         "vla-zenoh secure init makes certificates and rules",
+    )
+
+
+CONNECT_LIMIT_S = 1.0
+
+_TCP = re.compile(r"(?:tcp|tls)/(?P<host>\[[^\]]+\]|[^:/?#]+):(?P<port>\d+)")
+
+
+def router(endpoint: str, *, is_router: bool, try_zenoh: Callable[[str], str]) -> HostFinding:
+    """A router answers at `endpoint`, or could be started there.
+
+    Args:
+        endpoint: as Zenoh writes it, ``tcp/127.0.0.1:7447``.
+        is_router: the router is to run on this host.
+        try_zenoh: opens a session there and closes it; returns the reason when it cannot.
+    """
+    name = f"router {endpoint}"
+    match = _TCP.match(endpoint)
+    if match is None:
+        error = try_zenoh(endpoint)
+        return _silent(name, error, is_router) if error else HostFinding(name, "ok", "answers")
+    host, port = match["host"].strip("[]"), int(match["port"])
+    try:
+        socket.create_connection((host, port), timeout=CONNECT_LIMIT_S).close()
+    except socket.gaierror:
+        return HostFinding(
+            name, "fail", f"no host is called {host!r}", "correct session.connect in the profile"
+        )
+    except OSError as error:
+        return _silent(name, error.strerror or "no answer", is_router)
+    if endpoint.startswith("tls/"):
+        return HostFinding(
+            name, "ok", "something listens; its certificate is looked at by the nodes"
+        )
+    error = try_zenoh(endpoint)
+    if not error:
+        return HostFinding(name, "ok", "answers")
+    return HostFinding(
+        name,
+        "fail",
+        f"the port is taken by something that does not speak Zenoh ({error})",
+        f"see what it is: sudo ss -ltnp 'sport = :{port}'; stop it, or take another port in "
+        "session.listen and session.connect of the profile",
+    )
+
+
+def _silent(name: str, reason: str, is_router: bool) -> HostFinding:
+    if is_router:
+        return HostFinding(name, "ok", f"none yet ({reason}); vla-zenoh up starts it")
+    return HostFinding(
+        name,
+        "warn",
+        f"no answer ({reason})",
+        "start vla-zenoh up on the router's host, and open the port in its firewall",
     )

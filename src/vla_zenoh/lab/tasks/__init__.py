@@ -1,7 +1,7 @@
 """Tasks for the scene ``bricks``: what is asked, in which words, and whether it was done. Pure.
 
 Reset the scene with a seed, draw a `TaskEpisode` for it from the objects' true poses, put its
-prompt, and let a `Judge` look on::
+prompt, and let a `TaskJudge` look on::
 
     episode = draw_episode(seed, objects)
     judge = Judge(episode.order, objects)
@@ -11,9 +11,9 @@ prompt, and let a `Judge` look on::
 """
 
 from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode, draw_stay
-from vla_zenoh.lab.tasks.judge import FAILURES, LIMIT_S, Judge, Verdict
+from vla_zenoh.lab.tasks.judge import FAILURES, LIMIT_S, TaskJudge, Verdict
 from vla_zenoh.lab.tasks.order import COLOURS, DIRECTIONS, FAMILIES, Order, brick
-from vla_zenoh.lab.tasks.words import HELD_OUT, NONSENSE, TRAINING, say
+from vla_zenoh.lab.tasks.wording import HELD_OUT, NONSENSE, TRAINING, phrase
 
 __all__ = [
     "COLOURS",
@@ -24,12 +24,12 @@ __all__ = [
     "LIMIT_S",
     "NONSENSE",
     "TRAINING",
-    "Judge",
     "Order",
     "TaskEpisode",
+    "TaskJudge",
     "Verdict",
     "brick",
     "draw_episode",
     "draw_stay",
-    "say",
+    "phrase",
 ]

@@ -20,7 +20,7 @@ from vla_zenoh.lab.tasks.order import (
     Order,
     brick,
 )
-from vla_zenoh.lab.tasks.words import say
+from vla_zenoh.lab.tasks.wording import phrase
 from vla_zenoh.types import FloatArray, ObjectPoses
 
 PUSH_BEHIND_M, PUSH_AHEAD_M = 0.06, 0.11
@@ -77,14 +77,14 @@ def draw_episode(
             f"layout {seed}; take another seed"
         )
     order = orders[int(random.integers(len(orders)))]
-    prompt = say(order, int(random.integers(1 << 30)), held_out=held_out)
+    prompt = phrase(order, int(random.integers(1 << 30)), held_out=held_out)
     return TaskEpisode(seed, order, prompt)
 
 
 def draw_stay(seed: int) -> TaskEpisode:
     """A prompt without sense: the arm has to stay."""
     order = Order(STAY)
-    return TaskEpisode(seed, order, say(order, seed))
+    return TaskEpisode(seed, order, phrase(order, seed))
 
 
 def _orders(family: str, objects: ObjectPoses) -> Iterator[Order]:

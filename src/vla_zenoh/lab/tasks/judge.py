@@ -69,7 +69,7 @@ class Verdict:
     time_s: float
 
 
-class Judge:
+class TaskJudge:
     """Looks on while an order is carried out.
 
     Args:

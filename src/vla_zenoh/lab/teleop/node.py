@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+import os
+import select
+import sys
+import termios
 import threading
 import time
+import tty
 from collections import deque
+from collections.abc import Callable
 
 import zenoh
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.lab.teleop.keyboard import GIVE, LEGEND, QUIT, STOP, SWITCH, Keyboard
-from vla_zenoh.lab.teleop.keystrokes import KeystrokeParser
-from vla_zenoh.lab.teleop.operator_input import OperatorInput, joined
-from vla_zenoh.lab.teleop.policy import TeleopPolicy
-from vla_zenoh.lab.teleop.sticks import Stick
-from vla_zenoh.lab.teleop.terminal import Terminal
+from vla_zenoh.errors import NodeError
+from vla_zenoh.lab.teleop.keyboard import (
+    ACTIVATE,
+    BEGIN,
+    END,
+    LEGEND,
+    QUIT,
+    STOP,
+    TAKE_OVER,
+    Keyboard,
+    KeystrokeParser,
+)
+from vla_zenoh.lab.teleop.policy import InputDevice, OperatorInput, TeleopPolicy, combined
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import Frame
 from vla_zenoh.profile import Profile
@@ -46,7 +59,7 @@ class Teleop:
         people: zenoh.Session | None,
         name: str = "teleop",
         *,
-        stick: Stick | None = None,
+        stick: InputDevice | None = None,
         frame: Frame = "base",
         level: int = 2,
     ) -> None:
@@ -88,13 +101,13 @@ class Teleop:
 
     def _hung_up(self) -> None:
         with self._lock:
-            self._keyboard.let_go()
+            self._keyboard.release_all()
         self._stop.set()
 
     def _wish(self) -> OperatorInput:
         with self._lock:
-            typed = self._keyboard.wish(time.monotonic())
-        return typed if self._stick is None else joined(typed, self._stick.wish())
+            typed = self._keyboard.read(time.monotonic())
+        return typed if self._stick is None else combined(typed, self._stick.read())
 
     def _carry_out(self, order: str) -> None:
         client = self._client
@@ -104,10 +117,10 @@ class Teleop:
             self._news.append("these keys need the certificate of an operator on this computer")
         elif order == STOP:
             client.put(client.keys.stop, "stop")
-        elif order == SWITCH:
+        elif order == ACTIVATE:
             active = client.task is not None and client.task.active
             client.put(client.keys.active, "false" if active else "true")
-        elif order == GIVE:
+        elif order == TAKE_OVER:
             obeyed = client.task.worker if client.task is not None else ""
             if obeyed != self._name:
                 self._others = obeyed or self._others
@@ -140,3 +153,73 @@ class Teleop:
             f"{state}, obeys {whose} | {100 * speed.translation_m_s:g} cm/s, "
             f"{speed.rotation_rad_s:.2g} rad/s | {moving or 'still'}"
         )[:118]
+
+
+LOOK_S = 0.2
+_DISABLED = b"\x00"
+
+
+class Terminal:
+    """Reads keys in a thread while the block lasts.
+
+    Args:
+        read: is given bytes as they come, on that thread.
+        gone: called once when there will be no more.
+
+    Raises:
+        NodeError: standard input is no terminal.
+    """
+
+    def __init__(self, read: Callable[[bytes], None], gone: Callable[[], None]) -> None:
+        if not (sys.stdin.isatty() and sys.stdout.isatty()):
+            raise NodeError(
+                "teleop needs a terminal: its keyboard says what the arm does; start it in one, "
+                "without pipes (over ssh: `ssh -t`)"
+            )
+        self._read, self._gone = read, gone
+        self._in, self._out = sys.stdin.fileno(), sys.stdout.fileno()
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._listen, name="keyboard", daemon=True)
+
+    def __enter__(self) -> Terminal:
+        self._before = termios.tcgetattr(self._in)
+        tty.setcbreak(self._in)  # Ctrl-C stays a signal
+        mode = termios.tcgetattr(self._in)
+        # Ctrl-Z would leave an arm with a worker that sleeps.
+        mode[6][termios.VSUSP] = _DISABLED
+        termios.tcsetattr(self._in, termios.TCSADRAIN, mode)
+        os.write(self._out, BEGIN)
+        self._thread.start()
+        return self
+
+    def _listen(self) -> None:
+        while not self._end.is_set():
+            ready, _, _ = select.select([self._in], [], [], LOOK_S)
+            if not ready:
+                continue
+            try:
+                data = os.read(self._in, 1024)
+            except OSError:
+                data = b""
+            if not data:
+                self._gone()
+                return
+            self._read(data)
+
+    def show(self, line: str) -> None:
+        """Replace the last line."""
+        os.write(self._out, f"\r\x1b[K{line}".encode())
+
+    def say(self, line: str) -> None:
+        """A line that stays, above it."""
+        os.write(self._out, f"\r\x1b[K{line}\r\n".encode())
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join(2 * LOOK_S)
+        # A terminal that is gone has nothing to be put back.
+        try:
+            os.write(self._out, END + b"\r\x1b[K")
+            termios.tcsetattr(self._in, termios.TCSAFLUSH, self._before)
+        except (OSError, termios.error):
+            pass

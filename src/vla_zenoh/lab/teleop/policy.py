@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from vla_zenoh.lab.teleop.operator_input import OperatorInput
 from vla_zenoh.policy import ActionSpec, ActionSteps, Frame, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, GripperState
@@ -61,7 +60,7 @@ class TeleopPolicy:
         self,
         profile: Profile,
         name: str,
-        wish: Callable[[], OperatorInput],
+        read: Callable[[], OperatorInput],
         level: Callable[[], int],
         *,
         frame: Frame = "base",
@@ -80,7 +79,7 @@ class TeleopPolicy:
         )
         self.speeds = speeds_of(profile)
         self.last = OperatorInput()
-        self._name, self._wish, self._level = name, wish, level
+        self._name, self._wish, self._level = name, read, level
         self._most_m = profile.robot.gripper.max_width_m
         self._wanted_m: float | None = None
 
@@ -90,32 +89,32 @@ class TeleopPolicy:
         Raises:
             PeerError: the device is gone.
         """
-        wish, before = self._wish(), self.last
-        self.last = wish
+        wanted, before = self._wish(), self.last
+        self.last = wanted
         gripper = observation.gripper
         assert gripper is not None
         obeyed = observation.task.active and observation.task.worker == self._name
         if not obeyed:  # what the gripper keys say now is meant for nobody
-            wish, self._wanted_m = wish._replace(opening=0.0), None
+            wanted, self._wanted_m = wanted._replace(opening=0.0), None
         width_m = _kept(gripper) if self._wanted_m is None else self._wanted_m
-        if obeyed and (wish.toggles - before.toggles) % 2:
+        if obeyed and (wanted.toggles - before.toggles) % 2:
             width_m = 0.0 if width_m > self._most_m / 2 else self._most_m
         period_s = 1 / observation.rate_hz
         count = min(math.ceil((period_s + COVER_S) / DT_S - 1e-9), HORIZON)
         speed = self.speeds[self._level()]
         motion = DT_S * np.concatenate(
             [
-                speed.translation_m_s * _unit(wish.twist[:3]),
-                speed.rotation_rad_s * _unit(wish.twist[3:]),
+                speed.translation_m_s * _unit(wanted.twist[:3]),
+                speed.rotation_rad_s * _unit(wanted.twist[3:]),
             ]
         )
         after_s = DT_S * np.arange(1, count + 1)
-        widths = np.clip(width_m + wish.opening * OPENING_M_S * after_s, 0.0, self._most_m)
+        widths = np.clip(width_m + wanted.opening * OPENING_M_S * after_s, 0.0, self._most_m)
         steps = np.column_stack([np.tile(motion, (count, 1)), widths])
         if obeyed:
-            moved_m = wish.opening * OPENING_M_S * min(period_s, count * DT_S)
+            moved_m = wanted.opening * OPENING_M_S * min(period_s, count * DT_S)
             self._wanted_m = float(np.clip(width_m + moved_m, 0.0, self._most_m))
-        raw = {"twist": list(wish.twist), "speed_m_s": speed.translation_m_s}
+        raw = {"twist": list(wanted.twist), "speed_m_s": speed.translation_m_s}
         return ActionSteps(steps, raw=raw)
 
 
@@ -127,3 +126,71 @@ def _unit(direction: Sequence[float]) -> FloatArray:
 
 def _kept(gripper: GripperState) -> float:
     return 0.0 if gripper.holding else max(gripper.width_m, 0.0)
+
+
+AXES = 6
+Twist = tuple[float, float, float, float, float, float]
+STILL: Twist = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+DEAD_ZONE = 0.08
+"""A stick that is let go rests this near to its middle."""
+
+
+class OperatorInput(NamedTuple):
+    """One look at the controls.
+
+    Args:
+        twist: x, y, z and the rotation about them, each a share of the chosen speed in [-1, 1].
+        opening: the gripper wider (1) or narrower (-1), likewise.
+        toggles: how often so far the gripper was told to open or close; only changes count.
+    """
+
+    twist: Twist = STILL
+    opening: float = 0.0
+    toggles: int = 0
+
+
+class InputDevice(Protocol):
+    """A device with sticks beside the keyboard.
+
+    Attributes:
+        name: as the device calls itself.
+    """
+
+    name: str
+
+    def read(self) -> OperatorInput:
+        """Current input.
+
+        Raises:
+            PeerError: the device is gone.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release the device."""
+        ...
+
+
+def combined(one: OperatorInput, other: OperatorInput) -> OperatorInput:
+    """Both at once, no axis beyond its end."""
+    twist = [_clipped(a + b) for a, b in zip(one.twist, other.twist, strict=True)]
+    opening = _clipped(one.opening + other.opening)
+    return OperatorInput(clipped_twist(twist), opening, one.toggles + other.toggles)
+
+
+def clipped_twist(values: Sequence[float]) -> Twist:
+    """Six numbers in [-1, 1]; what is more is cut off."""
+    x, y, z, a, b, c = (_clipped(value) for value in values)
+    return x, y, z, a, b, c
+
+
+def without_dead_zone(value: float) -> float:
+    """A stick's position without its dead zone: steady from 0 at the zone's edge to +-1."""
+    size = (abs(value) - DEAD_ZONE) / (1 - DEAD_ZONE)
+    if not size > 0:  # NaN too
+        return 0.0
+    return min(size, 1.0) * (1.0 if value > 0 else -1.0)
+
+
+def _clipped(value: float) -> float:
+    return min(max(value, -1.0), 1.0)

@@ -7,23 +7,13 @@ REP 103 has it.
 from __future__ import annotations
 
 import os
-from typing import Any, Protocol
+from typing import Any
 
 from vla_zenoh.errors import MissingExtraError, NodeError, PeerError
-from vla_zenoh.lab.teleop.operator_input import Hand, OperatorInput, as_twist, of_stick
+from vla_zenoh.lab.teleop.policy import OperatorInput, clipped_twist, without_dead_zone
 
 MAX_READS = 64
 """A SpaceMouse says more often how it stands than it is asked: only the newest counts."""
-
-
-class Stick(Hand, Protocol):
-    """A device."""
-
-    name: str
-
-    def close(self) -> None:
-        """Give it back."""
-        ...
 
 
 class Gamepad:
@@ -59,8 +49,8 @@ class Gamepad:
         self.name = str(self._pad.name)
         self._toggles, self._was_down = 0, False
 
-    def wish(self) -> OperatorInput:
-        """See `Hand`."""
+    def read(self) -> OperatorInput:
+        """See `InputDevice`."""
         pygame, pad = self._pygame, self._pad
         pygame.event.pump()
         pygame.event.clear()
@@ -68,7 +58,7 @@ class Gamepad:
             raise PeerError("device_lost", f"gamepad {self.name!r} is gone; plug it in, start anew")
 
         def axis(number: int) -> float:
-            return of_stick(pad.get_axis(number) / 32767)
+            return without_dead_zone(pad.get_axis(number) / 32767)
 
         def button(number: int) -> float:
             return float(pad.get_button(number))
@@ -87,10 +77,10 @@ class Gamepad:
         )
         wider = axis(pygame.CONTROLLER_AXIS_TRIGGERLEFT)
         narrower = axis(pygame.CONTROLLER_AXIS_TRIGGERRIGHT)
-        return OperatorInput(as_twist(twist), wider - narrower, self._toggles)
+        return OperatorInput(clipped_twist(twist), wider - narrower, self._toggles)
 
     def close(self) -> None:
-        """See `Stick`."""
+        """See `InputDevice`."""
         self._pygame.quit()
 
 
@@ -118,8 +108,8 @@ class SpaceMouse:
         self.name = str(self._mouse.name)
         self._toggles, self._was_down = 0, False
 
-    def wish(self) -> OperatorInput:
-        """See `Hand`."""
+    def read(self) -> OperatorInput:
+        """See `InputDevice`."""
         try:
             state = self._mouse.read()
             for _ in range(MAX_READS):
@@ -133,10 +123,12 @@ class SpaceMouse:
         self._toggles += down and not self._was_down
         self._was_down = down
         axes = (state.x, state.y, state.z, state.roll, state.pitch, state.yaw)
-        return OperatorInput(as_twist([of_stick(axis) for axis in axes]), 0.0, self._toggles)
+        return OperatorInput(
+            clipped_twist([without_dead_zone(axis) for axis in axes]), 0.0, self._toggles
+        )
 
     def close(self) -> None:
-        """See `Stick`."""
+        """See `InputDevice`."""
         self._mouse.close()
 
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from vla_zenoh.lab.trial.judged import End, EpisodeVerdict, Verdict, read_verdict
-from vla_zenoh.lab.trial.plan import Due
+from vla_zenoh.lab.trial.plan import DueEpisode
+from vla_zenoh.lab.trial.verdict import End, EpisodeVerdict, Verdict, read_verdict
 
 DONE_S = 0.5
 """A policy that says it is done while the arm stands for so long means it."""
@@ -37,7 +37,7 @@ class Phase(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class TrialView:
+class EpisodeView:
     """What is seen of the robot while it runs.
 
     Args:
@@ -72,12 +72,12 @@ class EpisodeFsm:
         after: what ended the one before, in the same run.
     """
 
-    def __init__(self, due: Due, seconds: float, after: End | None = None) -> None:
+    def __init__(self, due: DueEpisode, seconds: float, after: End | None = None) -> None:
         self.due, self.seconds, self.after = due, seconds, after
         self.phase = Phase.LAY
         self.reasons = ""
         """Why the arm was not given the last time."""
-        self.seen = TrialView()
+        self.seen = EpisodeView()
         self.time_s = 0.0
         self.began_ns = 0
         self.start_m: tuple[float, float, float] | None = None
@@ -94,7 +94,7 @@ class EpisodeFsm:
         return self._end
 
     @property
-    def needs_a_person(self) -> bool:
+    def needs_confirmation(self) -> bool:
         """Something else than this trial took the arm away before: whoever it was may have his
         hands at it, so that somebody has to say that it may move, whatever was said beforehand."""
         return self.after in TAKEN_AWAY
@@ -140,7 +140,7 @@ class EpisodeFsm:
         self._began_s, self.began_ns, self.start_m = now_s, began_ns, start_m
         self.phase = Phase.RUN
 
-    def look(self, look: TrialView, now_s: float) -> None:
+    def look(self, look: EpisodeView, now_s: float) -> None:
         """The robot was looked at while it runs, by the clock of `given`."""
         self.seen, self.time_s = look, now_s - self._began_s
         if not look.done:
@@ -158,7 +158,7 @@ class EpisodeFsm:
         elif self.time_s >= self.seconds:
             self._ends("time")
 
-    def braked(self, look: TrialView) -> None:
+    def braked(self, look: EpisodeView) -> None:
         """It is over, and the arm stands or does not say so; `look` was made afterwards."""
         self.seen = look
         if self._end == "lost":  # what was heard last says why

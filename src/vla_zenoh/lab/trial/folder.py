@@ -20,8 +20,8 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.trial.judged import EpisodeVerdict
 from vla_zenoh.lab.trial.plan import TrialPlan
+from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 
 PLAN, TRIALS = "plan.json", "trials.jsonl"
 _RECORDING = re.compile(r"episode-(\d+)\.mcap")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from vla_zenoh.errors import RecordError
-from vla_zenoh.lab.trial.judged import EpisodeVerdict
+from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 
 MAX_SETUPS = 10_000
 HIDDEN = "[worker]"
@@ -18,7 +18,7 @@ HIDDEN = "[worker]"
 
 
 @dataclass(frozen=True, slots=True)
-class Due:
+class DueEpisode:
     """The next episode.
 
     Args:
@@ -84,13 +84,13 @@ class TrialPlan:
         random.Random(f"{self.seed} {setup}").shuffle(workers)
         return tuple(workers)
 
-    def next_due(self, done: Iterable[EpisodeVerdict]) -> Due | None:
+    def next_due(self, done: Iterable[EpisodeVerdict]) -> DueEpisode | None:
         """What comes after `done`; None: nothing. Void episodes do not count as done."""
         judged = {(each.setup, each.worker) for each in done if each.verdict != "void"}
         for setup in range(1, len(self.setups) + 1):
             for turn, worker in enumerate(self.order(setup), 1):
                 if (setup, worker) not in judged:
-                    return Due(setup, turn, worker)
+                    return DueEpisode(setup, turn, worker)
         return None
 
     def other_than(self, asked: Mapping[str, Any]) -> list[str]:

@@ -11,6 +11,7 @@ import time
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import zenoh
@@ -21,13 +22,12 @@ from vla_zenoh.bus.payload_limits import bytes_of
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.lab.demo.runner import Interrupted
+from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.recording.recorder import Recorder
-from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, Phase, TrialView
+from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, EpisodeView, Phase
 from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.judged import FACT, End, EpisodeVerdict
-from vla_zenoh.lab.trial.person import Operator
-from vla_zenoh.lab.trial.plan import Due, TrialPlan
+from vla_zenoh.lab.trial.plan import DueEpisode, TrialPlan
+from vla_zenoh.lab.trial.verdict import FACT, End, EpisodeVerdict
 from vla_zenoh.types import PoseState, Task
 
 COMMAND = "command"
@@ -45,7 +45,7 @@ FURTHER_M = 0.01
 DOES_NOT_STAND = "the command node does not say that the arm stands; look at `vla-zenoh status`"
 
 
-class TrialRun:
+class TrialRunner:
     """See the module.
 
     Args:
@@ -100,7 +100,7 @@ class TrialRun:
         return self._done
 
     # -- one episode --------------------------------------------------------------------------
-    def _episode(self, due: Due) -> None:
+    def _episode(self, due: DueEpisode) -> None:
         conduct, self._ended = EpisodeFsm(due, self._plan.seconds, self._ended), None
         try:
             while conduct.phase is not Phase.OVER:
@@ -194,7 +194,7 @@ class TrialRun:
         else:
             self._stop.wait(LOOK_S)
 
-    def _look(self) -> TrialView:
+    def _look(self) -> EpisodeView:
         given = self._task
         assert given is not None
         for node, _, event in self._client.take_events():
@@ -206,11 +206,11 @@ class TrialRun:
                 self._deactivated = event.level == "info"
         task, status = self._client.task, self._client.status(COMMAND)
         if task is None or status is None:
-            return TrialView(False, state="", why="no command node is heard")
+            return EpisodeView(False, state="", why="no command node is heard")
         ours = task.episode == given.episode
         detail = status.detail
         mine = detail.get("episode") == given.episode
-        return TrialView(
+        return EpisodeView(
             active=task.active,
             ours=ours,
             state=status.state,
@@ -310,3 +310,35 @@ def _changed(given: Task, now: Task) -> str:
     if (now.worker, now.prompt) != (given.worker, given.prompt):
         return f"the worker is {now.worker!r} now, the prompt {now.prompt!r}"
     return "another episode began: somebody activated, or the command node was started anew"
+
+
+class Operator(Protocol):
+    """Who lays setups and judges."""
+
+    def ask(self, conduct: EpisodeFsm) -> str:
+        """A line for phase LAY, REPAIR or JUDGE; waits for it.
+
+        Raises:
+            Interrupted: Ctrl-C.
+        """
+        ...
+
+    def typed(self) -> str | None:
+        """A line that was typed while the arm moves; None: none was."""
+        ...
+
+    def misunderstood(self, line: str, phase: Phase) -> None:
+        """It means nothing in this phase."""
+        ...
+
+    def watch(self, conduct: EpisodeFsm) -> None:
+        """The arm moves; called often."""
+        ...
+
+    def ended(self, conduct: EpisodeFsm) -> None:
+        """The episode is over, and the arm was braked."""
+        ...
+
+    def tell(self, text: str) -> None:
+        """Something else that has to be known."""
+        ...

@@ -8,8 +8,8 @@ from statistics import median
 
 from vla_zenoh.lab.bench.statistics import wilson_95
 from vla_zenoh.lab.evaluation.paired import Paired, paired
-from vla_zenoh.lab.trial.judged import INTERVENTIONS, EpisodeVerdict
 from vla_zenoh.lab.trial.plan import TrialPlan
+from vla_zenoh.lab.trial.verdict import INTERVENTIONS, EpisodeVerdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,30 +61,30 @@ class TrialScore:
 
 def score(plan: TrialPlan, episodes: Sequence[EpisodeVerdict]) -> TrialScore:
     """All that was judged so far."""
-    judged = [each for each in episodes if each.verdict != "void"]
+    is_judged = [each for each in episodes if each.verdict != "void"]
     workers = tuple(_of(worker, episodes) for worker in plan.workers)
-    both = _both(plan, judged) if len(plan.workers) == 2 else None
-    return TrialScore(workers, both, len(judged), plan.episodes)
+    both = _both(plan, is_judged) if len(plan.workers) == 2 else None
+    return TrialScore(workers, both, len(is_judged), plan.episodes)
 
 
 def _of(worker: str, episodes: Sequence[EpisodeVerdict]) -> WorkerScore:
     own = [each for each in episodes if each.worker == worker]
-    judged = [each for each in own if each.verdict != "void"]
-    times_s = [each.time_s for each in judged if each.verdict == "success"]
+    is_judged = [each for each in own if each.verdict != "void"]
+    times_s = [each.time_s for each in is_judged if each.verdict == "success"]
     return WorkerScore(
         worker,
         len(times_s),
-        len(judged),
-        wilson_95(len(times_s), len(judged)),
+        len(is_judged),
+        wilson_95(len(times_s), len(is_judged)),
         median(times_s) if times_s else None,
-        sum(each.brakes for each in judged),
-        sum(each.end in INTERVENTIONS for each in judged),
-        len(own) - len(judged),
+        sum(each.brakes for each in is_judged),
+        sum(each.end in INTERVENTIONS for each in is_judged),
+        len(own) - len(is_judged),
     )
 
 
-def _both(plan: TrialPlan, judged: Sequence[EpisodeVerdict]) -> Paired:
-    succeeded = {(each.setup, each.worker): each.verdict == "success" for each in judged}
+def _both(plan: TrialPlan, is_judged: Sequence[EpisodeVerdict]) -> Paired:
+    succeeded = {(each.setup, each.worker): each.verdict == "success" for each in is_judged}
     one, other = plan.workers
     return paired(
         (succeeded[setup, one], succeeded[setup, other])

@@ -10,11 +10,18 @@ from vla_zenoh.control import chunk_plausibility as plausible
 from vla_zenoh.control import spec_fit as fit
 from vla_zenoh.control.finding import distinct, error, note
 from vla_zenoh.errors import SpecError
-from vla_zenoh.lab.check import batch, judge
-from vla_zenoh.lab.check.examples import MAX_WIDTH_M, PROMPTS, ImageStyle, Maker, looks, noise
+from vla_zenoh.lab.check import judge
+from vla_zenoh.lab.check.examples import (
+    MAX_WIDTH_M,
+    PROMPTS,
+    ExampleMaker,
+    ImageStyle,
+    example_styles,
+    noise,
+)
 from vla_zenoh.lab.check.judge import Steps
-from vla_zenoh.lab.check.model_bench import Bench, Failed, Hung
-from vla_zenoh.lab.check.report import Report
+from vla_zenoh.lab.check.model_runner import Bench, ModelFailed, ModelHung
+from vla_zenoh.lab.check.report import CheckReport
 from vla_zenoh.policy import Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
 from vla_zenoh.profile import Limits, Profile, Timing
@@ -56,15 +63,15 @@ class Examination:
         self._timing = profile.timing if profile else Timing()
         self._width_m = profile.robot.gripper.max_width_m if profile else MAX_WIDTH_M
         named = prompts or getattr(policy, "example_prompts", None)
-        self._looks = looks(tuple(named) if named else PROMPTS)
+        self._looks = example_styles(tuple(named) if named else PROMPTS)
         self._runs, self._budget_s = runs, budget_s
         self._loaded_s = 0.0
-        self._maker, self._continuation = Maker(policy.spec, profile), ChunkPrefix(policy)
+        self._maker, self._continuation = ExampleMaker(policy.spec, profile), ChunkPrefix(policy)
         self._answers: list[tuple[ImageStyle, Steps]] = []
         self._took_ms: list[float] = []
-        self.report = Report(worker, policy.spec)
+        self.report = CheckReport(worker, policy.spec)
 
-    def run(self) -> Report:
+    def run(self) -> CheckReport:
         """Examine; never raises for what the model does."""
         report = self.report
         try:
@@ -72,9 +79,9 @@ class Examination:
             close = getattr(self._policy, "close", None)
             if callable(close):
                 self._bench.call(close)
-        except Failed as failed:
+        except ModelFailed as failed:
             report.findings.append(error("close_failed", str(failed)))
-        except Hung as hung:
+        except ModelHung as hung:
             report.findings.append(error("hangs", str(hung)))
         report.findings = distinct(report.findings)
         return report
@@ -112,7 +119,7 @@ class Examination:
         if callable(load):
             try:
                 _, report.load_s = self._bench.call(load)
-            except Failed as failed:
+            except ModelFailed as failed:
                 report.findings.append(error("load_failed", str(failed)))
                 return False
         self._loaded_s = self._bench.spent_s()
@@ -182,7 +189,7 @@ class Examination:
 
     def _together(self) -> None:
         """Whether two observations that are asked about at once are answered as each alone."""
-        if not batch.can(self._policy) or not self.report.deterministic:
+        if not judge.takes_batches(self._policy) or not self.report.deterministic:
             return
         chart = self._looks[0]
         pair = (chart, ImageStyle(chart.name, picture=noise, prompt=self._another_prompt()))
@@ -192,11 +199,11 @@ class Examination:
         self._reset()
         seen = [self._maker.make(look, again=True) for look in pair]
         try:
-            found, _ = self._bench.call(lambda: batch.ask(self._policy, seen))
-        except Failed as failed:
+            found, _ = self._bench.call(lambda: judge.ask_batch(self._policy, seen))
+        except ModelFailed as failed:
             self.report.findings.append(error("batch", f"infer_batch: {failed}"))
             return
-        self.report.findings += batch.findings(self._policy.spec.action, found, alone)
+        self.report.findings += judge.batch_findings(self._policy.spec.action, found, alone)
 
     def _another_prompt(self) -> str:
         prompts = [look.prompt for look in self._looks if not look.strange]
@@ -229,7 +236,7 @@ class Examination:
             return
         try:
             self._bench.call(reset)
-        except Failed as failed:
+        except ModelFailed as failed:
             self.report.findings.append(error("reset_failed", str(failed)))
 
     def _infer(self, look: ImageStyle, *, again: bool = False) -> Steps | None:
@@ -242,7 +249,7 @@ class Examination:
             return None
         try:
             answer, took_s = self._bench.call(lambda: self._continuation.infer(observation))
-        except Failed as failed:
+        except ModelFailed as failed:
             refused = look.strange and isinstance(failed.error, SpecError)
             if not refused:
                 findings.append(error("inference_failed", f"{look.name}: {failed}"))

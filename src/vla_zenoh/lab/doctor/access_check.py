@@ -11,7 +11,8 @@ import datetime as dt
 import json
 import socket
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import product
@@ -23,8 +24,6 @@ import zenoh
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import Keys, covers
-from vla_zenoh.lab.doctor import rehearsal_acts
-from vla_zenoh.lab.doctor.rehearsal_acts import WITNESS
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import SecurityProfile
 from vla_zenoh.security.identity import Identity, Role, identities
@@ -55,7 +54,7 @@ class AccessVerdict:
     faults: tuple[str, ...]
 
 
-def rehearse(
+def check_access(
     profile: Profile,
     access: Mapping[str, Any] | None = None,
     also: Sequence[Profile] = (),
@@ -82,13 +81,13 @@ def rehearse(
         went: Tried = frozenset().union(
             # First: a session that has had a publisher knows where nobody listens to it, and sends
             # nothing there, whatever the router would let through.
-            rehearsal_acts.deletions(witness, sessions, cast[Act.DELETE]),
-            rehearsal_acts.puts(witness, sessions, cast[Act.PUT]),
-            rehearsal_acts.subscriptions(witness, sessions, cast[Act.SUBSCRIBE]),
-            rehearsal_acts.questions(witness, sessions, cast[Act.ASK]),
-            rehearsal_acts.answers(witness, sessions, cast[Act.ANSWER]),
-            rehearsal_acts.tokens(witness, sessions, cast[Act.ANNOUNCE], keys),
-            rehearsal_acts.watching(witness, sessions, keys),
+            deletions(witness, sessions, cast[Act.DELETE]),
+            puts(witness, sessions, cast[Act.PUT]),
+            subscriptions(witness, sessions, cast[Act.SUBSCRIBE]),
+            questions(witness, sessions, cast[Act.ASK]),
+            answers(witness, sessions, cast[Act.ANSWER]),
+            tokens(witness, sessions, cast[Act.ANNOUNCE], keys),
+            watching(witness, sessions, keys),
         )
     return [_judge(played, cast, rules, went) for played in parts.values()]
 
@@ -117,7 +116,7 @@ def probes(profiles: Sequence[Profile]) -> dict[Act, list[str]]:
                 for key in expressions(profile.keys, row.member, identity, act):
                     made.setdefault(key.replace("*", somewhere), set()).update(acts)
     cast = {act: sorted(key for key, acts in made.items() if act in acts) for act in Act}
-    watched = [one for profile in profiles for one in rehearsal_acts.tokens_of(profile.keys)]
+    watched = [one for profile in profiles for one in tokens_of(profile.keys)]
     return {**cast, Act.DELETE: cast[Act.PUT], Act.WATCH: watched}
 
 
@@ -234,7 +233,7 @@ def try_identity(profile: Profile, node: str | None) -> str:
         SecurityError: the certificate is not there.
     """
     with open_session(profile.session, identity=node) as session:
-        if rehearsal_acts.alive(session, profile.keys):
+        if alive(session, profile.keys):
             return ""
     return (
         "the router takes the certificate and gives it nothing: it does not know this name. "
@@ -253,3 +252,194 @@ def read_access(file: Path) -> dict[str, Any]:
     except (zenoh.ZError, OSError) as error:
         raise SecurityError(f"{file} is no configuration of Zenoh: {error}") from error
     return dict(json.loads(text) or {})
+
+
+SETTLE_S = 0.4
+"""From a declaration until everybody who is concerned knows of it, on one computer."""
+ANSWER_S = 2.0
+WITNESS = Identity(Role.ROUTER, "witness", "rehearsal")
+"""Hears and says everything, as routers do."""
+
+
+def _listen(session: zenoh.Session, keys: Sequence[str], take: Callable[[Any], None]) -> list[Any]:
+    handler = zenoh.handlers.Callback(take, indirect=False)
+    return [session.declare_subscriber(key, handler) for key in keys]
+
+
+def _end(declared: Sequence[Any]) -> None:
+    for one in declared:
+        one.undeclare()
+
+
+def puts(
+    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
+) -> set[tuple[str, Act, str]]:
+    """What of each session's puts arrived at the witness, as (common name, act, key)."""
+    heard: set[tuple[str, Act, str]] = set()
+    listening = _listen(
+        witness,
+        keys,
+        lambda sample: heard.add((sample.payload.to_string(), Act.PUT, str(sample.key_expr))),
+    )
+    # As nodes write: a publisher that is never told of a listener sends nothing.
+    writing = [
+        (name, session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK))
+        for name, session in sessions.items()
+        for key in keys
+    ]
+    time.sleep(SETTLE_S)
+    for name, publisher in writing:
+        publisher.put(name)
+    time.sleep(SETTLE_S)
+    matching = {
+        (name, Act.PUT, str(publisher.key_expr))
+        for name, publisher in writing
+        if publisher.matching_status.matching  # pyright: ignore  # stub says bool
+    }
+    _end([*listening, *(publisher for _, publisher in writing)])
+    return heard & matching
+
+
+def deletions(
+    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
+) -> set[tuple[str, Act, str]]:
+    """Which of each session's deletions arrived at the witness. Nobody needs to be told of him."""
+    heard: set[tuple[str, Act, str]] = set()
+
+    def hear(sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.DELETE and sample.attachment is not None:
+            heard.add((sample.attachment.to_string(), Act.DELETE, str(sample.key_expr)))
+
+    listening = _listen(witness, keys, hear)
+    time.sleep(SETTLE_S)
+    for name, session in sessions.items():
+        for key in keys:
+            session.delete(key, attachment=name, congestion_control=zenoh.CongestionControl.BLOCK)
+    time.sleep(SETTLE_S)
+    _end(listening)
+    return set(heard)
+
+
+def subscriptions(
+    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
+) -> set[tuple[str, Act, str]]:
+    """Which keys each session hears the witness on."""
+    heard: set[tuple[str, Act, str]] = set()
+
+    def hear(name: str) -> Callable[[zenoh.Sample], None]:
+        return lambda sample: heard.add((name, Act.SUBSCRIBE, str(sample.key_expr)))
+
+    listening = [
+        one for name, session in sessions.items() for one in _listen(session, keys, hear(name))
+    ]
+    time.sleep(SETTLE_S)
+    for key in keys:
+        witness.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
+    time.sleep(SETTLE_S)
+    _end(listening)
+    return set(heard)
+
+
+def _serve(session: zenoh.Session, keys: Sequence[str], name: str) -> list[Any]:
+    def reply(key: str) -> Callable[[zenoh.Query], None]:
+        def handle(query: zenoh.Query) -> None:
+            with query:
+                query.reply(key, name)
+
+        return handle
+
+    return [
+        session.declare_queryable(
+            key, zenoh.handlers.Callback(reply(key), indirect=False), complete=True
+        )
+        for key in keys
+    ]
+
+
+def questions(
+    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
+) -> set[tuple[str, Act, str]]:
+    """Which keys each session is answered on by the witness."""
+    serving = _serve(witness, keys, "witness")
+    time.sleep(SETTLE_S)
+    found = {
+        (name, Act.ASK, key)
+        for name, session in sessions.items()
+        for key in keys
+        if any(reply.ok is not None for reply in session.get(key, timeout=ANSWER_S))
+    }
+    _end(serving)
+    return found
+
+
+def answers(
+    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
+) -> set[tuple[str, Act, str]]:
+    """Which keys each session answers the witness on."""
+    serving = [one for name, session in sessions.items() for one in _serve(session, keys, name)]
+    time.sleep(SETTLE_S)
+    found: set[tuple[str, Act, str]] = set()
+    for key in keys:
+        replies = witness.get(
+            key,
+            timeout=ANSWER_S,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+        heard = [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
+        found |= {(name, Act.ANSWER, key) for name in heard}
+    _end(serving)
+    return found
+
+
+def tokens(
+    witness: zenoh.Session,
+    sessions: Mapping[str, zenoh.Session],
+    keys: Sequence[str],
+    robots: Sequence[Keys],
+) -> set[tuple[str, Act, str]]:
+    """Which liveliness tokens of each session the witness sees."""
+    found: set[tuple[str, Act, str]] = set()
+    for name, session in sessions.items():
+        tokens = [session.liveliness().declare_token(key) for key in keys]
+        time.sleep(SETTLE_S)
+        found |= {(name, Act.ANNOUNCE, key) for of in robots for key in alive(witness, of)}
+        _end(tokens)
+        time.sleep(SETTLE_S)
+    return found
+
+
+def watching(
+    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], robots: Sequence[Keys]
+) -> set[tuple[str, Act, str]]:
+    """Whether each session sees the witness's liveliness tokens."""
+    own = {
+        expression: expression.replace("*", WITNESS.node)
+        for of in robots
+        for expression in tokens_of(of)
+    }
+    tokens = [witness.liveliness().declare_token(key) for key in own.values()]
+    time.sleep(SETTLE_S)
+    found = {
+        (name, Act.WATCH, expression)
+        for name, session in sessions.items()
+        for expression, key in own.items()
+        if key in _tokens(session, expression)
+    }
+    _end(tokens)
+    return found
+
+
+def tokens_of(keys: Keys) -> tuple[str, ...]:
+    """Every selector of liveliness tokens of a robot."""
+    return keys.all_alive, keys.all_holding
+
+
+def alive(session: zenoh.Session, keys: Keys) -> set[str]:
+    """Keys of all liveliness tokens of a robot that this session sees."""
+    return {key for expression in tokens_of(keys) for key in _tokens(session, expression)}
+
+
+def _tokens(session: zenoh.Session, expression: str) -> set[str]:
+    replies = session.liveliness().get(expression, timeout=ANSWER_S)
+    return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}

@@ -6,12 +6,14 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import metadata
 
-from vla_zenoh.errors import how_to_install
+from vla_zenoh.errors import MissingExtraError, NodeError, VlaZenohError, how_to_install
 from vla_zenoh.lab.doctor.finding import HostFinding
 from vla_zenoh.lab.doctor.needs import Role
+from vla_zenoh.profile import Profile
+from vla_zenoh.simulation.backend import RAYCAST, VARIABLE, Backend, choose_backend
 
 OLDEST_PYTHON = (3, 11)
 LIMIT_S = 60
@@ -146,3 +148,59 @@ def msgpack_in_c() -> HostFinding:
         "the slow implementation in Python",
         "unset MSGPACK_PUREPYTHON, or: pip install --force-reinstall --only-binary :all: msgpack",
     )
+
+
+NAME = "pictures"
+
+
+def opengl(wanted: str | None = None) -> HostFinding:
+    """What the simulator will draw with.
+
+    Args:
+        wanted: ``auto`` or the way to draw that is asked for; None: as the environment says.
+    """
+    try:
+        return judge(choose_backend(wanted))
+    except NodeError as error:
+        advice = f"do what it says, or let the simulator choose: unset {VARIABLE}"
+        return HostFinding(NAME, "fail", str(error), advice)
+
+
+def judge(backend: Backend) -> HostFinding:
+    """What was chosen, in words."""
+    if backend.name != RAYCAST:
+        return HostFinding(NAME, "ok", f"drawn by OpenGL through {backend.name}")
+    if not backend.reason:
+        return HostFinding(NAME, "ok", "ray cast, as asked for")
+    return HostFinding(
+        NAME,
+        "warn",
+        f"ray cast, which is slower: no OpenGL without a screen ({backend.reason})",
+        f"sudo apt install {backend.install} (with an NVIDIA card also its driver's libnvidia-gl; "
+        "in a container with one: NVIDIA_DRIVER_CAPABILITIES=all)",
+    )
+
+
+def robot(profile: Profile, host: str | None = None) -> Iterator[HostFinding]:
+    """The robot's description, its meshes, and whether it has what the profile names.
+
+    Args:
+        profile: the lab.
+        host: which of its hosts this computer is; None: all of them. Nothing is said of one that
+            does not run the command node.
+    """
+    hosts = [profile.hosts[host]] if host is not None else list(profile.hosts.values())
+    if not any("command" in part.nodes for part in hosts):
+        return
+    try:
+        from vla_zenoh.control.profile_arm import make_shadow
+
+        make_shadow(profile)
+    except (MissingExtraError, ImportError):
+        return  # told with the libraries
+    except (VlaZenohError, ValueError) as error:  # the latter Pinocchio's, of what is no URDF
+        advice = "vla-zenoh profile check"
+        yield HostFinding("robot", "fail", f"{profile.robot.description}: {error}", advice)
+        return
+    joints = len(profile.robot.arm_joints)
+    yield HostFinding("robot", "ok", f"{joints} joints, with collision shapes")

@@ -8,14 +8,12 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, TypeVar
-
-from vla_zenoh.lab.check.model_bench import Failed, Hung
+from typing import Any, Protocol, TypeVar
 
 Result = TypeVar("Result")
 
 
-class CheckBench:
+class ModelRunner:
     """One thread for the model, as a worker has; a call that does not come back is given up.
 
     Args:
@@ -42,14 +40,14 @@ class CheckBench:
             del what, answer
 
     def call(self, what: Callable[[], Result]) -> tuple[Result, float]:
-        """See `vla_zenoh.lab.check.model_bench.Bench`."""
+        """See `vla_zenoh.lab.check.model_runner.Bench`."""
         answer: Future[tuple[Result, float]] = Future()
         self._calls.put((what, answer))
         if not self._wait(answer):
-            raise Hung(f"nothing came back in {self._patience_s:g} s")
+            raise ModelHung(f"nothing came back in {self._patience_s:g} s")
         error = answer.exception()
         if error is not None:
-            raise Failed(error) from error
+            raise ModelFailed(error) from error
         return answer.result()
 
     def _wait(self, answer: Future[Any]) -> bool:
@@ -67,3 +65,39 @@ class CheckBench:
     def spent_s(self) -> float:
         """Seconds since this was made."""
         return time.monotonic() - self._began_s
+
+
+Result = TypeVar("Result")
+
+
+class ModelFailed(Exception):
+    """The model raised."""
+
+    def __init__(self, error: BaseException) -> None:
+        super().__init__(f"{type(error).__name__}: {error}")
+        self.error = error
+
+
+class ModelHung(Exception):
+    """The model did not come back in time; nothing more can be asked of it."""
+
+
+class Bench(Protocol):
+    """Where the model runs: who has the clock, the patience, and knows the memory."""
+
+    def call(self, what: Callable[[], Result]) -> tuple[Result, float]:
+        """What `what` returns, and the seconds it took.
+
+        Raises:
+            Failed: it raised.
+            Hung: it did not come back.
+        """
+        ...
+
+    def memory_kib(self) -> float:
+        """Resident memory of the process."""
+        ...
+
+    def spent_s(self) -> float:
+        """Seconds since the examination began."""
+        ...

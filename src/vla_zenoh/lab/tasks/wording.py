@@ -6,9 +6,11 @@ way to say the direction.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 
-from vla_zenoh.lab.tasks.order import PUSH, PUT, STACK, STAY, Order
+from vla_zenoh.lab.tasks.order import COLOURS, PUSH, PUT, STACK, STAY, Order
 
 TRAINING: Mapping[str, tuple[str, ...]] = {
     PUT: (
@@ -99,7 +101,7 @@ HELD_OUT: Mapping[str, tuple[str, ...]] = {
         "push the {x} one {d}",
     ),
 }
-WAYS: Mapping[str, tuple[str, ...]] = {
+DIRECTION_PHRASES: Mapping[str, tuple[str, ...]] = {
     "left": ("to the left", "left", "leftwards", "to your left"),
     "right": ("to the right", "right", "rightwards", "to your right"),
     "away": ("away", "away from you", "forward", "further away"),
@@ -124,7 +126,7 @@ NONSENSE = (
 """Nothing of this is a task: whoever reads it has to stay where it is."""
 
 
-def say(order: Order, choice: int, *, held_out: bool = False) -> str:
+def phrase(order: Order, choice: int, *, held_out: bool = False) -> str:
     """One way to say `order`.
 
     Args:
@@ -136,5 +138,41 @@ def say(order: Order, choice: int, *, held_out: bool = False) -> str:
         return NONSENSE[choice % len(NONSENSE)]
     wordings: Sequence[str] = (HELD_OUT if held_out else TRAINING)[order.family]
     which, rest = choice % len(wordings), choice // len(wordings)
-    ways = WAYS.get(order.direction, ("",))
+    ways = DIRECTION_PHRASES.get(order.direction, ("",))
     return wordings[which].format(x=order.target, y=order.onto, d=ways[rest % len(ways)])
+
+
+def parse_prompt(prompt: str) -> Order | None:
+    """The order that `prompt` is a wording of; None: of none that is known here.
+
+    Case, punctuation and spaces do not matter.
+    """
+    return _orders().get(_plain(prompt))
+
+
+def is_nonsense(prompt: str) -> bool:
+    """It is one of those that ask for nothing."""
+    return _plain(prompt) in {_plain(text) for text in NONSENSE}
+
+
+@cache
+def _orders() -> dict[str, Order]:
+    out: dict[str, Order] = {}
+    for wordings in (TRAINING, HELD_OUT):
+        for x in COLOURS:
+            for wording in wordings[PUT]:
+                out[_plain(wording.format(x=x))] = Order(PUT, x)
+            for wording in wordings[STACK]:
+                for y in COLOURS:
+                    if y != x:
+                        out[_plain(wording.format(x=x, y=y))] = Order(STACK, x, onto=y)
+            for wording in wordings[PUSH]:
+                for direction, ways in DIRECTION_PHRASES.items():
+                    for way in ways:
+                        text = _plain(wording.format(x=x, d=way))
+                        out[text] = Order(PUSH, x, direction=direction)
+    return out
+
+
+def _plain(text: str) -> str:
+    return " ".join(re.findall(r"[a-z]+", text.lower()))

@@ -1,0 +1,257 @@
+"""Whether nodes can keep time on this host: priority, processors, clock frequency."""
+
+from __future__ import annotations
+
+import codecs
+import ctypes
+import ctypes.util
+import fcntl
+import os
+import resource
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from vla_zenoh.lab.doctor.finding import HostFinding
+
+PRIORITY = 50
+NICENESS = -10
+FEWEST_PROCESSORS = 2
+
+LIMITS_FILE = "/etc/security/limits.d/90-vla-zenoh.conf"
+CPU = Path("/sys/devices/system/cpu")
+
+
+def real_time_priority() -> HostFinding:
+    """This user may run threads at a real-time priority: found out by doing it, and undone."""
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except OSError:
+        allowed = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+        return HostFinding(
+            "real-time priority",
+            "warn",
+            f"not permitted (RLIMIT_RTPRIO is {allowed}); pose commands may come late under load",
+            f"add the line '{_user()} - rtprio {PRIORITY}' to {LIMITS_FILE} and log in again; "
+            "in a container: --cap-add=SYS_NICE",
+        )
+    os.sched_setscheduler(0, policy, parameters)
+    return HostFinding("real-time priority", "ok", f"SCHED_FIFO {PRIORITY} is permitted")
+
+
+def niceness() -> HostFinding:
+    """This user may put nodes before other programs: found out by doing it, and undone."""
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+    except OSError:
+        return HostFinding(
+            "niceness",
+            "warn",
+            f"{NICENESS} is not permitted; other programs may hold up nodes that move an arm",
+            f"add the line '{_user()} - nice {NICENESS}' to {LIMITS_FILE} and log in again; "
+            "in a container: --cap-add=SYS_NICE",
+        )
+    os.setpriority(os.PRIO_PROCESS, 0, before)
+    return HostFinding("niceness", "ok", f"{NICENESS} is permitted")
+
+
+def processors() -> HostFinding:
+    """There is a processor for the controller besides the one for everything else."""
+    usable = len(os.sched_getaffinity(0))
+    found = f"{usable} usable of {os.cpu_count()}"
+    if usable < FEWEST_PROCESSORS:
+        return HostFinding(
+            "processors",
+            "warn",
+            found,
+            "give this host two or more; in a container: --cpus=2 or more",
+        )
+    return HostFinding("processors", "ok", found)
+
+
+def governor(cpu: Path = CPU) -> HostFinding:
+    """The processors do not fall asleep between two ticks of a controller."""
+    kinds = sorted({_text(path) for path in cpu.glob("cpu*/cpufreq/scaling_governor")})
+    if not kinds:
+        return HostFinding(
+            "frequency governor", "ok", "none; the clock frequency is fixed or hidden"
+        )
+    if kinds == ["performance"]:
+        return HostFinding("frequency governor", "ok", "performance")
+    return HostFinding(
+        "frequency governor",
+        "warn",
+        ", ".join(kinds),
+        "sudo cpupower frequency-set --governor performance (Debian: linux-cpupower, "
+        "Ubuntu: linux-tools-generic)",
+    )
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return "unreadable"
+
+
+def _user() -> str:
+    return os.environ.get("USER") or str(os.getuid())
+
+
+MIB = 1024 * 1024
+SHARED_MEMORY_WANTED_MIB = 256
+"""Each Zenoh session that sends pictures takes a pool of 16 MiB; a lab has up to ten of them."""
+DISK_WANTED_MIB = 2048
+DISK_NEEDED_MIB = 200
+
+SHARED_MEMORY = Path("/dev/shm")
+
+
+def shared_memory(
+    folder: Path = SHARED_MEMORY, wanted_mib: int = SHARED_MEMORY_WANTED_MIB
+) -> HostFinding:
+    """Pictures find room in shared memory; else they go through sockets, five times slower."""
+    advice = (
+        f"sudo mount -o remount,size={wanted_mib}M {folder}; "
+        f"in a container: --shm-size={wanted_mib}m"
+    )
+    if not os.access(folder, os.W_OK):
+        return HostFinding("shared memory", "warn", f"{folder} cannot be written", advice)
+    free_mib = shutil.disk_usage(folder).free // MIB
+    found = f"{free_mib} MiB free in {folder}"
+    if free_mib < wanted_mib:
+        return HostFinding("shared memory", "warn", found, advice)
+    return HostFinding("shared memory", "ok", found)
+
+
+def left_segments(folder: Path = SHARED_MEMORY) -> HostFinding:
+    """No killed process of this user has left its Zenoh shared memory behind."""
+    segments = sorted(folder.glob("*.zenoh"))
+    left = [path for path in segments if _is_left(path)]
+    if not left:
+        in_use = f"{len(segments)} segments in use" if segments else "no segments at all"
+        return HostFinding("left shared memory", "ok", f"none; {in_use}")
+    size_mib = sum(_size(path) for path in left) // MIB
+    return HostFinding(
+        "left shared memory",
+        "warn",
+        f"{len(left)} Zenoh segments, {size_mib} MiB, left by processes that were killed",
+        "the next Zenoh session on this host removes them; by hand: rm "
+        + " ".join(str(path) for path in left),
+    )
+
+
+def disk(folder: Path | None = None, wanted_mib: int = DISK_WANTED_MIB) -> HostFinding:
+    """Recordings and pictures of runs find room."""
+    folder = folder or Path.cwd()
+    free_mib = shutil.disk_usage(folder).free // MIB
+    found = f"{free_mib / 1024:.1f} GiB free in {folder}"
+    if free_mib >= wanted_mib:
+        return HostFinding("disk", "ok", found)
+    level = "fail" if free_mib < min(DISK_NEEDED_MIB, wanted_mib) else "warn"
+    return HostFinding("disk", level, found, "free some, or work in a folder on another disk")
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def _is_left(segment: Path) -> bool:
+    """Whether no process holds `segment`: each that uses it keeps a shared lock on it."""
+    try:
+        with segment.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:  # in use, gone meanwhile, or another user's
+        return False
+    return True
+
+
+DEV = Path("/dev")
+
+
+def video_devices(needed: Sequence[str] = (), dev: Path = DEV) -> HostFinding:
+    """Devices the profile names exist, and all there are may be opened.
+
+    Args:
+        needed: paths of devices, or their numbers.
+        dev: folder of the devices.
+    """
+    present = sorted(dev.glob("video[0-9]*"))
+    wanted = [dev / f"video{name}" if name.isdecimal() else Path(name) for name in needed]
+    missing = [str(path) for path in wanted if not path.exists()]
+    if missing:
+        there = ", ".join(map(str, present)) or "none"
+        return HostFinding(
+            "video devices",
+            "fail",
+            f"{', '.join(missing)} not there; devices: {there}",
+            "plug the camera in, or correct its source in the profile; in a container: "
+            f"--device={missing[0]}",
+        )
+    closed = [str(path) for path in {*present, *wanted} if not os.access(path, os.R_OK | os.W_OK)]
+    if closed:
+        return HostFinding(
+            "video devices",
+            "fail" if wanted else "warn",
+            f"no permission: {', '.join(sorted(closed))}",
+            "sudo usermod --append --groups video $USER, then log in again",
+        )
+    return HostFinding("video devices", "ok", ", ".join(map(str, present)) or "none")
+
+
+TIMEX_BYTES = 256
+"""More than struct timex has on any architecture."""
+TIME_ERROR = 5
+
+_ADVICE = "sudo apt install chrony (needed when nodes run on more than one host)"
+
+
+def wall_clock() -> HostFinding:
+    """The kernel says the wall clock is synchronised."""
+    state = kernel_state()
+    if state is None:
+        return HostFinding("wall clock", "warn", "cannot be told here", _ADVICE)
+    return judge(state)
+
+
+def judge(state: int) -> HostFinding:
+    """What adjtimex returned, in words."""
+    if state == TIME_ERROR:
+        return HostFinding("wall clock", "warn", "not synchronised", _ADVICE)
+    return HostFinding("wall clock", "ok", "synchronised")
+
+
+def kernel_state() -> int | None:
+    """What adjtimex says of the clock, None where it cannot be asked."""
+    try:
+        libc = ctypes.CDLL(ctypes.util.find_library("c") or "libc.so.6", use_errno=True)
+        state = int(libc.adjtimex(ctypes.create_string_buffer(TIMEX_BYTES)))
+    except (OSError, AttributeError):
+        return None
+    return state if state >= 0 else None
+
+
+NARROWEST_COLUMNS = 80
+
+
+def terminal(
+    environ: Mapping[str, str] | None = None,
+    encoding: str | None = None,
+    columns: int | None = None,
+) -> HostFinding:
+    """The terminal shows UTF-8 and is wide enough; arguments stand in for what is really there."""
+    environ = os.environ if environ is None else environ
+    encoding = encoding or str(sys.stdout.encoding or "ascii")
+    columns = columns or shutil.get_terminal_size().columns
+    found = f"{environ.get('TERM') or 'no TERM'}, {encoding}, {columns} columns"
+    if codecs.lookup(encoding).name != "utf-8":
+        return HostFinding("terminal", "warn", found, "export LANG=C.UTF-8")
+    if columns < NARROWEST_COLUMNS:
+        return HostFinding("terminal", "warn", found, f"make it {NARROWEST_COLUMNS} columns wide")
+    return HostFinding("terminal", "ok", found)
