@@ -24,7 +24,7 @@ from rerun.experimental import ViewerClient
 
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.view.paths import TIMELINE
-from vla_zenoh.lab.view.show import APPLICATION, Show
+from vla_zenoh.lab.view.rerun_logger import APPLICATION, RerunLogger
 from vla_zenoh.lab.view.viewer import open_headless
 from vla_zenoh.profile import read_profile
 
@@ -43,10 +43,10 @@ def picture_view(run: Path, at_s: float | None, out: Path) -> None:
     try:
         stream = rr.RecordingStream(APPLICATION)
         stream.connect_grpc(viewer.data_url)
-        show = Show(read_profile(file.profile_yaml, str(run)), stream, keys=file.keys)
+        show = RerunLogger(read_profile(file.profile_yaml, str(run)), stream, keys=file.keys)
         began_ns = ended_ns = 0
         for entry in file.entries(lambda key: not key.endswith("/raw")):
-            began_ns, ended_ns = began_ns or entry.heard_ns, entry.heard_ns
+            began_ns, ended_ns = began_ns or entry.received_ns, entry.received_ns
             show.take(entry)
         stream.disconnect()
         offset_ns = (ended_ns - began_ns) // 2 if at_s is None else int(at_s * 1e9)

@@ -13,7 +13,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, Sample
-from vla_zenoh.lab.recording.writer import RunWriter
+from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.types import (
     ActionChunk,
@@ -119,8 +119,8 @@ def write_run(
         header = Header(at_ns, number, "camera#1")
         key = KEYS.camera_jpeg("front")
         samples.append(Sample(key, picture(number), JPEG, header, at_ns + MS))
-    out = RunWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
-    for sample in sorted(samples, key=lambda each: each.heard_ns):
+    out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
+    for sample in sorted(samples, key=lambda each: each.received_ns):
         out.write(sample)
     out.finish({"dropped": {}, **(ended or {})})
     return path

@@ -36,9 +36,9 @@ from vla_zenoh.interop.ros2.definitions import parse
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.evaluation.csv_file import evaluate_csv
-from vla_zenoh.lab.evaluation.run_file import evaluate_run
+from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.recording import cdr
-from vla_zenoh.lab.recording.kinds import RECORDS
+from vla_zenoh.lab.recording.record_types import RECORDS
 from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.nodes.worker.inference_debug import InferenceView
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
@@ -250,14 +250,14 @@ def _bag_seed(kind: type) -> list[bytes]:
 def _recording() -> list[bytes]:
     from vla_zenoh.keys import Keys
     from vla_zenoh.lab.recording.sample import MSGPACK, TEXT, Sample
-    from vla_zenoh.lab.recording.writer import RunWriter
+    from vla_zenoh.lab.recording.writer import RecordingWriter
     from vla_zenoh.types import Header, PoseState
 
     keys, at_ns = Keys("panda"), 10**18
     payload = records.encode(examples()[PoseState])
 
     def write(path: Path) -> bytes:
-        out = RunWriter(path, keys, profile_yaml="a: 1\n", base_frame="base", began_ns=at_ns)
+        out = RecordingWriter(path, keys, profile_yaml="a: 1\n", base_frame="base", began_ns=at_ns)
         for number in range(2):
             head = Header(at_ns + number, number, "sim#1")
             out.write(Sample(keys.state_pose, payload, MSGPACK, head, at_ns + number))

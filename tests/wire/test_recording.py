@@ -26,7 +26,7 @@ from vla_zenoh.bus.node import Stream
 from vla_zenoh.codec import records
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Keys, Kind
-from vla_zenoh.lab.evaluation.run_file import evaluate_run
+from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.recording.replay import CAMERAS, Replay
@@ -76,8 +76,8 @@ def test_every_sample_is_there_once_and_in_order(run_file: Path) -> None:
     last_ns = 0
     seqs: dict[tuple[str, str], int] = {}
     for entry in open_recording(run_file).entries():
-        assert entry.heard_ns >= last_ns
-        last_ns = entry.heard_ns
+        assert entry.received_ns >= last_ns
+        last_ns = entry.received_ns
         if entry.header is not None and "state" in entry.key:
             source = (entry.key, entry.header.source)
             assert entry.header.seq == seqs.get(source, entry.header.seq - 1) + 1

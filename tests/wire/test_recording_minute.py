@@ -13,7 +13,7 @@ from camera_rig import free_endpoint
 from chain import command_line, running_chain
 from recording_rig import assert_same, ghost_of, recording
 
-from vla_zenoh.lab.evaluation.run_file import evaluate_run
+from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.recording.run import load_run, pictures
 
 LAB = """\

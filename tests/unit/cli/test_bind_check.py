@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from vla_zenoh.cli.bind_check import refuse_beyond_here
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.lab.recording.writer import RunWriter
+from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.profile import Profile, load_profile, override, to_yaml
 
 SERVE = ("serve", "openpi", "--worker", "no_such_model", "--port", "8123")
@@ -64,7 +64,7 @@ def test_nor_those_of_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("vla_zenoh.lab.cli.view.stop_on_signals", Event)
     path, profile = tmp_path / "run.mcap", load_profile("panda_sim")
     text = to_yaml(profile)
-    RunWriter(path, profile.keys, profile_yaml=text, base_frame="base", began_ns=1).finish()
+    RecordingWriter(path, profile.keys, profile_yaml=text, base_frame="base", began_ns=1).finish()
     assert "look through the cameras" in said("view", str(path), *VIEW[1:], "--bind", "0.0.0.0")
 
 

@@ -12,7 +12,7 @@ from chain import command_line
 from vla_zenoh.codec import records
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.sample import MSGPACK, Sample
-from vla_zenoh.lab.recording.writer import RunWriter
+from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.policy import ActionSpec, ModelSpec
 from vla_zenoh.types import ActionChunk, GripperState, Header, PoseState
 
@@ -29,7 +29,7 @@ def spec(name: str) -> ModelSpec:
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
     """Workers ``a`` and ``b``; b goes further along x by `BIAS_M` in two steps."""
-    out = RunWriter(
+    out = RecordingWriter(
         tmp_path / "run.mcap", KEYS, profile_yaml="about: t\n", base_frame="b", began_ns=START_NS
     )
 

@@ -16,10 +16,10 @@ from dataset_rig import write_run as make_run
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import episodes_of, fps_of, hold
+from vla_zenoh.lab.dataset.feature_statistics import Colours, of_numbers
 from vla_zenoh.lab.dataset.features import action_names
 from vla_zenoh.lab.dataset.lerobot import export
 from vla_zenoh.lab.dataset.openvla import openvla_statistics
-from vla_zenoh.lab.dataset.statistics import Colours, of_numbers
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.policy.state_vector import read_parts
 from vla_zenoh.types import JointState

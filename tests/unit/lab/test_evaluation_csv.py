@@ -24,9 +24,9 @@ from typer.testing import CliRunner
 
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import RecordingError
+from vla_zenoh.lab.evaluation.combined import overall
 from vla_zenoh.lab.evaluation.csv_file import COLUMNS, evaluate_csv
 from vla_zenoh.lab.evaluation.files import evaluate
-from vla_zenoh.lab.evaluation.overall import overall
 from vla_zenoh.lab.evaluation.result import Evaluation
 
 TOLERANCE = 1e-12  # of lengths that are sums of a few floats

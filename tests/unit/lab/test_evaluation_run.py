@@ -12,11 +12,11 @@ import pytest
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.evaluation.run_file import evaluate_run
+from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.restamp import Restamper
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, TEXT, Sample
-from vla_zenoh.lab.recording.writer import RunWriter
+from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.types import (
     ActionChunk,
@@ -97,8 +97,8 @@ def commands() -> Iterable[Sample]:
 
 
 def _heard(sample: Sample, later_ms: int) -> tuple[Any, ...]:
-    heard_ns = sample.stamp_ns + later_ms * 1_000_000
-    return sample.key, sample.payload, sample.encoding, sample.header, heard_ns, None
+    received_ns = sample.stamp_ns + later_ms * 1_000_000
+    return sample.key, sample.payload, sample.encoding, sample.header, received_ns, None
 
 
 def states() -> Iterable[Sample]:
@@ -132,9 +132,9 @@ def others() -> Iterable[Sample]:
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("run") / "lab" / "run.mcap"
-    out = RunWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
+    out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
     samples = [*chunks(), *commands(), *states(), *others()]
-    for sample in sorted(samples, key=lambda each: each.heard_ns):
+    for sample in sorted(samples, key=lambda each: each.received_ns):
         out.write(sample)
     out.finish({"dropped": {}})
     return path
@@ -217,7 +217,7 @@ def test_a_run_that_moves_to_another_time_and_robot_keeps_its_latencies(recordin
     for entry in open_recording(recording).entries():
         moved = restamper.move(entry)
         assert moved.key == entry.key.replace("vla/panda", "lab/ghost")
-        assert moved.heard_ns == entry.heard_ns + later_ns
+        assert moved.received_ns == entry.received_ns + later_ns
         if entry.header is None:
             assert moved.payload == entry.data
             continue
@@ -239,5 +239,5 @@ def test_at_twice_the_speed_everything_takes_half_the_time(recording: Path) -> N
     restamper = Restamper(ZERO_NS, ZERO_NS, 2.0, KEYS, KEYS, "abc")
     entries = list(open_recording(recording).entries())
     moved = [restamper.move(entry) for entry in entries]
-    assert moved[-1].heard_ns - ZERO_NS == (entries[-1].heard_ns - ZERO_NS) // 2
+    assert moved[-1].received_ns - ZERO_NS == (entries[-1].received_ns - ZERO_NS) // 2
     assert restamper.moved_ns(0) == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from vla_zenoh.keys import Keys, covers
-from vla_zenoh.lab.recording.recorder import to_record
+from vla_zenoh.lab.recording.recorder import recorded_keys
 
 KEYS = Keys("panda")
 RAW = KEYS.camera_raw("front")
@@ -29,17 +29,17 @@ def heard(expressions: tuple[str, ...], key: str) -> int:
 def test_without_keys_everything_is_recorded_once_and_raw_pictures_by_their_switch(
     raw: bool,
 ) -> None:
-    expressions = to_record(KEYS, raw=raw)
+    expressions = recorded_keys(KEYS, raw=raw)
     assert [heard(expressions, key) for key in OTHERS] == [1] * len(OTHERS)
     assert heard(expressions, RAW) == int(raw)
 
 
 def test_keys_are_in_place_of_everything_and_raw_pictures_come_to_them() -> None:
     given = ("state/*", KEYS.prompt)
-    assert to_record(KEYS, given) == ("vla/panda/state/*", "vla/panda/prompt")
-    assert to_record(KEYS, given, raw=True)[-1] == "vla/panda/camera/*/raw"
+    assert recorded_keys(KEYS, given) == ("vla/panda/state/*", "vla/panda/prompt")
+    assert recorded_keys(KEYS, given, raw=True)[-1] == "vla/panda/camera/*/raw"
 
 
 def test_what_two_expressions_mean_is_recorded_once() -> None:
-    expressions = to_record(KEYS, ("**", "state/*", "state/pose", "state/*"), raw=True)
+    expressions = recorded_keys(KEYS, ("**", "state/*", "state/pose", "state/*"), raw=True)
     assert heard(expressions, KEYS.state_pose) == heard(expressions, RAW) == 1

@@ -27,7 +27,7 @@ from vla_zenoh.errors import RecordingError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, TEXT, Sample, heard
-from vla_zenoh.lab.recording.writer import RunWriter, topic_of
+from vla_zenoh.lab.recording.writer import RecordingWriter, topic_of
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import (
     ActionChunk,
@@ -72,8 +72,10 @@ EXAMPLES = settings(
 )
 
 
-def writer(path: Path) -> RunWriter:
-    return RunWriter(path, KEYS, profile_yaml="about: test\n", base_frame="base", began_ns=START_NS)
+def writer(path: Path) -> RecordingWriter:
+    return RecordingWriter(
+        path, KEYS, profile_yaml="about: test\n", base_frame="base", began_ns=START_NS
+    )
 
 
 def sample(key: str, payload: bytes, encoding: str, index: int = 0) -> Sample:
@@ -319,7 +321,7 @@ def test_kill_9_leaves_a_file_that_any_tool_opens(tmp_path: Path) -> None:
     assert open_recording(path).damage == ""
 
 
-def write_many(out: RunWriter) -> None:
+def write_many(out: RecordingWriter) -> None:
     for index in range(1000):
         out.write(picture(index))
 

@@ -18,9 +18,9 @@ from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, TEXT, Sample
-from vla_zenoh.lab.recording.writer import RunWriter
-from vla_zenoh.lab.view.shapes import RobotShapes, primitive_corners
-from vla_zenoh.lab.view.show import DRAW_NS, Show
+from vla_zenoh.lab.recording.writer import RecordingWriter
+from vla_zenoh.lab.view.rerun_logger import DRAW_NS, RerunLogger
+from vla_zenoh.lab.view.robot_model import RobotModel, primitive_corners
 from vla_zenoh.policy import ActionSpec, ModelSpec
 from vla_zenoh.profile import (
     Profile,
@@ -152,13 +152,13 @@ def run() -> Iterable[Sample]:
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
     """The run, written as a recording, read from it, and shown."""
     folder = tmp_path_factory.mktemp("view")
-    writer = RunWriter(
+    writer = RecordingWriter(
         folder / "run.mcap", KEYS, profile_yaml="about: x\n", base_frame="base", began_ns=ZERO_NS
     )
     for sample in run():
         writer.write(sample)
     writer.finish({"dropped": {}})
-    show = Show(PROFILE, stream := stream_to(folder / "run.rrd"))
+    show = RerunLogger(PROFILE, stream := stream_to(folder / "run.rrd"))
     for entry in open_recording(folder / "run.mcap").entries():
         show.take(entry)
     assert show.refused == {}
@@ -172,9 +172,9 @@ def stream_to(path: Path) -> rr.RecordingStream:
     return stream
 
 
-def heard(tmp_path: Path, *samples: Sample, profile: Profile = BARE) -> tuple[Show, Shown]:
+def heard(tmp_path: Path, *samples: Sample, profile: Profile = BARE) -> tuple[RerunLogger, Shown]:
     """Samples off the wire, shown."""
-    show = Show(profile, stream := stream_to(tmp_path / "a.rrd"), live=True)
+    show = RerunLogger(profile, stream := stream_to(tmp_path / "a.rrd"), live=True)
     for sample in samples:
         show.hear(sample)
     stream.disconnect()
@@ -202,7 +202,7 @@ def test_the_hand_stands_where_kinematics_has_it(shown: Shown) -> None:
 
 
 def test_normals_are_unit_and_point_outwards() -> None:
-    shapes = RobotShapes(PROFILE)
+    shapes = RobotModel(PROFILE)
     for mesh in shapes.meshes:
         lengths = np.linalg.norm(mesh.normals, axis=1)
         assert np.median(lengths) == pytest.approx(1.0, abs=1e-5)

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import Pose, exp3, quat_from_rotation
-from vla_zenoh.lab.compare.worker_agreement import (
+from vla_zenoh.lab.compare.agreement import (
+    ArmState,
+    ArmStateHistory,
     Disagreement,
-    StandingHistory,
-    WorkerStanding,
     compare,
 )
 from vla_zenoh.policy import ActionSpec
@@ -25,7 +25,7 @@ ATOL_M, ATOL_RAD = 1e-6, 1e-6
 MS = 1_000_000
 START_NS = 10**18
 MAX_WIDTH_M = 0.08
-START = WorkerStanding(Pose(np.array([0.45, 0.1, 0.3]), exp3(np.array([3.1, 0.2, 0.1]))), 0.05)
+START = ArmState(Pose(np.array([0.45, 0.1, 0.3]), exp3(np.array([3.1, 0.2, 0.1]))), 0.05)
 
 DELTA = ActionSpec(horizon=8, dt_s=0.1, gripper="absolute_m")
 ABSOLUTE = ActionSpec(
@@ -137,7 +137,7 @@ def test_every_chunk_is_counted_once(times_a: list[int], times_b: list[int]) -> 
 
 
 def test_where_the_arm_was_is_the_nearest_state_and_unknown_without_one() -> None:
-    history = StandingHistory()
+    history = ArmStateHistory()
     with pytest.raises(RecordError, match="is not known"):
         history.at(START_NS)
     for index in range(10):

@@ -22,14 +22,14 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import console, fail, print_json
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import VlaZenohError
-from vla_zenoh.lab.compare.listener import CompareListener
-from vla_zenoh.lab.compare.worker_agreement import (
+from vla_zenoh.lab.compare.agreement import (
     AXES,
     DEFAULT_TOLERANCE_S,
+    ArmStateHistory,
     Disagreement,
-    StandingHistory,
 )
-from vla_zenoh.lab.compare.worker_agreement import compare as disagreement
+from vla_zenoh.lab.compare.agreement import compare as disagreement
+from vla_zenoh.lab.compare.listener import CompareListener
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk
@@ -124,7 +124,7 @@ def _recorded(path: Path, profile: Profile, a: str, b: str, tolerance_s: float) 
         if worker not in specs:
             there = sorted({heard.record.worker for heard in run.chunks})
             fail(f"{path} has no chunks of {worker!r}; it has: {', '.join(there) or 'none'}")
-    standing = StandingHistory()
+    standing = ArmStateHistory()
     for heard in (*run.poses, *run.grippers):
         standing.add(heard.header.stamp_wall_ns, heard.record)
     return _of(profile, chunks, specs, standing, a, b, tolerance_s)
@@ -134,7 +134,7 @@ def _of(
     profile: Profile,
     chunks: dict[str, list[ActionChunk]],
     specs: dict[str, ModelSpec],
-    standing: StandingHistory,
+    standing: ArmStateHistory,
     a: str,
     b: str,
     tolerance_s: float,

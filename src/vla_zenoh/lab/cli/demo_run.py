@@ -103,7 +103,7 @@ def _summary(profile: Profile, rate_hz: float, result: DemoResult, run: Run) -> 
 def _rate(entries: list[Any]) -> float:
     if len(entries) < 2:
         return 0.0
-    span_s = (entries[-1].heard_ns - entries[0].heard_ns) / 1e9
+    span_s = (entries[-1].received_ns - entries[0].received_ns) / 1e9
     return round((len(entries) - 1) / span_s, 2) if span_s > 0 else 0.0
 
 

@@ -137,8 +137,8 @@ class Stage:
     def _frames(self, run: Run) -> list[tuple[int, bytes]]:
         frames: list[tuple[int, bytes]] = []
         for picture in pictures(run.file, self.camera) if self.camera is not None else ():
-            if not frames or picture.heard_ns - frames[-1][0] >= PICTURE_NS:
-                frames.append((picture.heard_ns, picture.jpeg))
+            if not frames or picture.received_ns - frames[-1][0] >= PICTURE_NS:
+                frames.append((picture.received_ns, picture.jpeg))
         return frames
 
 

@@ -16,8 +16,8 @@ from rich.table import Table
 
 from vla_zenoh.cli.output import console, errors, fail, plain_types
 from vla_zenoh.lab.evaluation import tables
+from vla_zenoh.lab.evaluation.combined import overall, to_mapping
 from vla_zenoh.lab.evaluation.files import evaluate
-from vla_zenoh.lab.evaluation.overall import overall, to_mapping
 from vla_zenoh.lab.evaluation.result import STAGES, Evaluation
 
 PICTURES = 8

@@ -52,12 +52,12 @@ def record(
     Foxglove, Rerun and `ros2 bag` open it. It is whole at any time, also when the recorder is
     killed or the disk is full.
     """
-    from vla_zenoh.lab.recording.recorder import Recorded, Recorder, to_record
+    from vla_zenoh.lab.recording.recorder import Recorder, RecordingResult, recorded_keys
 
     loaded = RobotTarget(profile, connect, host).load()
     path = out or Path("runs") / time.strftime("record-%Y%m%d-%H%M%S.mcap")
-    expressions = to_record(loaded.keys, keys or (), raw=raw)
-    done: list[Recorded] = []
+    expressions = recorded_keys(loaded.keys, keys or (), raw=raw)
+    done: list[RecordingResult] = []
 
     def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
         recorder = Recorder(loaded, session, path, expressions=expressions, name=name)

@@ -48,14 +48,14 @@ def replay(
     Refused where a robot lives on these keys, unless only pictures are replayed.
     """
     from vla_zenoh.lab.recording.reader import open_recording
-    from vla_zenoh.lab.recording.replay import Replay, Replayed, chosen_groups
+    from vla_zenoh.lab.recording.replay import Replay, ReplayResult, parse_groups
 
-    groups = chosen_groups(only or ())
+    groups = parse_groups(only or ())
     run_file = open_recording(file)
     loaded = RobotTarget(profile, connect, host).load()
     loaded = as_robot(loaded, robot or run_file.keys.robot)
     _refuse_without_the_right(loaded)
-    done: list[Replayed] = []
+    done: list[ReplayResult] = []
 
     def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
         node = Replay(loaded, session, run_file, groups=groups, speed=speed, loop=loop)

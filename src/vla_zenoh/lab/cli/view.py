@@ -26,8 +26,8 @@ from vla_zenoh.profile import Profile, read_profile
 from vla_zenoh.runtime.process import run_node, stop_on_signals
 
 if TYPE_CHECKING:
-    from vla_zenoh.lab.recording.reader import RunFile
-    from vla_zenoh.lab.view.show import Show
+    from vla_zenoh.lab.recording.reader import Recording
+    from vla_zenoh.lab.view.rerun_logger import RerunLogger
 
 POLL_S = 0.03
 FLUSH_S = 5.0
@@ -86,15 +86,15 @@ def _live(
     profile: Profile, serve: bool, save: Path | None, seconds: float | None, bind: str, port: int
 ) -> None:
     from vla_zenoh.lab.view.listener import ViewListener
-    from vla_zenoh.lab.view.show import Show
+    from vla_zenoh.lab.view.rerun_logger import RerunLogger
 
-    done: list[Show] = []
+    done: list[RerunLogger] = []
     if serve:
         _refuse_strangers(profile, bind, port)
 
     def run(session: Any, stop: threading.Event) -> None:
         with _sink(profile.robot.name, serve, save, bind, port) as (stream, viewer):
-            show = Show(profile, stream, live=True)
+            show = RerunLogger(profile, stream, live=True)
             listener = ViewListener(session, profile)
             errors().print(f"looking at robot {profile.robot.name}; Ctrl-C ends it")
             end_s = None if seconds is None else time.monotonic() + seconds
@@ -120,7 +120,7 @@ def _recorded(
     path: Path, profile_name: str, serve: bool, save: Path | None, bind: str, port: int
 ) -> None:
     from vla_zenoh.lab.recording.reader import open_recording
-    from vla_zenoh.lab.view.show import Show
+    from vla_zenoh.lab.view.rerun_logger import RerunLogger
 
     stop = stop_on_signals()
     file = open_recording(path)
@@ -128,7 +128,7 @@ def _recorded(
     if serve:
         _refuse_strangers(profile, bind, port)
     with _sink(path.stem, serve, save, bind, port) as (stream, viewer):
-        show = Show(profile, stream, keys=file.keys)
+        show = RerunLogger(profile, stream, keys=file.keys)
         for entry in file.entries(lambda key: not key.endswith("/raw")):
             if stop.is_set() or (viewer is not None and viewer.closed):
                 break
@@ -155,7 +155,7 @@ def _refuse_strangers(profile: Profile, bind: str, port: int) -> None:
     )
 
 
-def _profile_of(file: RunFile, name: str) -> Profile:
+def _profile_of(file: Recording, name: str) -> Profile:
     try:
         return read_profile(file.profile_yaml, f"profile in {file.path}")
     except ProfileError as error:
@@ -171,7 +171,7 @@ def _sink(
     """A Rerun stream to a window, to browsers, into a file, and the viewer where there is one."""
     import rerun as rr
 
-    from vla_zenoh.lab.view.show import APPLICATION
+    from vla_zenoh.lab.view.rerun_logger import APPLICATION
 
     sinks: list[Any] = []
     if save is not None:
@@ -202,7 +202,7 @@ def _sink(
             viewer.close()
 
 
-def _tell(show: Show, save: Path | None) -> None:
+def _tell(show: RerunLogger, save: Path | None) -> None:
     screen = errors()
     where = f" in {save}" if save is not None else ""
     screen.print(

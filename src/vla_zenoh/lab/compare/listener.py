@@ -13,7 +13,7 @@ from vla_zenoh.bus.payload_limits import bytes_of, header_of
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.compare.worker_agreement import StandingHistory
+from vla_zenoh.lab.compare.agreement import ArmStateHistory
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import ActionChunk, GripperState, Header, PoseState
 
@@ -38,7 +38,7 @@ class CompareListener:
     def __init__(self, session: zenoh.Session, keys: Keys, workers: tuple[str, str]) -> None:
         self.specs = {worker: _spec(session, keys, worker) for worker in workers}
         self.chunks: dict[str, list[ActionChunk]] = {worker: [] for worker in workers}
-        self.standing = StandingHistory()
+        self.standing = ArmStateHistory()
         self._deltas = {worker: CallbackRing(MAX_CHUNKS) for worker in workers}
         self._poses, self._grippers = CallbackRing(MAX_STATES), CallbackRing(MAX_STATES)
         listening = [

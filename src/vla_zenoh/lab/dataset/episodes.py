@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.evaluation.spans import obeyed_chunks, task_spans
+from vla_zenoh.lab.evaluation.activations import activations, obeyed_chunks
 from vla_zenoh.lab.recording.run import RecordedSample, Run
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec
 
@@ -95,7 +95,7 @@ def episodes_of(run: Run, worker: str | None = None) -> list[RecordedEpisode]:
         if (chunk.record.worker, chunk.header.seq, chunk.record.observation_stamp_ns) in done
     ]
     out: list[RecordedEpisode] = []
-    for since_ns, until_ns, whose in task_spans(run):
+    for since_ns, until_ns, whose in activations(run):
         chunks = [
             chunk
             for chunk in carried_out

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import MissingExtraError, RecordingError
-from vla_zenoh.lab.dataset import statistics
+from vla_zenoh.lab.dataset import feature_statistics
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode, fps_of
+from vla_zenoh.lab.dataset.feature_statistics import Colours
 from vla_zenoh.lab.dataset.features import (
     ACTION,
     PICTURE,
@@ -30,7 +31,7 @@ from vla_zenoh.lab.dataset.features import (
     state_names,
     states_of,
 )
-from vla_zenoh.lab.dataset.pictures import (
+from vla_zenoh.lab.dataset.videos import (
     CODEC,
     PIXELS,
     EpisodeVideo,
@@ -38,7 +39,6 @@ from vla_zenoh.lab.dataset.pictures import (
     stamps_of,
     write_videos,
 )
-from vla_zenoh.lab.dataset.statistics import Colours
 
 VERSION = "v3.0"
 FILES_IN_A_CHUNK = 1000
@@ -259,7 +259,7 @@ class _Dataset:
                 "worker": episode.worker,
                 "run": episode.run.path.name,
             }
-            found = {name: statistics.of_numbers(values) for name, values in mine.items()}
+            found = {name: feature_statistics.of_numbers(values) for name, values in mine.items()}
             chunk, file = divmod(number, FILES_IN_A_CHUNK)
             for camera, of_episodes in videos.items():
                 name = PICTURE + camera
@@ -282,7 +282,7 @@ class _Dataset:
         self, rows: list[dict[str, NDArray[Any]]], videos: dict[str, list[EpisodeVideo]]
     ) -> None:
         stats = {
-            name: statistics.of_numbers(np.concatenate([each[name] for each in rows]))
+            name: feature_statistics.of_numbers(np.concatenate([each[name] for each in rows]))
             for name in rows[0]
         }
         for camera, of_episodes in videos.items():

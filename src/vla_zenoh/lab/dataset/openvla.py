@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import MissingExtraError, RecordingError
-from vla_zenoh.lab.dataset import statistics
+from vla_zenoh.lab.dataset import feature_statistics
 from vla_zenoh.lab.dataset.features import ACTION, STATE
 from vla_zenoh.lab.dataset.lerobot import INFO
 
@@ -31,7 +31,7 @@ def openvla_statistics(folder: Path, name: str) -> dict[str, Any]:
     for part, column in (("action", ACTION), ("proprio", STATE)):
         if column in columns:
             names = info["features"][column]["names"] or []
-            found = statistics.of_numbers(columns[column])
+            found = feature_statistics.of_numbers(columns[column])
             content[part] = {figure: found[figure] for figure in FIGURES} | {
                 "mask": [not str(each).startswith("gripper") for each in names]
             }

@@ -49,8 +49,8 @@ def plot_run(
     if not poses:
         return
     if not commands:  # an arm that takes joints: what its controller holds is the command
-        commands = [_Held(entry.heard_ns, _held(entry.record)) for entry in poses]
-    zero_ns = poses[0].heard_ns
+        commands = [_Held(entry.received_ns, _held(entry.record)) for entry in poses]
+    zero_ns = poses[0].received_ns
     figure = plt.figure(figsize=(13, 9), layout="constrained")
     grid = figure.add_gridspec(3, 3)
     space = figure.add_subplot(grid[0:2, 0], projection="3d")
@@ -94,7 +94,7 @@ def plot_run(
 
 
 class _Held(NamedTuple):
-    heard_ns: int
+    received_ns: int
     record: Any
 
 
@@ -113,7 +113,7 @@ def _positions(entries: Sequence[Any]) -> FloatArray:
 
 
 def _seconds(entries: Sequence[Any], zero_ns: int) -> FloatArray:
-    return np.array([(entry.heard_ns - zero_ns) / 1e9 for entry in entries])
+    return np.array([(entry.received_ns - zero_ns) / 1e9 for entry in entries])
 
 
 def _draw_path(axes: Any, measured: FloatArray, commanded: FloatArray) -> None:

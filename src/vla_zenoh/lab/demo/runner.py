@@ -211,12 +211,14 @@ class DemoRunner:
         # Decoding may lag behind on a busy computer: what was heard before now does not count.
         until_ns = time.time_ns() + STAND_WINDOW_NS
         self._wait(
-            lambda: heard.poses[-1].heard_ns > until_ns and heard.grippers[-1].heard_ns > until_ns,
+            lambda: (
+                heard.poses[-1].received_ns > until_ns and heard.grippers[-1].received_ns > until_ns
+            ),
             SLACK_S,
             "no state is heard any more",
         )
-        since_ns = heard.poses[-1].heard_ns - STAND_WINDOW_NS
-        poses = [entry.record for entry in heard.poses[-200:] if entry.heard_ns >= since_ns]
+        since_ns = heard.poses[-1].received_ns - STAND_WINDOW_NS
+        poses = [entry.record for entry in heard.poses[-200:] if entry.received_ns >= since_ns]
         position = np.mean([pose.position_m for pose in poses], axis=0)
         first = rotation_from_quat(poses[0].quat_xyzw)
         turns = [log3(rotation_from_quat(pose.quat_xyzw) @ first.T) for pose in poses]

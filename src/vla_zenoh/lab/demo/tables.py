@@ -23,7 +23,7 @@ def write_commands(path: Path, commands: Iterable[Any]) -> None:
     """One row per pose command."""
     rows = (
         [
-            entry.heard_ns,
+            entry.received_ns,
             entry.header.stamp_wall_ns,
             entry.header.seq,
             *_numbers(entry.record.position_m),
@@ -42,7 +42,7 @@ def write_poses(path: Path, poses: Iterable[Any]) -> None:
     """One row per measured pose."""
     rows = (
         [
-            entry.heard_ns,
+            entry.received_ns,
             entry.header.stamp_wall_ns,
             entry.header.seq,
             *_numbers(entry.record.position_m),

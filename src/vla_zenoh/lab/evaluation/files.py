@@ -53,6 +53,6 @@ def _evaluate(path: Path, first: int | None, pictures: int) -> Evaluation:
     if path.suffix.lower() == CSV:
         return evaluate_csv(path, first)
     # Whoever evaluates CSV alone needs no MCAP library.
-    from vla_zenoh.lab.evaluation.run_file import evaluate_run
+    from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 
     return evaluate_run(path, first, pictures=pictures)

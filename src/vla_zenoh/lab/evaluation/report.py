@@ -10,7 +10,7 @@ from typing import Any
 from vla_zenoh import __version__
 from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.lab.evaluation import plots
-from vla_zenoh.lab.evaluation.overall import overall
+from vla_zenoh.lab.evaluation.combined import overall
 from vla_zenoh.lab.evaluation.result import STAGES, CameraView, Evaluation
 from vla_zenoh.lab.evaluation.tables import LATENCY_COLUMNS, figures, latency_rows, segment_rows
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.lab.evaluation.numbers import Spread, spread
+from vla_zenoh.lab.evaluation.trajectory import Distribution, spread
 from vla_zenoh.types import FloatArray
 
 STAGES = {
@@ -174,7 +174,7 @@ class Evaluation:
             return None
         return self.succeeded / self.requests
 
-    def latency(self) -> dict[str, Spread]:
+    def latency(self) -> dict[str, Distribution]:
         """Stage -> distribution in ms, in the order of `STAGES`."""
         found = {stage: spread(self.stages_ms.get(stage, ())) for stage in STAGES}
         return {stage: value for stage, value in found.items() if value is not None}
@@ -184,7 +184,7 @@ class Evaluation:
         out: dict[str, Any] = {"record_id": self.name, "n_rows": self.requests}
         for name, stage in THESIS_NAMES.items():
             found = spread(self.stages_ms.get(stage, ()))
-            values = asdict(found) if found else dict.fromkeys(Spread.__dataclass_fields__)
+            values = asdict(found) if found else dict.fromkeys(Distribution.__dataclass_fields__)
             out[f"{name}_count"] = found.count if found else 0
             for short in ("mean", "std", "p50", "p95", "p99", "min", "max"):
                 out[f"{name}_{'median' if short == 'p50' else short}_ms"] = values[short]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from vla_zenoh.lab.evaluation.numbers import spread
 from vla_zenoh.lab.evaluation.result import Evaluation
+from vla_zenoh.lab.evaluation.trajectory import spread
 from vla_zenoh.types import FloatArray
 
 LATENCY_COLUMNS = ("min", "mean", "p50", "p95", "max")

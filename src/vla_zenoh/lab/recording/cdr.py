@@ -16,7 +16,7 @@ from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, MissingExtraError
 from vla_zenoh.lab.recording import definitions
 from vla_zenoh.lab.recording.definitions import Unfit, fields_of, type_name
-from vla_zenoh.lab.recording.kinds import RECORDS
+from vla_zenoh.lab.recording.record_types import RECORDS
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import Cause
 

@@ -27,7 +27,7 @@ from vla_zenoh.errors import CodecError, RecordError, RecordingError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording import cdr
 from vla_zenoh.lab.recording.definitions import SAMPLE_NAME, type_name
-from vla_zenoh.lab.recording.kinds import RECORDS
+from vla_zenoh.lab.recording.record_types import RECORDS
 from vla_zenoh.lab.recording.sample import Sample
 from vla_zenoh.lab.recording.writer import ABOUT, ENDED, PROFILE_FILE
 from vla_zenoh.types import Header
@@ -55,7 +55,7 @@ class RecordedEntry:
 
     key: str
     header: Header | None
-    heard_ns: int
+    received_ns: int
     encoding: str
     kind: type | None = None
     fields: dict[str, Any] = field(default_factory=dict)
@@ -76,7 +76,7 @@ class RecordedEntry:
     def sample(self) -> Sample:
         """As it was heard."""
         return Sample(
-            self.key, self.payload, self.encoding, self.header, self.heard_ns, self.attachment
+            self.key, self.payload, self.encoding, self.header, self.received_ns, self.attachment
         )
 
     def record(self) -> Any:
@@ -91,7 +91,7 @@ class RecordedEntry:
         return records.from_map(self.kind, data)
 
 
-class RunFile:
+class Recording:
     """A recorded run; see `open_recording`.
 
     Args:
@@ -186,7 +186,7 @@ class _Source:
             data = found.data.tobytes()
         return RecordedEntry(self.key, header, message.log_time, self.encoding, data=data)
 
-    def _stray(self, found: Any, heard_ns: int) -> RecordedEntry:
+    def _stray(self, found: Any, received_ns: int) -> RecordedEntry:
         attachment = found.attachment.tobytes() if found.has_attachment else None
         header = None
         if attachment is not None:
@@ -194,7 +194,7 @@ class _Source:
                 header, attachment = header_codec.decode(attachment), None
         payload = found.payload.tobytes()
         return RecordedEntry(
-            self.key, header, heard_ns, self.encoding, data=payload, attachment=attachment
+            self.key, header, received_ns, self.encoding, data=payload, attachment=attachment
         )
 
 
@@ -226,7 +226,7 @@ def _whole(file: IO[bytes], damage: Callable[[str], None]) -> Iterator[Any]:
         yield record
 
 
-def open_recording(path: Path) -> RunFile:
+def open_recording(path: Path) -> Recording:
     """Open a file that ``vla-zenoh record`` wrote.
 
     Raises:
@@ -246,7 +246,7 @@ def open_recording(path: Path) -> RunFile:
                 if isinstance(record, Metadata) and record.name == ABOUT:
                     about = record.metadata
                 elif isinstance(record, Attachment) and about and record.name == PROFILE_FILE:
-                    return RunFile(
+                    return Recording(
                         path, _checked(path, about), record.data.decode("utf-8", "replace")
                     )
                 elif isinstance(record, Channel):

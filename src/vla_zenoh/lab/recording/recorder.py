@@ -22,7 +22,7 @@ from vla_zenoh.bus.payload_limits import bytes_of, whole
 from vla_zenoh.errors import CodecError, RecordingError
 from vla_zenoh.keys import Keys, covers
 from vla_zenoh.lab.recording.sample import TEXT, heard
-from vla_zenoh.lab.recording.writer import RunWriter
+from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.types import Event
 
@@ -39,7 +39,7 @@ RECORDING, FAILED, STOPPED = "recording", "failed", "stopped"
 
 
 @dataclass(slots=True)
-class Recorded:
+class RecordingResult:
     """What became of a recording.
 
     Args:
@@ -61,7 +61,7 @@ class Recorded:
     failure: str = ""
 
 
-def to_record(keys: Keys, given: Sequence[str] = (), *, raw: bool = False) -> tuple[str, ...]:
+def recorded_keys(keys: Keys, given: Sequence[str] = (), *, raw: bool = False) -> tuple[str, ...]:
     """Which key expressions are recorded.
 
     Args:
@@ -86,7 +86,7 @@ class Recorder:
         profile: the effective profile; it goes into the file.
         session: an open session, closed by whoever opened it.
         path: of the file.
-        expressions: which keys, see `to_record`; None: what that gives by itself.
+        expressions: which keys, see `recorded_keys`; None: what that gives by itself.
         name: the node's; a second recorder needs another one.
         queue_bytes: payloads in memory at most.
 
@@ -106,16 +106,16 @@ class Recorder:
         queue_bytes: int = QUEUE_BYTES,
     ) -> None:
         self.node = Node(name, profile, session)
-        self._expressions = expressions or to_record(self.node.keys)
+        self._expressions = expressions or recorded_keys(self.node.keys)
         self._queue: deque[tuple[str, bytes, str, bytes | None, int]] = deque()
         self._queued_bytes, self._queue_limit = 0, queue_bytes
         self._change = threading.Condition()
         self._closing = False
         self._ended: Mapping[str, Any] = {}
         self._subscribers: list[Any] = []
-        self.recorded = Recorded(path)
+        self.recorded = RecordingResult(path)
         self._began_s = time.monotonic()
-        self._writer = RunWriter(
+        self._writer = RecordingWriter(
             path,
             self.node.keys,
             profile_yaml=to_yaml(profile),
@@ -156,7 +156,7 @@ class Recorder:
                 if reply.ok is not None:
                     self._put(key, bytes_of(reply.ok.payload), TEXT, None)
 
-    def run(self, stop: threading.Event, seconds: float | None = None) -> Recorded:
+    def run(self, stop: threading.Event, seconds: float | None = None) -> RecordingResult:
         """Record until `stop` is set, `seconds` have passed, or the disk is full."""
         end_s = None if seconds is None else time.monotonic() + seconds
         self.start()
@@ -173,7 +173,7 @@ class Recorder:
             subscriber.undeclare()
         self._subscribers.clear()
 
-    def close(self, ended: Mapping[str, Any] | None = None) -> Recorded:
+    def close(self, ended: Mapping[str, Any] | None = None) -> RecordingResult:
         """Stop listening, write what is queued, and finish the file.
 
         Args:

@@ -20,7 +20,7 @@ from vla_zenoh.bus.liveliness import alive_nodes
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import CodecError, NodeError, RecordingError
-from vla_zenoh.lab.recording.reader import RecordedEntry, RunFile
+from vla_zenoh.lab.recording.reader import RecordedEntry, Recording
 from vla_zenoh.lab.recording.restamp import Restamper
 from vla_zenoh.lab.recording.sample import JPEG, Sample
 from vla_zenoh.profile import Profile
@@ -67,7 +67,7 @@ _BYSTANDERS = ("worker-", "camera", "recorder", "router", NAME)
 
 
 @dataclass(slots=True)
-class Replayed:
+class ReplayResult:
     """How a replay went.
 
     Args:
@@ -112,7 +112,7 @@ class Replay:
         self,
         profile: Profile,
         session: zenoh.Session,
-        file: RunFile,
+        file: Recording,
         *,
         groups: Collection[str] = GROUPS,
         speed: float = 1.0,
@@ -127,7 +127,7 @@ class Replay:
         self.node.on_alive(self._on_alive)
         self._publishers: dict[str, Any] = {}
         self._raw: dict[str, Any] = {}
-        self.replayed = Replayed()
+        self.replayed = ReplayResult()
         self._late_ns: deque[int] = deque(maxlen=MAX_ERRORS)
         self._errors_ns: deque[int] = deque(maxlen=MAX_ERRORS)
         self._last: dict[str, tuple[int, int]] = {}
@@ -149,7 +149,7 @@ class Replay:
             )
 
     # -- running ------------------------------------------------------------------------------
-    def run(self, stop: threading.Event) -> Replayed:
+    def run(self, stop: threading.Event) -> ReplayResult:
         """Replay until the end, or until `stop` is set."""
         # Else this thread may wait 5 ms for the one that reads ahead.
         sys.setswitchinterval(SWITCH_INTERVAL_S)
@@ -210,11 +210,11 @@ class Replay:
         for entry in self._chosen():
             if restamper is None:
                 restamper = Restamper(
-                    entry.heard_ns, starts_ns, self._speed, self._here, self._there, suffix
+                    entry.received_ns, starts_ns, self._speed, self._here, self._there, suffix
                 )
             sample = restamper.move(entry)
             self._publisher(sample.key)
-            if not _hand_over(ready, (entry.heard_ns, sample), ending):
+            if not _hand_over(ready, (entry.received_ns, sample), ending):
                 return
         _hand_over(ready, None, ending)
 
@@ -239,7 +239,7 @@ class Replay:
     def _put(
         self, recorded_ns: int, sample: Sample, to_mono_ns: int, stop: threading.Event
     ) -> None:
-        due_ns = sample.heard_ns + to_mono_ns
+        due_ns = sample.received_ns + to_mono_ns
         while (left_s := (due_ns - time.monotonic_ns()) / 1e9) > 0:
             if left_s > SLICE_S:
                 self._watch()
@@ -285,7 +285,7 @@ class Replay:
             self.node.report("replaying", detail=detail)
 
 
-def chosen_groups(names: Collection[str]) -> frozenset[str]:
+def parse_groups(names: Collection[str]) -> frozenset[str]:
     """The groups that `names` say; none says all.
 
     Raises:

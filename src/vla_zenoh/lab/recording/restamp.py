@@ -48,7 +48,7 @@ class Restamper:
         return max(0, self._starts_ns + since_ns)
 
     def move(self, entry: RecordedEntry) -> Sample:
-        """The sample to put, `heard_ns` being when it is to be put."""
+        """The sample to put, `received_ns` being when it is to be put."""
         header = entry.header
         if header is not None:
             node, _, _ = header.source.partition("#")
@@ -62,7 +62,7 @@ class Restamper:
             payload,
             entry.encoding,
             header,
-            self.moved_ns(entry.heard_ns),
+            self.moved_ns(entry.received_ns),
             entry.attachment,
         )
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Keys, last
-from vla_zenoh.lab.recording.reader import RunFile, open_recording
+from vla_zenoh.lab.recording.reader import Recording, open_recording
 from vla_zenoh.lab.recording.sample import JPEG
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import (
@@ -38,14 +38,14 @@ class RecordedSample(NamedTuple):
 
     header: Header
     record: Any
-    heard_ns: int
+    received_ns: int
     key: str
 
 
 class RecordedImage(NamedTuple):
     """A JPEG file, when it was heard, and when it was taken."""
 
-    heard_ns: int
+    received_ns: int
     stamp_ns: int
     seq: int
     jpeg: bytes
@@ -54,7 +54,7 @@ class RecordedImage(NamedTuple):
 class RecordedSetting(NamedTuple):
     """What somebody put on a setting's key."""
 
-    heard_ns: int
+    received_ns: int
     name: str
     text: str
 
@@ -66,7 +66,7 @@ class Run:
     Pictures stay in the file: see `pictures`.
     """
 
-    file: RunFile
+    file: Recording
     poses: list[RecordedSample] = field(default_factory=list)
     joints: list[RecordedSample] = field(default_factory=list)
     grippers: list[RecordedSample] = field(default_factory=list)
@@ -111,7 +111,7 @@ class Run:
 
     def prompts(self) -> list[tuple[int, str]]:
         """(wall ns, prompt) of each prompt that was put."""
-        return [(put.heard_ns, put.text) for put in self.settings if put.name == "prompt"]
+        return [(put.received_ns, put.text) for put in self.settings if put.name == "prompt"]
 
     def first_commands(self) -> list[tuple[Cause, int]]:
         """For each chunk its cause, and the stamp of the first command that carries it out."""
@@ -156,12 +156,12 @@ def load_run(path: Path) -> Run:
         Seen: run.seen,
     }
     for entry in file.entries(_of_interest(keys)):
-        run.began_ns = run.began_ns or entry.heard_ns
-        run.ended_ns = max(run.ended_ns, entry.heard_ns)
+        run.began_ns = run.began_ns or entry.received_ns
+        run.ended_ns = max(run.ended_ns, entry.received_ns)
         if entry.kind is None:
             if entry.header is None and entry.attachment is None:
                 run.settings.append(
-                    RecordedSetting(entry.heard_ns, keys.short(entry.key), entry.text)
+                    RecordedSetting(entry.received_ns, keys.short(entry.key), entry.text)
                 )
             elif entry.encoding == JPEG:
                 run.picture_counts[_camera(keys, entry.key)] += 1
@@ -175,7 +175,7 @@ def load_run(path: Path) -> Run:
             continue
         if entry.header is None:
             continue
-        _keep(run, lists, RecordedSample(entry.header, record, entry.heard_ns, entry.key))
+        _keep(run, lists, RecordedSample(entry.header, record, entry.received_ns, entry.key))
     if file.damage:
         run.problems.append(f"{path.name} is {file.damage}; evaluated up to there")
     run.problems += [f"{what} ({count})" for what, count in refused.most_common(MAX_PROBLEMS)]
@@ -212,18 +212,18 @@ def _keep(run: Run, lists: dict[type, list[RecordedSample]], heard: RecordedSamp
         run.statuses[node] = heard.record
 
 
-def pictures(file: RunFile, camera: str) -> Iterator[RecordedImage]:
+def pictures(file: Recording, camera: str) -> Iterator[RecordedImage]:
     """Every JPEG of a camera, oldest first, one in memory at a time."""
     return _jpegs(file, file.keys.camera_jpeg(camera))
 
 
-def seen_pictures(file: RunFile, worker: str, camera: str) -> Iterator[RecordedImage]:
+def seen_pictures(file: Recording, worker: str, camera: str) -> Iterator[RecordedImage]:
     """What a model was given of a camera; `seq` is its chunk's, the stamp the observation's."""
     return _jpegs(file, file.keys.seen(worker, camera))
 
 
-def _jpegs(file: RunFile, key: str) -> Iterator[RecordedImage]:
+def _jpegs(file: Recording, key: str) -> Iterator[RecordedImage]:
     for entry in file.entries(lambda each: each == key):
         if entry.header is not None and entry.encoding == JPEG:
             stamp_ns, seq = entry.header.stamp_wall_ns, entry.header.seq
-            yield RecordedImage(entry.heard_ns, stamp_ns, seq, entry.data)
+            yield RecordedImage(entry.received_ns, stamp_ns, seq, entry.data)

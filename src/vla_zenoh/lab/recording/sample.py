@@ -31,13 +31,13 @@ class Sample:
     payload: bytes
     encoding: str
     header: Header | None
-    heard_ns: int
+    received_ns: int
     attachment: bytes | None = None
 
     @property
     def stamp_ns(self) -> int:
         """Its header's stamp, or when it was heard."""
-        return self.heard_ns if self.header is None else self.header.stamp_wall_ns
+        return self.received_ns if self.header is None else self.header.stamp_wall_ns
 
     @property
     def attached(self) -> bytes | None:
@@ -46,7 +46,7 @@ class Sample:
 
 
 def heard(
-    key: str, payload: bytes, encoding: str, attachment: bytes | None, heard_ns: int
+    key: str, payload: bytes, encoding: str, attachment: bytes | None, received_ns: int
 ) -> Sample:
     """A sample of what came from the wire, whatever it is."""
     header = None
@@ -54,5 +54,5 @@ def heard(
         try:
             header = header_codec.decode(attachment)
         except CodecError:
-            return Sample(key, payload, encoding, None, heard_ns, attachment)
-    return Sample(key, payload, encoding, header, heard_ns)
+            return Sample(key, payload, encoding, None, received_ns, attachment)
+    return Sample(key, payload, encoding, header, received_ns)

@@ -118,12 +118,12 @@ class StreamListener:
             time.sleep(0.05)
             with self._ready:
                 queue, self._queue = self._queue, []
-            for name, key, payload, attachment, heard_ns in queue:
+            for name, key, payload, attachment, received_ns in queue:
                 try:
                     heard = RecordedSample(
                         header_codec.decode(attachment),
                         records.decode(kinds[name], payload),
-                        heard_ns,
+                        received_ns,
                         key,
                     )
                 except CodecError:

@@ -26,10 +26,10 @@ from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording import cdr
+from vla_zenoh.lab.recording.crash_safe_file import CrashSafeFile
 from vla_zenoh.lab.recording.definitions import SAMPLE_NAME, Unfit, type_name
-from vla_zenoh.lab.recording.kinds import Kinds
+from vla_zenoh.lab.recording.record_types import RecordTypes
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, RAW, Sample
-from vla_zenoh.lab.recording.spool import Spool
 from vla_zenoh.lab.recording.views import VIEWS
 
 ABOUT, ENDED = "vla_zenoh", "vla_zenoh.ended"
@@ -47,7 +47,7 @@ def topic_of(key: str, *below: str) -> str:
     return _DIGIT_FIRST.sub("_", _NOT_ROS.sub("_", "/" + "/".join((key, *below))))
 
 
-class RunWriter:
+class RecordingWriter:
     """See the module.
 
     Args:
@@ -75,12 +75,12 @@ class RunWriter:
     ) -> None:
         cdr.messages()
         self._robot, self._frame = robot, base_frame
-        self._kinds: dict[str, Kinds] = {}
+        self._kinds: dict[str, RecordTypes] = {}
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, ...], int] = {}
         self.counts: Counter[str] = Counter()
         """Samples by key."""
-        self._spool = Spool(path)
+        self._spool = CrashSafeFile(path)
         # The MCAP writer asks for no more of a stream than Spool can.
         self._out = Writer(self._spool, CHUNK_BYTES, CompressionType.ZSTD)  # pyright: ignore
         self._out.start("ros2", f"vla-zenoh {__version__}")
@@ -210,12 +210,12 @@ class RunWriter:
         if robot is None:
             return None
         if robot.robot not in self._kinds:
-            self._kinds[robot.robot] = Kinds(robot)
+            self._kinds[robot.robot] = RecordTypes(robot)
         return self._kinds[robot.robot].of(key)
 
     def _write_bytes(self, sample: Sample) -> None:
         try:
-            header = cdr.header(sample.heard_ns, "")
+            header = cdr.header(sample.received_ns, "")
         except Unfit:
             header = cdr.header(0, "")
         attachment = sample.attached
@@ -238,7 +238,7 @@ class RunWriter:
             )
         seq = 0 if header is None else header.seq
         self._out.add_message(
-            self._channels[channel], sample.heard_ns, data, sample.stamp_ns, seq % MAX_SEQ
+            self._channels[channel], sample.received_ns, data, sample.stamp_ns, seq % MAX_SEQ
         )
 
     def _new_channel(self, channel: tuple[str, ...], topic: str, shows: bool) -> int:

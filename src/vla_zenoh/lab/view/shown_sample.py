@@ -19,7 +19,7 @@ class ShownSample(Protocol):
     @property
     def header(self) -> Header | None: ...
     @property
-    def heard_ns(self) -> int: ...
+    def received_ns(self) -> int: ...
     @property
     def encoding(self) -> str: ...
     @property
@@ -50,8 +50,8 @@ class Live:
         return self.sample.header
 
     @property
-    def heard_ns(self) -> int:
-        return self.sample.heard_ns
+    def received_ns(self) -> int:
+        return self.sample.received_ns
 
     @property
     def encoding(self) -> str:

@@ -45,7 +45,7 @@ class LinkMesh:
     colour: tuple[float, float, float, float]
 
 
-class RobotShapes:
+class RobotModel:
     """Meshes of the profile's robot, and their poses in the base frame.
 
     Args:
@@ -214,9 +214,9 @@ def _stacked(rings: list[tuple[FloatArray, float]]) -> FloatArray:
     return np.concatenate(triangles)
 
 
-def shapes_or_none(profile: Profile) -> tuple[RobotShapes | None, str]:
+def load_robot_model(profile: Profile) -> tuple[RobotModel | None, str]:
     """The robot's shapes, or why there are none: the rest can be looked at without them."""
     try:
-        return RobotShapes(profile), ""
+        return RobotModel(profile), ""
     except VlaZenohError as error:
         return None, str(error)

@@ -20,7 +20,7 @@ def until(stream: Sequence[RecordedSample], until_ns: int) -> list[RecordedSampl
 
 def obeyed_chunks(run: Run) -> list[RecordedSample]:
     """Chunks of the obeyed worker that came while the arm obeyed: the requests."""
-    spans = task_spans(run)
+    spans = activations(run)
     starts = [since_ns for since_ns, _, _ in spans]
     out: list[RecordedSample] = []
     for entry in run.chunks:
@@ -31,12 +31,12 @@ def obeyed_chunks(run: Run) -> list[RecordedSample]:
     return out
 
 
-def task_spans(run: Run) -> list[tuple[int, int, str]]:
+def activations(run: Run) -> list[tuple[int, int, str]]:
     """(since ns, until ns, worker) of each time in which the arm obeyed one worker."""
     return _spans(run, lambda task: task.worker)
 
 
-def prompt_spans(run: Run) -> list[tuple[int, int, str]]:
+def prompt_intervals(run: Run) -> list[tuple[int, int, str]]:
     """The same for prompts."""
     return _spans(run, lambda task: task.prompt)
 

@@ -29,14 +29,14 @@ GRIPPER_SHARE = 0.25
 """Of the gripper's width: one that wants so much more open disagrees with the other."""
 
 
-class WorkerStanding(NamedTuple):
+class ArmState(NamedTuple):
     """Where arm and gripper were."""
 
     pose: Pose
     width_m: float
 
 
-class StandingHistory:
+class ArmStateHistory:
     """Where the arm was, by the stamps of its states; these are added in their order."""
 
     def __init__(self) -> None:
@@ -50,7 +50,7 @@ class StandingHistory:
             stamps.append(stamp_ns)
             states.append(state)  # pyright: ignore[reportArgumentType]
 
-    def at(self, stamp_ns: int) -> WorkerStanding:
+    def at(self, stamp_ns: int) -> ArmState:
         """The measured pose and width nearest to `stamp_ns`.
 
         Raises:
@@ -62,7 +62,7 @@ class StandingHistory:
             )
         pose = self._poses[1][_nearest(self._poses[0], stamp_ns)]
         gripper = self._grippers[1][_nearest(self._grippers[0], stamp_ns)]
-        return WorkerStanding(pose_of(pose), gripper.width_m)
+        return ArmState(pose_of(pose), gripper.width_m)
 
 
 def _nearest(stamps: Sequence[int], stamp_ns: int) -> int:
@@ -71,7 +71,7 @@ def _nearest(stamps: Sequence[int], stamp_ns: int) -> int:
     return min(left, right, key=lambda index: abs(stamps[index] - stamp_ns))
 
 
-class AgreementPath(NamedTuple):
+class RequestedPath(NamedTuple):
     """What a chunk asks for.
 
     Args:
@@ -135,9 +135,9 @@ class Disagreement:
     gripper: float | None = None
 
 
-def way_of(
-    spec: ActionSpec, chunk: ActionChunk, start: WorkerStanding, max_width_m: float
-) -> AgreementPath:
+def requested_path(
+    spec: ActionSpec, chunk: ActionChunk, start: ArmState, max_width_m: float
+) -> RequestedPath:
     """What `chunk` asks for from `start` on.
 
     Raises:
@@ -148,7 +148,7 @@ def way_of(
         width_m = step_width(spec, step, widths_m[-1], max_width_m)
         poses.append(step_pose(spec, step, poses[-1]))
         widths_m.append(widths_m[-1] if width_m is None else width_m)
-    return AgreementPath(spec.dt_s, poses, None if spec.gripper == "none" else widths_m)
+    return RequestedPath(spec.dt_s, poses, None if spec.gripper == "none" else widths_m)
 
 
 def compare(
@@ -156,7 +156,7 @@ def compare(
     b: Sequence[ActionChunk],
     spec_a: ActionSpec,
     spec_b: ActionSpec,
-    standing_at: Callable[[int], WorkerStanding],
+    standing_at: Callable[[int], ArmState],
     *,
     max_width_m: float,
     tolerance_s: float = DEFAULT_TOLERANCE_S,
@@ -180,8 +180,8 @@ def compare(
         try:
             rows.append(
                 _row(
-                    way_of(spec_a, one, start, max_width_m),
-                    way_of(spec_b, other, start, max_width_m),
+                    requested_path(spec_a, one, start, max_width_m),
+                    requested_path(spec_b, other, start, max_width_m),
                     max_width_m,
                 )
             )
@@ -216,7 +216,7 @@ class _Row(NamedTuple):
     gripper: bool | None
 
 
-def _row(one: AgreementPath, other: AgreementPath, max_width_m: float) -> _Row:
+def _row(one: RequestedPath, other: RequestedPath, max_width_m: float) -> _Row:
     after_s = min(one.end_s, other.end_s)
     (pose_a, width_a), (pose_b, width_b) = one.at(after_s), other.at(after_s)
     difference = np.concatenate(

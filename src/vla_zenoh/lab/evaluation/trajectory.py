@@ -15,7 +15,7 @@ STILL_M_S, STILL_RAD_S = 0.002, 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class Distribution:
     """How values are distributed; percentiles are interpolated linearly.
 
     Args:
@@ -39,14 +39,14 @@ class Spread:
     max: float
 
 
-def spread(values: ArrayLike) -> Spread | None:
+def spread(values: ArrayLike) -> Distribution | None:
     """The distribution of the finite ones among `values`, None when there are none."""
     found = np.asarray(values, np.float64)
     found = found[np.isfinite(found)]
     if not found.size:
         return None
     p50, p95, p99 = np.percentile(found, (50, 95, 99))
-    return Spread(
+    return Distribution(
         int(found.size),
         float(found.mean()),
         float(found.std(ddof=1)) if found.size > 1 else 0.0,

@@ -20,7 +20,7 @@ HEIGHT_PX = 150
 QUALITY = 80
 
 
-def views_of(run: Run, chunks: Sequence[ActionChunk], count: int) -> list[CameraView]:
+def filmstrip(run: Run, chunks: Sequence[ActionChunk], count: int) -> list[CameraView]:
     """For each camera `count` pictures, evenly over the run.
 
     With chunks they are the pictures that chunks were made of. What the model was given of them

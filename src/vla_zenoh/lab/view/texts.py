@@ -18,7 +18,7 @@ BOUND_NS = 1_000_000_000
 MAX_RAW = 600
 
 
-class Words:
+class TextPanels:
     """Logs texts at the time the stream is set to.
 
     Args:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.lab.evaluation.numbers import concatenated
 from vla_zenoh.lab.evaluation.result import STAGES, Evaluation
+from vla_zenoh.lab.evaluation.trajectory import concatenated
 from vla_zenoh.types import FloatArray
 
 OVERALL = "ALL"

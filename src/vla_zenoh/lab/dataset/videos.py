@@ -12,7 +12,7 @@ import numpy as np
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import MissingExtraError, RecordingError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
-from vla_zenoh.lab.dataset.statistics import Colours
+from vla_zenoh.lab.dataset.feature_statistics import Colours
 from vla_zenoh.lab.recording.run import Run, pictures
 
 CODEC, PIXELS = "libx264", "yuv420p"

@@ -28,7 +28,7 @@ END = _end()
 """What ends an MCAP file without a summary."""
 
 
-class Spool:
+class CrashSafeFile:
     """Where the MCAP writer writes to: kept in memory until `commit`.
 
     Args:

@@ -40,7 +40,7 @@ RECORDS: tuple[type, ...] = (
 """Every record that has a key."""
 
 
-class Kinds:
+class RecordTypes:
     """Answers for the keys of one robot; what it was asked it knows by heart."""
 
     def __init__(self, keys: Keys) -> None:

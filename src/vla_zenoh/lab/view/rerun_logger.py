@@ -12,15 +12,15 @@ import rerun as rr
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.keys import Keys, last
-from vla_zenoh.lab.recording.kinds import Kinds
+from vla_zenoh.lab.recording.record_types import RecordTypes
 from vla_zenoh.lab.recording.sample import JPEG, Sample
 from vla_zenoh.lab.view import paths
 from vla_zenoh.lab.view.charts import Charts
 from vla_zenoh.lab.view.layout import blueprint
+from vla_zenoh.lab.view.robot_model import load_robot_model
 from vla_zenoh.lab.view.scene import Scene, pose_of
-from vla_zenoh.lab.view.shapes import shapes_or_none
 from vla_zenoh.lab.view.shown_sample import Live, ShownSample
-from vla_zenoh.lab.view.words import Words
+from vla_zenoh.lab.view.texts import TextPanels
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.types import (
@@ -48,7 +48,7 @@ COMMAND_NODE = "command"
 APPLICATION = "vla-zenoh"
 
 
-class Show:
+class RerunLogger:
     """Takes samples in the order heard and logs what they show.
 
     What cannot be shown is counted in `refused`, and stands in the view itself.
@@ -70,15 +70,15 @@ class Show:
     ) -> None:
         self._stream, self._live = stream, live
         self.keys = keys or profile.keys
-        self._kinds = Kinds(self.keys)
+        self._kinds = RecordTypes(self.keys)
         self._command_status = self.keys.status(COMMAND_NODE)
-        shapes, missing = shapes_or_none(profile)
+        shapes, missing = load_robot_model(profile)
         self._kinematics = shapes.kinematics if shapes is not None else None
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
         self._scene = Scene(stream, profile, shapes)
         self._charts = Charts(stream, profile.robot.arm_joints)
-        self._words = Words(stream, to_yaml(profile), missing)
+        self._words = TextPanels(stream, to_yaml(profile), missing)
         self._drawn_ns: dict[str, int] = {}
         self._specs: dict[str, ModelSpec] = {}
         self._obeyed = profile.task.worker
@@ -142,7 +142,7 @@ class Show:
             self.refused[f"{self.keys.short(said.key)}: does not fit its spec"] += 1
 
     def _stamp_ns(self, said: ShownSample) -> int:
-        stamp_ns = said.heard_ns
+        stamp_ns = said.received_ns
         if said.header is not None and abs(said.header.stamp_wall_ns - stamp_ns) < APART_NS:
             stamp_ns = said.header.stamp_wall_ns
         self._stream.set_time(paths.TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))

@@ -10,11 +10,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vla_zenoh.lab.evaluation import numbers
+from vla_zenoh.lab.evaluation import trajectory
+from vla_zenoh.lab.evaluation.activations import (
+    activations,
+    last_ns,
+    obeyed_chunks,
+    prompt_intervals,
+    until,
+)
+from vla_zenoh.lab.evaluation.filmstrip import filmstrip
 from vla_zenoh.lab.evaluation.result import Evaluation, PlotTrace
 from vla_zenoh.lab.evaluation.segments import segment
-from vla_zenoh.lab.evaluation.spans import last_ns, obeyed_chunks, prompt_spans, task_spans, until
-from vla_zenoh.lab.evaluation.strip import views_of
 from vla_zenoh.lab.recording.run import RecordedSample, Run, load_run
 from vla_zenoh.types import Cause, FloatArray, NodeStatus
 
@@ -86,7 +92,7 @@ def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) ->
     out.gripper_orders = len(until(run.gripper_commands, until_ns))
     _segments(out, run, causes, measured, until_ns)
     if pictures:
-        out.views = views_of(run, [entry.record for entry in obeyed], pictures)
+        out.views = filmstrip(run, [entry.record for entry in obeyed], pictures)
     return out
 
 
@@ -165,15 +171,15 @@ def _commanded(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
 
 
 def _motion(out: Evaluation, measured: MeasuredMotion, commanded: MeasuredMotion, run: Run) -> None:
-    out.path_m = numbers.path_m(measured.position_m)
-    out.path_rad = numbers.turned_rad(measured.quat_xyzw)
-    out.command_path_m = numbers.path_m(commanded.position_m)
-    out.command_path_rad = numbers.turned_rad(commanded.quat_xyzw)
+    out.path_m = trajectory.path_m(measured.position_m)
+    out.path_rad = trajectory.turned_rad(measured.quat_xyzw)
+    out.command_path_m = trajectory.path_m(commanded.position_m)
+    out.command_path_rad = trajectory.turned_rad(commanded.quat_xyzw)
     start = measured if len(measured.t_s) else commanded
     for name, motion in (("measured", measured), ("commanded", commanded)):
         if len(motion.t_s):
             quats = np.vstack([start.quat_xyzw[:1], motion.quat_xyzw])
-            trace = PlotTrace(motion.t_s, motion.position_m, numbers.rotvecs(quats)[1:])
+            trace = PlotTrace(motion.t_s, motion.position_m, trajectory.rotvecs(quats)[1:])
             setattr(out, name, trace)
     if not (len(measured.t_s) and len(commanded.t_s) > 1):
         return
@@ -187,7 +193,7 @@ def _motion(out: Evaluation, measured: MeasuredMotion, commanded: MeasuredMotion
     )
     off = np.linalg.norm(between - measured.position_m, axis=1)
     nearer = np.where(share < 0.5, later - 1, later)
-    turned = numbers.angles_rad(commanded.quat_xyzw[nearer], measured.quat_xyzw)
+    turned = trajectory.angles_rad(commanded.quat_xyzw[nearer], measured.quat_xyzw)
     out.tracking_mm, out.tracking_mrad = off[within] * 1e3, turned[within] * 1e3
 
 
@@ -233,7 +239,7 @@ def _joint_jerk(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
 def _active(run: Run, until_ns: int, zero_ns: int) -> list[tuple[float, float]]:
     return [
         ((since_ns - zero_ns) / 1e9, (min(end_ns, until_ns) - zero_ns) / 1e9)
-        for since_ns, end_ns, _ in task_spans(run)
+        for since_ns, end_ns, _ in activations(run)
         if since_ns < until_ns
     ]
 
@@ -248,7 +254,7 @@ def _idle(out: Evaluation, active: Sequence[tuple[float, float]], measured: Meas
         if len(part.t_s) > 1:
             speed = np.linalg.norm(part.twist[:-1, :3], axis=1)
             turn = np.linalg.norm(part.twist[:-1, 3:], axis=1)
-            out.idle_s += numbers.idle_s(part.t_s, speed, turn)
+            out.idle_s += trajectory.idle_s(part.t_s, speed, turn)
 
 
 def _counted(
@@ -277,7 +283,7 @@ def _segments(
     """One for each prompt that was in force while the arm obeyed."""
     zero_ns = run.began_ns
     steps = {(e.record.worker, e.header.seq): len(e.record.steps) for e in run.chunks}
-    for since_ns, end_ns, prompt in prompt_spans(run):
+    for since_ns, end_ns, prompt in prompt_intervals(run):
         if since_ns >= until_ns:
             break
         end_ns = min(end_ns, until_ns)
