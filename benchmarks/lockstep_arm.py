@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.control.profile_arm import make_kinematics, make_shadow
+from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import log3, quat_from_rotation
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy import Policy
@@ -94,7 +95,9 @@ def activated(
         RuntimeError: it could not be activated; says why.
     """
     world: Any = PerfectArm(profile) if perfect else build_world(profile)
-    loop = Lockstep(profile, world, policy, delays=delays, reach=make_shadow(profile), seed=seed)
+    loop = Lockstep(
+        profile, world, policy, delays=delays, reach=make_reachability_filter(profile), seed=seed
+    )
     loop.put("rate", rate_hz)
     loop.run(WARM_UP_S)
     loop.put("active", True)

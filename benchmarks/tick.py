@@ -22,7 +22,8 @@ import numpy as np
 
 from vla_zenoh.control.commander import Commander, Inputs, Setting
 from vla_zenoh.control.preflight import PeerSnapshot
-from vla_zenoh.control.profile_arm import make_kinematics, make_shadow
+from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile
@@ -44,7 +45,7 @@ class Scenario(NamedTuple):
     table_z_m: float = 0.0
 
 
-def _around(t_s: float) -> tuple[float, ...]:
+def _peers(t_s: float) -> tuple[float, ...]:
     return (0.004 * np.cos(t_s), 0.004 * np.sin(t_s), 0.002 * np.cos(t_s), 0.0, 0.0, 0.0)
 
 
@@ -53,11 +54,11 @@ def _down(t_s: float) -> tuple[float, ...]:
 
 
 SCENARIOS = (
-    Scenario("free space", _around),
+    Scenario("free space", _peers),
     Scenario("at the table", _down, table_z_m=0.1),
     Scenario("at a joint's end", lambda _: (0.0, 0.0, 0.0, 0.0, 0.0, -0.05)),
     Scenario("stretched (singularity)", lambda _: (0.002, 0.01, 0.01, 0.0, 0.0, 0.0)),
-    Scenario("a heap, free space", _around, heap=True),
+    Scenario("a heap, free space", _peers, heap=True),
     Scenario("a heap, at the table", _down, heap=True, table_z_m=0.1),
 )
 
@@ -68,21 +69,23 @@ class Player:
     def __init__(self, profile: Profile, scenario: Scenario) -> None:
         self.profile, self.scenario = profile, scenario
         self.kinematics = make_kinematics(profile)
-        self.commander = Commander(profile, reach=make_shadow(profile, self.kinematics))
+        self.commander = Commander(
+            profile, reach=make_reachability_filter(profile, self.kinematics)
+        )
         self.spec = ModelSpec(
             name=WORKER,
             observation=ObservationSpec(cameras=(CameraSpec(camera="front"),)),
             action=ActionSpec(horizon=HORIZON, dt_s=DT_S, rotation="rotvec", gripper="none"),
         )
         nodes = frozenset({"sim", "camera", f"worker-{WORKER}"})
-        self.around = PeerSnapshot(
+        self.peers = PeerSnapshot(
             alive=nodes,
             robot_node="sim",
             specs={WORKER: self.spec},
             spec_sources={WORKER: SOURCE},
             camera_ages_s={"front": 0.0},
             camera_nodes={"front": "camera"},
-            beside=nodes,
+            same_host=nodes,
         )
         robot = profile.robot
         self.joints_rad = self.kinematics.ordered(robot.arm_joints, robot.home_rad)
@@ -129,7 +132,7 @@ class Player:
             chunks,
             Stamped(header, pose, self.now_ns),
             Stamped(header, gripper, self.now_ns),
-            self.around,
+            self.peers,
             Stamped(header, joint, self.now_ns),
         )
         began_ns = time.perf_counter_ns()

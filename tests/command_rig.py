@@ -75,14 +75,14 @@ class Rig:
         self.spec = model_spec(**action)
         self.now_ns = START_NS
         self.period_ns = round(1e9 / self.profile.timing.command_hz)
-        self.around = PeerSnapshot(
+        self.peers = PeerSnapshot(
             alive=frozenset({"sim", "camera", f"worker-{WORKER}", f"worker-{OTHER}"}),
             robot_node="sim",
             specs={WORKER: self.spec, OTHER: self.spec},
             spec_sources={WORKER: SOURCE, OTHER: "worker-other-1"},
             camera_ages_s={"front": 0.0},
             camera_nodes={"front": "camera"},
-            beside=frozenset({"sim", "camera", f"worker-{WORKER}", f"worker-{OTHER}"}),
+            same_host=frozenset({"sim", "camera", f"worker-{WORKER}", f"worker-{OTHER}"}),
         )
         self.position_m, self.quat_xyzw = START_M.copy(), DOWN.copy()
         self.reference: PoseCommand | None = None
@@ -105,13 +105,13 @@ class Rig:
         """One call of the commander, `ticks` periods after the last one."""
         self.now_ns += ticks * self.period_ns
         put = [Setting(s) if isinstance(s, str) else s for s in settings]
-        inputs = Inputs(put, list(chunks), around=self.around)
+        inputs = Inputs(put, list(chunks), peers=self.peers)
         if not self.silent:
             inputs.pose, inputs.gripper = self.pose_state(), self.gripper_state()
             inputs.joint = self.joint_state()
         out = self.commander.step(inputs, self.now_ns, ticks)
         self.events += out.events
-        self.refused.update(refusal.reason for refusal in out.refusals)
+        self.refused.update(refusal.reason for refusal in out.rejections)
         if out.pose is not None:
             self.reference = out.pose
             self.commands.append(out.pose)
@@ -204,7 +204,7 @@ class Rig:
         header = Header(
             now_ns - round(published_ago_s * 1e9),
             self.seq[worker] if seq is None else seq,
-            self.around.spec_sources.get(worker, SOURCE) if source is None else source,
+            self.peers.spec_sources.get(worker, SOURCE) if source is None else source,
         )
         return Stamped(header, ActionChunk(**made), now_ns)
 

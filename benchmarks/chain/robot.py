@@ -12,8 +12,8 @@ from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.records import SMALL_BYTES
-from vla_zenoh.control.profile_arm import make_kinematics
 from vla_zenoh.keys import Kind
+from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S

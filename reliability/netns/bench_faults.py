@@ -60,9 +60,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, help="write all figures to this file")
     parser.add_argument("--only", action="append", help="this fault; may be given more than once")
-    parser.add_argument(
-        "--no-table", action="store_true", help="do not rewrite the table in docs/"
-    )
+    parser.add_argument("--no-table", action="store_true", help="do not rewrite the table in docs/")
     given = parser.parse_args()
     screen = Console(stderr=True)
     every = list(catalogue())

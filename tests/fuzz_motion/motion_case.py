@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.control.profile_arm import make_kinematics
-from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile, override

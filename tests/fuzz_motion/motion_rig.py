@@ -16,7 +16,7 @@ from motion_case import WORKER, Actions, Case, base_profile, kinematics
 
 from vla_zenoh.control.commander import Commander, Inputs, Setting
 from vla_zenoh.control.preflight import PeerSnapshot
-from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.guard.arm_guard import Measured, make_arm_guard
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation
 from vla_zenoh.types import (
@@ -105,7 +105,7 @@ class Rig:
         profile = case.profile
         self.case, self._rng = case, case.random
         self.trace = Trace()
-        reach = make_shadow(profile, kinematics()) if case.reach else None
+        reach = make_reachability_filter(profile, kinematics()) if case.reach else None
         self._kinematics = kinematics() if case.reach else None
         self._joints = np.array(base_profile().robot.home_rad)
         self._measured = self._held = case.start
@@ -127,15 +127,15 @@ class Rig:
         self._seq = 0
         self._wire: list[tuple[int, int, Stamped[Any]]] = []
         self._sent = self._held_until_ns = 0
-        beside = frozenset({"sim", "camera", f"worker-{WORKER}"})
-        self._around: PeerSnapshot | None = PeerSnapshot(
-            alive=beside,
+        same_host = frozenset({"sim", "camera", f"worker-{WORKER}"})
+        self._peers: PeerSnapshot | None = PeerSnapshot(
+            alive=same_host,
             robot_node="sim",
             specs={WORKER: case.spec},
             spec_sources={WORKER: SOURCE},
             camera_ages_s={"front": 0.0},
             camera_nodes={"front": "camera"},
-            beside=beside,
+            same_host=same_host,
         )
         self._grippers = {
             mode: GripperState(0.08, moving=False, holding=False, mode=mode)
@@ -183,8 +183,8 @@ class Rig:
         if self._heap and at >= self._heap_until:
             chunks += self._heap
             self._heap = []
-        inputs = Inputs(settings, chunks, around=self._around)
-        self._around = None
+        inputs = Inputs(settings, chunks, peers=self._peers)
+        self._peers = None
         if at >= self._silent_until:
             self._tell(at, inputs)
         followed, before = self.guard.following, self.commander.state.value

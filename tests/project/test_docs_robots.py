@@ -10,8 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from vla_zenoh.cli.profile import profile_app
-from vla_zenoh.control.profile_arm import make_kinematics, make_shadow
+from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.interop.ros2.gripper_actions import position
+from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import load_profile
 from vla_zenoh.resources import robot_urdf
@@ -69,7 +70,7 @@ def test_at_home_its_arm_is_where_the_text_says_and_free_to_move(file: Path) -> 
     box, reach = profile.limits.workspace, profile.limits.reach
     for at_m, (low_m, high_m) in zip(home.position_m, (box.x_m, box.y_m, box.z_m), strict=True):
         assert low_m < at_m < high_m
-    margins = make_shadow(profile, kinematics).margins
+    margins = make_reachability_filter(profile, kinematics).margins
     assert margins.singular_value > reach.singularity_slow
     assert margins.self_m > reach.collision_slow_m
 

@@ -107,9 +107,9 @@ def test_a_clock_beyond_the_bound_is_told_and_its_stamps_stay() -> None:
     with two_nodes() as (near, far):
         set_ahead(far, 2_000_000_000)
         found = asked(near, "sim")
-        around = PeerSnapshot(frozenset({"sim"}), clocks=near.clocks.known())
+        peers = PeerSnapshot(frozenset({"sim"}), clocks=near.clocks.known())
         reasons = reasons_not_to_activate(
-            near.profile, "scripted", "hold", around, None, None, None, time.time_ns()
+            near.profile, "scripted", "hold", peers, None, None, None, time.time_ns()
         )
         said = [reason for reason in reasons if "clock of node 'sim'" in reason]
         assert len(said) == 1

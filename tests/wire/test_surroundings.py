@@ -33,7 +33,7 @@ class Scene:
     def __init__(self, command: Node, camera: Node, thief: Node) -> None:
         self.command, self.camera, self.thief = command, camera, thief
         self.ears = PeerMonitor(command)
-        self.around = PeerSnapshot()
+        self.peers = PeerSnapshot()
         self.nodes = (command, camera, thief)
         for node in (camera, thief):
             await_match(node.session, node.keys.status(node.name))
@@ -41,8 +41,8 @@ class Scene:
 
     def look(self) -> PeerSnapshot:
         self.command.clocks.tick()
-        self.around = self.ears.look(self.command.clock.wall_ns()) or self.around
-        return self.around
+        self.peers = self.ears.look(self.command.clock.wall_ns()) or self.peers
+        return self.peers
 
     def says(self, node: Node, age_s: Any) -> None:
         """A status of `node` that tells of the front camera, and is heard."""
@@ -89,15 +89,15 @@ def made() -> Iterator[Scene]:
 def test_a_camera_is_believed_by_the_node_that_serves_it_and_by_no_other(scene: Scene) -> None:
     scene.says(scene.thief, -1e9)
     assert scene.look().camera_nodes == {}
-    assert scene.around.camera_ages_s == {}
+    assert scene.peers.camera_ages_s == {}
 
     scene.says(scene.camera, 3.0)
     until("the camera's own word", lambda: scene.look().camera_nodes == {"front": "camera"})
-    assert 3.0 <= scene.around.camera_ages_s["front"] < 3.0 + AGE_TOLERANCE_S
+    assert 3.0 <= scene.peers.camera_ages_s["front"] < 3.0 + AGE_TOLERANCE_S
 
     scene.says(scene.thief, -1e9)
     assert scene.look().camera_nodes == {"front": "camera"}
-    assert scene.around.camera_ages_s["front"] >= 3.0
+    assert scene.peers.camera_ages_s["front"] >= 3.0
 
 
 def test_what_is_wrong_with_a_camera_is_its_own_nodes_word_until_it_is_good(scene: Scene) -> None:
@@ -110,7 +110,7 @@ def test_what_is_wrong_with_a_camera_is_its_own_nodes_word_until_it_is_good(scen
     count = scene.refused("foreign_camera")
     says(scene.thief, None)
     until("it is refused", lambda: scene.look() and scene.refused("foreign_camera") > count)
-    assert scene.around.camera_faults == {"front": "is black"}
+    assert scene.peers.camera_faults == {"front": "is black"}
     says(scene.camera, None)
     until("it is good", lambda: scene.look().camera_faults == {})
     for nonsense in (True, "black", {}, {"why": 3.0}):
@@ -145,7 +145,7 @@ def test_a_worker_among_many_who_complain_says_when_it_is_well_again(scene: Scen
     until("it is well", lambda: "scripted" not in scene.look().worker_complaints)
     complain(workers[-1], "no sun")
     until("there is room", lambda: str(MAX_WORKERS - 1) in scene.look().worker_complaints)
-    assert len(scene.around.worker_complaints) == MAX_WORKERS
+    assert len(scene.peers.worker_complaints) == MAX_WORKERS
     for node in others:
         node.close()
 
@@ -161,7 +161,7 @@ def test_no_picture_is_younger_than_now(scene: Scene) -> None:
             "all of it is heard",
             lambda nth=nth: scene.look().camera_ages_s.get("wrist", 0.0) >= 100.0 * nth,
         )
-        assert scene.around.camera_ages_s["front"] >= (0.0 if age_s == -1e9 else 7.0), age_s
+        assert scene.peers.camera_ages_s["front"] >= (0.0 if age_s == -1e9 else 7.0), age_s
 
 
 def test_made_up_names_do_not_keep_out_a_clock_that_is_there(scene: Scene) -> None:

@@ -110,9 +110,9 @@ def _arm(profile: Profile, name: str, host: str | None) -> list[str]:
     """
     commands = _runs_command(profile, name, host)
     try:
-        from vla_zenoh.control.profile_arm import make_shadow
+        from vla_zenoh.control.reachability import make_reachability_filter
 
-        make_shadow(profile)
+        make_reachability_filter(profile)
     except ResourceError as error:
         if commands:
             raise ProfileError(f"{profile_file(name)}: robot.description: {error}") from error

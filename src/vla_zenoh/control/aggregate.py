@@ -29,8 +29,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from vla_zenoh.control.limits import Slowdown
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
-from vla_zenoh.control.slowdown import Slowdown
 from vla_zenoh.kinematics.so3 import Pose, between, exp3, log3, norm3, orthonormal
 from vla_zenoh.profile import Composition
 from vla_zenoh.types import FloatArray
@@ -61,7 +61,7 @@ class PlanAggregator:
             return [timeline.plan]
         if self._mode == "blend":
             return self._blended(timeline, now_ns)
-        newest, *older = timeline.kin()
+        newest, *older = timeline.episode_plans()
         alive = [plan for plan in older if now_ns < plan.end_ns]
         return [newest, *alive[: self._most - 1]][::-1]
 
@@ -85,9 +85,9 @@ class PlanAggregator:
         return self._mean
 
     def _blended(self, timeline: GoalTimeline, now_ns: int) -> list[Plan]:
-        kin = timeline.kin()
-        plans = [next(kin)]
-        for older in kin:
+        episode_plans = timeline.episode_plans()
+        plans = [next(episode_plans)]
+        for older in episode_plans:
             if self._weight(older, plans[-1], now_ns) >= 1.0:
                 break
             plans.append(older)
@@ -95,8 +95,8 @@ class PlanAggregator:
 
     def _weight(self, older: Plan, plan: Plan, now_ns: int) -> float:
         """Share of `plan` against `older`: 0 when it arrives, 1 at the end of its window."""
-        had_ns = plan.lasted_ns(now_ns) - plan.lasted_ns(plan.arrival_ns)
-        left_ns = len(older.goals) * older.dt_ns - older.lasted_ns(plan.arrival_ns)
+        had_ns = plan.elapsed_ns(now_ns) - plan.elapsed_ns(plan.arrival_ns)
+        left_ns = len(older.goals) * older.dt_ns - older.elapsed_ns(plan.arrival_ns)
         window_ns = min(self._blend_ns, left_ns)
         if had_ns >= window_ns:
             return 1.0

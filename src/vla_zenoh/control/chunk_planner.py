@@ -17,10 +17,17 @@ import numpy as np
 
 from vla_zenoh.control.actions import rotation_of, step_pose, step_width
 from vla_zenoh.control.chunk_validation import Rejection
-from vla_zenoh.control.limits import LimitHit, bound_step
+from vla_zenoh.control.limits import (
+    APPROACH,
+    LEAST,
+    LimitHit,
+    Slowdown,
+    bound_step,
+    full_speed_s,
+    going_on,
+)
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.control.reachability import Bounded, ReachabilityFilter
-from vla_zenoh.control.slowdown import APPROACH, LEAST, Slowdown, full_speed_s, going_on
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import Pose, between, distance
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec
@@ -157,7 +164,7 @@ class ChunkPlanner:
         done = record.done and count == len(record.steps)
         observed_ns = record.observation_stamp_ns
         standing_on = timeline.in_force(observed_ns)
-        before = standing_on.asked_until(observed_ns)
+        before = standing_on.goal_at(observed_ns)
         steps = np.asarray(record.steps[:count], np.float64)
         refusal = self._mistake(action, steps, before)
         if refusal is not None:
@@ -185,9 +192,9 @@ class ChunkPlanner:
         if isinstance(standing_on, ChunkPlan) and standing_on.approaches:
             # What goes on is not told again, nor faster the more often a model is asked.
             plan.announced = True
-            plan.first_ns = min(plan.dt_ns, max(standing_on.lasted_ns(observed_ns), 0))
+            plan.first_ns = min(plan.dt_ns, max(standing_on.elapsed_ns(observed_ns), 0))
         if standing_on.episode == record.episode:
-            plan.begun = standing_on.steps_asked_until(observed_ns)
+            plan.begun = standing_on.steps_until(observed_ns)
             if done and standing_on.done:  # it only says the last of its steps again
                 plan.most = min(standing_on.begun + len(standing_on.goals), standing_on.most)
         return plan
@@ -199,7 +206,7 @@ class ChunkPlanner:
             whether it may come in force; where the profile says that what is out of bounds is to
             be refused, all of it is made before that is known.
         """
-        until = len(plan.goals) if self._refusing else plan.due_at(now_ns) + 1
+        until = len(plan.goals) if self._refusing else plan.due_index(now_ns) + 1
         while plan.bounded < until:
             acted = self._make_step(plan)
             if acted is None:
@@ -220,7 +227,7 @@ class ChunkPlanner:
         chunks = [plan for plan in reversed(plans) if isinstance(plan, ChunkPlan)]
         for ahead in (0, LOOK_AHEAD):
             for plan in chunks:
-                due = plan.due_at(now_ns)
+                due = plan.due_index(now_ns)
                 if plan.action.kind == "absolute" and plan.bounded > due:
                     plan.made = plan.bounded  # the leash moves no pose that is named
                 until = min(due + 1 + ahead, len(plan.goals))

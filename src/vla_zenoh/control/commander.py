@@ -4,7 +4,7 @@
 clock, no thread and no session; the same inputs give the same outputs, in a test, in lockstep with
 a simulator and on the robot.
 
-Here are states and settings. `composer` makes plans of chunks, `mover` makes commands of plans,
+Here are states and settings. `planner` makes plans of chunks, `mover` makes commands of plans,
 `watch` sees what is lost.
 """
 
@@ -16,16 +16,14 @@ from dataclasses import replace
 from vla_zenoh.control.chunk_planner import ChunkPlan, ChunkPlanner
 from vla_zenoh.control.chunk_validation import Lease, Rejection, refuse
 from vla_zenoh.control.commander_io import Inputs, Outputs, Setting
-from vla_zenoh.control.deadman import Deadman
-from vla_zenoh.control.episode_progress import EpisodeProgress
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
 from vla_zenoh.control.joint_monitor import JointMonitor
 from vla_zenoh.control.motion_pipeline import MotionPipeline
-from vla_zenoh.control.plan_timeline import Goal, Plan
+from vla_zenoh.control.plan_timeline import EpisodeProgress, Goal, Plan
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_not_to_activate
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
-from vla_zenoh.control.watchdog import Watchdog
+from vla_zenoh.control.watchdog import Deadman, Watchdog
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.joint_check import JOINT_PATIENCE_S, reasons_joints_do_not_fit
 from vla_zenoh.kinematics.so3 import held_pose, pose_of
@@ -73,18 +71,18 @@ class Commander:
         self.joint: Stamped[JointState] | None = None
         self.gripper_state: Stamped[GripperState] | None = None
         self.lease: Lease | None = None
-        self.progress, self.holding = EpisodeProgress(), Deadman()
+        self.progress, self.deadman = EpisodeProgress(), Deadman()
         self._resumed_ns = 0
-        self._around = PeerSnapshot()
+        self._peers = PeerSnapshot()
         self._shadow: dict[str, Stamped[ActionChunk]] = {}
-        self._composer = ChunkPlanner(profile, reach)
+        self._planner = ChunkPlanner(profile, reach)
         self._waiting: deque[Stamped[ActionChunk]] = deque()
         self._coming: tuple[Stamped[ActionChunk], ChunkPlan] | None = None
-        self._mover = MotionPipeline(profile, reach, self._composer)
-        self.contact, self._retreat = self._mover.contact, self._mover.retreat
+        self._motion = MotionPipeline(profile, reach, self._planner)
+        self.contact, self._retreat = self._motion.contact, self._motion.retreat
         self._feels = True
-        self._watch = Watchdog(profile)
-        self._joint_watch = None if reach is None else JointMonitor(profile, reach)
+        self._watchdog = Watchdog(profile)
+        self._joint_monitor = None if reach is None else JointMonitor(profile, reach)
         self._speed_changed = False
         self._out = Outputs()
 
@@ -106,24 +104,24 @@ class Commander:
             self._change(Trigger.STOP, "emergency stop")
         for setting in inputs.settings:
             self._take_setting(setting, now_ns, stopped)
-        self._composer.tick()
+        self._planner.tick()
         for chunk in inputs.chunks:
             self._take_chunk(chunk, now_ns)
         self._compose(now_ns)
         self._look_around(now_ns)
         if not inputs.chunks:  # those cost enough in one tick
             self._look_at_joints(now_ns)
-        if not self._mover.advance(
-            self.state, self.task, self._watch.deadline_ns, now_ns, ticks, self._out
+        if not self._motion.advance(
+            self.state, self.task, self._watchdog.deadline_ns, now_ns, ticks, self._out
         ):
             self._change(Trigger.FAULT, "no trajectory could be computed; braked")
-        if self._speed_changed and self._mover.timeline is not None:
+        if self._speed_changed and self._motion.timeline is not None:
             self._speed_changed = False
-            self._expect_next(self._mover.timeline.plan, now_ns)
-        if self.state is State.ACTIVE and self._mover.timeline is not None:
-            self.progress.look(self._mover.timeline, self.task.episode, now_ns)
+            self._expect_next(self._motion.timeline.plan, now_ns)
+        if self.state is State.ACTIVE and self._motion.timeline is not None:
+            self.progress.look(self._motion.timeline, self.task.episode, now_ns)
         if not self.dry_run:
-            self._mover.command(self.state, now_ns, self.gripper_state, self._out)
+            self._motion.command(self.state, now_ns, self.gripper_state, self._out)
         if self.state is not state_before and self.task.active != (self.state in OBEYING):
             self.task = replace(self.task, active=self.state in OBEYING)
         self._out.task_changed = self.task != task_before
@@ -132,22 +130,22 @@ class Commander:
     @property
     def goal(self) -> Goal | None:
         """Where the arm is heading, None before the first activation."""
-        return self._mover.goal
+        return self._motion.goal
 
     @property
     def gripper(self) -> GripperArbiter:
         """What decides when the gripper is commanded."""
-        return self._mover.gripper
+        return self._motion.gripper
 
     @property
     def at_rest(self) -> bool:
         """What is commanded stands still."""
-        return self._mover.at_rest
+        return self._motion.at_rest
 
     @property
     def streaming(self) -> bool:
         """Commands are being published."""
-        return self._mover.streaming
+        return self._motion.streaming
 
     @property
     def retreating(self) -> bool:
@@ -157,32 +155,32 @@ class Commander:
     @property
     def speed(self) -> float:
         """Share of the speed limits that the arm has now; less than 1 near a bound."""
-        return self._mover.speed
+        return self._motion.speed
 
     @property
     def smoothing_failures(self) -> int:
         """Times Ruckig found no way and the arm was braked instead."""
-        return self._mover.failures
+        return self._motion.failures
 
     @property
     def tracking_m(self) -> float:
         """How far the measured TCP is from the commanded one."""
-        return self._watch.tracking_m
+        return self._watchdog.tracking_m
 
     @property
     def tracking_rad(self) -> float:
         """Likewise."""
-        return self._watch.tracking_rad
+        return self._watchdog.tracking_rad
 
     @property
     def elbow_rad(self) -> float:
         """How far the worst measured joint is from where the arm is believed to have it."""
-        return 0.0 if self._joint_watch is None else self._joint_watch.elbow_rad
+        return 0.0 if self._joint_monitor is None else self._joint_monitor.elbow_rad
 
     # -- states and settings ------------------------------------------------------------------
     def _take_state(self, inputs: Inputs) -> None:
-        if inputs.around is not None:
-            self._around = inputs.around
+        if inputs.peers is not None:
+            self._peers = inputs.peers
         if inputs.pose is not None:
             self.pose = inputs.pose
             self.contact.take_pose(inputs.pose)
@@ -241,7 +239,7 @@ class Commander:
         self.task = replace(self.task, episode=episode, **changes)  # pyright: ignore
         self.progress.begin()
         if self.state in OBEYING:
-            self._watch.expect_first(now_ns, self.task.rate_hz, self.task.speed)
+            self._watchdog.expect_first(now_ns, self.task.rate_hz, self.task.speed)
 
     def _change_worker(self, worker: str, now_ns: int) -> None:
         if self.state in OBEYING:
@@ -262,29 +260,29 @@ class Commander:
             )
             return
         lease, reasons = self._preflight(self.task.worker, now_ns)
-        reasons += self.holding.refused(holder, self._around.holders)
-        reasons += self._mover.unsettled(now_ns)
+        reasons += self.deadman.refused(holder, self._peers.holders)
+        reasons += self._motion.unsettled(now_ns)
         if lease is None or self.pose is None or self.gripper_state is None or reasons:
             self._refuse_setting("activate", reasons)
             return
         self.lease = lease
-        self.holding.begin(holder)
+        self.deadman.begin(holder)
         self.contact.begin()
         self._resumed_ns = 0
         measured, joint = self.pose.record, self.joint.record if self.joint else None
-        blocked = self._watch.begin(held_pose(measured), pose_of(measured))
-        self._mover.anchor(measured, self.gripper_state.record, joint, now_ns, blocked=blocked)
+        blocked = self._watchdog.begin(held_pose(measured), pose_of(measured))
+        self._motion.anchor(measured, self.gripper_state.record, joint, now_ns, blocked=blocked)
         held = f", while {holder!r} holds it" if holder else ""
         self._change(Trigger.ACTIVATE, f"activated with worker {self.task.worker!r}{held}")
         self._new_episode(now_ns)
 
     def _hold_as_well(self, holder: str) -> None:
         """An arm that obeys already is held by one; nobody takes that away without a brake."""
-        reasons = self.holding.refused(holder, self._around.holders, obeying=True)
+        reasons = self.deadman.refused(holder, self._peers.holders, obeying=True)
         if reasons:
             self._refuse_setting("activate", reasons)
-        elif holder not in ("", self.holding.name):
-            self.holding.begin(holder)
+        elif holder not in ("", self.deadman.name):
+            self.deadman.begin(holder)
             self._out.tell("info", "notice", "held", f"obeys from now on while {holder!r} holds it")
 
     def _preflight(self, worker: str, now_ns: int) -> tuple[Lease | None, list[str]]:
@@ -293,7 +291,7 @@ class Commander:
             self.profile,
             worker,
             self.task.prompt,
-            self._around,
+            self._peers,
             self.pose,
             self.gripper_state,
             chunk,
@@ -310,7 +308,7 @@ class Commander:
                 reasons.append(f"joints and pose are by different writers: {', '.join(writers)}")
         if reasons or chunk is None:
             return None, reasons
-        spec = self._around.specs[worker]
+        spec = self._peers.specs[worker]
         return Lease(spec, chunk.header.source, now_ns, chunk.header.seq), []
 
     def _refuse_setting(self, what: str, reasons: list[str]) -> None:
@@ -319,7 +317,7 @@ class Commander:
             self.why = f"{what} refused: {'; '.join(reasons)}"[:MAX_TEXT]
         for reason in reasons:
             self._out.tell("warning", "refusal", f"{what}_refused", reason)
-            self._out.refusals.append(Rejection(f"{what}_refused", reason))
+            self._out.rejections.append(Rejection(f"{what}_refused", reason))
 
     def latch(self, why: str) -> None:
         """Begin stopped: an emergency stop outlives the process that heard it."""
@@ -349,7 +347,7 @@ class Commander:
     # -- chunks -------------------------------------------------------------------------------
     def _take_chunk(self, chunk: Stamped[ActionChunk], now_ns: int) -> None:
         worker = chunk.record.worker
-        owner = self._around.spec_sources.get(worker)
+        owner = self._peers.spec_sources.get(worker)
         if owner is None:
             unknown = Rejection("unknown_worker", "its spec is not known yet", quiet=True)
             self._out.refuse(unknown, worker)
@@ -383,13 +381,13 @@ class Commander:
 
     def _expect_next(self, plan: Plan, now_ns: int) -> None:
         rate_hz, speed = self.task.rate_hz, self.task.speed
-        self._watch.expect_next(max(plan.end_ns, now_ns), rate_hz, now_ns, speed)
+        self._watchdog.expect_next(max(plan.end_ns, now_ns), rate_hz, now_ns, speed)
 
     def _begin(self, chunk: Stamped[ActionChunk], now_ns: int) -> None:
-        timeline, lease = self._mover.timeline, self.lease
+        timeline, lease = self._motion.timeline, self.lease
         if timeline is None or lease is None or self._superseded(chunk):
             return
-        plan = self._composer.begin(chunk, lease.spec.action, timeline)
+        plan = self._planner.begin(chunk, lease.spec.action, timeline)
         if isinstance(plan, Rejection):
             self._out.refuse(plan, chunk.record.worker)
             return
@@ -399,11 +397,11 @@ class Commander:
         self._go_on(chunk, plan, now_ns)
 
     def _go_on(self, chunk: Stamped[ActionChunk], plan: ChunkPlan, now_ns: int) -> None:
-        timeline, worker = self._mover.timeline, chunk.record.worker
+        timeline, worker = self._motion.timeline, chunk.record.worker
         if timeline is None or self._superseded(chunk):
             self._coming = None
             return
-        ready = self._composer.go_on(plan, now_ns)
+        ready = self._planner.go_on(plan, now_ns)
         if ready is False:
             return
         self._coming = None
@@ -438,32 +436,32 @@ class Commander:
     # -- watching -----------------------------------------------------------------------------
     def _look_around(self, now_ns: int) -> None:
         if self.pose is not None:
-            self._watch.measure(self._mover.commanded, pose_of(self.pose.record))
-            self._mover.look_at(self.pose.record, now_ns)
+            self._watchdog.measure(self._motion.commanded, pose_of(self.pose.record))
+            self._motion.look_at(self.pose.record, now_ns)
         if self._retreat.busy and not self._may_retreat(now_ns):
             self._retreat.end()
         if self.state not in OBEYING:
             return
         assert self.pose is not None and self.gripper_state is not None and self.lease is not None
-        self._mover.pressed = self.contact.slowdown()
+        self._motion.pressed = self.contact.slowdown()
         self._tell_whether_it_feels()
-        lost = self._watch.lost(
-            self.pose, self.gripper_state, self._around, self.task.worker, self.lease, now_ns
+        lost = self._watchdog.lost(
+            self.pose, self.gripper_state, self._peers, self.task.worker, self.lease, now_ns
         )
         if not lost and self.streaming and not self.dry_run:
             lost = self._obstructed()
-        lost = lost or self._mover.stuck or self._joints_lost(now_ns)
-        if not lost and self._watch.forsaken(now_ns):
+        lost = lost or self._motion.stuck or self._joints_lost(now_ns)
+        if not lost and self._watchdog.forsaken(now_ns):
             lost = f"held for {self.profile.timing.max_hold_s:g} s, no fresh chunk came"
-        lost = lost or self.holding.lost(self._around.holders)
+        lost = lost or self.deadman.lost(self._peers.holders)
         if lost:
             self._change(Trigger.LOSE, lost)
-        elif self._watch.starved(now_ns):
+        elif self._watchdog.starved(now_ns):
             self._change(Trigger.STARVE, "no fresh chunk within the watchdog")
 
     def _joints_lost(self, now_ns: int) -> str:
         """That the measured joints, which are watched, are not heard any more."""
-        if self._joint_watch is None or self.joint is None:
+        if self._joint_monitor is None or self.joint is None:
             return ""
         silent_s = (now_ns - self.joint.received_ns) / 1e9
         patience_s = self.profile.timing.state_timeout_s + JOINT_PATIENCE_S
@@ -473,7 +471,7 @@ class Commander:
 
     def _look_at_joints(self, now_ns: int) -> None:
         """Hold the arm back, or brake it, where its measured joints come too near to something."""
-        watch, reach, mover = self._joint_watch, self.reach, self._mover
+        watch, reach, mover = self._joint_monitor, self.reach, self._motion
         if watch is None or reach is None or self.joint is None:
             return
         if self.state not in OBEYING or not self.streaming:
@@ -496,9 +494,9 @@ class Commander:
 
     def _obstructed(self) -> str:
         """Why the arm cannot go on, empty when it can; then it brakes and is led back."""
-        commanded, pressed = self._mover.commanded, self.contact.pressed()
+        commanded, pressed = self._motion.commanded, self.contact.pressed()
         if pressed is None:
-            why = self._watch.blocked()
+            why = self._watchdog.blocked()
             # Who feels nothing is not blocked: its state is stuck, or it was made slow.
             leads_back = bool(why) and not (self.contact.told and self.contact.quiet)
         else:
@@ -516,9 +514,9 @@ class Commander:
     def _may_retreat(self, now_ns: int) -> bool:
         """The robot is there, well, and says where the arm is."""
         pose, gripper = self.pose, self.gripper_state
-        if pose is None or gripper is None or self._watch.unheard(pose, gripper, now_ns):
+        if pose is None or gripper is None or self._watchdog.unheard(pose, gripper, now_ns):
             return False
-        there = self._around.robot_node in self._around.alive
+        there = self._peers.robot_node in self._peers.alive
         return there and gripper.record.mode == "ready" and not gripper.record.faults
 
     def _tell_whether_it_feels(self) -> None:

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from vla_zenoh.control.chunk_validation import Rejection
-from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.limits import APPROACH, LimitHit
 from vla_zenoh.control.preflight import PeerSnapshot
-from vla_zenoh.control.slowdown import APPROACH
 from vla_zenoh.types import (
     MAX_TEXT,
     ActionChunk,
@@ -54,7 +53,7 @@ class Inputs:
     chunks: Sequence[Stamped[ActionChunk]] = ()
     pose: Stamped[PoseState] | None = None
     gripper: Stamped[GripperState] | None = None
-    around: PeerSnapshot | None = None
+    peers: PeerSnapshot | None = None
     joint: Stamped[JointState] | None = None
 
 
@@ -77,7 +76,7 @@ class Outputs:
     gripper: GripperCommand | None = None
     task_changed: bool = False
     events: list[Event] = field(default_factory=list)
-    refusals: list[Rejection] = field(default_factory=list)
+    rejections: list[Rejection] = field(default_factory=list)
     accepted: Cause | None = None
 
     def tell(
@@ -96,7 +95,7 @@ class Outputs:
 
     def refuse(self, refusal: Rejection, worker: str) -> None:
         """Count a chunk of `worker` as refused, and tell it unless that is normal running."""
-        self.refusals.append(refusal)
+        self.rejections.append(refusal)
         if not refusal.quiet:
             why = f"{worker}: {refusal.why}"
             self.tell("warning", "refusal", refusal.reason, why, refusal.value, refusal.limit)

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from vla_zenoh.control.slowdown import SLOWEST, Slowdown
+from vla_zenoh.control.limits import SLOWEST, Slowdown
 from vla_zenoh.profile import ContactLimits
 from vla_zenoh.types import JointState, PoseState, Stamped
 

@@ -36,8 +36,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vla_zenoh.control.barriers import DistanceConstraints
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.walls import Walls
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.ik import pose_error
 from vla_zenoh.kinematics.kinematics import Kinematics, smallest_singular_value
@@ -127,7 +127,7 @@ class JointFollower:
         kinematics: Kinematics,
         posture_rad: ArrayLike,
         settings: FollowSettings | None = None,
-        walls: Walls | None = None,
+        walls: DistanceConstraints | None = None,
     ) -> None:
         self.kinematics, self.walls = kinematics, walls
         self.settings = settings = settings or FollowSettings()

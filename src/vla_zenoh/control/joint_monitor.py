@@ -17,9 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.limits import SLOWEST, LimitHit, Slowdown
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.slowdown import SLOWEST, Slowdown
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
 

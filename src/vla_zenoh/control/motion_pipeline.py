@@ -11,12 +11,18 @@ from vla_zenoh.control.chunk_planner import ChunkPlanner
 from vla_zenoh.control.commander_io import Outputs
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
-from vla_zenoh.control.limits import into_workspace, leash, workspace_corners
+from vla_zenoh.control.limits import (
+    APPROACH,
+    Slowdown,
+    into_workspace,
+    leash,
+    slowest,
+    workspace_corners,
+)
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.control.pose_to_joint import PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.retreat import Retreat
-from vla_zenoh.control.slowdown import APPROACH, Slowdown, slowest
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother, motion_limits
 from vla_zenoh.control.states import OBEYING, State
 from vla_zenoh.control.step_timing import StepTiming
@@ -66,12 +72,12 @@ class MotionPipeline:
     """
 
     def __init__(
-        self, profile: Profile, reach: ReachabilityFilter | None, composer: ChunkPlanner
+        self, profile: Profile, reach: ReachabilityFilter | None, planner: ChunkPlanner
     ) -> None:
         self._limits = profile.limits
         self._dt_s = 1.0 / profile.timing.command_hz
         self._max_width_m = profile.robot.gripper.max_width_m
-        self._reach, self._composer = reach, composer
+        self._reach, self._planner = reach, planner
         self._aggregator = PlanAggregator(profile.composition)
         self._joints: PoseToJoint | None = None
         if profile.robot.command == "joint":
@@ -303,7 +309,7 @@ class MotionPipeline:
         out: Outputs,
     ) -> Cause | None:
         plans = self._aggregator.plans(timeline, now_ns)
-        out.shortened(self._composer.bound_until(plans, now_ns))
+        out.shortened(self._planner.bound_until(plans, now_ns))
         goal = self._aggregator.goal(plans, now_ns)
         if self._override == 0.0:
             self._stand(smoother)

@@ -32,8 +32,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from vla_zenoh.control.limits import into_workspace
-from vla_zenoh.control.slowdown import Slowdown
+from vla_zenoh.control.limits import Slowdown, into_workspace
 from vla_zenoh.kinematics.so3 import Pose, between, orthonormal
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import Cause, FloatArray
@@ -43,6 +42,8 @@ HISTORY_NS = 15_000_000_000
 OVERRIDES_NS = 600_000_000_000
 """A slow plan lasts long: how long changes of the override are remembered."""
 FOREVER_NS = 1 << 62
+WHOLE_STEP = 1e-6
+"""Parts of steps that sum up to all but this are a step."""
 
 
 class PlanClock:
@@ -140,21 +141,21 @@ class Plan:
         if self.bounded < 0:
             self.bounded = self.made = len(self.goals)
 
-    def lasted_ns(self, t_ns: int) -> int:
+    def elapsed_ns(self, t_ns: int) -> int:
         """Plan time from the observation to `t_ns`."""
         return self.clock.at(t_ns) - self.clock.at(self.start_ns)
 
-    def due_at(self, t_ns: int) -> int:
+    def due_index(self, t_ns: int) -> int:
         """Index of the step whose time it is at `t_ns`."""
-        return min(max(self.lasted_ns(t_ns) // self.dt_ns, 0), len(self.goals) - 1)
+        return min(max(self.elapsed_ns(t_ns) // self.dt_ns, 0), len(self.goals) - 1)
 
     def index_at(self, t_ns: int) -> int:
         """Index of the step in force at `t_ns`: that one, or the last that is bounded."""
-        return min(self.due_at(t_ns), self.bounded - 1)
+        return min(self.due_index(t_ns), self.bounded - 1)
 
-    def asked_until(self, t_ns: int) -> Goal:
+    def goal_at(self, t_ns: int) -> Goal:
         """What its steps have asked for until `t_ns`, its first step at least."""
-        done, part_ns = divmod(self.lasted_ns(t_ns), self.dt_ns)
+        done, part_ns = divmod(self.elapsed_ns(t_ns), self.dt_ns)
         if done < 1:
             return self.goals[0]
         if done >= self.bounded or part_ns == 0:
@@ -165,9 +166,9 @@ class Plan:
             last.width_m + share * (coming.width_m - last.width_m),
         )
 
-    def steps_asked_until(self, t_ns: int) -> float:
+    def steps_until(self, t_ns: int) -> float:
         """Steps of the episode that have been asked for until `t_ns`, parts of one included."""
-        had = self.lasted_ns(t_ns) / self.dt_ns
+        had = self.elapsed_ns(t_ns) / self.dt_ns
         return min(self.begun + min(max(had, 1.0), self.bounded), self.most)
 
     def steps_in_force(self, t_ns: int) -> float:
@@ -212,7 +213,7 @@ class GoalTimeline:
         if self._plans:
             last = self.plan
             hold.episode, hold.done = last.episode, last.done
-            hold.begun = hold.most = last.steps_asked_until(now_ns)
+            hold.begun = hold.most = last.steps_until(now_ns)
         self.add(hold, now_ns)
 
     def restart(self, goal: Goal, now_ns: int) -> None:
@@ -234,7 +235,7 @@ class GoalTimeline:
         """The newest plan."""
         return self._plans[-1]
 
-    def kin(self) -> Iterator[Plan]:
+    def episode_plans(self) -> Iterator[Plan]:
         """The newest plan, then older ones of the same episode back to a hold, which is none."""
         newest = self.plan
         yield newest
@@ -252,4 +253,25 @@ class GoalTimeline:
 
     def at(self, t_ns: int) -> Goal:
         """G(t): what the plan that was in force at `t_ns` had asked for by then."""
-        return self.in_force(t_ns).asked_until(t_ns)
+        return self.in_force(t_ns).goal_at(t_ns)
+
+
+class EpisodeProgress:
+    """See the module. `chunks` that were accepted, `steps` of them that came in force."""
+
+    def __init__(self) -> None:
+        self.begin()
+
+    def begin(self) -> None:
+        """An episode begins."""
+        self.chunks = self.steps = 0
+        self.done = False
+
+    def look(self, timeline: GoalTimeline, episode: int, now_ns: int) -> None:
+        """Steps that have come in force, and whether they were the last ones."""
+        plan = timeline.plan
+        if plan.episode != episode:
+            return
+        steps = math.floor(plan.steps_in_force(now_ns) + WHOLE_STEP)
+        self.steps = max(self.steps, steps)
+        self.done = plan.done and plan.index_at(now_ns) == len(plan.goals) - 1

@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla_zenoh.control.barriers import Barriers
+from vla_zenoh.control.barriers import Barriers, DistanceConstraints
 from vla_zenoh.control.joint_follower import FollowSettings, JointFollower, JointMotion
 from vla_zenoh.control.limits import JointMotionLimits, into_workspace
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother
-from vla_zenoh.control.walls import Walls
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, distance, exp3, log3
 from vla_zenoh.profile import Profile
@@ -87,7 +86,7 @@ class PoseToJoint:
             singularity_stop=limits.reach.singularity_stop,
         )
         self._bounds = limits
-        self._walls = Walls(limits, barriers)
+        self._walls = DistanceConstraints(limits, barriers)
         self._follower = JointFollower(kinematics, home_rad, settings, self._walls)
         most = float(jerk.min()) / PULL_JERK / settings.posture_rad_s
         self._pull_1_s = min(PULL_1_S, most**0.5)

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from vla_zenoh.control import chunk_plausibility as plausible
-from vla_zenoh.control import spec_fit as fit
+from vla_zenoh.control import policy_check
 from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.errors import SpecError
 from vla_zenoh.keys import worker_node
@@ -53,7 +52,7 @@ class PeerSnapshot:
     camera_ages_s: Mapping[str, float] = field(default_factory=dict)
     camera_nodes: Mapping[str, str] = field(default_factory=dict)
     hosts: Mapping[str, str] = field(default_factory=dict)
-    beside: frozenset[str] = frozenset()
+    same_host: frozenset[str] = frozenset()
     clocks: Mapping[str, Offset] = field(default_factory=dict)
     holders: frozenset[str] = frozenset()
     camera_faults: Mapping[str, str] = field(default_factory=dict)
@@ -63,7 +62,7 @@ def reasons_not_to_activate(
     profile: Profile,
     worker: str,
     prompt: str,
-    around: PeerSnapshot,
+    peers: PeerSnapshot,
     pose: Stamped[PoseState] | None,
     gripper: Stamped[GripperState] | None,
     chunk: Stamped[ActionChunk] | None,
@@ -84,25 +83,25 @@ def reasons_not_to_activate(
         rate_hz: chunks per second asked of the worker.
     """
     return [
-        *_robot(profile, around, pose, now_ns),
+        *_robot(profile, peers, pose, now_ns),
         *_gripper(profile, gripper, now_ns),
-        *_worker(worker, prompt, around),
-        *_spec(profile, worker, around, rate_hz),
-        *_chunk(profile, worker, around, chunk, now_ns, rate_hz),
-        *_cameras(profile, worker, around),
-        *_clocks(profile, worker, around),
+        *_worker(worker, prompt, peers),
+        *_spec(profile, worker, peers, rate_hz),
+        *_chunk(profile, worker, peers, chunk, now_ns, rate_hz),
+        *_cameras(profile, worker, peers),
+        *_clocks(profile, worker, peers),
     ]
 
 
 def _robot(
     profile: Profile,
-    around: PeerSnapshot,
+    peers: PeerSnapshot,
     pose: Stamped[PoseState] | None,
     now_ns: int,
 ) -> list[str]:
     reasons: list[str] = []
-    if around.robot_node not in around.alive:
-        reasons.append(f"the robot's node {around.robot_node!r} is not alive")
+    if peers.robot_node not in peers.alive:
+        reasons.append(f"the robot's node {peers.robot_node!r} is not alive")
     if pose is None:
         return [*reasons, "the TCP pose is not known: nothing was heard on state/pose"]
     reasons += _too_old("TCP pose", pose, profile, now_ns)
@@ -141,33 +140,35 @@ def _too_old(what: str, state: Stamped[Any], profile: Profile, now_ns: int) -> l
     return [f"the {what} is {age_s:.2f} s old, at most {limit_s:g} s is allowed"]
 
 
-def _worker(worker: str, prompt: str, around: PeerSnapshot) -> list[str]:
+def _worker(worker: str, prompt: str, peers: PeerSnapshot) -> list[str]:
     node = worker_node(worker)
-    if node not in around.alive:
+    if node not in peers.alive:
         others = sorted(
-            name.removeprefix("worker-") for name in around.alive if name.startswith("worker-")
+            name.removeprefix("worker-") for name in peers.alive if name.startswith("worker-")
         )
         return [f"worker {worker!r} is not alive; alive are: {', '.join(others) or 'none'}"]
-    spec = around.specs.get(worker)
+    spec = peers.specs.get(worker)
     if spec is None:
         return [f"worker {worker!r} has not published its spec"]
     reasons: list[str] = []
     if spec.observation.prompt and not prompt:
         reasons.append(f"worker {worker!r} needs a prompt and there is none")
-    complaint = around.worker_complaints.get(worker)
+    complaint = peers.worker_complaints.get(worker)
     if complaint:
         reasons.append(f"worker {worker!r} says: {complaint}")
     return reasons
 
 
-def _spec(profile: Profile, worker: str, around: PeerSnapshot, rate_hz: float) -> list[str]:
+def _spec(profile: Profile, worker: str, peers: PeerSnapshot, rate_hz: float) -> list[str]:
     """What its spec asks for and the profile does not give."""
-    spec = around.specs.get(worker)
+    spec = peers.specs.get(worker)
     if spec is None:
         return []
     return [
         f"worker {worker!r} {why}" if name == "camera" else f"worker {worker!r}: {name}: {why}"
-        for level, name, why in fit.findings(profile, spec, worker=worker, rate_hz=rate_hz)
+        for level, name, why in policy_check.check_spec(
+            profile, spec, worker=worker, rate_hz=rate_hz
+        )
         if level == "error"
     ]
 
@@ -175,18 +176,18 @@ def _spec(profile: Profile, worker: str, around: PeerSnapshot, rate_hz: float) -
 def _chunk(
     profile: Profile,
     worker: str,
-    around: PeerSnapshot,
+    peers: PeerSnapshot,
     chunk: Stamped[ActionChunk] | None,
     now_ns: int,
     rate_hz: float,
 ) -> list[str]:
-    spec = around.specs.get(worker)
-    if spec is None or worker_node(worker) not in around.alive:
+    spec = peers.specs.get(worker)
+    if spec is None or worker_node(worker) not in peers.alive:
         return []
     oldest_s = profile.timing.max_observation_age_s
     patience_s = max(CHUNK_PATIENCE_S, oldest_s) + 1.0 / rate_hz
     # What a worker that was restarted had published before says nothing about it.
-    ours = chunk is not None and chunk.header.source == around.spec_sources.get(worker)
+    ours = chunk is not None and chunk.header.source == peers.spec_sources.get(worker)
     if chunk is None or not ours or now_ns - chunk.received_ns > patience_s * 1e9:
         return [f"worker {worker!r} has published no chunk in the last {patience_s:g} s"]
     if chunk.record.spec_hash != spec.hash:
@@ -206,7 +207,7 @@ def _chunk(
         steps = check_steps(spec.action, chunk.record.steps)
     except SpecError as error:
         return [f"worker {worker!r}: its newest chunk is not sane: {error}"]
-    found = plausible.findings(
+    found = policy_check.check_chunk(
         spec.action, steps, profile.limits, profile.robot.gripper.max_width_m
     )
     return [
@@ -216,8 +217,8 @@ def _chunk(
     ]
 
 
-def _cameras(profile: Profile, worker: str, around: PeerSnapshot) -> list[str]:
-    spec = around.specs.get(worker)
+def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
+    spec = peers.specs.get(worker)
     if spec is None:
         return []
     reasons: list[str] = []
@@ -225,36 +226,34 @@ def _cameras(profile: Profile, worker: str, around: PeerSnapshot) -> list[str]:
         camera = wanted.camera
         if camera not in profile.cameras:
             continue  # said already, by what the spec asks for
-        age_s = around.camera_ages_s.get(camera, math.inf)
-        node = around.camera_nodes.get(camera)
-        if node is None or node not in around.alive:
+        age_s = peers.camera_ages_s.get(camera, math.inf)
+        node = peers.camera_nodes.get(camera)
+        if node is None or node not in peers.alive:
             reasons.append(f"no living node serves camera {camera!r}")
         elif age_s > CAMERA_PATIENCE_S:
             reasons.append(f"camera {camera!r} has sent no picture for {age_s:.1f} s")
-        elif camera in around.camera_faults:
-            reasons.append(f"camera {camera!r} {around.camera_faults[camera]}")
+        elif camera in peers.camera_faults:
+            reasons.append(f"camera {camera!r} {peers.camera_faults[camera]}")
     return reasons
 
 
-def _clocks(profile: Profile, worker: str, around: PeerSnapshot) -> list[str]:
+def _clocks(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
     """Clocks that are off by more than can be reckoned with, or not known and not our own."""
-    spec = around.specs.get(worker)
+    spec = peers.specs.get(worker)
     cameras = spec.observation.cameras if spec is not None else ()
-    nodes = [around.robot_node, worker_node(worker)]
-    nodes += [
-        around.camera_nodes[one.camera] for one in cameras if one.camera in around.camera_nodes
-    ]
+    nodes = [peers.robot_node, worker_node(worker)]
+    nodes += [peers.camera_nodes[one.camera] for one in cameras if one.camera in peers.camera_nodes]
     bound_s, reasons = profile.timing.max_clock_offset_s, []
     for node in dict.fromkeys(nodes):
-        found = around.clocks.get(node)
+        found = peers.clocks.get(node)
         if found is not None and found.beyond(bound_s):
             reasons.append(
                 f"the clock of node {node!r} is {found.offset_s:+.3f} s off this one's "
                 f"(+-{found.uncertainty_s:.4f} s), at most {bound_s:g} s is allowed "
                 "(timing.max_clock_offset_s); synchronise the clocks of both hosts (chrony or ptp)"
             )
-        elif found is None and node in around.alive - around.beside:
-            where = f" on {around.hosts[node]}" if node in around.hosts else ""
+        elif found is None and node in peers.alive - peers.same_host:
+            where = f" on {peers.hosts[node]}" if node in peers.hosts else ""
             reasons.append(
                 f"the clock of node {node!r}{where} is not known: it has not answered yet"
             )

@@ -15,7 +15,7 @@ posture put it, because that is what a Cartesian controller does with it: a solu
 the elbow to swing aside is none. `free_elbow` is for arms whose joints are commanded.
 
 A step for which the joints alone are too slow is kept and told to be taken slower, see
-`vla_zenoh.control.slowdown`; only where that would take more than ten times as long it is
+`vla_zenoh.control.limits`; only where that would take more than ten times as long it is
 shortened: such joints leap to another solution.
 """
 
@@ -28,13 +28,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vla_zenoh.control.barriers import Barriers, Margins
-from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.slowdown import LEAST, SLOWEST, Slowdown, full_speed_s
+from vla_zenoh.control.limits import LEAST, SLOWEST, LimitHit, Slowdown, full_speed_s
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.ik import Approach, IkSettings, InverseKinematics, pose_error
-from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, orthonormal
-from vla_zenoh.profile import Limits
+from vla_zenoh.profile import Limits, Profile
 from vla_zenoh.types import FloatArray
 
 HALVINGS = 4
@@ -355,3 +354,29 @@ def _part(before: Pose, step: FloatArray, fraction: float) -> Pose:
     """`fraction` of a step (6,) m and rad on the straight line and the shortest turn."""
     turned = exp3(fraction * step[3:]) @ before.rotation
     return Pose(before.position_m + fraction * step[:3], orthonormal(turned))
+
+
+def make_reachability_filter(
+    profile: Profile, kinematics: Kinematics | None = None
+) -> ReachabilityFilter:
+    """The kinematic shadow that bounds goals, standing at home.
+
+    Raises:
+        ResourceError: description or collision shapes are not there.
+        ProfileError: frames or joints that the description does not have.
+    """
+    kinematics = kinematics or make_kinematics(profile)
+    names = profile.robot.arm_joints
+    home_rad = kinematics.ordered(names, profile.robot.home_rad)
+    # Its joints are ours to command, and to hold back, only where the profile says so.
+    commanded = profile.robot.command == "joint"
+    most_rad_s = profile.limits.joint.of("velocity_rad_s", len(names))
+    return ReachabilityFilter(
+        kinematics,
+        home_rad,
+        profile.limits,
+        free_elbow=commanded,
+        posture_rad=home_rad if profile.robot.posture == "home" else None,
+        known_good_rad=[home_rad],
+        velocity_rad_s=kinematics.ordered(names, most_rad_s) if commanded else None,
+    )

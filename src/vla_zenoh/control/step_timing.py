@@ -143,7 +143,7 @@ class StepTiming:
         self._gone = 0.0
         if before is not None:
             now_ns = plan.clock.wall_at(plan_ns)
-            asked = before.steps_asked_until(now_ns) - before.steps_asked_until(plan.start_ns)
+            asked = before.steps_until(now_ns) - before.steps_until(plan.start_ns)
             self._gone = min(max(asked * before.dt_ns / plan.dt_ns, 0.0), steps - 1.0)
         lasts_ns = (steps - self._gone) * plan.dt_ns
         wait_ns = max(self._arrivals.next_ns - plan_ns, 0.0)

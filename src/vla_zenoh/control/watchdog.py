@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Set as AbstractSet
+
 from vla_zenoh.control.chunk_validation import Lease
 from vla_zenoh.control.preflight import CLOCK_TOLERANCE_S, PeerSnapshot
-from vla_zenoh.keys import worker_node
+from vla_zenoh.keys import NOT_SEEN, worker_node
 from vla_zenoh.kinematics.so3 import Pose, distance
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import GripperState, PoseState, Stamped
@@ -109,7 +111,7 @@ class Watchdog:
         self,
         pose: Stamped[PoseState],
         gripper: Stamped[GripperState],
-        around: PeerSnapshot,
+        peers: PeerSnapshot,
         worker: str,
         lease: Lease,
         now_ns: int,
@@ -118,15 +120,47 @@ class Watchdog:
         silent = self.unheard(pose, gripper, now_ns)
         if silent:
             return silent
-        needed = [around.robot_node, worker_node(worker)]
+        needed = [peers.robot_node, worker_node(worker)]
         cameras = [camera.camera for camera in lease.spec.observation.cameras]
-        needed += [around.camera_nodes.get(camera, "camera") for camera in cameras]
+        needed += [peers.camera_nodes.get(camera, "camera") for camera in cameras]
         for node in needed:
-            if node not in around.alive:
+            if node not in peers.alive:
                 return f"node {node!r} is gone"
         for camera in cameras:
-            if camera in around.camera_faults:
-                return f"camera {camera!r} {around.camera_faults[camera]}"
-        if around.spec_sources.get(worker) != lease.source:
+            if camera in peers.camera_faults:
+                return f"camera {camera!r} {peers.camera_faults[camera]}"
+        if peers.spec_sources.get(worker) != lease.source:
             return f"worker {worker!r} was started anew"
         return ""
+
+
+class Deadman:
+    """See the module. `name` is whose hand it is, empty while nobody's is needed."""
+
+    def __init__(self) -> None:
+        self.name = ""
+
+    def begin(self, holder: str) -> None:
+        """An activation begins, which `holder` holds, if not empty."""
+        self.name = holder
+
+    def refused(self, holder: str, there: AbstractSet[str], *, obeying: bool = False) -> list[str]:
+        """Why `holder` cannot hold the arm active, empty when he can.
+
+        Args:
+            holder: empty: nobody, which is no reason.
+            there: whose tokens are there.
+            obeying: the arm obeys already.
+        """
+        reasons = []
+        if holder and holder not in there:
+            reasons.append(f"{holder!r}, who is to hold the arm active, {NOT_SEEN}")
+        if obeying and holder and self.name and holder != self.name:
+            reasons.append(f"it obeys already, while {self.name!r} holds it; deactivate it first")
+        return reasons
+
+    def lost(self, there: AbstractSet[str]) -> str:
+        """Why the arm must brake, empty when it need not."""
+        if not self.name or self.name in there:
+            return ""
+        return f"{self.name!r}, who held the arm active, is gone"

@@ -25,7 +25,7 @@ def make_forward(profile: Profile) -> Forward:
         ProfileError: frames or joints that the description does not have.
     """
     try:
-        from vla_zenoh.control.profile_arm import make_kinematics
+        from vla_zenoh.kinematics.kinematics import make_kinematics
     except ImportError as error:
         raise MissingExtraError(error.name or "pinocchio", "control") from error
     kinematics = make_kinematics(profile)

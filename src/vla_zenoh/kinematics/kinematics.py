@@ -17,9 +17,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from vla_zenoh import resources
 from vla_zenoh.errors import ProfileError, RecordError
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.profile import JointEnds
+from vla_zenoh.profile import JointEnds, Profile
 from vla_zenoh.types import FloatArray, JointState
 
 BEYOND_LIMITS = 0.1
@@ -140,6 +141,24 @@ class Kinematics:
             placement = self.base_placement.actInv(placement)
         # Copies: the placement is a view into the work space.
         return Pose(placement.translation.copy(), placement.rotation.copy())
+
+
+def make_kinematics(profile: Profile) -> Kinematics:
+    """Kinematics of the profile's robot.
+
+    Raises:
+        ResourceError: its description is not there.
+        ProfileError: frames or joints that the description does not have.
+    """
+    robot = profile.robot
+    return Kinematics(
+        resources.robot_urdf(robot.description),
+        robot.tcp_frame,
+        robot.arm_joints,
+        robot.finger_joints,
+        base_frame=robot.base_frame,
+        finger_ends=robot.gripper.joint_ends,
+    )
 
 
 def smallest_singular_value(jacobian: FloatArray) -> float:

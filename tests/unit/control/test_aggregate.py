@@ -171,13 +171,13 @@ def test_steps_are_counted_as_the_way_is(horizon: int, requests: list[tuple[int,
         observed_ns = now_ns + wait_ms * MS
         made = plan(observed_ns // MS, rising(timeline.at(observed_ns), horizon))
         before = timeline.in_force(observed_ns)
-        made.begun = before.steps_asked_until(observed_ns) if before.cause else 0.0
+        made.begun = before.steps_until(observed_ns) if before.cause else 0.0
         now_ns = observed_ns + latency_ms * MS
         made.effective_ns = now_ns
         timeline.add(made, now_ns)
         for t_ns in (now_ns, now_ns + 70 * MS, now_ns + 999 * MS):
-            asked = timeline.plan.steps_asked_until(t_ns)
-            assert height(timeline.plan.asked_until(t_ns)) == pytest.approx(asked * STEP_M)
+            asked = timeline.plan.steps_until(t_ns)
+            assert height(timeline.plan.goal_at(t_ns)) == pytest.approx(asked * STEP_M)
             assert asked - ATOL_M <= timeline.plan.steps_in_force(t_ns) <= asked + 1 + ATOL_M
     end_ns = timeline.plan.end_ns
-    assert timeline.plan.steps_in_force(end_ns) == timeline.plan.steps_asked_until(end_ns)
+    assert timeline.plan.steps_in_force(end_ns) == timeline.plan.steps_until(end_ns)

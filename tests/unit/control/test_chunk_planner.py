@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from panda_arm import HOME_RAD, panda, tool_down_at
 
 from vla_zenoh.control.chunk_planner import PATIENCE, ChunkPlan, ChunkPlanner
+from vla_zenoh.control.limits import Slowdown, going_on
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.slowdown import Slowdown, going_on
 from vla_zenoh.kinematics.ik import Approach
 from vla_zenoh.kinematics.so3 import Pose, angle_between, norm3, rotation_from_quat
 from vla_zenoh.profile import Limits, Profile, ReachLimits
@@ -90,20 +90,20 @@ def whole_plan(
 ) -> ChunkPlan:
     """The plan of a chunk with every step of it bounded, `budget` evaluations a tick."""
     reach.reset(START_RAD)
-    composer = ChunkPlanner(of, reach)
-    composer.budget = budget
+    planner = ChunkPlanner(of, reach)
+    planner.budget = budget
     timeline = GoalTimeline(Goal(START, 0.08), START_NS)
     spec = model_spec(**{**FAST_STEPS, **action}).action
-    plan = composer.begin(chunk_of(steps), spec, timeline)
+    plan = planner.begin(chunk_of(steps), spec, timeline)
     assert isinstance(plan, ChunkPlan), plan
     ready: Any = False
     while not ready:
-        composer.tick()
-        ready = composer.go_on(plan, START_NS)
+        planner.tick()
+        ready = planner.go_on(plan, START_NS)
     assert ready is True
     while plan.bounded < len(plan.goals):
-        composer.tick()
-        composer.bound_until([plan], plan.end_ns)
+        planner.tick()
+        planner.bound_until([plan], plan.end_ns)
     return plan
 
 
@@ -143,7 +143,7 @@ def test_absolute_targets_behind_a_limit_do_not_wander_with_what_it_cut() -> Non
 @pytest.mark.parametrize("mode", ["replace", "blend", "ensemble"])
 def test_no_tick_evaluates_the_arm_more_often_than_its_budget_allows(mode: str) -> None:
     rig = arm_rig(profile(composition={"mode": mode}))
-    budget = rig.commander._composer.budget
+    budget = rig.commander._planner.budget
     assert budget <= 10
     most = total = 0
     for tick in range(1, 400):
@@ -181,7 +181,7 @@ def test_until_a_chunk_is_bounded_the_one_before_it_stays_in_force() -> None:
         assert out.pose is not None
         assert out.pose.cause == first
         out, waited = rig.tick(), waited + 1
-    assert 0 < waited <= math.ceil(PATIENCE / rig.commander._composer.budget)
+    assert 0 < waited <= math.ceil(PATIENCE / rig.commander._planner.budget)
     rig.settle(2.0)
     # The first step of the first, in whose time the second was observed, and all of the second.
     np.testing.assert_allclose(rig.moved_m(), [0, 0, 0.01 * 25], atol=AT_GOAL_M)
@@ -213,9 +213,9 @@ def test_of_a_heap_only_the_newest_is_carried_out_and_the_others_are_counted_qui
     assert out.accepted is not None
     assert out.accepted.chunk_seq == heap[-1].header.seq
     assert rig.refused == {"overtaken": 63}
-    assert all(refusal.quiet for refusal in out.refusals)
+    assert all(refusal.quiet for refusal in out.rejections)
     assert rig.events == []
-    assert rig.commander._composer.budget >= IN_PIECES.count
+    assert rig.commander._planner.budget >= IN_PIECES.count
     rig.settle()
     np.testing.assert_allclose(rig.moved_m(), UP[:3], atol=AT_GOAL_M)
 
@@ -253,7 +253,7 @@ def test_a_profile_that_refuses_what_is_out_of_bounds_decides_when_all_of_it_is_
     IN_PIECES.count = 0
     out = rig.send([[0, 0, -0.01, 0, 0, 0, 0]] * count)
     assert out.accepted is None
-    assert rig.commander._composer.budget == IN_PIECES.count
+    assert rig.commander._planner.budget == IN_PIECES.count
     accepted = [rig.tick().accepted for _ in range(10)]
     assert any(accepted) == (not refused)
     assert rig.refused == refused

@@ -57,13 +57,13 @@ def test_before_activation_nothing_is_streamed_and_chunks_are_only_looked_at() -
 
 def test_activation_is_refused_with_every_reason_as_an_event() -> None:
     rig = Rig()
-    rig.around = replace(rig.around, alive=frozenset())
+    rig.peers = replace(rig.peers, alive=frozenset())
     rig.put("active", True)
     assert rig.state == "inactive"
-    refusals = [event for event in rig.events if event.kind == "refusal"]
-    assert len(refusals) >= 3
-    assert {event.what for event in refusals} == {"activate_refused"}
-    assert rig.refused["activate_refused"] == len(refusals)
+    rejections = [event for event in rig.events if event.kind == "refusal"]
+    assert len(rejections) >= 3
+    assert {event.what for event in rejections} == {"activate_refused"}
+    assert rig.refused["activate_refused"] == len(rejections)
 
 
 def test_activation_begins_where_the_robot_holds_and_does_not_move_it() -> None:
@@ -453,12 +453,12 @@ def test_a_node_that_is_gone_ends_the_activation_and_coming_back_does_not_renew_
     node: str,
 ) -> None:
     rig = moving_rig()
-    whole = rig.around
-    rig.around = replace(whole, alive=whole.alive - {node})
+    whole = rig.peers
+    rig.peers = replace(whole, alive=whole.alive - {node})
     rig.tick()
     assert rig.state == "inactive"
     assert node in rig.commander.why
-    rig.around = whole
+    rig.peers = whole
     rig.run(1.0)
     assert rig.state == "inactive"
     rig.assert_smooth()
@@ -468,11 +468,11 @@ def test_a_node_that_is_gone_ends_the_activation_and_coming_back_does_not_renew_
 def test_a_camera_that_lies_ends_the_activation_by_name() -> None:
     rig = moving_rig()
     frozen = {"front": "shows the same picture since 1.2 s"}
-    rig.around = replace(rig.around, camera_faults=frozen)
+    rig.peers = replace(rig.peers, camera_faults=frozen)
     rig.tick()
     assert rig.state == "inactive"
     assert rig.commander.why == "camera 'front' shows the same picture since 1.2 s"
-    rig.around = replace(rig.around, camera_faults={})
+    rig.peers = replace(rig.peers, camera_faults={})
     rig.run(1.0)
     assert rig.state == "inactive"
     rig.assert_smooth()
@@ -481,21 +481,21 @@ def test_a_camera_that_lies_ends_the_activation_by_name() -> None:
 
 def test_a_camera_that_the_model_does_not_use_may_lie() -> None:
     rig = moving_rig()
-    rig.around = replace(rig.around, camera_faults={"wrist": "is black"})
+    rig.peers = replace(rig.peers, camera_faults={"wrist": "is black"})
     rig.tick()
     assert rig.state == "active"
 
 
 def test_a_node_that_is_not_needed_may_go() -> None:
     rig = moving_rig()
-    rig.around = replace(rig.around, alive=rig.around.alive - {f"worker-{OTHER}"})
+    rig.peers = replace(rig.peers, alive=rig.peers.alive - {f"worker-{OTHER}"})
     rig.tick()
     assert rig.state == "active"
 
 
 def test_a_worker_that_was_started_anew_has_to_be_activated_anew() -> None:
     rig = moving_rig()
-    rig.around = replace(rig.around, spec_sources={WORKER: "worker-scripted-2"})
+    rig.peers = replace(rig.peers, spec_sources={WORKER: "worker-scripted-2"})
     rig.tick()
     assert rig.state == "inactive"
     assert "started anew" in rig.commander.why
@@ -534,7 +534,7 @@ def test_a_gripper_that_falls_silent_ends_the_activation() -> None:
     rig = moving_rig()
     for _ in range(50):
         rig.now_ns += rig.period_ns
-        rig.commander.step(Inputs(pose=rig.pose_state(), around=rig.around), rig.now_ns)
+        rig.commander.step(Inputs(pose=rig.pose_state(), peers=rig.peers), rig.now_ns)
     assert rig.state == "inactive"
     assert "robot state lost: gripper" in rig.commander.why
 
@@ -626,7 +626,7 @@ def test_chunks_of_another_spec_than_agreed_are_refused() -> None:
     rig = Rig()
     rig.activate()
     changed = model_spec(dt_s=0.2)
-    rig.around = replace(rig.around, specs={WORKER: changed})
+    rig.peers = replace(rig.peers, specs={WORKER: changed})
     rig.send([UP], spec_hash=changed.hash)
     assert rig.refused == {"spec_mismatch": 1}
 
@@ -915,7 +915,7 @@ def test_the_robots_own_reference_is_where_it_begins() -> None:
     record = PoseState(START_M, rig.quat_xyzw, np.zeros(6), None, held_m, rig.quat_xyzw)
     rig.tick(chunks=[rig.chunk([STAND])])
     pose = replace(rig.pose_state(), record=record)
-    inputs = Inputs([Setting("active", True)], [], pose, rig.gripper_state(), rig.around)
+    inputs = Inputs([Setting("active", True)], [], pose, rig.gripper_state(), rig.peers)
     out = rig.commander.step(inputs, rig.now_ns)
     assert out.pose is not None
     np.testing.assert_allclose(out.pose.position_m, held_m, atol=1e-12)

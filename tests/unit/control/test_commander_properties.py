@@ -93,7 +93,7 @@ def hostile(rig: Rig, wish: dict[str, Any]) -> Stamped[ActionChunk] | None:
 
 
 def play(rig: Rig, script: list[Any]) -> None:
-    whole = rig.around
+    whole = rig.peers
     for event in script:
         if isinstance(event, dict):
             chunk = hostile(rig, event)
@@ -108,10 +108,10 @@ def play(rig: Rig, script: list[Any]) -> None:
             rig.tick("reset", chunks=[rig.chunk([[0.0] * rig.spec.action.dimension])])
             rig.put("active", True)
         elif event == "lose a node":
-            rig.around = replace(whole, alive=frozenset({"sim", "camera"}))
+            rig.peers = replace(whole, alive=frozenset({"sim", "camera"}))
             rig.tick()
         elif event == "find it":
-            rig.around = whole
+            rig.peers = whole
             rig.tick()
         elif event in ("fault", "repair"):
             faults = ("sore",) if event == "fault" else ()
@@ -211,7 +211,7 @@ def test_inputs_of_everything_at_once_in_one_tick() -> None:
         [rig.chunk([[0.01] * 7]) for _ in range(64)],
         rig.pose_state(),
         rig.gripper_state(),
-        rig.around,
+        rig.peers,
     )
     out = rig.commander.step(inputs, rig.now_ns)
     assert rig.state == "stopped"

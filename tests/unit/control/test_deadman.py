@@ -21,7 +21,7 @@ NAMES = st.from_regex(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,20}", fullmatch=True)
 def rig_with(*there: str) -> Rig:
     """A rig that is ready to be activated, where these hold a token."""
     rig = Rig()
-    rig.around = replace(rig.around, holders=frozenset(there))
+    rig.peers = replace(rig.peers, holders=frozenset(there))
     rig.tick(chunks=[rig.chunk([[0.0] * 7])])
     return rig
 
@@ -34,7 +34,7 @@ def test_an_arm_in_motion_brakes_when_who_holds_it_is_gone() -> None:
         rig.send([FORTH])
         rig.run(0.096)
     assert not rig.commander.at_rest
-    rig.around = replace(rig.around, holders=frozenset({BEN}))
+    rig.peers = replace(rig.peers, holders=frozenset({BEN}))
     rig.tick()
     assert rig.state == "inactive"
     assert rig.commander.why == "'anna-1', who held the arm active, is gone"
@@ -44,9 +44,9 @@ def test_an_arm_in_motion_brakes_when_who_holds_it_is_gone() -> None:
 def test_who_comes_back_does_not_activate_by_that() -> None:
     rig = rig_with(ANNA)
     rig.put("active", ANNA)
-    rig.around = replace(rig.around, holders=frozenset())
+    rig.peers = replace(rig.peers, holders=frozenset())
     rig.tick()
-    rig.around = replace(rig.around, holders=frozenset({ANNA}))
+    rig.peers = replace(rig.peers, holders=frozenset({ANNA}))
     rig.run(0.5)
     assert rig.state == "inactive"
 
@@ -65,8 +65,8 @@ def test_what_one_holds_is_not_taken_over_by_others_or_by_nobody() -> None:
     rig.put("active", True)
     rig.put("active", BEN)
     assert rig.refused == {"activate_refused": 1}
-    assert rig.commander.holding.name == ANNA
-    rig.around = replace(rig.around, holders=frozenset({BEN}))
+    assert rig.commander.deadman.name == ANNA
+    rig.peers = replace(rig.peers, holders=frozenset({BEN}))
     rig.tick()
     assert rig.state == "inactive"
 
@@ -78,7 +78,7 @@ def test_an_arm_that_obeys_already_can_be_held_as_well() -> None:
     assert rig.state == "active"
     told = [event.what for event in rig.events if event.kind == "notice"]
     assert [what for what in told if what != "contact_not_told"] == ["held"]
-    rig.around = replace(rig.around, holders=frozenset())
+    rig.peers = replace(rig.peers, holders=frozenset())
     rig.tick()
     assert rig.state == "inactive"
 
@@ -87,7 +87,7 @@ def test_the_next_activation_is_nobodys_again() -> None:
     rig = rig_with(ANNA)
     rig.put("active", ANNA)
     rig.put("active", False)
-    rig.around = replace(rig.around, holders=frozenset())
+    rig.peers = replace(rig.peers, holders=frozenset())
     rig.settle()
     rig.activate()
     rig.run(0.2)

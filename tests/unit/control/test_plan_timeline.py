@@ -54,12 +54,12 @@ def test_a_plan_has_asked_for_the_time_it_had_and_for_one_step_at_least(
     t_ms: float, steps: float
 ) -> None:
     plan = Plan(0, 0, DT_NS, rising(at(0.3), 3))
-    assert height(plan.asked_until(int(t_ms * MS))) == pytest.approx(0.3 + steps * STEP_M)
+    assert height(plan.goal_at(int(t_ms * MS))) == pytest.approx(0.3 + steps * STEP_M)
 
 
 def test_between_two_waypoints_rotation_and_width_go_along() -> None:
     plan = Plan(0, 0, DT_NS, [at(0.3, 0.08, 0.0), at(0.3, 0.04, 0.2)])
-    goal = plan.asked_until(125 * MS)
+    goal = plan.goal_at(125 * MS)
     assert goal.width_m == pytest.approx(0.07)
     assert angle_between(goal.pose.rotation, at(0.3, yaw_rad=0.05).pose.rotation) < ATOL_RAD
 

@@ -10,10 +10,11 @@ from vla_zenoh.control.chunk_planner import ChunkPlanner
 from vla_zenoh.control.commander_io import Outputs
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.pose_to_joint import PoseToJoint
-from vla_zenoh.control.profile_arm import make_kinematics, make_shadow
+from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.control.smoothing import Smoother, motion_limits
 from vla_zenoh.control.states import State
 from vla_zenoh.guard.joint_guard import joint_motion_limits
+from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import FloatArray, GripperState, JointCommand, JointState, PoseState, Task
@@ -52,7 +53,7 @@ class Moved:
     """A mover of joints, and what the robot last said of itself."""
 
     def __init__(self) -> None:
-        self.shadow = make_shadow(PROFILE)
+        self.shadow = make_reachability_filter(PROFILE)
         self.mover = MotionPipeline(PROFILE, self.shadow, ChunkPlanner(PROFILE, self.shadow))
         self.now_ns = START_NS
 

@@ -21,7 +21,7 @@ class Ready:
 
     def __init__(self) -> None:
         rig = Rig()
-        self.profile, self.around = rig.profile, rig.around
+        self.profile, self.peers = rig.profile, rig.peers
         self.worker, self.prompt, self.rate_hz = WORKER, "hold", 5.0
         self.pose, self.gripper = rig.pose_state(), rig.gripper_state()
         self.chunk = rig.chunk([[0.0] * 7], observed_ago_s=0.05)
@@ -32,7 +32,7 @@ class Ready:
             self.profile,
             self.worker,
             self.prompt,
-            self.around,
+            self.peers,
             self.pose,
             self.gripper,
             self.chunk,
@@ -41,8 +41,8 @@ class Ready:
         )
 
 
-def without(around: PeerSnapshot, *nodes: str) -> PeerSnapshot:
-    return replace(around, alive=around.alive - set(nodes))
+def without(peers: PeerSnapshot, *nodes: str) -> PeerSnapshot:
+    return replace(peers, alive=peers.alive - set(nodes))
 
 
 def pose_at(x: float) -> Stamped[PoseState]:
@@ -65,16 +65,16 @@ def set_(name: str, value: object) -> Callable[[Ready], None]:
     return lambda ready: setattr(ready, name, value)
 
 
-def around(**fields: object) -> Callable[[Ready], None]:
+def peers(**fields: object) -> Callable[[Ready], None]:
     def change(ready: Ready) -> None:
-        ready.around = replace(ready.around, **fields)  # pyright: ignore[reportArgumentType]
+        ready.peers = replace(ready.peers, **fields)  # pyright: ignore[reportArgumentType]
 
     return change
 
 
 def gone(*nodes: str) -> Callable[[Ready], None]:
     def change(ready: Ready) -> None:
-        ready.around = without(ready.around, *nodes)
+        ready.peers = without(ready.peers, *nodes)
 
     return change
 
@@ -105,7 +105,7 @@ def clocks_apart(ready: Ready) -> None:
 
 
 def clock(node: str, offset: Offset) -> Callable[[Ready], None]:
-    return around(clocks={node: offset})
+    return peers(clocks={node: offset})
 
 
 def test_when_all_is_well_there_is_no_reason() -> None:
@@ -130,13 +130,13 @@ def test_when_all_is_well_there_is_no_reason() -> None:
         ("worker 'scripted' is not alive; alive are: other", gone("worker-scripted")),
         ("alive are: none", gone("worker-scripted", "worker-other")),
         ("worker 'ghost' is not alive", set_("worker", "ghost")),
-        ("has not published its spec", around(specs={})),
+        ("has not published its spec", peers(specs={})),
         ("needs a prompt and there is none", set_("prompt", "")),
-        ("worker 'scripted' says: no sun", around(worker_complaints={WORKER: "no sun"})),
+        ("worker 'scripted' says: no sun", peers(worker_complaints={WORKER: "no sun"})),
         ("has published no chunk in the last 2.2 s", set_("chunk", None)),
         ("has published no chunk in the last 2.2 s", later(2.3)),
         ("has published no chunk", by_another_source),
-        ("has published no chunk", around(spec_sources={})),
+        ("has published no chunk", peers(spec_sources={})),
         ("chunks of another spec than its own", another_chunk(spec_hash="another")),
         (r"newest chunk is not sane: .*\(H, 7\)", another_chunk(steps=np.zeros((1, 6)))),
         (r"too slow: .* 1\.20 s after its observation, at most 1 s", lambda r: seen_ago(r, 1.2)),
@@ -154,21 +154,21 @@ def test_when_all_is_well_there_is_no_reason() -> None:
             another_chunk(steps=np.array([[0, 0, 0, 0, 0, 0, 80.0]])),
         ),
         ("no living node serves camera 'front'", gone("camera")),
-        ("no living node serves camera 'front'", around(camera_nodes={})),
-        ("camera 'front' has sent no picture for 1.5 s", around(camera_ages_s={"front": 1.5})),
-        ("camera 'front' has sent no picture for inf s", around(camera_ages_s={})),
+        ("no living node serves camera 'front'", peers(camera_nodes={})),
+        ("camera 'front' has sent no picture for 1.5 s", peers(camera_ages_s={"front": 1.5})),
+        ("camera 'front' has sent no picture for inf s", peers(camera_ages_s={})),
         (
             r"camera 'front' shows the same picture since 1\.2 s",
-            around(camera_faults={"front": "shows the same picture since 1.2 s"}),
+            peers(camera_faults={"front": "shows the same picture since 1.2 s"}),
         ),
         (r"the clock of node 'camera' is \+0\.150 s off", clock("camera", Offset(0.15, 0.1, 0.2))),
         (r"the clock of node 'sim' is -0\.101 s off", clock("sim", Offset(-0.101, 0.3, 0.6))),
         (
             "the clock of node 'worker-scripted' on gpu is not known",
-            around(hosts={"worker-scripted": "gpu"}, beside=frozenset({"sim", "camera"})),
+            peers(hosts={"worker-scripted": "gpu"}, same_host=frozenset({"sim", "camera"})),
         ),
         # Whoever has not said yet where it is may be anywhere.
-        ("the clock of node 'sim' is not known", around(beside=frozenset())),
+        ("the clock of node 'sim' is not known", peers(same_host=frozenset())),
     ],
 )
 def test_each_thing_that_is_missing_is_a_reason(
@@ -187,8 +187,8 @@ def test_a_clock_that_is_reckoned_with_is_no_reason() -> None:
 
 def test_a_clock_that_is_measured_need_not_be_our_own() -> None:
     ready = Ready()
-    nodes = (*ready.around.beside, "camera")
-    around(beside=frozenset(), clocks=dict.fromkeys(nodes, Offset(0.0, 0.3, 0.6)))(ready)
+    nodes = (*ready.peers.same_host, "camera")
+    peers(same_host=frozenset(), clocks=dict.fromkeys(nodes, Offset(0.0, 0.3, 0.6)))(ready)
     assert ready.reasons() == []
 
 
@@ -209,19 +209,19 @@ def test_all_reasons_come_at_once() -> None:
     ready = Ready()
     ready.pose = ready.gripper = ready.chunk = None  # pyright: ignore[reportAttributeAccessIssue]
     ready.prompt = ""
-    ready.around = without(ready.around, "sim", "camera")
+    ready.peers = without(ready.peers, "sim", "camera")
     assert len(ready.reasons()) == 6
 
 
 def test_a_picture_of_a_size_the_spec_cannot_take_is_a_reason() -> None:
     ready = Ready()
-    spec = ready.around.specs[WORKER]
+    spec = ready.peers.specs[WORKER]
     small = CameraSpec(camera="front", width=64, height=48)
     looks = spec.observation.model_copy(update={"cameras": (small,)})
     spec = spec.model_copy(update={"observation": looks})
     record = replace(ready.chunk.record, spec_hash=spec.hash)
     ready.chunk = replace(ready.chunk, record=record)
-    ready.around = replace(ready.around, specs={WORKER: spec})
+    ready.peers = replace(ready.peers, specs={WORKER: spec})
     (reason,) = ready.reasons()
     assert re.search(r"picture_size: camera 'front' sends \d+x\d+, the spec asks for 64x48", reason)
 
@@ -231,7 +231,7 @@ def test_a_worker_that_needs_no_prompt_and_no_camera_gets_neither() -> None:
     spec = model_spec()
     looks = spec.observation.model_copy(update={"cameras": (), "prompt": False})
     spec = spec.model_copy(update={"observation": looks})
-    ready.around = replace(without(ready.around, "camera"), specs={WORKER: spec})
+    ready.peers = replace(without(ready.peers, "camera"), specs={WORKER: spec})
     another_chunk(spec_hash=spec.hash)(ready)
     ready.prompt = ""
     assert ready.reasons() == []

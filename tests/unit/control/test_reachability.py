@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from panda_arm import HOME_RAD, moved, panda, tool_down_at
 
-from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.limits import SLOWEST, LimitHit
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.slowdown import SLOWEST
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.collision import TABLE, CollisionModel
 from vla_zenoh.kinematics.kinematics import smallest_singular_value

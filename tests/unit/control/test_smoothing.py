@@ -348,5 +348,5 @@ def test_a_motion_along_a_line_stays_on_it_whatever_the_limits_become(
         for _ in range(ticks):
             motion.tick()
             away = Ends(motion).away()
-            beside = away - (away @ way) / max(length, 1e-9) ** 2 * way
-            assert np.abs(beside).max() < AT_GOAL[0]
+            same_host = away - (away @ way) / max(length, 1e-9) ** 2 * way
+            assert np.abs(same_host).max() < AT_GOAL[0]

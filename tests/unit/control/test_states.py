@@ -85,7 +85,7 @@ def pull(rig: Rig, trigger: str) -> None:
     elif trigger == "starve":
         rig.run(2.0)
     elif trigger == "lose":
-        rig.around = replace(rig.around, alive=frozenset({"sim", "camera"}))
+        rig.peers = replace(rig.peers, alive=frozenset({"sim", "camera"}))
         rig.tick()
     elif trigger in ("stop", "reset"):
         rig.tick(trigger)

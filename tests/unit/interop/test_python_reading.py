@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vla_zenoh.control.profile_arm import make_kinematics
 from vla_zenoh.interop.python_reading import FAULT_NS, MAX_WORDS, Fault, PythonReading
+from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robot import Reading
 

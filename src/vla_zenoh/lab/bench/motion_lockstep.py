@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.bench.motion import (
@@ -115,7 +115,7 @@ def _row(profile: Profile, trial: MotionCase, conditions: Conditions) -> Row:
         build_world(profile),
         make_policy(find_model("scripted"), options),
         delays=Delays(conditions.delay_ms / 1e3, conditions.jitter, CAMERA_S, wire_s=WIRE_S),
-        reach=make_shadow(profile),
+        reach=make_reachability_filter(profile),
     )
     loop.put("rate", PREPARATION_HZ)
     loop.run(WARM_UP_S)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import encode_jpeg
-from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.errors import NodeError, SpecError, VlaZenohError, WorkerError
 from vla_zenoh.lab.bench.task import (
     ARM_LOST,
@@ -201,7 +201,7 @@ def _episode(bench: _Bench, asked: TaskRequest) -> TaskOutcome:
         bench.policy,
         delays=Delays(plan.delay_ms / 1e3, camera_s=CAMERA_S, wire_s=WIRE_S),
         picture=bench.picture,
-        reach=make_shadow(bench.profile),
+        reach=make_reachability_filter(bench.profile),
         seed=asked.seed,
     )
     beginning = bench.draw(bench.camera, world.qpos()) if bench.camera else None

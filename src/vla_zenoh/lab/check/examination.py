@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vla_zenoh.control import chunk_plausibility as plausible
-from vla_zenoh.control import spec_fit as fit
-from vla_zenoh.control.finding import distinct, error, note
+from vla_zenoh.control import policy_check
+from vla_zenoh.control.policy_check import error, note
 from vla_zenoh.errors import SpecError
 from vla_zenoh.lab.check import judge
 from vla_zenoh.lab.check.examples import (
@@ -21,7 +20,7 @@ from vla_zenoh.lab.check.examples import (
 )
 from vla_zenoh.lab.check.judge import Steps
 from vla_zenoh.lab.check.model_runner import Bench, ModelFailed, ModelHung
-from vla_zenoh.lab.check.report import CheckReport
+from vla_zenoh.lab.check.report import CheckReport, distinct
 from vla_zenoh.policy import Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
 from vla_zenoh.profile import Limits, Profile, Timing
@@ -89,7 +88,7 @@ class Examination:
     def _run(self) -> None:
         report = self.report
         if self._profile is not None:
-            report.findings += fit.findings(
+            report.findings += policy_check.check_spec(
                 self._profile, self._policy.spec, worker=report.worker, rate_hz=self._rate_hz
             )
         before_kib = self._bench.memory_kib()
@@ -260,7 +259,7 @@ class Examination:
         except SpecError as fault:
             findings.append(error(fault.reason, f"{look.name}: {fault}"))
             return None
-        findings += plausible.findings(action, steps, self._limits, self._width_m)
+        findings += policy_check.check_chunk(action, steps, self._limits, self._width_m)
         self._answers.append((look, steps))
         # So that one that takes what is under way is given some at the next look.
         arrival_ns = observation.stamp_wall_ns + round(took_s * 1e9)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.control import chunk_plausibility as plausible
-from vla_zenoh.control.finding import Finding, error, note, warning
+from vla_zenoh.control import policy_check
+from vla_zenoh.control.policy_check import Finding, error, note, warning
 from vla_zenoh.errors import SpecError
 from vla_zenoh.lab.check.examples import MAX_WIDTH_M, ImageStyle
 from vla_zenoh.policy import ActionSpec, ActionSteps, Observation, Policy, check_steps
@@ -114,7 +114,8 @@ def _polarity(action: ActionSpec, answers: Answers) -> list[Finding]:
     shares = [
         opening
         for look, steps in answers
-        if look.width_m == MAX_WIDTH_M and (opening := plausible.opening(action, steps)) is not None
+        if look.width_m == MAX_WIDTH_M
+        and (opening := policy_check.gripper_opening(action, steps)) is not None
     ]
     if not shares or float(np.concatenate(shares).max()) > 0.5:
         return []

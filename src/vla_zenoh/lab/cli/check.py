@@ -14,7 +14,7 @@ from rich.text import Text
 from vla_zenoh.cli.options import PROFILE_VARIABLE, JsonOption
 from vla_zenoh.cli.output import console, print_json, styled
 from vla_zenoh.cli.worker_choice import Chosen, chosen_worker
-from vla_zenoh.control.finding import Finding, error
+from vla_zenoh.control.policy_check import Finding, error
 from vla_zenoh.errors import WorkerError
 from vla_zenoh.lab.check.examination import DEFAULT_RUNS, Examination
 from vla_zenoh.lab.check.model_runner import ModelRunner

@@ -193,9 +193,9 @@ def robot(profile: Profile, host: str | None = None) -> Iterator[HostFinding]:
     if not any("command" in part.nodes for part in hosts):
         return
     try:
-        from vla_zenoh.control.profile_arm import make_shadow
+        from vla_zenoh.control.reachability import make_reachability_filter
 
-        make_shadow(profile)
+        make_reachability_filter(profile)
     except (MissingExtraError, ImportError):
         return  # told with the libraries
     except (VlaZenohError, ValueError) as error:  # the latter Pinocchio's, of what is no URDF

@@ -174,14 +174,14 @@ class Lockstep:
             heapq.heappop(self._arrivals)[2]()
 
     def _command(self) -> None:
-        self._inbox.around = PeerSnapshot(
+        self._inbox.peers = PeerSnapshot(
             alive=frozenset(self.alive),
             robot_node=SIM,
             specs={name: worker.spec for name, worker in self.workers.items()},
             spec_sources={name: worker.source for name, worker in self.workers.items()},
             camera_ages_s=dict.fromkeys(self.profile.cameras, 0.0),
             camera_nodes=dict.fromkeys(self.profile.cameras, CAMERA),
-            beside=frozenset(self.alive),
+            same_host=frozenset(self.alive),
             camera_faults=dict(self.camera_faults),
         )
         inputs, self._inbox = self._inbox, Inputs([], [])
@@ -197,7 +197,7 @@ class Lockstep:
 
     def _publish(self, out: Outputs) -> None:
         self.events += out.events
-        self.refused.update(refusal.reason for refusal in out.refusals)
+        self.refused.update(refusal.reason for refusal in out.rejections)
         if out.pose is not None:
             self._send(COMMAND, out.pose, self._take_pose_command)
         if out.joint is not None:

@@ -18,9 +18,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vla_zenoh.control.profile_arm import make_kinematics
 from vla_zenoh.errors import ResourceError, VlaZenohError
 from vla_zenoh.kinematics.fingers import Fingers
+from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray

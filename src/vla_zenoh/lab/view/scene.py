@@ -175,9 +175,7 @@ class Scene:
         if plan is None or not plan.start_ns <= seen_ns < plan.end_ns:
             return goal
         ends = plan.goals[plan.index_at(seen_ns)].pose.position_m
-        return Pose(
-            goal.position_m + plan.asked_until(seen_ns).pose.position_m - ends, goal.rotation
-        )
+        return Pose(goal.position_m + plan.goal_at(seen_ns).pose.position_m - ends, goal.rotation)
 
     def _take_stale_ribbons(self, stamp_ns: int) -> None:
         for worker, drawn_ns in list(self._ribbons.items()):

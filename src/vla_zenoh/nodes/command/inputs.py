@@ -72,7 +72,7 @@ class CommandInputs:
             now_ns: nominal time of this tick on the node's wall clock.
         """
         put = self._settings_put()
-        around = self._neighbours.look(now_ns)
+        peers = self._neighbours.look(now_ns)
         chunks = [self._chunk(arrival) for arrival in self._chunks.take_all()]
         clock = self._check_clock()
         return Inputs(
@@ -81,7 +81,7 @@ class CommandInputs:
             pose=self._state(PoseState, self._pose_slot),
             joint=self._joints(put),
             gripper=self._state(GripperState, self._gripper_slot),
-            around=around,
+            peers=peers,
         )
 
     def _settings_put(self) -> list[Setting]:

@@ -15,7 +15,7 @@ from vla_zenoh.bus.clock import FixedRate, Tick
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import records
 from vla_zenoh.control.commander import Commander, Outputs, Setting
-from vla_zenoh.control.profile_arm import make_shadow
+from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.control.states import State
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.command.inputs import CommandInputs
@@ -50,7 +50,9 @@ class CommandNode:
         latch: Path | None = None,
     ) -> None:
         node = self.node = Node("command", profile, session)
-        self.commander = Commander(profile, reach=make_shadow(profile), dry_run=dry_run)
+        self.commander = Commander(
+            profile, reach=make_reachability_filter(profile), dry_run=dry_run
+        )
         self._latch = None if latch is None else EstopLatch(latch)
         before = None if self._latch is None else self._latch.read()
         if before is not None:
@@ -153,7 +155,7 @@ class CommandNode:
             self._joint_out.put(out.joint, stamp_wall_ns=now_ns)
         if out.gripper is not None:
             self._gripper_out.put(out.gripper)
-        for refusal in out.refusals:
+        for refusal in out.rejections:
             kind = "skipped" if refusal.quiet else "refused"
             self.node.counters[f"{kind}.{refusal.reason}"] += 1
         for event in out.events:

@@ -91,7 +91,7 @@ class CommandStatus:
                 "accepted_chunks": mind.progress.chunks,
                 "accepted_steps": mind.progress.steps,
                 "policy_done": mind.progress.done,
-                "held_by": mind.holding.name if task.active else "",
+                "held_by": mind.deadman.name if task.active else "",
                 "at_rest": mind.at_rest,
                 "streaming": mind.streaming,
                 "speed_share": round(mind.speed, 3),

@@ -18,11 +18,11 @@ from vla_zenoh.bus.clock import FixedRate, Tick
 from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec.records import SMALL_BYTES
-from vla_zenoh.control.profile_arm import make_kinematics
 from vla_zenoh.errors import CodecError, NodeError, ProfileError
 from vla_zenoh.guard.arm_guard import Measured
 from vla_zenoh.guard.gripper_guard import GripperGuard
 from vla_zenoh.interop.python_reading import MAX_WORDS
+from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Command
 from vla_zenoh.robots.command_follower import UNHEEDED_WHY, CommandFollower

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.bus.node import Node
-from vla_zenoh.control.profile_arm import make_kinematics
 from vla_zenoh.errors import ProfileError, RecordError
 from vla_zenoh.guard.arm_guard import Measured
 from vla_zenoh.interop.joint_reading import pose_state
@@ -19,6 +18,7 @@ from vla_zenoh.interop.ros2.qos import COMMAND
 from vla_zenoh.interop.ros2.samples import Stamp
 from vla_zenoh.interop.ros2.topics import pose
 from vla_zenoh.keys import Kind
+from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.profile.ros2 import Ros2Output, Ros2Profile
 from vla_zenoh.robots.command_follower import UNHEEDED_WHY, CommandFollower
 from vla_zenoh.robots.ros2.ros_graph import RosGraph

@@ -1,0 +1,329 @@
+"""Static checks of a model against a profile: does its spec fit, and are its chunks plausible?
+
+No model runs here. Wrong units show in the size of the numbers: a step in millimetres or degrees is
+far above what an arm may do, and above `vla_zenoh.profile.REFUSE_FACTOR` times a limit the command
+node rejects the chunk.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, CameraSpec, ModelSpec
+from vla_zenoh.profile import POSE_JOINTS, REACH_M, REFUSE_FACTOR, Limits, Profile
+from vla_zenoh.types import QUATERNION_NORM_TOLERANCE
+
+SHAPE_TOLERANCE = 0.02
+"""An image may be stretched by this share of its aspect ratio without a note."""
+FRACTION_SLACK = 0.25
+WIDTH_SLACK_M = 0.05
+"""What the command node accepts as rounding; see `vla_zenoh.control.actions`."""
+BINARY_SPAN = 2.0
+"""A number further than this from the threshold is not a choice of two but another quantity."""
+ROUNDING = 1e-6
+
+Steps = NDArray[np.float32]
+Level = Literal["error", "warning", "note"]
+
+
+class Finding(NamedTuple):
+    """One result of a check.
+
+    Args:
+        level: ``error``: the model must not get the arm; ``warning``: look at it; ``note``.
+        name: stable short name.
+        why: a sentence with the value found and the value expected.
+    """
+
+    level: Level
+    name: str
+    why: str
+
+
+def error(name: str, why: str) -> Finding:
+    """A finding that keeps the model from the arm."""
+    return Finding("error", name, why)
+
+
+def warning(name: str, why: str) -> Finding:
+    """A finding to look at before the model gets the arm."""
+    return Finding("warning", name, why)
+
+
+def note(name: str, why: str) -> Finding:
+    """A finding that is good to know."""
+    return Finding("note", name, why)
+
+
+# -- the spec -------------------------------------------------------------------------------------
+def check_spec(
+    profile: Profile, spec: ModelSpec, *, worker: str, rate_hz: float | None = None
+) -> list[Finding]:
+    """All that does not fit.
+
+    Args:
+        profile: the effective profile.
+        spec: what the model declares.
+        worker: name of the worker.
+        rate_hz: chunks per second asked of it; None: as the profile says.
+    """
+    rate_hz = rate_hz or profile.task.rate_hz
+    return [
+        *_cameras(profile, spec),
+        *_joints(profile, spec),
+        *_timing(profile, spec, rate_hz),
+        *_task(profile, spec, worker),
+    ]
+
+
+def _cameras(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
+    wanted = spec.observation
+    known = [camera for camera in wanted.cameras if camera.camera in profile.cameras]
+    for camera in wanted.cameras:
+        if camera not in known:
+            yield error(
+                "camera",
+                f"needs camera {camera.camera!r}, the profile has: "
+                f"{', '.join(profile.cameras) or 'none'}",
+            )
+            continue
+        yield from _size(profile, camera)
+        rate_hz = profile.cameras[camera.camera].rate_hz
+        if wanted.max_age_s * rate_hz < 1.0:
+            yield error(
+                "camera_rate",
+                f"camera {camera.camera!r} gives a picture every {1 / rate_hz:.2f} s, the spec "
+                f"allows none older than {wanted.max_age_s:g} s",
+            )
+    slowest = min((profile.cameras[camera.camera].rate_hz for camera in known), default=0.0)
+    if len(known) > 1 and wanted.max_skew_s * slowest < 1.0:
+        yield warning(
+            "camera_rate",
+            f"at {slowest:g} Hz pictures may lie {1 / slowest:.3f} s apart, the spec allows "
+            f"{wanted.max_skew_s:g} s: many observations will be refused",
+        )
+
+
+def _joints(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
+    joints = len(profile.robot.arm_joints)
+    if joints >= POSE_JOINTS:
+        return
+    short = f"robot {profile.robot.name!r} has {joints} arm joints, a pose of the TCP needs six"
+    if spec.action.kind == "absolute":
+        yield error(
+            "too_few_joints",
+            f"{short}: it cannot go straight from one absolute pose to the next, also where joint "
+            "positions were made into poses; use a model whose action is delta",
+        )
+        return
+    yield warning(
+        "too_few_joints",
+        f"{short}: steps that it has no joint for are shortened, to nothing at worst (limit reach)",
+    )
+
+
+def _size(profile: Profile, camera: CameraSpec) -> Iterator[Finding]:
+    source = profile.cameras[camera.camera]
+    if camera.width is None or camera.height is None:
+        return
+    gives, asks = f"{source.width}x{source.height}", f"{camera.width}x{camera.height}"
+    if camera.resize == "none" and gives != asks:
+        yield error(
+            "picture_size",
+            f"camera {camera.camera!r} sends {gives}, the spec asks for {asks} and says "
+            "resize: none",
+        )
+    stretch = (source.width * camera.height) / (source.height * camera.width)
+    if camera.resize == "stretch" and abs(stretch - 1.0) > SHAPE_TOLERANCE:
+        yield note(
+            "picture_shape",
+            f"camera {camera.camera!r}: {gives} is stretched to {asks}, out of shape by "
+            f"{abs(stretch - 1.0):.0%}; right if it was trained so",
+        )
+
+
+def _timing(profile: Profile, spec: ModelSpec, rate_hz: float) -> Iterator[Finding]:
+    chunk_s = spec.action.horizon * spec.action.dt_s
+    if chunk_s * rate_hz < 1.0 - 1e-9:
+        yield note(
+            "gaps",
+            f"a chunk lasts {chunk_s:g} s and one is asked for every {1 / rate_hz:g} s: the arm "
+            "waits in between",
+        )
+    oldest_s = profile.timing.max_observation_age_s
+    if spec.observation.max_age_s > oldest_s:
+        yield warning(
+            "camera_rate",
+            f"the spec takes observations {spec.observation.max_age_s:g} s old, the command node "
+            f"refuses chunks of those over {oldest_s:g} s (timing.max_observation_age_s)",
+        )
+
+
+def _task(profile: Profile, spec: ModelSpec, worker: str) -> Iterator[Finding]:
+    if spec.action.gripper == "none" and profile.robot.finger_joints:
+        yield note("no_gripper", f"robot {profile.robot.name!r} has a gripper, the model none")
+    if spec.observation.prompt and not profile.task.prompt:
+        yield warning("no_prompt", "needs a prompt; task.prompt of the profile is empty")
+    if worker not in profile.workers:
+        yield note(
+            "not_listed",
+            f"the profile's workers are {', '.join(profile.workers)}; `vla-zenoh up` will not "
+            f"start {worker!r}",
+        )
+
+
+# -- a chunk --------------------------------------------------------------------------------------
+def check_chunk(
+    spec: ActionSpec, steps: Steps, limits: Limits, max_width_m: float
+) -> list[Finding]:
+    """All that is not plausible in one chunk.
+
+    Args:
+        spec: what the numbers are said to mean.
+        steps: (H, D), as `vla_zenoh.policy.check_steps` gives them.
+        limits: of the robot.
+        max_width_m: of its gripper.
+    """
+    return [
+        *_position(spec, steps[:, :3].astype(np.float64) * spec.position_scale_m, limits),
+        *_rotation(spec, steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]].astype(float), limits),
+        *_gripper(spec, steps[:, -1].astype(np.float64), max_width_m),
+    ]
+
+
+def gripper_opening(spec: ActionSpec, steps: Steps) -> NDArray[np.float64] | None:
+    """How far each step opens the gripper, 0 shut to 1 open; None where it does not say so."""
+    if spec.gripper not in ("open_fraction", "binary"):
+        return None
+    value = steps[:, -1].astype(np.float64)
+    if spec.gripper == "binary":
+        value = (value > spec.gripper_threshold).astype(np.float64)
+    return value if spec.gripper_open_is_high else 1.0 - value
+
+
+def _position(
+    spec: ActionSpec, position_m: NDArray[np.float64], limits: Limits
+) -> Iterator[Finding]:
+    longest_m = float(np.linalg.norm(position_m, axis=1).max())
+    if spec.kind == "absolute":
+        if longest_m > REACH_M:
+            yield error(
+                "position_units",
+                f"a pose {longest_m:.4g} m from the base, no arm here reaches over {REACH_M:g} m; "
+                "are these metres? position_scale_m is "
+                f"{spec.position_scale_m:g}",
+            )
+            return
+        box = limits.workspace
+        low = np.array([box.x_m[0], box.y_m[0], box.z_m[0]])
+        high = np.array([box.x_m[1], box.y_m[1], box.z_m[1]])
+        outside_m = float(np.maximum(low - position_m, position_m - high).max())
+        if outside_m > limits.step_m:
+            yield warning(
+                "workspace",
+                f"a pose {outside_m:.3f} m outside the workspace x {box.x_m} y {box.y_m} "
+                f"z {box.z_m}: is it in the base frame?",
+            )
+        return
+    if longest_m > REFUSE_FACTOR * limits.step_m:
+        yield error(
+            "position_units",
+            f"a step of {longest_m:.4g} m, over {REFUSE_FACTOR:g} times the limit of "
+            f"{limits.step_m:g} m; are these metres, and was the output unnormalised? "
+            f"position_scale_m is {spec.position_scale_m:g}",
+        )
+        return
+    if longest_m > limits.step_m * (1 + ROUNDING):
+        yield warning(
+            "step_limit", f"a step of {longest_m:.4g} m, the limit is {limits.step_m:g} m"
+        )
+    yield from _speed("m/s", longest_m, spec.dt_s, limits.translation.velocity_m_s)
+
+
+def _rotation(spec: ActionSpec, rotation: NDArray[np.float64], limits: Limits) -> Iterator[Finding]:
+    if spec.rotation == "quaternion":
+        yield from _quaternion(spec, rotation, limits)
+        return
+    largest = float(np.linalg.norm(rotation, axis=1).max())
+    if spec.kind == "absolute":
+        if float(np.abs(rotation).max()) > 2 * math.pi:
+            yield error(
+                "rotation_units",
+                f"an angle of {float(np.abs(rotation).max()):.4g}, more than a turn; give radians",
+            )
+        return
+    yield from _turn(largest, spec, limits)
+
+
+def _turn(largest_rad: float, spec: ActionSpec, limits: Limits) -> Iterator[Finding]:
+    if largest_rad > REFUSE_FACTOR * limits.step_rad:
+        yield error(
+            "rotation_units",
+            f"a step of {largest_rad:.4g} rad, over {REFUSE_FACTOR:g} times the limit of "
+            f"{limits.step_rad:g} rad; are these radians, and was the output unnormalised?",
+        )
+        return
+    if largest_rad > limits.step_rad * (1 + ROUNDING):
+        yield warning(
+            "step_limit", f"a step of {largest_rad:.4g} rad, the limit is {limits.step_rad:g} rad"
+        )
+    yield from _speed("rad/s", largest_rad, spec.dt_s, limits.rotation.velocity_rad_s)
+
+
+def _speed(unit: str, step: float, dt_s: float, limit: float) -> Iterator[Finding]:
+    if step / dt_s > limit * (1 + 1e-3):
+        yield warning(
+            "speed_limit",
+            f"a step of {step:.4g} in {dt_s:g} s is {step / dt_s:.3g} {unit}, the limit is "
+            f"{limit:g}: the arm will come later than asked",
+        )
+
+
+def _quaternion(
+    spec: ActionSpec, rotation: NDArray[np.float64], limits: Limits
+) -> Iterator[Finding]:
+    norms = np.linalg.norm(rotation, axis=1)
+    worst = float(norms[np.argmax(np.abs(norms - 1.0))])
+    if abs(worst - 1.0) > QUATERNION_NORM_TOLERANCE:
+        yield error("quaternion", f"a quaternion of norm {worst:.4g}, wanted 1")
+        return
+    if spec.kind == "absolute":
+        return
+    turns = 2 * np.arccos(np.clip(np.abs(rotation[:, 3]), 0.0, 1.0))
+    swapped = 2 * np.arccos(np.clip(np.abs(rotation[:, 0]), 0.0, 1.0))
+    largest = float(turns.max())
+    if largest > REFUSE_FACTOR * limits.step_rad >= float(swapped.max()):
+        yield error(
+            "quaternion",
+            f"a step of {largest:.4g} rad, which would be {float(swapped.max()):.4g} rad read as "
+            "w, x, y, z; the order is x, y, z, w",
+        )
+        return
+    yield from _turn(largest, spec, limits)
+
+
+def _gripper(spec: ActionSpec, value: NDArray[np.float64], max_width_m: float) -> Iterator[Finding]:
+    bounds = {
+        "delta_m": (-max_width_m - WIDTH_SLACK_M, max_width_m + WIDTH_SLACK_M),
+        "absolute_m": (-0.01, max_width_m + WIDTH_SLACK_M),
+        "open_fraction": (-FRACTION_SLACK, 1.0 + FRACTION_SLACK),
+        "binary": (spec.gripper_threshold - BINARY_SPAN, spec.gripper_threshold + BINARY_SPAN),
+    }
+    if spec.gripper not in bounds:
+        return
+    low, high = bounds[spec.gripper]
+    # A choice of two is one whatever the numbers; the others the command node would refuse.
+    level = warning if spec.gripper == "binary" else error
+    for found in (float(value.min()), float(value.max())):
+        if not low <= found <= high:
+            yield level(
+                "gripper_range",
+                f"gripper {found:.4g}, declared as {spec.gripper}: at most {low:.3g} to "
+                f"{high:.3g} (this gripper opens to {max_width_m:g} m)",
+            )
+            return
