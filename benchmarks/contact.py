@@ -42,7 +42,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.robots.sim.node import build_world
+from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import PoseState
 
 SPEEDS_M_S = (0.02, 0.1, 0.4)

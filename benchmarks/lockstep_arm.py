@@ -16,7 +16,7 @@ from vla_zenoh.kinematics.so3 import log3, quat_from_rotation
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy import Policy
 from vla_zenoh.profile import Profile
-from vla_zenoh.robots.sim.node import build_world
+from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
 from vla_zenoh.types.references import JointReference, PoseReference
 

@@ -13,8 +13,7 @@ from pathlib import Path
 from vla_zenoh.kinematics.so3 import rotation_from_quat
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robot import Command, Reading
-from vla_zenoh.robots.sim.node import build_world
-from vla_zenoh.simulation.world import STEP_NS
+from vla_zenoh.simulation.world import STEP_NS, build_world
 from vla_zenoh.types import GripperState, JointCommand, JointState
 from vla_zenoh.types.references import JointReference, PoseReference
 

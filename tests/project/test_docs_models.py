@@ -37,7 +37,7 @@ from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.policy.state_vector import COORDINATES, PARTS, read_parts
 from vla_zenoh.profile import load_profile
 from vla_zenoh.profile.fit import workers_of
-from vla_zenoh.robots.sim.node import build_world
+from vla_zenoh.simulation.world import build_world
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "how-to" / "models.md").read_text("utf-8")

@@ -26,8 +26,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.robots.sim.node import build_world
-from vla_zenoh.simulation.world import World
+from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import ActionChunk, FloatArray, PoseCommand
 
 RATE_HZ = 10.0

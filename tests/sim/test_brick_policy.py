@@ -30,10 +30,9 @@ from vla_zenoh.lab.tasks import (
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, example_observation
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.world import World
+from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses
 
 FOLDER = resources.find("models", "brick")

@@ -23,13 +23,12 @@ from vla_zenoh.simulation.appearance import (
     TABLE,
     VARIATIONS,
     Appearance,
-    Dresser,
-    draw_look,
+    AppearanceSwitcher,
+    draw_appearance,
 )
-from vla_zenoh.simulation.backend import Backend, why_not
 from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
-from vla_zenoh.simulation.placement import draw_places, footprint_m, objects_of
-from vla_zenoh.simulation.render import Renderer
+from vla_zenoh.simulation.objects import draw_places, footprint_m, objects_of
+from vla_zenoh.simulation.render import Backend, Renderer, why_not
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import build_model
 from vla_zenoh.simulation.world import World
@@ -73,7 +72,7 @@ def test_distractors_do_not_change_where_the_bricks_are(seed: int) -> None:
 
 @given(SEEDS)
 def test_a_camera_shifts_and_turns_within_its_bounds(seed: int) -> None:
-    look = draw_look(seed, VARIATIONS)
+    look = draw_appearance(seed, VARIATIONS)
     assert look.shift_m is not None
     assert look.turn_rad is not None
     assert np.linalg.norm(look.shift_m) <= MAX_SHIFT_M
@@ -82,17 +81,17 @@ def test_a_camera_shifts_and_turns_within_its_bounds(seed: int) -> None:
 
 @given(SEEDS)
 def test_each_part_of_a_look_is_the_same_whatever_else_is_varied(seed: int) -> None:
-    every = draw_look(seed, VARIATIONS)
+    every = draw_appearance(seed, VARIATIONS)
     for part, names in ((LIGHTS, ("ambient", "head", "key")), (TABLE, ("table",))):
-        alone = draw_look(seed, [part])
+        alone = draw_appearance(seed, [part])
         for name in names:
             np.testing.assert_array_equal(getattr(alone, name), getattr(every, name))
-    assert draw_look(seed, [DISTRACTORS]) == Appearance()
+    assert draw_appearance(seed, [DISTRACTORS]) == Appearance()
 
 
 def test_an_unknown_variation_is_refused_by_name() -> None:
     with pytest.raises(ResourceError, match="wind"):
-        draw_look(0, ["wind"])
+        draw_appearance(0, ["wind"])
     with pytest.raises(ResourceError, match="wind"):
         world(vary=["wind"])
 
@@ -100,7 +99,7 @@ def test_an_unknown_variation_is_refused_by_name() -> None:
 def test_a_scene_that_cannot_be_varied_says_what_it_lacks() -> None:
     other = build_model("table", RobotModel())
     with pytest.raises(ResourceError, match="material 'table'"):
-        Dresser(other).wear(draw_look(0, [TABLE]))
+        AppearanceSwitcher(other).apply(draw_appearance(0, [TABLE]))
 
 
 def world(vary: list[str] | None = None, seed: int | None = None) -> World:

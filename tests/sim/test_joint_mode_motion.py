@@ -12,7 +12,7 @@ from vla_zenoh.codec import message
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.lab.lockstep import Lockstep, Message
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.robots.sim.node import build_world
+from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import JointState
 
 PROFILE = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})

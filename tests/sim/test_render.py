@@ -11,16 +11,16 @@ import pytest
 from motions import SCENE, make_world
 
 from vla_zenoh.errors import NodeError, RecordError, ResourceError
-from vla_zenoh.simulation.backend import (
+from vla_zenoh.simulation.render import (
     EGL,
     OSMESA,
     RAYCAST,
     VARIABLE,
     Backend,
+    Renderer,
     choose_backend,
     why_not,
 )
-from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
 
 SIZE = (640, 480)
@@ -88,7 +88,7 @@ def test_the_wrist_picture_shows_the_brick_below_it(rays: Renderer) -> None:
 
 
 def test_the_whole_arm_is_in_the_front_picture_when_it_is_raised(rays: Renderer) -> None:
-    from vla_zenoh.simulation.home import solve_home
+    from scripts.home_pose import solve_home
 
     world = make_world()
     empty = rays.render("front", *SIZE)
@@ -198,7 +198,7 @@ def test_a_driver_that_fails_is_noticed_in_a_process_of_its_own(
 
 def test_choosing_a_back_end_does_not_import_mujoco() -> None:
     code = (
-        "import sys; from vla_zenoh.simulation.backend import choose_backend; choose_backend(); "
+        "import sys; from vla_zenoh.simulation.render import choose_backend; choose_backend(); "
         "import vla_zenoh.simulation.render; sys.exit('mujoco' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)

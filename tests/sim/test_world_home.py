@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from motions import HOME_RAD, SCENE, make_world
 
+from scripts.home_pose import TOOL_DOWN, solve_home
 from vla_zenoh.errors import ResourceError
-from vla_zenoh.simulation.home import TOOL_DOWN, solve_home
 from vla_zenoh.simulation.robot_model import RobotModel
 
 HOME_M = (0.43, 0.0, 0.16)

@@ -19,7 +19,7 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes.camera.rendered import IDLE_PERIOD_S
 from vla_zenoh.profile import load_profile
 from vla_zenoh.profile.schema import CameraProfile
-from vla_zenoh.robots.sim.node import build_world
+from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import Header, SceneState
 
 JPEG_TOLERANCE = 6  # of 255, within a patch of one colour

@@ -45,11 +45,10 @@ from vla_zenoh.lab.tasks import (
 )
 from vla_zenoh.policy import Observation
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.simulation.appearance import VARIATIONS
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.world import World
+from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses
 
 PROFILE = "panda_bricks"

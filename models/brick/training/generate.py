@@ -28,7 +28,7 @@ from worker import FRONT, WRIST
 from vla_zenoh.lab.tasks import brick
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.appearance import VARIATIONS
-from vla_zenoh.simulation.placement import DISTRACTOR_PREFIX, regions_of
+from vla_zenoh.simulation.objects import DISTRACTOR_PREFIX, regions_of
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import PREFIX, TCP_SITE, build_model

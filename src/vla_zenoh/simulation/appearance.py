@@ -1,7 +1,7 @@
-"""How a scene looks, varied by a seed: lights, colour of the table, where the front camera stands.
+"""Appearance of a scene, drawn from a seed: lights, colour of the table, pose of the front camera.
 
-Only pictures change, so only a renderer needs to know. Distractors are bodies; where they stand is
-the world's business, see `vla_zenoh.simulation.placement`.
+It changes images alone, so only a renderer uses it. Distractors are bodies; the world places them,
+see `vla_zenoh.simulation.objects`.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from vla_zenoh.errors import ResourceError
-
-FloatArray = NDArray[np.float64]
+from vla_zenoh.types import FloatArray
 
 LIGHTS, TABLE, CAMERA, DISTRACTORS = "lights", "table", "camera", "distractors"
 VARIATIONS = (LIGHTS, TABLE, CAMERA, DISTRACTORS)
@@ -29,12 +27,12 @@ MAX_TINT = 0.12
 MAX_LIGHT_TURN_RAD = 0.8
 TABLE_BRIGHTNESS, TABLE_SATURATION = (0.35, 0.95), 0.35
 _STREAM = 0x100C
-"""Told to the random generator beside the seed, so that looks and places are independent."""
+"""Second seed of the random generator: appearance and places of objects are independent."""
 
 
 @dataclass(frozen=True, slots=True)
 class Appearance:
-    """What is different from the scene file; None: as the file has it.
+    """Differences from the scene file; None: as in the file.
 
     Args:
         ambient: (3,) ambient colour of the head light.
@@ -42,8 +40,8 @@ class Appearance:
         key: (3,) diffuse colour of the scene's light.
         key_turn_rad: rotation vector (3,) of the direction of that light, world frame.
         table: (3,) colour of the table.
-        shift_m: (3,) by which the front camera stands elsewhere, world frame.
-        turn_rad: (3,) rotation vector by which it looks elsewhere, world frame.
+        shift_m: (3,) offset of the front camera, world frame.
+        turn_rad: (3,) rotation vector of the front camera, world frame.
     """
 
     ambient: FloatArray | None = None
@@ -55,12 +53,12 @@ class Appearance:
     turn_rad: FloatArray | None = None
 
 
-def draw_look(seed: int, vary: Collection[str]) -> Appearance:
-    """The look of `seed`: the same for the same numbers, each part whatever else is varied.
+def draw_appearance(seed: int, vary: Collection[str]) -> Appearance:
+    """The appearance of `seed`; each part is the same whatever else is varied.
 
     Args:
         seed: of the reset.
-        vary: names of `VARIATIONS`; ``camera`` shifts by at most 3 cm and turns by at most 5
+        vary: names of `VARIATIONS`; ``camera`` shifts by at most 3 cm and rotates by at most 5
             degrees, each uniform in a ball.
 
     Raises:
@@ -83,11 +81,11 @@ def draw_look(seed: int, vary: Collection[str]) -> Appearance:
     )
 
 
-class Dresser:
-    """Gives one model its looks, each in place of the last.
+class AppearanceSwitcher:
+    """Applies appearances to one model, each in place of the last.
 
     Args:
-        model: a compiled scene; it is changed.
+        model: a compiled scene; it is modified.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -98,11 +96,11 @@ class Dresser:
         self._rgba = model.mat_rgba.copy()
         self._cam_pos, self._cam_quat = model.cam_pos.copy(), model.cam_quat.copy()
 
-    def wear(self, look: Appearance) -> None:
-        """Look like this from now on; positions in data are to be computed anew.
+    def apply(self, look: Appearance) -> None:
+        """Apply `look`; the caller recomputes the positions in its data.
 
         Raises:
-            ResourceError: the scene has not got what this look changes.
+            ResourceError: the scene lacks what this appearance changes.
         """
         model, head = self._model, self._model.vis.headlight
         head.ambient[:] = self._ambient if look.ambient is None else look.ambient

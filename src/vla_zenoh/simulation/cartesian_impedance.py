@@ -1,7 +1,7 @@
 """Cartesian impedance control of an arm by joint torques.
 
-The TCP behaves like a damped spring that hangs on a moving reference. With ``Lambda`` the inertia
-the TCP shows in task space and ``J`` its Jacobian::
+The TCP behaves as if a damped spring connected it to a moving reference. With ``Lambda`` its
+inertia in task space and ``J`` its Jacobian::
 
     e       = [p_ref - p ; log3(R_ref R^T)]            base frame, clamped to ``max_error_*``
     Lambda  = (J M^-1 J^T)^-1
@@ -16,9 +16,9 @@ and the dynamically consistent nullspace are Khatib's (*A unified approach for m
 control of robot manipulators: the operational space formulation*, IEEE J. Robotics and Automation
 3(1), 1987). The damping is the factorisation design of Albu-Schaeffer, Ott, Frese and Hirzinger
 (*Cartesian impedance control of redundant robots*, ICRA 2003; Ott, *Cartesian Impedance Control of
-Redundant and Flexible-Joint Robots*, Springer 2008), which keeps the damping ratio in every pose
-where a constant matrix does not. The integral term carries joint friction and payload that the
-model does not know.
+Redundant and Flexible-Joint Robots*, Springer 2008), which keeps the damping ratio in every pose;
+a constant matrix does not. The integral term carries joint friction and payload that the model
+lacks.
 """
 
 from __future__ import annotations
@@ -29,19 +29,17 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vla_zenoh.types import FloatArray
 from vla_zenoh.types.references import PoseReference
 
-FloatArray = NDArray[np.float64]
-
-# Below this task-space mobility (1/kg or 1/(kg m^2)) a direction counts as singular; the inertia
-# seen there grows without bound and would turn damping and feed-forward into a hammer.
+# Task-space mobility (1/kg or 1/(kg m^2)) below which a direction counts as singular: its apparent
+# inertia grows without bound, and so would damping and feed-forward.
 MIN_MOBILITY = 0.01
 
 
 class ArmState(NamedTuple):
-    """What the law has to know of the arm: n joints, everything in the base frame.
+    """State of an arm of n joints, input of an impedance law; everything in the base frame.
 
     Args:
         position_rad: (n,).
@@ -70,7 +68,7 @@ class ImpedanceOutput(NamedTuple):
     Args:
         torque_nm: (n,) within the effort limits.
         error: (6,) m and rad from TCP to reference, before the clamp.
-        wrench: (6,) N and Nm the law asks the TCP to exert, without the nullspace part.
+        wrench: (6,) N and Nm that the TCP should exert, without the nullspace part.
         saturated: an effort limit cut the torque.
     """
 
@@ -91,8 +89,8 @@ class ImpedanceGains:
         integral_1_s: ki, 0 switches integral action off.
         max_integral_n: bound of the integral force, per axis.
         max_integral_nm: bound of the integral moment, per axis.
-        max_error_m: the spring is not stretched further, which bounds the pressing force.
-        max_error_rad: likewise for rotation.
+        max_error_m: largest stretch of the spring, which bounds the pressing force.
+        max_error_rad: the same for rotation.
         posture_nm_rad: nullspace stiffness towards the posture.
         limit_nm_rad: stiffness with which the nullspace leaves a joint limit.
         limit_margin_rad: distance to a joint limit at which that begins.
@@ -117,21 +115,21 @@ class ImpedanceGains:
 
     @classmethod
     def compliant(cls) -> ImpedanceGains:
-        """Gives way to a hand; presses with at most 39 N."""
+        """Yields to a hand; presses with at most 39 N."""
         return cls(
             translational_n_m=400.0, rotational_nm_rad=20.0, max_error_m=0.06, max_error_rad=0.5
         )
 
 
 class CartesianImpedance:
-    """The law with its only state, the integral wrench.
+    """Cartesian impedance controller; its only state is the integral wrench.
 
     Args:
         gains: stiffness, damping, bounds.
         lower_rad: (n,) joint limits.
         upper_rad: (n,) joint limits.
         effort_nm: (n,) torque limits.
-        posture_rad: (n,) joints the nullspace prefers.
+        posture_rad: (n,) joints that the nullspace prefers.
         period_s: time between two calls of `torque`.
     """
 
@@ -160,20 +158,20 @@ class CartesianImpedance:
 
     @property
     def integral(self) -> FloatArray:
-        """(6,) N and Nm the integral action adds now; a copy."""
+        """(6,) N and Nm of the integral action; a copy."""
         return self._integral.copy()
 
     def reset(self, posture_rad: FloatArray | None = None) -> None:
-        """Forget the integral; take `posture_rad` (n,) as new posture where given."""
+        """Clear the integral; set the posture where `posture_rad` (n,) is given."""
         self._integral = np.zeros(6)
         if posture_rad is not None:
             self._posture_rad = np.array(posture_rad, float)
 
     def take_over(self, torque_nm: FloatArray, state: ArmState) -> None:
-        """Begin where another law held the arm at rest with `torque_nm` (n,), in that posture.
+        """Take over from another law that held the arm at rest with `torque_nm` (n,).
 
-        What that torque carried at the TCP beyond the model (friction, payload) goes into the
-        integral, so that the first torque of this law equals the last of the other there.
+        The part of that torque beyond the model (friction, payload) goes into the integral, so that
+        the first torque of this law equals the last of the other at the TCP.
         """
         compliance = np.linalg.solve(state.inertia, state.jacobian.T)
         mobility, axes = np.linalg.eigh(state.jacobian @ compliance)
@@ -210,9 +208,9 @@ class CartesianImpedance:
         return ImpedanceOutput(torque, error, wrench, saturated)
 
     def _clamp(self, error: FloatArray) -> tuple[FloatArray, float]:
-        """Bound the spring's stretch; also how much of the feed-forward may stay, 1 to 0.
+        """Bounded stretch of the spring, and the share of the feed-forward that remains, 1 to 0.
 
-        A reference that runs on while the arm is blocked would push through its velocity alone,
+        A reference that moves on while the arm is blocked would push by its velocity alone,
         so the feed-forward fades over the second half of the allowed error.
         """
         x, y, z, a, b, c = error.tolist()
@@ -226,7 +224,7 @@ class CartesianImpedance:
         return clamped, max(0.0, 2.0 - 2.0 * stretch)
 
     def _integrate(self, error: FloatArray, *, held: bool) -> None:
-        """Integrate; while the arm is blocked or a torque is at its limit only towards zero."""
+        """Integrate; towards zero only while the arm is blocked or a torque is at its limit."""
         step = self._integral_rate * error
         if held:
             step = np.where(step * self._integral < 0.0, step, 0.0)

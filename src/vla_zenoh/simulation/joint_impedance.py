@@ -1,6 +1,6 @@
 """Joint impedance control of an arm by joint torques.
 
-Every joint behaves like a damped spring that hangs on a moving reference. With ``M`` the arm's
+Every joint behaves as if a damped spring connected it to a moving reference. With ``M`` the arm's
 inertia::
 
     e    = q_ref - q                                    clamped to ``max_error_rad``
@@ -14,7 +14,7 @@ controller for robot manipulators*, Int. J. Control 47(6), 1988); the damping is
 square roots of Albu-Schaeffer, Ott, Frese and Hirzinger (*Cartesian impedance control of redundant
 robots*, ICRA 2003), here in joint space. The stiffness is that of Franka's own example
 (``joint_impedance_example_controller`` of franka_ros). The integral term carries joint friction and
-payload that the model does not know.
+payload that the model lacks.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ class JointImpedanceOutput(NamedTuple):
 class JointGains:
     """Gains of the law, per joint from the base outwards.
 
-    A longer arm repeats the last number, a shorter one leaves the last ones out.
+    A longer arm repeats the last number, a shorter one ignores the surplus.
 
     Args:
         stiffness_nm_rad: K.
         damping_ratio: zeta, 1 is critical.
         integral_1_s: ki, 0 switches integral action off.
         max_integral_nm: bound of the integral torque.
-        max_error_rad: the spring is not stretched further, which bounds the pressing force.
+        max_error_rad: largest stretch of the spring, which bounds the torque of a blocked joint.
     """
 
     stiffness_nm_rad: tuple[float, ...] = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)
@@ -66,19 +66,19 @@ class JointGains:
 
     @classmethod
     def stiff(cls) -> JointGains:
-        """Follows within a milliradian; a joint presses with at most 40 Nm."""
+        """Follows within a milliradian; a blocked joint exerts at most 40 Nm."""
         return cls()
 
     @classmethod
     def compliant(cls) -> JointGains:
-        """Gives way to a hand: a quarter of the stiffness, and at most 33 Nm."""
+        """Yields to a hand: a quarter of the stiffness, and at most 33 Nm."""
         return cls(
             stiffness_nm_rad=(150.0, 150.0, 150.0, 150.0, 60.0, 40.0, 15.0), max_error_rad=0.15
         )
 
 
-class JointImpedanceController:
-    """The law with its only state, the integral torque.
+class JointImpedance:
+    """Joint impedance controller; its only state is the integral torque.
 
     Args:
         gains: stiffness, damping, bounds.
@@ -99,18 +99,18 @@ class JointImpedanceController:
 
     @property
     def integral_nm(self) -> FloatArray:
-        """(n,) what the integral action adds now; a copy."""
+        """(n,) torque of the integral action; a copy."""
         return self._integral.copy()
 
     def reset(self) -> None:
-        """Forget the integral."""
+        """Clear the integral."""
         self._integral = np.zeros_like(self._integral)
 
     def take_over(self, torque_nm: FloatArray, state: ArmState) -> None:
-        """Begin where another law held the arm at rest with `torque_nm` (n,).
+        """Take over from another law that held the arm at rest with `torque_nm` (n,).
 
-        What that torque carried beyond the model (friction, payload) goes into the integral, so
-        that the first torque of this law equals the last of the other.
+        The part of that torque beyond the model (friction, payload) goes into the integral, so that
+        the first torque of this law equals the last of the other.
         """
         self._integral = self._bounded(torque_nm - state.bias_nm)
 
@@ -119,7 +119,7 @@ class JointImpedanceController:
         error = reference.position_rad - state.position_rad
         stretch = np.abs(error) / self.gains.max_error_rad
         spring_error = error / np.maximum(stretch, 1.0)
-        # A reference that runs on while the arm is blocked would push through its velocity alone,
+        # A reference that moves on while the arm is blocked would push by its velocity alone,
         # so the feed-forward fades over the second half of the allowed error.
         feed = min(1.0, max(0.0, 2.0 - 2.0 * float(stretch.max())))
 
@@ -140,7 +140,7 @@ class JointImpedanceController:
         return JointImpedanceOutput(torque, error, bool(cut.any()))
 
     def _integrate(self, error: FloatArray, held: NDArray[np.bool_]) -> None:
-        """Integrate; a joint that is blocked or at its torque limit only towards zero."""
+        """Integrate; towards zero only at joints that are blocked or at their torque limit."""
         step = self._integral_rate * error
         step[held & (step * self._integral >= 0.0)] = 0.0
         self._integral = self._bounded(self._integral + step)

@@ -1,9 +1,15 @@
-"""Pictures by OpenGL, through EGL or OSMesa, without a window system."""
+"""Renders by OpenGL through EGL or OSMesa, without a window system.
+
+``python -m vla_zenoh.simulation.opengl egl`` renders one small test image and exits with 0 when it
+is right. `vla_zenoh.simulation.render` runs that in a process of its own, since a broken driver can
+crash it.
+"""
 
 from __future__ import annotations
 
 import importlib
 import os
+import sys
 from typing import Any
 
 import mujoco
@@ -13,13 +19,23 @@ from numpy.typing import NDArray
 from vla_zenoh.errors import NodeError
 
 MAX_GEOMS = 1000
+PROBE_SIZE = 16
+PROBE_SCENE = """
+<mujoco>
+  <visual><headlight ambient="1 1 1"/></visual>
+  <worldbody>
+    <camera name="eye" pos="0 0 1"/>
+    <geom type="box" size="2 2 0.1" rgba="1 0 0 1"/>
+  </worldbody>
+</mujoco>
+"""
 
 
 class OpenGlCanvas:
-    """An off-screen OpenGL context of one model. Belongs to the thread that made it.
+    """Off-screen OpenGL context of one model; use it from the thread that made it.
 
     Args:
-        model: what to draw.
+        model: the scene.
         platform: ``egl`` or ``osmesa``.
 
     Raises:
@@ -29,18 +45,18 @@ class OpenGlCanvas:
     def __init__(self, model: mujoco.MjModel, platform: str) -> None:
         self._model = model
         # MuJoCo's own Renderer takes its context from MUJOCO_GL as it was at `import mujoco`; the
-        # platform's module can be asked directly and does not care who imported what when.
+        # platform's module does not depend on the order of imports.
         other = os.environ.get("PYOPENGL_PLATFORM")
         if other not in (None, "", platform):
             raise NodeError(
-                f"this process already draws with PYOPENGL_PLATFORM={other}; {platform} needs a "
+                f"this process already renders with PYOPENGL_PLATFORM={other}; {platform} needs a "
                 "process of its own"
             )
         try:
             self._context: Any = importlib.import_module(f"mujoco.{platform}").GLContext(64, 64)
             self._context.make_current()
             self._gl = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        except Exception as error:  # drivers raise whatever they like here
+        except Exception as error:  # drivers raise exceptions of many types here
             raise NodeError(f"no OpenGL through {platform}: {error}") from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._gl)
         self._scene = mujoco.MjvScene(model, MAX_GEOMS)
@@ -52,7 +68,7 @@ class OpenGlCanvas:
         self._size = (0, 0)
 
     def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> NDArray[np.uint8]:
-        """Draw what `camera` sees, (height, width, 3) RGB."""
+        """Image of `camera`, (height, width, 3) RGB."""
         if self._size != (width, height):
             mujoco.mjr_resizeOffscreen(width, height, self._gl)
             self._size = (width, height)
@@ -73,9 +89,26 @@ class OpenGlCanvas:
         return np.ascontiguousarray(rgb[::-1])  # OpenGL's first row is the lowest
 
     def refresh(self) -> None:
-        """Nothing to do: every picture reads the model anew."""
+        """Nothing to do: every image reads the model."""
 
     def close(self) -> None:
-        """Give the context back."""
+        """Free the context."""
         self._gl.free()
         self._context.free()
+
+
+def main() -> None:
+    """Exit with 0 when a red box is rendered red, else print the reason on stderr."""
+    model = mujoco.MjModel.from_xml_string(PROBE_SCENE)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    canvas = OpenGlCanvas(model, sys.argv[1])
+    image = canvas.draw(data, "eye", PROBE_SIZE, PROBE_SIZE)
+    red, green, _ = image[PROBE_SIZE // 2, PROBE_SIZE // 2].tolist()
+    canvas.close()
+    if not red > 2 * green:
+        sys.exit(f"the test image has the wrong colour: {red}, {green}")
+
+
+if __name__ == "__main__":
+    main()

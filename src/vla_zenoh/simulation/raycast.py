@@ -1,11 +1,11 @@
-"""Pictures by ray casting: no OpenGL, no driver, the same on every machine.
+"""Renders by ray casting: no OpenGL, no driver, the same image on every machine.
 
-One ray a pixel costs 110 ms at 640x480, so most of them are not cast. Before a camera that stands
-still only the pixels that moving bodies can cover are, over a background cast once. Before a moving
-camera a coarse grid comes first; only its cells with an edge in them are cast in full, the others
-are interpolated. What fits between the grid's rays, 4 pixels apart, may then be overlooked.
+One ray a pixel costs 110 ms at 640x480, so most of them are not cast. For a fixed camera only the
+pixels that moving bodies can cover are, over a background cast once. For a moving camera a coarse
+grid comes first; its cells that contain an edge are cast in full, the others interpolated. An
+object that fits between the grid's rays, 4 pixels apart, may be missed.
 
-The light is that of MuJoCo's OpenGL without shadows, textures and gloss::
+Lighting is that of MuJoCo's OpenGL without shadows, textures and specular highlights::
 
     colour = rgb (sum of ambients + sum over lights of diffuse max(0, n . l))
 """
@@ -20,9 +20,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_zenoh.simulation.objects import box_corners
 from vla_zenoh.simulation.scene import MOVING_GROUP, STATIC_GROUP
+from vla_zenoh.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
 GRID_PX = 4
@@ -30,12 +31,12 @@ SMOOTH_COSINE = 0.97
 FAR = 100.0
 NEAR_M = 1e-3
 GROUPS = 6
-# MuJoCo's marker for "no colour of its own": the material's colour counts.
+# MuJoCo's marker for a geom that takes the colour of its material.
 NO_COLOUR = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 
 
 class Hits(NamedTuple):
-    """What n rays met: geom (n,) or -1, distance (n,) in ray lengths, normal (n, 3)."""
+    """Hits of n rays: geom (n,) or -1, distance (n,) in ray lengths, normal (n, 3)."""
 
     geom: NDArray[np.int32]
     distance: FloatArray
@@ -43,14 +44,14 @@ class Hits(NamedTuple):
 
 
 class Background(NamedTuple):
-    """What a camera that stands still sees of the bodies that do, (height, width, ...)."""
+    """Static bodies as a fixed camera sees them, (height, width, ...)."""
 
     rgb: Pixels
     distance: FloatArray
 
 
 class Viewpoint(NamedTuple):
-    """A camera now: where it is, its axes (3, 3), focal length in pixels, size in pixels."""
+    """A camera's pose, with axes (3, 3), its focal length in pixels and its size in pixels."""
 
     position_m: FloatArray
     axes: FloatArray
@@ -60,10 +61,10 @@ class Viewpoint(NamedTuple):
 
 
 class RaycastCanvas:
-    """Ray casting of one model, whose geoms `build_model` has sorted into groups.
+    """Renders one model, whose geoms `build_model` has sorted into groups, by ray casting.
 
     Args:
-        model: what to draw.
+        model: the scene.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -75,14 +76,14 @@ class RaycastCanvas:
         self.refresh()
 
     def refresh(self) -> None:
-        """Take colours from the model, and forget what was drawn with others."""
+        """Read colours from the model, and discard the backgrounds that were cast with others."""
         model = self._model
         own = (model.geom_rgba != NO_COLOUR).any(axis=1) | (model.geom_matid < 0)
         self._rgb = np.where(own[:, None], model.geom_rgba, model.mat_rgba[model.geom_matid])[:, :3]
         self._backgrounds.clear()
 
     def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> Pixels:
-        """Draw what `camera` sees, (height, width, 3) RGB."""
+        """Image of `camera`, (height, width, 3) RGB."""
         index = self._model.camera(camera).id
         focal = height / 2.0 / math.tan(math.radians(self._model.cam_fovy[index]) / 2.0)
         axes = data.cam_xmat[index].reshape(3, 3)
@@ -93,7 +94,7 @@ class RaycastCanvas:
         return self._coarse_to_fine(data, view)
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Nothing to free."""
 
     def _over_background(
         self, data: mujoco.MjData, view: Viewpoint, key: tuple[int, int, int]
@@ -109,10 +110,10 @@ class RaycastCanvas:
         rays = self._directions(view)[rows, columns]
         hits = self._cast(data, view, rays, {MOVING_GROUP})
         seen = (hits.geom >= 0) & (hits.distance < background.distance[rows, columns])
-        picture = background.rgb.copy()
+        image = background.rgb.copy()
         front = Hits(hits.geom[seen], hits.distance[seen], hits.normal[seen])
-        picture[rows[seen], columns[seen]] = self._shade(data, view, rays[seen], front)
-        return picture
+        image[rows[seen], columns[seen]] = self._shade(data, view, rays[seen], front)
+        return image
 
     def _coarse_to_fine(self, data: mujoco.MjData, view: Viewpoint) -> Pixels:
         groups = {STATIC_GROUP, MOVING_GROUP}
@@ -123,7 +124,7 @@ class RaycastCanvas:
         smooth = _smooth_cells(hits.geom.reshape(grid), hits.normal.reshape(*grid, 3))
 
         size, scale = (view.width, view.height), 1.0 / GRID_PX
-        picture = cv2.warpAffine(
+        image = cv2.warpAffine(
             colour,
             np.array([[scale, 0.0, 0.0], [0.0, scale, 0.0]]),
             size,
@@ -133,14 +134,14 @@ class RaycastCanvas:
         rows, columns = np.nonzero(rough[: view.height, : view.width])
         rays = self._directions(view)[rows, columns]
         fine = self._cast(data, view, rays, groups)
-        picture[rows, columns] = self._shade(data, view, rays, fine)
-        return np.asarray(picture, np.uint8)
+        image[rows, columns] = self._shade(data, view, rays, fine)
+        return np.asarray(image, np.uint8)
 
     def _directions(self, view: Viewpoint, step_px: int = 1) -> FloatArray:
         """Rays through every `step_px`-th pixel, in the camera's own axes, one unit deep.
 
-        (height, width, 3) for a step of 1; else the grid reaches over the picture's edge, so that
-        every pixel lies in a cell of it.
+        (height, width, 3) for a step of 1; else the grid reaches over the image's edge, so that
+        every pixel lies in one of its cells.
         """
         key = (view.focal_px, view.width, view.height, step_px)
         if key not in self._rays:
@@ -180,7 +181,7 @@ class RaycastCanvas:
         return Hits(geom, distance, normal)
 
     def _shade(self, data: mujoco.MjData, view: Viewpoint, rays: FloatArray, hits: Hits) -> Pixels:
-        """(n, 3) colours; black where a ray met nothing, as in OpenGL."""
+        """(n, 3) colours; black where a ray hit nothing, as in OpenGL."""
         model, head = self._model, self._model.vis.headlight
         normal = hits.normal
         light = np.zeros((len(rays), 3))
@@ -202,7 +203,7 @@ class RaycastCanvas:
         return np.where(hits.geom[:, None] < 0, 0, colour).astype(np.uint8)
 
     def _covered(self, data: mujoco.MjData, view: Viewpoint) -> NDArray[np.bool_]:
-        """Pixels (height, width) that moving geoms may cover."""
+        """(height, width) mask of the pixels that moving geoms may cover."""
         mask = np.zeros((view.height, view.width), np.uint8)
         centre = np.array([view.width / 2.0, view.height / 2.0])
         for geom, points in self._outlines.items():
@@ -221,14 +222,12 @@ class RaycastCanvas:
 
 
 def _outline(model: mujoco.MjModel, geom: int) -> FloatArray:
-    """(n, 3) points in the geom's frame whose convex hull holds it."""
+    """(n, 3) points in the geom's frame whose convex hull contains it."""
     mesh = model.geom_dataid[geom]
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH and mesh >= 0:
         first = model.mesh_vertadr[mesh]
         return model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(float)
-    centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-    signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
-    return centre + signs * half
+    return box_corners(model, geom)
 
 
 def _smooth_cells(geom: NDArray[np.int32], normal: FloatArray) -> NDArray[np.bool_]:

@@ -1,31 +1,122 @@
-"""Pictures of a simulated world, from a copy of its poses.
+"""Renders images of a simulated world from a copy of its poses.
 
-Drawing belongs in a process of its own: it would disturb the control loop. That process makes a
-`Renderer` of the same scene and robot as the `World` and feeds it `World.qpos`.
+Rendering belongs in a process of its own: it would disturb the control loop. That process makes a
+`Renderer` of the same scene and robot as the `World` and gives it `World.qpos`.
+
+OpenGL is fast but needs a system library; ray casting needs nothing. With ``MUJOCO_GL`` naming a
+missing library ``import mujoco`` itself fails, and a broken driver can crash the process: so this
+module does not import MuJoCo, and `choose_backend` tries each OpenGL platform in another process.
 """
 
 from __future__ import annotations
 
+import ctypes.util
+import os
+import subprocess
+import sys
 from collections.abc import Collection
+from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import ResourceError
-from vla_zenoh.simulation.backend import RAYCAST, Backend, choose_backend
+from vla_zenoh.errors import NodeError, ResourceError
 from vla_zenoh.simulation.robot_model import RobotModel
 
 if TYPE_CHECKING:
     import mujoco
 
+VARIABLE = "VLA_ZENOH_RENDERER"
+EGL, OSMESA, RAYCAST = "egl", "osmesa", "raycast"
+BACKENDS = (EGL, OSMESA, RAYCAST)
+AUTO = "auto"
+PROBE_LIMIT_S = 60.0
+
+# Libraries that PyOpenGL and MuJoCo load for each platform, and the Debian packages that have them.
+_LIBRARIES = {EGL: ("EGL", "OpenGL"), OSMESA: ("OSMesa",)}
+_PACKAGES = {EGL: "libegl1 libopengl0 libgl1-mesa-dri", OSMESA: "libosmesa6"}
+_GL_VARIABLES = ("MUJOCO_GL", "PYOPENGL_PLATFORM")
+
+
+@dataclass(frozen=True, slots=True)
+class Backend:
+    """A way to render.
+
+    Args:
+        name: ``egl``, ``osmesa`` or ``raycast``.
+        reason: why no faster one works; empty where it is the one asked for.
+        install: Debian packages that would bring the faster one; may be empty.
+    """
+
+    name: str
+    reason: str = ""
+    install: str = ""
+
+
+def choose_backend(wanted: str | None = None) -> Backend:
+    """The fastest back end that works on this machine, or the one asked for.
+
+    Args:
+        wanted: a name of `BACKENDS`, ``auto``, or None for the environment variable
+            ``VLA_ZENOH_RENDERER``, and ``auto`` where that is not set.
+
+    Raises:
+        NodeError: `wanted` is unknown, or is asked for by name and does not work here.
+    """
+    name = wanted if wanted is not None else os.environ.get(VARIABLE) or AUTO
+    if name not in (AUTO, *BACKENDS):
+        raise NodeError(f"no renderer called {name!r}; there are: {AUTO}, {', '.join(BACKENDS)}")
+    if name == RAYCAST:
+        return Backend(RAYCAST)
+    if name != AUTO:
+        failure = why_not(name)
+        if failure:
+            raise NodeError(
+                f"the renderer {name!r} does not work here: {failure}; "
+                f"on Debian: apt-get install {_PACKAGES[name]}"
+            )
+        return Backend(name)
+    failures = []
+    for candidate in (EGL, OSMESA):
+        failure = why_not(candidate)
+        if not failure:
+            return Backend(candidate)
+        failures.append(f"{candidate}: {failure}")
+    return Backend(RAYCAST, "; ".join(failures), _PACKAGES[EGL])
+
+
+def why_not(name: str) -> str:
+    """Why the OpenGL platform `name` does not work here; empty when it does."""
+    missing = [part for part in _LIBRARIES[name] if ctypes.util.find_library(part) is None]
+    if missing:
+        return f"the library lib{missing[0]} is not installed"
+    # The caller's own choice of a platform must not decide which one the probe tries.
+    environment = {key: value for key, value in os.environ.items() if key not in _GL_VARIABLES}
+    environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "vla_zenoh.simulation.opengl", name],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=PROBE_LIMIT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return f"rendering a test image took longer than {PROBE_LIMIT_S:g} s"
+    if done.returncode == 0:
+        return ""
+    errors = done.stderr.strip().splitlines()
+    return errors[-1] if errors else f"rendering a test image exited with code {done.returncode}"
+
 
 class Canvas(Protocol):
-    """Something that draws what a camera of a model sees."""
+    """Renders the cameras of one model."""
 
     def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> NDArray[np.uint8]:
-        """Draw (height, width, 3) RGB; positions in `data` are up to date."""
+        """(height, width, 3) RGB; positions in `data` are up to date."""
         ...
 
     def refresh(self) -> None:
@@ -33,17 +124,17 @@ class Canvas(Protocol):
         ...
 
     def close(self) -> None:
-        """Give resources back."""
+        """Free resources."""
         ...
 
 
 class Renderer:
-    """Draws a scene with its robot. Use it from the thread that made it.
+    """Renders a scene with its robot. Use it from the thread that made it.
 
     Args:
         scene: name or path of the scene, as the world's.
         robot: the robot, as the world's.
-        backend: how to draw; None lets `choose_backend` choose.
+        backend: how to render; None: `choose_backend` chooses.
 
     Raises:
         ResourceError: scene or robot are missing.
@@ -51,18 +142,17 @@ class Renderer:
     """
 
     def __init__(self, scene: str, robot: RobotModel, backend: Backend | None = None) -> None:
-        chosen = choose_backend() if backend is None else backend
-        # Not before the choice: with a bad MUJOCO_GL in the environment the import itself fails.
+        self.backend = choose_backend() if backend is None else backend
+        # After the choice: with a bad MUJOCO_GL in the environment the import itself fails.
         import mujoco
 
-        from vla_zenoh.simulation.appearance import Dresser
+        from vla_zenoh.simulation.appearance import AppearanceSwitcher
         from vla_zenoh.simulation.scene import build_model
 
-        self.backend = chosen
         self._model = build_model(scene, robot)
         self._data = mujoco.MjData(self._model)
-        self._canvas = _canvas(chosen.name, self._model)
-        self._dresser = Dresser(self._model)
+        self._canvas = _canvas(self.backend.name, self._model)
+        self._appearance = AppearanceSwitcher(self._model)
         self._update()
 
     @property
@@ -76,28 +166,25 @@ class Renderer:
         Raises:
             RecordError: the vector is of another scene, or not finite.
         """
-        from vla_zenoh.simulation.pose_vector import write_pose_vector
+        from vla_zenoh.simulation.scene import write_pose_vector
 
         write_pose_vector(self._model, self._data, vector)
         self._update()
 
     def vary(self, seed: int | None, vary: Collection[str]) -> None:
-        """Look as a reset with `seed` makes the scene look; None: as the scene file says.
+        """Take the appearance that a reset with `seed` gives; None: that of the scene file.
 
         Raises:
-            ResourceError: an unknown name in `vary`, or the scene has nothing to vary so.
+            ResourceError: an unknown name in `vary`, or the scene lacks what it varies.
         """
-        from vla_zenoh.simulation.appearance import Appearance, draw_look
+        from vla_zenoh.simulation.appearance import Appearance, draw_appearance
 
-        self._dresser.wear(Appearance() if seed is None else draw_look(seed, vary))
+        self._appearance.apply(Appearance() if seed is None else draw_appearance(seed, vary))
         self._canvas.refresh()
         self._update()
 
     def render(self, camera: str, width: int, height: int) -> NDArray[np.uint8]:
-        """Draw what `camera` sees.
-
-        Returns:
-            RGB uint8, (height, width, 3), C-contiguous.
+        """Image of `camera`: RGB uint8, (height, width, 3), C-contiguous.
 
         Raises:
             ResourceError: there is no such camera.
@@ -107,7 +194,7 @@ class Renderer:
         return self._canvas.draw(self._data, camera, width, height)
 
     def view(self, camera: str) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-        """Where `camera` is now: position (3,) m, axes (3, 3) in columns, vertical view in rad.
+        """Camera pose: position (3,) m, axes (3, 3) in columns; and vertical field of view in rad.
 
         The axes are MuJoCo's: x to the right, y up, looking along -z.
         """
@@ -117,7 +204,7 @@ class Renderer:
         return self._data.cam_xpos[index].copy(), axes, fovy_rad
 
     def close(self) -> None:
-        """Give the graphics context back."""
+        """Free the graphics context."""
         self._canvas.close()
 
     def __enter__(self) -> Renderer:

@@ -1,4 +1,4 @@
-"""What the simulator has to know of a robot besides its URDF. The defaults are a Franka Panda."""
+"""Description of a robot for the simulator, beside its URDF. The defaults are a Franka Panda."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class MountedCamera:
         name: the camera's name.
         link: the link that carries it.
         position_m: (3,) of the lens.
-        look_at_m: (3,) a point in the middle of the picture.
-        up: (3,) direction that is up in the picture.
+        look_at_m: (3,) a point on the optical axis.
+        up: (3,) direction that is up in the image.
         fovy_rad: vertical field of view.
     """
 
@@ -44,16 +44,16 @@ def _panda_wrist() -> MountedCamera:
 class RobotModel:
     """An arm with a two-finger parallel gripper.
 
-    Kinematics, inertia, joint limits and effort limits come from the URDF and are not changed;
-    nothing is added to them (no armature), so Pinocchio and MuJoCo compute the same dynamics.
+    Kinematics, inertia, joint limits and effort limits are those of the URDF, without armature: so
+    Pinocchio and MuJoCo compute the same dynamics.
 
     Args:
         description: the URDF, see `vla_zenoh.resources.robot_urdf`.
         arm_joints: the joints under torque control, base to tip.
         finger_joints: two prismatic joints; the opening is their sum.
-        finger_links: links whose geoms grip.
-        tcp_link: link whose frame is the tool centre point.
-        camera: the camera the robot carries, or None.
+        finger_links: links whose geoms touch the object.
+        tcp_link: link whose frame is the TCP.
+        camera: the camera mounted on the robot, or None.
         gripper_stiffness_n_m: of the width servo; the force bound of a command caps it.
         gripper_damping_ns_m: of the width servo.
         pad_friction: sliding, torsional, rolling friction of the fingers.

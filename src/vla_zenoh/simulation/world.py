@@ -1,4 +1,4 @@
-"""The simulated world: robot, its controllers, gripper and objects, one millisecond a tick."""
+"""The simulated world: robot, controllers, gripper and objects, stepped by 1 ms per tick."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from collections.abc import Collection
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.simulation.appearance import DISTRACTORS, draw_look
+from vla_zenoh.profile import Profile
+from vla_zenoh.simulation.appearance import DISTRACTORS, draw_appearance
 from vla_zenoh.simulation.cartesian_impedance import (
     ArmState,
     CartesianImpedance,
@@ -19,47 +20,43 @@ from vla_zenoh.simulation.cartesian_impedance import (
 )
 from vla_zenoh.simulation.joint_impedance import (
     JointGains,
-    JointImpedanceController,
+    JointImpedance,
     JointImpedanceOutput,
 )
-from vla_zenoh.simulation.pose_vector import read_pose_vector, write_pose_vector
+from vla_zenoh.simulation.objects import SimulatedObjects
 from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.scene import STEP_S, build_model
-from vla_zenoh.simulation.simulated_arm import SimulatedArm
-from vla_zenoh.simulation.simulated_hand import SimulatedHand
-from vla_zenoh.simulation.simulated_objects import SimulatedObjects
-from vla_zenoh.types import GripperState, JointState, PoseState, vector
+from vla_zenoh.simulation.scene import STEP_S, build_model, read_pose_vector, write_pose_vector
+from vla_zenoh.simulation.simulated_robot import SimulatedArm, SimulatedGripper
+from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState, vector
 from vla_zenoh.types.references import JointReference, PoseReference
-
-FloatArray = NDArray[np.float64]
 
 STEP_NS = round(STEP_S * 1e9)
 WRENCH_FILTER_S = 0.01
-"""A robot's estimate of forces is filtered likewise; a blow of one step means nothing."""
+"""Time constant of the reported wrench: a robot's own estimate is filtered too."""
 
 
 class World:
     """A scene with a robot under impedance control, of its TCP (`tick`) or joints (`tick_joint`).
 
-    Either may follow the other while the arm stands: the next law takes over what the last one
-    carried. Who changes between them in motion gets a jolt.
+    At rest either law takes over from the other with the same torque; a change between them in
+    motion jolts the arm.
 
     Deterministic to the bit: the same seed, references and gripper commands give the same state.
-    All poses are those of the TCP in the robot's base frame, which is the world frame.
+    All poses are of the TCP in the robot's base frame, which is the world frame.
 
     Args:
         scene: name of a folder of ``sim/``, or a path.
         robot: the robot in it.
-        home_rad: (n,) arm joints after a reset; also the posture the nullspace prefers.
+        home_rad: (n,) arm joints after a reset; also the posture that the nullspace prefers.
         gains: of the Cartesian impedance controller.
         joint_gains: of the joint impedance controller; None: the stiff ones.
-        joint_friction_nm: dry friction in every arm joint, unknown to the controller.
+        joint_friction_nm: dry friction in every arm joint, which the controller does not model.
         seed: see `reset`.
-        vary: what else a seeded reset changes, names of `look.VARIATIONS`.
+        vary: what else a seeded reset changes, names of `appearance.VARIATIONS`.
 
     Raises:
-        ResourceError: scene or robot are not there or do not fit.
-        RecordError: `home_rad` is not a vector of the arm's size.
+        ResourceError: scene or robot are missing or do not fit.
+        RecordError: `home_rad` does not have one number per arm joint.
     """
 
     def __init__(
@@ -74,7 +71,7 @@ class World:
         seed: int | None = None,
         vary: Collection[str] = (),
     ) -> None:
-        draw_look(0, vary)  # an unknown name is told here, not by the renderer
+        draw_appearance(0, vary)  # an unknown name fails here, not in the renderer
         self._vary = frozenset(vary)
         self.seed: int | None = None
         self.robot = robot
@@ -82,7 +79,7 @@ class World:
         self._data = mujoco.MjData(self.model)
         self._home_rad = vector("home_rad", home_rad, len(robot.arm_joints))
         self._arm = SimulatedArm(self.model, self._data, robot)
-        self._hand = SimulatedHand(self.model, self._data, robot)
+        self._gripper = SimulatedGripper(self.model, self._data, robot)
         self._objects = SimulatedObjects(self.model, self._data)
         self._controller = CartesianImpedance(
             gains,
@@ -92,85 +89,84 @@ class World:
             posture_rad=self._home_rad,
             period_s=STEP_S,
         )
-        self._joint_controller = JointImpedanceController(
+        self._joint_controller = JointImpedance(
             joint_gains or JointGains.stiff(),
             effort_nm=self._arm.effort_limit_nm,
             period_s=STEP_S,
         )
-        self._in_charge: CartesianImpedance | JointImpedanceController | None = None
+        self._active_law: CartesianImpedance | JointImpedance | None = None
         self._held_rad: FloatArray | None = None
-        self._felt = np.zeros(6)
+        self._filtered_wrench = np.zeros(6)
         self.saturated = 0
         self.reset(seed)
 
     # -- time ----------------------------------------------------------------------------------
 
     def reset(self, seed: int | None = None) -> None:
-        """Back to the home pose, gripper open, clock at zero.
+        """Return to the home pose with the gripper open and the clock at zero.
 
         Args:
-            seed: places objects at random in the scene's regions, the same for the same number;
-                None puts them where the scene file has them.
+            seed: places objects at random in the scene's regions; None: as in the scene file.
         """
         model, data = self.model, self._data
         self.seed = seed
         mujoco.mj_resetData(model, data)
         self._arm.position_rad[:] = self._home_rad
-        self._hand.open()
+        self._gripper.open()
         if seed is not None:
             self._objects.draw(seed, distractors=DISTRACTORS in self._vary)
         self._controller.reset(self._home_rad)
-        self._forget_controllers()
+        self._reset_laws()
         self._ticks = 0
-        self._felt = np.zeros(6)
+        self._filtered_wrench = np.zeros(6)
         self.saturated = 0
         mujoco.mj_forward(model, data)
         self._fresh = True
 
     def tick(self, reference: PoseReference) -> None:
-        """Go on by exactly one millisecond towards `reference`.
+        """Step by one millisecond towards a TCP reference.
 
         Raises:
-            NodeError: the simulation blew up; `reset` makes it usable again.
+            NodeError: the simulation diverged; `reset` makes it usable again.
         """
         mujoco.mj_step1(self.model, self._data)
-        state = self._put_in_charge(self._controller)
+        state = self._switch_to(self._controller)
         self._held_rad = None
         self._apply(self._controller.torque(reference, state), reference)
 
     def tick_joint(self, reference: JointReference) -> None:
-        """Likewise towards joint positions.
+        """Step by one millisecond towards a joint reference.
 
         Raises:
-            NodeError: the simulation blew up; `reset` makes it usable again.
+            NodeError: the simulation diverged; `reset` makes it usable again.
         """
         mujoco.mj_step1(self.model, self._data)
-        state = self._put_in_charge(self._joint_controller)
+        state = self._switch_to(self._joint_controller)
         self._held_rad = reference.position_rad
         self._apply(self._joint_controller.torque(reference, state), reference)
 
     def hold_joint_reference(self) -> JointReference:
-        """The reference that keeps the joints where they are now."""
+        """Reference at the measured joints, at rest."""
         return JointReference.at_rest(self._arm.position_rad)
 
     def hold_reference(self) -> PoseReference:
-        """The reference that keeps the TCP where it is now."""
+        """Reference at the measured TCP, at rest."""
         position, rotation = self.tcp()
         return PoseReference(position, rotation, np.zeros(6), np.zeros(6))
 
     def set_gripper(self, width_m: float, speed_m_s: float, force_n: float) -> None:
-        """Open or close to `width_m` at `speed_m_s`, pressing with at most `force_n`.
+        """Open or close to `width_m` at `speed_m_s`, pressing with at most `force_n` (N).
 
         Raises:
             RecordError: speed or force are not above zero.
         """
-        self._hand.command(width_m, speed_m_s, force_n)
+        self._gripper.command(width_m, speed_m_s, force_n)
 
-    # -- what a robot reports ------------------------------------------------------------------
+    # -- measurements ------------------------------------------------------------------
 
     @property
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
-        """Least and greatest position of every arm joint, (n,) each."""
+        """Lower and upper limit of every arm joint, (n,) each."""
         return self._arm.lower_rad.copy(), self._arm.upper_rad.copy()
 
     @property
@@ -180,18 +176,17 @@ class World:
 
     @property
     def wrench(self) -> FloatArray:
-        """(6,) what the surroundings exert on the robot right now: N, Nm about the TCP, base axes.
+        """(6,) external contact wrench of the last step: N, Nm about the TCP, base axes.
 
-        What it holds counts with its weight; what its parts exert on each other does not.
+        A held object counts with its weight; contacts between parts of the robot do not.
         """
         self._refresh()
         return self._arm.contact_wrench()
 
     def joint_state(self) -> JointState:
-        """Arm joints; the effort is what the motors apply.
+        """Arm joints; the effort is that of the motors.
 
-        The reference is that of `tick_joint`; under Cartesian control, which has none for joints,
-        it is where they are.
+        The reference is that of `tick_joint`; under Cartesian control the measured position.
         """
         arm = self._arm
         return JointState(
@@ -208,9 +203,9 @@ class World:
         return self._arm.tcp_position_m.copy(), self._arm.tcp_rotation.copy()
 
     def pose_state(self, reference: PoseReference | JointReference) -> PoseState:
-        """Measured TCP pose, twist and wrench beside the reference held now.
+        """Measured TCP pose, twist and wrench, with `reference`.
 
-        The wrench is `wrench` after a low-pass of the first order with `WRENCH_FILTER_S`.
+        The wrench is `wrench` behind a first-order low-pass of `WRENCH_FILTER_S`.
         """
         position, rotation = self.tcp()
         if isinstance(reference, JointReference):
@@ -221,21 +216,21 @@ class World:
             position_m=position,
             quat_xyzw=_quat_xyzw(rotation),
             twist=self._arm.jacobian() @ self._arm.velocity_rad_s,
-            wrench=self._felt.copy(),
+            wrench=self._filtered_wrench.copy(),
             reference_position_m=held_m,
             reference_quat_xyzw=_quat_xyzw(held_rotation),
         )
 
     def gripper_state(self) -> GripperState:
-        """Opening between the fingers, and whether they move or hold something."""
-        return self._hand.state()
+        """Opening between the fingers, and whether they move or hold an object."""
+        return self._gripper.state()
 
     @property
     def grip_force_n(self) -> float:
-        """What either finger presses with, inwards positive."""
-        return self._hand.force_n
+        """Force of either finger, inwards positive."""
+        return self._gripper.force_n
 
-    # -- objects and pictures ------------------------------------------------------------------
+    # -- objects and poses of all bodies ------------------------------------------------------
 
     def objects(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Position (3,) and quaternion x, y, z, w (4,) of every object, copies."""
@@ -243,42 +238,42 @@ class World:
         return self._objects.poses()
 
     def place(self, name: str, position_m: ArrayLike, quat_xyzw: ArrayLike = (0, 0, 0, 1)) -> None:
-        """Put an object somewhere, at rest.
+        """Put an object at a pose, at rest.
 
         Raises:
             ResourceError: the scene has no such object.
         """
-        self._objects.put(name, position_m, quat_xyzw)
+        self._objects.place(name, position_m, quat_xyzw)
         mujoco.mj_forward(self.model, self._data)
         self._fresh = True
 
     def qpos(self) -> FloatArray:
-        """Every pose of the world in one flat vector, for a renderer of the same scene."""
-        return read_pose_vector(self.model, self._data)
+        """Every pose of the world in one vector, for a renderer of the same scene."""
+        return read_pose_vector(self._data)
 
     def set_qpos(self, vector: FloatArray) -> None:
-        """Take over poses from `qpos` of an equal world; everything stands still afterwards."""
+        """Set all poses from `qpos` of a world of the same scene, at rest."""
         write_pose_vector(self.model, self._data, vector)
         self._data.qvel[:] = 0.0
         self._controller.reset()
-        self._forget_controllers()
-        self._hand.stand()
+        self._reset_laws()
+        self._gripper.stand()
         mujoco.mj_forward(self.model, self._data)
         self._fresh = True
 
     # -- inside --------------------------------------------------------------------------------
 
-    def _put_in_charge(self, law: CartesianImpedance | JointImpedanceController) -> ArmState:
+    def _switch_to(self, law: CartesianImpedance | JointImpedance) -> ArmState:
         state = self._arm.state()
-        if self._in_charge is not law:
-            if self._in_charge is not None:
+        if self._active_law is not law:
+            if self._active_law is not None:
                 law.take_over(self._data.ctrl[self._arm.actuators], state)
-            self._in_charge = law
+            self._active_law = law
         return state
 
-    def _forget_controllers(self) -> None:
+    def _reset_laws(self) -> None:
         self._joint_controller.reset()
-        self._in_charge = None
+        self._active_law = None
         self._held_rad = None
 
     def _apply(
@@ -288,33 +283,58 @@ class World:
     ) -> None:
         data = self._data
         if not math.isfinite(output.torque_nm.sum()):
-            raise NodeError(f"the impedance controller got a bad reference: {reference}")
+            raise NodeError(f"the reference is not finite: {reference}")
         self.saturated += output.saturated
         data.ctrl[self._arm.actuators] = output.torque_nm
-        self._hand.drive()
+        self._gripper.step()
         mujoco.mj_step2(self.model, data)
         self._ticks += 1
         self._fresh = False
-        self._felt += (STEP_S / WRENCH_FILTER_S) * (self._arm.contact_wrench() - self._felt)
+        error = self._arm.contact_wrench() - self._filtered_wrench
+        self._filtered_wrench += (STEP_S / WRENCH_FILTER_S) * error
         if data.warning.number.any():
-            self._raise_blown_up()
+            self._raise_diverged()
 
     def _refresh(self) -> None:
-        """Bring positions up to the last step; contacts and forces stay those of that step."""
+        """Compute positions after the last step; contacts and forces stay those of that step."""
         if not self._fresh:
             mujoco.mj_kinematics(self.model, self._data)
             mujoco.mj_comPos(self.model, self._data)
             self._fresh = True
 
-    def _raise_blown_up(self) -> None:
+    def _raise_diverged(self) -> None:
         raised = [
             mujoco.mjtWarning(kind).name.removeprefix("mjWARN_").lower()
             for kind in np.flatnonzero(self._data.warning.number)
         ]
         raise NodeError(
-            f"the simulation blew up after {self.time_ns / 1e9:.3f} s ({', '.join(raised)}); "
-            "reset it, and look at gains, limits and the scene"
+            f"the simulation diverged after {self.time_ns / 1e9:.3f} s ({', '.join(raised)}); "
+            "reset it, and check gains, limits and the scene"
         )
+
+
+def build_world(profile: Profile) -> World:
+    """The world that a profile describes.
+
+    Raises:
+        ResourceError: scene or robot description are missing.
+    """
+    robot = RobotModel(
+        description=profile.robot.description,
+        arm_joints=profile.robot.arm_joints,
+        tcp_link=profile.robot.tcp_frame,
+    )
+    stiff = profile.sim.gains == "stiff"
+    return World(
+        profile.sim.scene,
+        robot,
+        home_rad=profile.robot.home_rad,
+        gains=ImpedanceGains.stiff() if stiff else ImpedanceGains.compliant(),
+        joint_gains=JointGains.stiff() if stiff else JointGains.compliant(),
+        joint_friction_nm=profile.sim.joint_friction_nm,
+        seed=profile.sim.seed,
+        vary=profile.sim.vary,
+    )
 
 
 def _quat_xyzw(rotation: FloatArray) -> FloatArray:

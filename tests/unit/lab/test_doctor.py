@@ -47,7 +47,7 @@ from vla_zenoh.lab.doctor.software import (
 )
 from vla_zenoh.lab.doctor.software import judge as judge_backend
 from vla_zenoh.profile import SessionProfile, load_profile
-from vla_zenoh.simulation.backend import Backend
+from vla_zenoh.simulation.render import Backend
 
 TIBIBYTE_MIB = 1024 * 1024
 SEGMENT_BYTES = 3 * 1024 * 1024

@@ -8,7 +8,7 @@ import pytest
 
 from vla_zenoh import resources
 from vla_zenoh.simulation.cartesian_impedance import ArmState, CartesianImpedance, ImpedanceGains
-from vla_zenoh.simulation.joint_impedance import JointGains, JointImpedanceController
+from vla_zenoh.simulation.joint_impedance import JointGains, JointImpedance
 from vla_zenoh.types import FloatArray
 from vla_zenoh.types.references import JointReference, PoseReference
 
@@ -51,9 +51,9 @@ def resting(model: pin.Model) -> ArmState:
     return state_at(model, HOME_RAD, np.zeros(JOINTS))
 
 
-def controller(gains: JointGains | None = None, effort_nm: float = 1e6) -> JointImpedanceController:
+def controller(gains: JointGains | None = None, effort_nm: float = 1e6) -> JointImpedance:
     effort = np.full(JOINTS, effort_nm)
-    return JointImpedanceController(gains or JointGains(), effort_nm=effort, period_s=PERIOD_S)
+    return JointImpedance(gains or JointGains(), effort_nm=effort, period_s=PERIOD_S)
 
 
 def ahead(by_rad: FloatArray) -> JointReference:
@@ -179,9 +179,7 @@ def test_a_joint_at_its_torque_limit_winds_nothing_up(model: pin.Model) -> None:
     ("joints", "last"), [(6, FRANKA_NM_RAD[5]), (7, FRANKA_NM_RAD[6]), (8, FRANKA_NM_RAD[6])]
 )
 def test_arms_with_fewer_or_more_joints_have_gains(joints: int, last: float) -> None:
-    law = JointImpedanceController(
-        JointGains(), effort_nm=np.full(joints, 100.0), period_s=PERIOD_S
-    )
+    law = JointImpedance(JointGains(), effort_nm=np.full(joints, 100.0), period_s=PERIOD_S)
     zeros = np.zeros(joints)
     state = ArmState(
         zeros, zeros, np.zeros(3), np.eye(3), np.zeros((6, joints)), np.zeros(6), np.eye(joints),

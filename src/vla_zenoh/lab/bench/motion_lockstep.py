@@ -34,8 +34,8 @@ from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, judge, make_segme
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import Profile
-from vla_zenoh.robots.sim.node import build_world
 from vla_zenoh.runtime.process import die_with_parent
+from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import PoseCommand
 
 CAMERA_S, WIRE_S = 0.015, 0.0005

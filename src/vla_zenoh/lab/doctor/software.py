@@ -13,7 +13,7 @@ from vla_zenoh.errors import MissingExtraError, NodeError, VlaZenohError, how_to
 from vla_zenoh.lab.doctor.finding import HostFinding
 from vla_zenoh.lab.doctor.needs import Role
 from vla_zenoh.profile import Profile
-from vla_zenoh.simulation.backend import RAYCAST, VARIABLE, Backend, choose_backend
+from vla_zenoh.simulation.render import RAYCAST, VARIABLE, Backend, choose_backend
 
 OLDEST_PYTHON = (3, 11)
 LIMIT_S = 60

@@ -20,8 +20,7 @@ from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
 from vla_zenoh.nodes.camera.render_budget import Coarseness
 from vla_zenoh.nodes.camera.source import STALL_S
 from vla_zenoh.profile import Profile
-from vla_zenoh.simulation.backend import AUTO, choose_backend
-from vla_zenoh.simulation.render import Renderer
+from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.types import SceneState, Stamped
 

@@ -30,10 +30,7 @@ from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.sim.inputs import SimInputs
 from vla_zenoh.runtime.scheduling import realtime_thread
-from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
-from vla_zenoh.simulation.joint_impedance import JointGains
-from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.world import STEP_NS, World
+from vla_zenoh.simulation.world import STEP_NS, World, build_world
 from vla_zenoh.types import Event, ObjectPoses, SceneState
 from vla_zenoh.types.references import JointReference
 
@@ -42,30 +39,6 @@ SCENE_HZ, OBJECTS_HZ, WATCH_HZ = 60.0, 10.0, 4.0
 MAX_LOCKSTEP_NS = 60_000_000_000
 MAX_STEP_BYTES = 1024
 SWITCH_INTERVAL_S = 1e-4
-
-
-def build_world(profile: Profile) -> World:
-    """The world a profile describes.
-
-    Raises:
-        ResourceError: scene or robot description are not there.
-    """
-    robot = RobotModel(
-        description=profile.robot.description,
-        arm_joints=profile.robot.arm_joints,
-        tcp_link=profile.robot.tcp_frame,
-    )
-    stiff = profile.sim.gains == "stiff"
-    return World(
-        profile.sim.scene,
-        robot,
-        home_rad=profile.robot.home_rad,
-        gains=ImpedanceGains.stiff() if stiff else ImpedanceGains.compliant(),
-        joint_gains=JointGains.stiff() if stiff else JointGains.compliant(),
-        joint_friction_nm=profile.sim.joint_friction_nm,
-        seed=profile.sim.seed,
-        vary=profile.sim.vary,
-    )
 
 
 def build_guard(profile: Profile, world: World) -> ArmGuard:

@@ -1,19 +1,24 @@
-"""Finds arm joints that put the TCP somewhere; meant for choosing a home pose once."""
+"""Solves for the arm joints of a TCP position, to choose a home pose for a profile.
+
+    python scripts/home_pose.py table 0.43 0.0 0.16
+
+Prints the joint positions in rad of a Franka Panda whose tool points straight down.
+"""
 
 from __future__ import annotations
 
+import argparse
 import math
 
 import mujoco
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import PREFIX, TCP_SITE, build_model
-
-FloatArray = NDArray[np.float64]
+from vla_zenoh.types import FloatArray
 
 MAX_STEPS = 2000
 DAMPING = 1e-6
@@ -30,7 +35,7 @@ def solve_home(
     rotation: FloatArray = TOOL_DOWN,
     start_rad: ArrayLike = PANDA_START_RAD,
 ) -> FloatArray:
-    """Joints (n,) that put the TCP at `position_m`, `rotation`, as near `start_rad` as can be.
+    """Joints (n,) with the TCP at `position_m` and `rotation`, as near to `start_rad` as possible.
 
     Damped least squares with the posture in the nullspace::
 
@@ -65,3 +70,16 @@ def solve_home(
             return q
         data.qpos[addresses] = np.clip(q + step + POSTURE_PULL * drift, lower, upper)
     raise ResourceError(f"no joints put the TCP of {robot.description} at {goal.tolist()}")
+
+
+def main() -> None:
+    """Print the joints of one position."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("scene", help="name of a folder in sim/, or a path")
+    parser.add_argument("position_m", type=float, nargs=3, metavar="M", help="x, y and z")
+    given = parser.parse_args()
+    print(*(f"{q:.10f}" for q in solve_home(given.scene, RobotModel(), given.position_m)), sep=", ")
+
+
+if __name__ == "__main__":
+    main()

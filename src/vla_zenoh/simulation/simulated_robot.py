@@ -1,0 +1,219 @@
+"""The robot as MuJoCo simulates it: arm state for a torque controller, and a parallel gripper."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from vla_zenoh.errors import RecordError, ResourceError
+from vla_zenoh.simulation.cartesian_impedance import ArmState
+from vla_zenoh.simulation.robot_model import RobotModel
+from vla_zenoh.simulation.scene import GRIPPER, PREFIX, STEP_S, TCP_SITE
+from vla_zenoh.types import FloatArray, GripperState
+
+AT_REST_M_S = 2e-3
+AT_REST_TICKS = 50  # milliseconds of standstill before the gripper reports "holding"
+HELD_MARGIN_M = 5e-4  # set narrower than measured by this much: an object is in between
+DEFAULT_FORCE_N = 20.0
+MAX_FORCE_N = 70.0
+
+
+class SimulatedArm:
+    """The arm's part of a MuJoCo state, as views that stay valid as long as `data` lives.
+
+    They are as fresh as the last MuJoCo call of the code that steps `data`.
+
+    Args:
+        model: the scene with the robot in it.
+        data: its state.
+        robot: names of joints.
+
+    Raises:
+        ResourceError: the arm's joints are not one chain.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotModel) -> None:
+        self._model, self._data = model, data
+        joints = [model.joint(PREFIX + name) for name in robot.arm_joints]
+        first_dof, first_q = int(joints[0].dofadr[0]), int(joints[0].qposadr[0])
+        if [int(joint.dofadr[0]) - first_dof for joint in joints] != list(range(len(joints))):
+            raise ResourceError("the arm's joints do not follow each other in the URDF")
+        self._dofs = slice(first_dof, first_dof + len(joints))
+        self.lower_rad = np.array([joint.range[0] for joint in joints])
+        self.upper_rad = np.array([joint.range[1] for joint in joints])
+        self.actuators = [int(model.actuator(PREFIX + name).id) for name in robot.arm_joints]
+        self.effort_limit_nm = model.actuator_ctrlrange[self.actuators, 1].copy()
+
+        self._qpos = slice(first_q, first_q + len(joints))
+        self.position_rad = data.qpos[self._qpos]
+        self.velocity_rad_s = data.qvel[self._dofs]
+        self.effort_nm = data.qfrc_actuator[self._dofs]
+        self._bias_nm = data.qfrc_bias[self._dofs]
+        self._tcp = int(model.site(PREFIX + TCP_SITE).id)
+        self._tcp_body = int(model.site_bodyid[self._tcp])
+        self.tcp_position_m = data.site_xpos[self._tcp]
+        self.tcp_rotation = data.site_xmat[self._tcp].reshape(3, 3)
+        root = model.body_rootid[self._tcp_body]
+        # The fixed base presses against the ground it stands on, which is no contact of the arm.
+        moves = model.body_weldid[model.geom_bodyid] != 0
+        self._own_geom = moves & (model.body_rootid[model.geom_bodyid] == root)
+        self._linear, self._angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+        self._inertia = np.zeros((model.nv, model.nv))
+        self._scratch = mujoco.MjData(model)
+
+    def state(self) -> ArmState:
+        """State for an impedance law; some arrays are views, valid until the next step."""
+        mujoco.mj_fullM(self._model, self._data, self._inertia)
+        return ArmState(
+            position_rad=self.position_rad,
+            velocity_rad_s=self.velocity_rad_s,
+            tcp_position_m=self.tcp_position_m,
+            tcp_rotation=self.tcp_rotation,
+            jacobian=self.jacobian(),
+            drift=self._jacobian_rate() @ self.velocity_rad_s,
+            inertia=self._inertia[self._dofs, self._dofs],
+            bias_nm=self._bias_nm,
+        )
+
+    def tcp_at(self, position_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """TCP position (3,) in m and rotation (3, 3) with the joints at `position_rad` (n,)."""
+        data = self._scratch
+        data.qpos[self._qpos] = position_rad
+        mujoco.mj_kinematics(self._model, data)
+        return data.site_xpos[self._tcp].copy(), data.site_xmat[self._tcp].reshape(3, 3).copy()
+
+    def jacobian(self) -> FloatArray:
+        """(6, n) of the TCP, linear rows first, base axes."""
+        mujoco.mj_jacSite(self._model, self._data, self._linear, self._angular, self._tcp)
+        return self._stacked()
+
+    def _jacobian_rate(self) -> FloatArray:
+        mujoco.mj_jacDot(
+            self._model,
+            self._data,
+            self._linear,
+            self._angular,
+            self.tcp_position_m,
+            self._tcp_body,
+        )
+        return self._stacked()
+
+    def _stacked(self) -> FloatArray:
+        return np.concatenate([self._linear[:, self._dofs], self._angular[:, self._dofs]])
+
+    def contact_wrench(self) -> FloatArray:
+        """(6,) external contact wrench on the robot: N, and Nm about the TCP, base axes.
+
+        Contacts between the robot's own parts are left out. What the fingers squeeze presses on
+        both of them and cancels, so that its weight remains.
+        """
+        model, data = self._model, self._data
+        total, local = np.zeros(6), np.zeros(6)
+        if data.ncon == 0:
+            return total
+        own = self._own_geom[data.contact.geom]
+        for index in np.flatnonzero(own[:, 0] != own[:, 1]):
+            contact, second = data.contact[index], own[index, 1]
+            mujoco.mj_contactForce(model, data, index, local)
+            axes = contact.frame.reshape(3, 3)  # rows; the force acts on the second geom
+            sign = 1.0 if second else -1.0
+            force, moment = sign * (local[:3] @ axes), sign * (local[3:] @ axes)
+            lever = contact.pos - self.tcp_position_m
+            total[:3] += force
+            total[3:] += moment + np.cross(lever, force)
+        return total
+
+
+class SimulatedGripper:
+    """Two fingers with a width servo: the set width runs at a speed, under a bounded force.
+
+    Args:
+        model: the scene with the robot in it.
+        data: its state.
+        robot: names of the finger joints.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotModel) -> None:
+        self._model, self._data = model, data
+        fingers = [model.joint(PREFIX + name) for name in robot.finger_joints]
+        self._q = [int(joint.qposadr[0]) for joint in fingers]
+        self._dofs = [int(joint.dofadr[0]) for joint in fingers]
+        self._open_m = [float(joint.range[1]) for joint in fingers]
+        self._actuator = int(model.actuator(PREFIX + GRIPPER).id)
+        self._max_width_m = sum(self._open_m)
+        self._hold_at(self._max_width_m)
+
+    def open(self) -> None:
+        """Put the fingers at their widest, as after a reset."""
+        self._data.qpos[self._q] = self._open_m
+        self._hold_at(self._max_width_m)
+
+    def stand(self) -> None:
+        """Stay at the measured width."""
+        self._hold_at(self._opening()[0])
+
+    def _hold_at(self, width_m: float) -> None:
+        self._target_m = self._set_m = self._measured_m = width_m
+        self._step_m = 0.0
+        self._rest_ticks = AT_REST_TICKS
+        self._bound_force(DEFAULT_FORCE_N)
+
+    def command(self, width_m: float, speed_m_s: float, force_n: float) -> None:
+        """Go to `width_m` at `speed_m_s`, pressing with at most `force_n` (N).
+
+        Replaces the command before.
+
+        Raises:
+            RecordError: speed or force are not above zero.
+        """
+        if not speed_m_s > 0.0 or not force_n > 0.0:
+            raise RecordError(
+                f"a gripper needs speed and force above 0, got {speed_m_s} and {force_n}"
+            )
+        target = min(max(width_m, 0.0), self._max_width_m)
+        # Squeezing continues from the ramp, else a repeated command would let go for a moment; a
+        # reversal starts at the fingers, else it would lag by the whole squeeze.
+        if (target - self._measured_m) * (self._set_m - self._measured_m) <= 0.0:
+            self._set_m = self._measured_m
+        self._target_m = target
+        self._step_m = speed_m_s * STEP_S
+        if abs(target - self._measured_m) > HELD_MARGIN_M and not self._holding:
+            self._rest_ticks = 0
+        self._bound_force(force_n)
+
+    def step(self) -> None:
+        """Set the actuator for this tick."""
+        self._measured_m, rate_m_s = self._opening()
+        self._rest_ticks = self._rest_ticks + 1 if abs(rate_m_s) < AT_REST_M_S else 0
+        left = self._target_m - self._set_m
+        self._set_m += min(max(left, -self._step_m), self._step_m)
+        self._data.ctrl[self._actuator] = self._set_m
+
+    def state(self) -> GripperState:
+        """Opening between the fingers, and whether they move or hold an object."""
+        width_m, _ = self._opening()
+        return GripperState(width_m, moving=self._moving, holding=self._holding)
+
+    @property
+    def force_n(self) -> float:
+        """Force of either finger, inwards positive."""
+        return -float(self._data.actuator_force[self._actuator])
+
+    @property
+    def _moving(self) -> bool:
+        return self._rest_ticks < AT_REST_TICKS
+
+    @property
+    def _holding(self) -> bool:
+        """The fingers stand still wider than set: an object keeps them apart."""
+        return self._measured_m - self._set_m > HELD_MARGIN_M and not self._moving
+
+    def _opening(self) -> tuple[float, float]:
+        left, right = self._q
+        left_dof, right_dof = self._dofs
+        q, v = self._data.qpos, self._data.qvel
+        return float(q[left] + q[right]), float(v[left_dof] + v[right_dof])
+
+    def _bound_force(self, force_n: float) -> None:
+        limit_n = min(force_n, MAX_FORCE_N)
+        self._model.actuator_forcerange[self._actuator] = (-limit_n, limit_n)
