@@ -8,9 +8,9 @@ from typing import Any
 
 from rich.table import Table
 
+from benchmarks.chain.rounds import Interval, Summary, summarise
 from benchmarks.chain.ways import REFERENCE, ServingWay
 from vla_zenoh.errors import how_to_install
-from vla_zenoh.lab.bench.statistics import Interval, Summary, summarise
 
 CHUNK, POSE, TICK_WAIT, ROUND_TRIP = "chunk", "pose", "tick_wait", "round_trip"
 POSE_WITHOUT_WAIT = "pose_without_tick_wait"

@@ -21,13 +21,13 @@ from benchmarks.chain.echo import EchoClient
 from benchmarks.chain.our_chain import WORKER, Chain
 from benchmarks.chain.process import START_PATIENCE_S, Server, free_port
 from benchmarks.chain.report import Result
+from benchmarks.chain.rounds import Interval
 from benchmarks.chain.ways import ServingWay
 from benchmarks.picture import noisy_picture
 from vla_zenoh import __version__
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.bench.cpu_time import cpu_s
-from vla_zenoh.lab.bench.statistics import Interval
 
 PERIOD_S = (0.012, 0.020)
 """From one request to the next, evenly drawn: two ticks of 250 Hz wide, so that every phase of the

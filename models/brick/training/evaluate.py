@@ -29,8 +29,8 @@ from generate import labelled
 from states import Situation
 from worker import HORIZON, Brick, Hand, Waypoints
 
-from vla_zenoh.lab.bench.statistics import wilson_95
 from vla_zenoh.lab.lockstep import Delays, Lockstep
+from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.tasks import (
     COLOURS,
     FAMILIES,

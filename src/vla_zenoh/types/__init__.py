@@ -19,7 +19,13 @@ from vla_zenoh.types.checks import (
     vector,
 )
 from vla_zenoh.types.chunk import ActionChunk
-from vla_zenoh.types.commands import Cause, GripperCommand, JointCommand, PoseCommand
+from vla_zenoh.types.commands import (
+    LATENCY_STAGES,
+    Cause,
+    GripperCommand,
+    JointCommand,
+    PoseCommand,
+)
 from vla_zenoh.types.image import Image
 from vla_zenoh.types.reports import Event, NodeStatus
 from vla_zenoh.types.scene import ObjectPoses, SceneState
@@ -29,6 +35,7 @@ from vla_zenoh.types.states import GripperState, JointState, PoseState
 from vla_zenoh.types.task import Task
 
 __all__ = [
+    "LATENCY_STAGES",
     "MAX_NAMES",
     "MAX_TEXT",
     "QUATERNION_NORM_TOLERANCE",

@@ -18,6 +18,15 @@ from vla_zenoh.types.checks import (
     vector,
 )
 
+LATENCY_STAGES = (
+    "capture_to_worker",
+    "inference",
+    "worker_to_command",
+    "command_to_pose",
+    "end_to_end",
+)
+"""Stages between the capture of an image and the first command of its chunk."""
+
 
 @dataclass(frozen=True, slots=True)
 class Cause:
@@ -37,6 +46,17 @@ class Cause:
         for name in self.__dataclass_fields__:
             if name != "worker":
                 set_field(self, name, integer(name, getattr(self, name)))
+
+    def latency_ms(self, command_ns: int) -> dict[str, float]:
+        """Duration of each of `LATENCY_STAGES` for a command stamped `command_ns` (wall clock)."""
+        stages_ns = (
+            self.observed_ns - self.observation_stamp_ns,
+            self.inference_end_ns - self.inference_start_ns,
+            self.received_ns - self.inference_end_ns,
+            command_ns - self.received_ns,
+            command_ns - self.observation_stamp_ns,
+        )
+        return {name: ns / 1e6 for name, ns in zip(LATENCY_STAGES, stages_ns, strict=True)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,12 +20,12 @@ from benchmarks.chain import report
 from benchmarks.chain.our_chain import bench_profile
 from benchmarks.chain.process import Server, free_port
 from benchmarks.chain.report import CHUNK, LINES, POSE, ROUND_TRIP, STAGES, TICK_WAIT, Result
+from benchmarks.chain.rounds import Interval, summarise
 from benchmarks.chain.ways import REFERENCE, WAYS, ServingWay
 from benchmarks.peers import arrays
 from benchmarks.picture import NOISE_SIGMA, noisy_picture
 from vla_zenoh.errors import NodeError, how_to_install
 from vla_zenoh.lab.bench.cpu_time import cpu_s
-from vla_zenoh.lab.bench.statistics import Interval, summarise
 
 SIGMA_TOLERANCE = 0.2  # grey levels
 PNG_BYTES = (300_000, 700_000)  # what a camera's picture of this size has

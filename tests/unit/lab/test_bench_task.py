@@ -18,11 +18,11 @@ from typer.testing import CliRunner
 
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.bench.statistics import wilson_95
 from vla_zenoh.lab.bench.task import BASELINES, TaskOutcome, TaskPlan, TaskRequest, TaskScore
 from vla_zenoh.lab.bench.task_sheet import TEXT_HEIGHT, TILE_HEIGHT, TILE_WIDTH, failure_sheet
 from vla_zenoh.lab.cli.bench_file import LAST_LINES, up_with_last_lines
 from vla_zenoh.lab.cli.bench_task import _named, _varied, _with_bricks, task
+from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.tasks import COLOURS, FAMILIES, Order, TaskEpisode, Verdict, brick
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Image, ObjectPoses

@@ -164,7 +164,7 @@ def test_figures_of_pictures_are_those_of_their_pixels() -> None:
     colours, seen = Colours(), []
     for _ in range(3):
         rgb = random.integers(0, 256, (40, 40, 3), np.uint8)
-        colours.see(rgb)
+        colours.add(rgb)
         seen.append(rgb[::4, ::4].reshape(-1, 3) / 255)
     found, wanted = colours.statistics(), of_numbers(np.concatenate(seen))
     assert found["count"] == [3]

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import RecordError, RecordingError
-from vla_zenoh.lab.evaluation.paired import Paired
+from vla_zenoh.lab.statistics import Paired
 from vla_zenoh.lab.trial.episode_fsm import DONE_S, EpisodeFsm, EpisodeView, Phase
 from vla_zenoh.lab.trial.folder import PLAN, TRIALS, TrialFolder
 from vla_zenoh.lab.trial.plan import HIDDEN, DueEpisode, TrialPlan

@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from vla_zenoh.errors import RecordError
-from vla_zenoh.lab.evaluation.paired import Paired, paired
+from vla_zenoh.lab.statistics import Paired, paired
 from vla_zenoh.pydantic_errors import in_words
 
 ALPHA = 0.05

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.errors import ResourceError
-from vla_zenoh.lab.bench.statistics import wilson_95
+from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.tasks import (
     COLOURS,
     FAMILIES,

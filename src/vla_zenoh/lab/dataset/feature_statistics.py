@@ -34,8 +34,8 @@ class Colours:
         self.levels = np.zeros((3, LEVELS), np.int64)
         self.count = 0
 
-    def see(self, rgb: NDArray[np.uint8]) -> None:
-        """Take in a picture, (H, W, 3)."""
+    def add(self, rgb: NDArray[np.uint8]) -> None:
+        """Count the colours of an image, (H, W, 3)."""
         for channel in range(3):
             seen = rgb[::STRIDE, ::STRIDE, channel].reshape(-1)
             self.levels[channel] += np.bincount(seen, minlength=LEVELS)

@@ -32,13 +32,12 @@ from vla_zenoh.lab.dataset.features import (
     states_of,
 )
 from vla_zenoh.lab.dataset.videos import (
-    CODEC,
-    PIXELS,
     EpisodeVideo,
     chosen,
     stamps_of,
     write_videos,
 )
+from vla_zenoh.lab.video import CODEC, PIXEL_FORMAT
 
 VERSION = "v3.0"
 FILES_IN_A_CHUNK = 1000
@@ -173,7 +172,7 @@ class _Dataset:
                 for at in mine
             ]
             out.update(zip(mine, write_videos(run, camera, wanted, self._fps), strict=True))
-        sizes = {video.size for video in out.values()}
+        sizes = {video.video.size for video in out.values()}
         if len(sizes) > 1:
             raise RecordingError(f"camera {camera!r} has pictures of {len(sizes)} sizes: {sizes}")
         return [out[at] for at in range(len(self._episodes))]
@@ -325,7 +324,7 @@ class _Dataset:
     def _features(self, videos: dict[str, list[EpisodeVideo]]) -> dict[str, Any]:
         out: dict[str, Any] = {}
         for camera, of_episodes in videos.items():
-            height, width = of_episodes[0].size
+            height, width = of_episodes[0].video.size
             out[PICTURE + camera] = {
                 "dtype": "video",
                 "shape": [height, width, 3],
@@ -334,7 +333,7 @@ class _Dataset:
                     "video.height": height,
                     "video.width": width,
                     "video.codec": CODEC.replace("libx264", "h264"),
-                    "video.pix_fmt": PIXELS,
+                    "video.pix_fmt": PIXEL_FORMAT,
                     "video.fps": self._fps,
                     "video.channels": 3,
                     "is_depth_map": False,

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from fractions import Fraction
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from vla_zenoh.codec import image as image_codec
-from vla_zenoh.errors import MissingExtraError, RecordingError
+from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
 from vla_zenoh.lab.dataset.feature_statistics import Colours
 from vla_zenoh.lab.recording.run import Run, pictures
+from vla_zenoh.lab.video import VideoWriter
 
-CODEC, PIXELS = "libx264", "yuv420p"
-OPTIONS = {"crf": "18", "preset": "veryfast", "g": "2", "bf": "0"}
-"""Every other picture is whole, so that training finds any one quickly."""
+OPTIONS = {"crf": "18", "g": "2", "bf": "0"}
+"""Every second frame is a key frame, so that training can seek to any frame quickly."""
 OLDEST_NS = 500_000_000
 
 
@@ -47,57 +43,24 @@ def chosen(episode: RecordedEpisode, camera: str, stamps: list[int]) -> list[int
 
 
 class EpisodeVideo:
-    """Writes one MP4.
-
-    Args:
-        path: of the file.
-        fps: frames per second.
+    """The MP4 of one episode and camera, and the colour statistics of its images.
 
     Raises:
         MissingExtraError: PyAV is not installed.
     """
 
     def __init__(self, path: Path, fps: int) -> None:
-        try:
-            import av
-        except ImportError as error:
-            raise MissingExtraError("av", "dataset") from error
-        self._av, self.fps = av, fps
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._container: Any = av.open(str(path), "w")
-        self._stream: Any = None
-        self.size = (0, 0)
-        """Height and width; even, as the codec wants it: an odd last row or column is cut off."""
+        self.video = VideoWriter(path, fps, extra="dataset", **OPTIONS)
         self.colours = Colours()
 
-    def add(self, jpeg: bytes, times: int) -> None:
-        """Append a picture as so many frames.
+    def add(self, jpeg: bytes, count: int) -> None:
+        """Append an image as `count` frames.
 
         Raises:
-            RecordingError: it has another size than those before.
-            CodecError: it is none.
+            RecordingError: its size differs from that of the images before.
+            CodecError: it is no JPEG file.
         """
-        rgb = image_codec.decode_jpeg(jpeg).rgb
-        size = (rgb.shape[0] // 2 * 2, rgb.shape[1] // 2 * 2)
-        if self._stream is None:
-            self.size = size
-            self._stream = self._container.add_stream(CODEC, rate=Fraction(self.fps))
-            self._stream.height, self._stream.width = size
-            self._stream.pix_fmt = PIXELS
-            self._stream.options = dict(OPTIONS)
-        if size != self.size:
-            raise RecordingError(f"pictures of {self.size} and of {size} pixels in one dataset")
-        cut = np.ascontiguousarray(rgb[: size[0], : size[1]])
-        self.colours.see(cut)
-        for _ in range(times):
-            frame = self._av.VideoFrame.from_ndarray(cut, format="rgb24")
-            self._container.mux(self._stream.encode(frame))
-
-    def close(self) -> None:
-        """Finish the file."""
-        if self._stream is not None:
-            self._container.mux(self._stream.encode())
-        self._container.close()
+        self.colours.add(self.video.add(image_codec.decode_jpeg(jpeg).rgb, count))
 
 
 def write_videos(
@@ -122,5 +85,5 @@ def write_videos(
                 videos[which].add(picture.jpeg, times)
     finally:
         for video in videos:
-            video.close()
+            video.video.close()
     return videos

@@ -11,7 +11,7 @@ import numpy as np
 from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.kinematics.so3 import log3, rotation_from_quat
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import Cause, FloatArray, PoseState
+from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray, PoseState
 
 MAX_POINTS = 4000
 AXES = (("x", "tab:red"), ("y", "tab:green"), ("z", "tab:blue"))
@@ -160,18 +160,12 @@ def _draw_latency(axes: Any, first_commands: Sequence[tuple[Cause, int]]) -> Non
     axes.grid(alpha=0.25)
     if not first_commands:
         return
-    stages = np.array(
-        [
-            (
-                cause.observed_ns - cause.observation_stamp_ns,
-                cause.inference_end_ns - cause.observed_ns,
-                cause.received_ns - cause.inference_end_ns,
-                stamp_ns - cause.received_ns,
-            )
-            for cause, stamp_ns in first_commands
-        ]
+    names = LATENCY_STAGES[:-1]
+    stages_ms = np.array(
+        [[cause.latency_ms(stamp_ns)[name] for name in names] for cause, stamp_ns in first_commands]
     )
-    names = ("picture waits for worker", "inference", "worker to command", "command to pose")
-    axes.stackplot(range(len(stages)), np.maximum(stages.T, 0) / 1e6, labels=names, alpha=0.8, lw=0)
-    axes.set_ylim(0, float(np.percentile(stages.sum(axis=1), 99)) / 1e6 * 1.5)
+    labels = [name.replace("_", " ") for name in names]
+    below = np.maximum(stages_ms.T, 0)
+    axes.stackplot(range(len(stages_ms)), below, labels=labels, alpha=0.8, lw=0)
+    axes.set_ylim(0, float(np.percentile(stages_ms.sum(axis=1), 99)) * 1.5)
     axes.legend(loc="upper left", fontsize=7)

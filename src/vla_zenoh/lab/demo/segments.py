@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.kinematics.so3 import Pose, log3
+from vla_zenoh.lab.statistics import percentiles
 from vla_zenoh.policy.scripted_motions import HardMotion, HardPrompt, parse_hard
-from vla_zenoh.types import Cause, FloatArray
+from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray
 
 TOUR: tuple[tuple[str, int], ...] = (
     ("HARD: go up", 15),
@@ -236,31 +237,12 @@ def _split(vector: FloatArray, asked: FloatArray) -> tuple[float, float]:
     return along, float(np.linalg.norm(vector - along * asked / norm))
 
 
-def percentiles(values: Sequence[float]) -> dict[str, float]:
-    """p50, p95 and max; empty without values."""
-    if not values:
-        return {}
-    p50, p95, top = np.percentile(np.asarray(values), [50, 95, 100])
-    return {"p50": round(float(p50), 3), "p95": round(float(p95), 3), "max": round(float(top), 3)}
-
-
 def latencies(first_commands: Sequence[tuple[Cause, int]]) -> dict[str, Any]:
     """Latency from the camera's stamp to the pose command that first carries a chunk out, in ms.
 
     Args:
         first_commands: for each chunk, its cause and that command's stamp (wall ns).
     """
-    stages: dict[str, list[float]] = {
-        "camera_to_worker": [c.observed_ns - c.observation_stamp_ns for c, _ in first_commands],
-        "inference": [c.inference_end_ns - c.inference_start_ns for c, _ in first_commands],
-        "worker_to_command": [c.received_ns - c.inference_end_ns for c, _ in first_commands],
-        "command_to_pose": [stamp - c.received_ns for c, stamp in first_commands],
-    }
-    total = [stamp - c.observation_stamp_ns for c, stamp in first_commands]
-    return {
-        **percentiles([ns / 1e6 for ns in total]),
-        "chunks": len(total),
-        "stages": {
-            name: percentiles([ns / 1e6 for ns in values]) for name, values in stages.items()
-        },
-    }
+    rows = [cause.latency_ms(stamp_ns) for cause, stamp_ns in first_commands]
+    stages = {name: percentiles([row[name] for row in rows]) for name in LATENCY_STAGES}
+    return {**stages.pop("end_to_end"), "chunks": len(rows), "stages": stages}

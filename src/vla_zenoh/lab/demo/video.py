@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
-from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -12,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec import image as image_codec
-from vla_zenoh.errors import CodecError, MissingExtraError
+from vla_zenoh.errors import CodecError
+from vla_zenoh.lab.video import VideoWriter
 
 VIDEO_HZ = 15
 STRIP_PX = 36
@@ -36,17 +36,13 @@ def write_video(
     Raises:
         MissingExtraError: PyAV is not installed.
     """
-    try:
-        import av
-    except ImportError as error:
-        raise MissingExtraError("av", "sim") from error
     if not frames:
         return 0
     stamps = [stamp_ns for stamp_ns, _ in frames]
     total = max(1, int((stamps[-1] - stamps[0]) / 1e9 * VIDEO_HZ))
     shown, picture = -1, None
-    with av.open(str(path), "w") as container:
-        stream = None
+    video = VideoWriter(path, VIDEO_HZ, extra="sim", crf=QUALITY)
+    try:
         for index in range(total):
             now_ns = stamps[0] + int(index / VIDEO_HZ * 1e9)
             newest = bisect_right(stamps, now_ns) - 1
@@ -55,17 +51,10 @@ def write_video(
                 picture = _decode(frames[newest][1])
             if picture is None:
                 continue
-            if stream is None:
-                stream = container.add_stream("libx264", rate=Fraction(VIDEO_HZ))
-                stream.height, stream.width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2
-                stream.pix_fmt = "yuv420p"
-                stream.options = {"crf": QUALITY, "preset": "veryfast"}
-            drawn = _write_prompt(picture, _prompt_at(marks, now_ns))
-            cut = np.ascontiguousarray(drawn[: stream.height, : stream.width])
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(cut, format="rgb24")))
+            video.add(_write_prompt(picture, _prompt_at(marks, now_ns)))
             progress(index + 1, total)
-        if stream is not None:
-            container.mux(stream.encode())
+    finally:
+        video.close()
     return total
 
 

@@ -22,7 +22,7 @@ from vla_zenoh.lab.evaluation.filmstrip import filmstrip
 from vla_zenoh.lab.evaluation.result import Evaluation, PlotTrace
 from vla_zenoh.lab.evaluation.segments import segment
 from vla_zenoh.lab.recording.run import RecordedSample, Run, load_run
-from vla_zenoh.types import Cause, FloatArray, NodeStatus
+from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray, NodeStatus
 
 GAP_S = 0.05
 """A stream that says nothing for longer was interrupted: nothing is derived across the gap."""
@@ -109,15 +109,11 @@ def _requests(
     if obeyed:
         first, last = obeyed[0].header, obeyed[-1].header
         out.seconds = (last.stamp_wall_ns - first.stamp_wall_ns) / 1e9
-    stages = {
-        "end_to_end": [stamp - cause.observation_stamp_ns for cause, stamp in causes],
-        "outbound": [c.observed_ns - c.observation_stamp_ns for c, _ in causes],
-        "inference": [c.inference_end_ns - c.inference_start_ns for c, _ in causes],
-        "inbound": [stamp - cause.inference_end_ns for cause, stamp in causes],
-        "worker_to_command": [c.received_ns - c.inference_end_ns for c, _ in causes],
-        "command_to_pose": [stamp - cause.received_ns for cause, stamp in causes],
-    }
-    out.stages_ms = {stage: np.array(ns, np.float64) / 1e6 for stage, ns in stages.items()}
+    rows = [cause.latency_ms(stamp_ns) for cause, stamp_ns in causes]
+    out.stages_ms = {name: np.array([row[name] for row in rows]) for name in LATENCY_STAGES}
+    # Names of the thesis, which its CSV has as well.
+    out.stages_ms["outbound"] = out.stages_ms.pop("capture_to_worker")
+    out.stages_ms["inbound"] = out.stages_ms["worker_to_command"] + out.stages_ms["command_to_pose"]
     out.request_t_s = np.array([(stamp - zero_ns) / 1e9 for _, stamp in causes])
 
 

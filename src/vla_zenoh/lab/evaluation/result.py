@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.lab.evaluation.trajectory import Distribution, spread
+from vla_zenoh.lab.statistics import Distribution, distribution
 from vla_zenoh.types import FloatArray
 
 STAGES = {
@@ -176,14 +176,14 @@ class Evaluation:
 
     def latency(self) -> dict[str, Distribution]:
         """Stage -> distribution in ms, in the order of `STAGES`."""
-        found = {stage: spread(self.stages_ms.get(stage, ())) for stage in STAGES}
+        found = {stage: distribution(self.stages_ms.get(stage, ())) for stage in STAGES}
         return {stage: value for stage, value in found.items() if value is not None}
 
     def row(self) -> dict[str, Any]:
         """Flat: the thesis's column names first, with its definitions, then ours."""
         out: dict[str, Any] = {"record_id": self.name, "n_rows": self.requests}
         for name, stage in THESIS_NAMES.items():
-            found = spread(self.stages_ms.get(stage, ()))
+            found = distribution(self.stages_ms.get(stage, ()))
             values = asdict(found) if found else dict.fromkeys(Distribution.__dataclass_fields__)
             out[f"{name}_count"] = found.count if found else 0
             for short in ("mean", "std", "p50", "p95", "p99", "min", "max"):
@@ -210,7 +210,7 @@ class Evaluation:
             ("seam_goal_mm", self.seam_goal_mm),
             ("seam_velocity_mm_s", self.seam_velocity_mm_s),
         ):
-            found = spread(values)
+            found = distribution(values)
             for short in ("mean", "p95", "max"):
                 out[f"{name}_{short}"] = getattr(found, short) if found else None
         out["seams"] = len(self.seam_goal_mm)

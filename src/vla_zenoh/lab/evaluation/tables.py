@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from vla_zenoh.lab.evaluation.result import Evaluation
-from vla_zenoh.lab.evaluation.trajectory import spread
+from vla_zenoh.lab.statistics import distribution
 from vla_zenoh.types import FloatArray
 
 LATENCY_COLUMNS = ("min", "mean", "p50", "p95", "max")
@@ -37,7 +37,7 @@ def number(value: float | None, unit: str, digits: int = 3, scale: float = 1.0) 
 def summary_row(run: Evaluation) -> tuple[str, ...]:
     """One line for one run, see `SUMMARY_COLUMNS`."""
     latency = run.latency().get("end_to_end")
-    tracking = spread(run.tracking_mm)
+    tracking = distribution(run.tracking_mm)
     drift_m = [found.drift_m for found in run.segments if found.drift_m is not None]
     return (
         run.name,
@@ -123,7 +123,7 @@ def figures(run: Evaluation) -> list[tuple[str, str]]:
 
 
 def _three(values: FloatArray, unit: str, digits: int = 3) -> str:
-    found = spread(values)
+    found = distribution(values)
     if found is None:
         return NONE
     return " / ".join(f"{value:.{digits}f}" for value in (found.mean, found.p95, found.max)) + (

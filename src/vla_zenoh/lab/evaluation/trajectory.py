@@ -1,61 +1,15 @@
-"""Statistics of values and lengths of paths."""
+"""Lengths, angles and standstill of sampled paths, vectorised over rows."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from vla_zenoh.types import FloatArray
 
 STILL_M_S, STILL_RAD_S = 0.002, 0.01
 """An arm that is slower stands."""
-
-
-@dataclass(frozen=True, slots=True)
-class Distribution:
-    """How values are distributed; percentiles are interpolated linearly.
-
-    Args:
-        count: of the values.
-        mean: likewise.
-        std: of a sample (divisor n - 1), 0 for a single value.
-        min: smallest.
-        p50: median.
-        p95: likewise.
-        p99: likewise.
-        max: largest.
-    """
-
-    count: int
-    mean: float
-    std: float
-    min: float
-    p50: float
-    p95: float
-    p99: float
-    max: float
-
-
-def spread(values: ArrayLike) -> Distribution | None:
-    """The distribution of the finite ones among `values`, None when there are none."""
-    found = np.asarray(values, np.float64)
-    found = found[np.isfinite(found)]
-    if not found.size:
-        return None
-    p50, p95, p99 = np.percentile(found, (50, 95, 99))
-    return Distribution(
-        int(found.size),
-        float(found.mean()),
-        float(found.std(ddof=1)) if found.size > 1 else 0.0,
-        float(found.min()),
-        float(p50),
-        float(p95),
-        float(p99),
-        float(found.max()),
-    )
 
 
 def known(rows: FloatArray) -> FloatArray:

@@ -23,6 +23,7 @@ from vla_zenoh.errors import CodecError, NodeError, RecordingError
 from vla_zenoh.lab.recording.reader import RecordedEntry, Recording
 from vla_zenoh.lab.recording.restamp import Restamper
 from vla_zenoh.lab.recording.sample import JPEG, Sample
+from vla_zenoh.lab.statistics import percentiles
 from vla_zenoh.profile import Profile
 from vla_zenoh.runtime.scheduling import realtime_thread
 
@@ -161,8 +162,8 @@ class Replay:
             self.replayed.failure = str(error)
         self.replayed.seconds = time.monotonic() - began_s
         self.replayed.damage = self._file.damage
-        self.replayed.late_ms = _summary(self._late_ns)
-        self.replayed.interval_error_ms = _summary(self._errors_ns)
+        self.replayed.late_ms = percentiles(np.array(self._late_ns) / 1e6)
+        self.replayed.interval_error_ms = percentiles(np.array(self._errors_ns) / 1e6)
         self.node.report("stopped", now=True)
         self.node.close()
         return self.replayed
@@ -310,10 +311,3 @@ def _hand_over(ready: queue.Queue[Any], item: Any, ending: threading.Event) -> b
         except queue.Full:
             continue
     return False
-
-
-def _summary(values_ns: Collection[int]) -> dict[str, float]:
-    if not values_ns:
-        return {}
-    p50, p95, top = np.percentile(np.array(values_ns), (50, 95, 100)) / 1e6
-    return {"p50": float(p50), "p95": float(p95), "max": float(top)}

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from vla_zenoh.lab.bench.statistics import wilson_95
-from vla_zenoh.lab.evaluation.paired import Paired, paired
+from vla_zenoh.lab.statistics import Paired, paired, wilson_95
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.verdict import INTERVENTIONS, EpisodeVerdict
 

@@ -9,14 +9,13 @@ from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.control.commander import Commander, Outputs
 from vla_zenoh.kinematics.so3 import quat_from_rotation
-from vla_zenoh.types import Cause
+from vla_zenoh.types import LATENCY_STAGES, Cause
 
 MAX_WHY = 2000
 SPREAD_S = 8.0
 """Status tells how cost and lateness of ticks were spread over so long."""
 CHUNKS = 128
 """Status tells the latencies of so many: at 10 Hz of the last 13 s."""
-STAGES = ("capture_to_worker", "inference", "worker_to_command", "command_to_pose", "end_to_end")
 
 
 class CommandStatus:
@@ -30,7 +29,7 @@ class CommandStatus:
     def __init__(self, node: Node, mind: Commander) -> None:
         self._node, self._mind = node, mind
         ticks = round(SPREAD_S * node.profile.timing.command_hz)
-        self._latency = {stage: Percentiles(CHUNKS) for stage in STAGES}
+        self._latency = {stage: Percentiles(CHUNKS) for stage in LATENCY_STAGES}
         self._cost_us, self._late_us = Percentiles(ticks), Percentiles(ticks)
         self._pose_age_ms = Percentiles(ticks)
         self._rate = RateMeter()
@@ -49,15 +48,8 @@ class CommandStatus:
     def measure(self, cause: Cause) -> None:
         """A chunk came into force: how long each stage of its way took."""
         published_ns = self._node.clock.wall_ns()
-        steps_ms = (
-            cause.observed_ns - cause.observation_stamp_ns,
-            cause.inference_end_ns - cause.inference_start_ns,
-            cause.received_ns - cause.published_ns,
-            published_ns - cause.received_ns,
-            published_ns - cause.observation_stamp_ns,
-        )
-        for stage, nanoseconds in zip(STAGES, steps_ms, strict=True):
-            self._latency[stage].add(nanoseconds / 1e6)
+        for stage, duration_ms in cause.latency_ms(published_ns).items():
+            self._latency[stage].add(duration_ms)
 
     def report(self, out: Outputs, chunks_dropped: int) -> None:
         """Write status when it is due, or there is news."""

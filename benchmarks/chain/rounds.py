@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -90,20 +89,4 @@ def summarise(
         float(np.median(cpus)) if cpus else None,
         float(np.median(ratios)) if ratios else None,
         len(values),
-    )
-
-
-def wilson_95(successes: int, trials: int) -> tuple[float, float]:
-    """Interval of a success rate at 95 % (E. B. Wilson, J. Am. Stat. Assoc. 22, 1927).
-
-    Without trials nothing is known: 0 to 1.
-    """
-    if trials == 0:
-        return 0.0, 1.0
-    z, rate = 1.959963984540054, successes / trials
-    spread = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
-    middle, scale = rate + z * z / (2 * trials), 1 + z * z / trials
-    # At the ends rounding would put the rate itself outside.
-    return max(0.0, min(rate, (middle - spread) / scale)), min(
-        1.0, max(rate, (middle + spread) / scale)
     )

@@ -1,4 +1,4 @@
-"""Two policies on the same setups: McNemar's exact test and the interval of the difference."""
+"""Paired comparisons: McNemar's exact test and the interval of the difference."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.lab.evaluation.paired import Paired, mcnemar_exact, paired
+from vla_zenoh.lab.statistics import Paired, mcnemar_exact, paired
 
 ATOL = 1e-12
 COVERED_AT_LEAST = 0.93
