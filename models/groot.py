@@ -46,14 +46,14 @@ class Groot(Adapter):
         timeout_s: str = "2",
         api_token: str = "",
         profile: str = "panda_sim",
-        **layout: str,
+        **mapping: str,
     ) -> None:
         super().__init__(
             "groot",
             address(url, "tcp").geturl(),
             GROOT,
             preset,
-            layout,
+            mapping,
             timeout_s=timeout_s,
             profile=profile,
             clock_s=time.monotonic,
@@ -61,7 +61,7 @@ class Groot(Adapter):
         one_of("version", version, get_args(groot.Version))
         self._version: groot.Version = cast(groot.Version, version)
         self._token = api_token
-        for name, source in self.layout.fields.items():
+        for name, source in self.mapping.fields.items():
             prefix = groot.STATE if source.parts else "" if source.prompt else groot.VIDEO
             if not name.startswith(prefix):
                 raise SpecError(f"map: {name!r} must begin with {prefix!r}")
@@ -85,7 +85,7 @@ class Groot(Adapter):
             if error.reason != "peer_error":
                 raise
             modalities = None  # a server that does not know the question says nothing of itself
-        return groot.mismatches(modalities, self.layout)
+        return groot.mismatches(modalities, self.mapping)
 
     def _ask(self, fields: dict[str, Any], *, begins: bool) -> Any:
         reset = groot.reset_data(self._version)

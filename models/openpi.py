@@ -52,7 +52,7 @@ class OpenPi(Adapter):
         dialect: str = "auto",
         api_key: str = "",
         profile: str = "panda_sim",
-        **layout: str,
+        **mapping: str,
     ) -> None:
         server = address(url, "ws", "wss")
         super().__init__(
@@ -60,7 +60,7 @@ class OpenPi(Adapter):
             server.geturl(),
             OPENPI,
             preset,
-            layout,
+            mapping,
             timeout_s=timeout_s,
             profile=profile,
             clock_s=time.monotonic,
@@ -94,7 +94,7 @@ class OpenPi(Adapter):
         seconds = struct.pack("ll", int(self.timeout_s), int(self.timeout_s % 1 * 1e6))
         connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, seconds)
         metadata = openpi.read_metadata(connection.recv(self.timeout_s))
-        return openpi.mismatches(metadata, self.layout)
+        return openpi.mismatches(metadata, self.mapping)
 
     def _ask(self, fields: dict[str, Any], *, begins: bool) -> Any:
         if self._vllm and begins:

@@ -46,7 +46,7 @@ class OpenVlaRest(Adapter):
         encoded: str = "no",
         timeout_s: str = "2",
         profile: str = "panda_sim",
-        **layout: str,
+        **mapping: str,
     ) -> None:
         self._url = address(url, "http", "https")
         super().__init__(
@@ -54,7 +54,7 @@ class OpenVlaRest(Adapter):
             self._url.geturl(),
             OPENVLA_REST,
             preset,
-            layout,
+            mapping,
             timeout_s=timeout_s,
             profile=profile,
             clock_s=time.monotonic,

@@ -47,7 +47,7 @@ class Origami(Adapter):
         preset: str = "north_right",
         timeout_s: str = "2",
         profile: str = "panda_sim",
-        **layout: str,
+        **mapping: str,
     ) -> None:
         if not session_id:
             raise SpecError("session_id is empty; a policy is started for one")
@@ -56,7 +56,7 @@ class Origami(Adapter):
             f"the policy behind {url}",
             ORIGAMI,
             preset,
-            layout,
+            mapping,
             timeout_s=timeout_s,
             profile=profile,
             clock_s=time.monotonic,
@@ -68,7 +68,7 @@ class Origami(Adapter):
     def _connect(self) -> list[str]:
         if self._known:
             return []
-        wrong = origami.mismatches(self._query("metadata"), self.layout)
+        wrong = origami.mismatches(self._query("metadata"), self.mapping)
         self._known = not wrong
         return wrong
 

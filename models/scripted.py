@@ -35,7 +35,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 from vla_zenoh.policy.model_options import number, whole_number
-from vla_zenoh.policy.scripted_motions import parse_hard
+from vla_zenoh.policy.scripted_motions import parse_scripted
 
 ROUNDING = 1e-6
 """Less than this of a step is none."""
@@ -85,7 +85,7 @@ class Scripted:
 
     def infer(self, observation: Observation) -> ActionSteps:
         """The next chunk of the motion the prompt names."""
-        asked = parse_hard(observation.prompt)
+        asked = parse_scripted(observation.prompt)
         if self._delay_s:
             time.sleep(self._delay_s * (1 + self._jitter * self._random.uniform(-1, 1)))
         begun, place = self._asked_by(observation.stamp_wall_ns, observation.task.speed)

@@ -40,7 +40,7 @@ from vla_zenoh_model_lerobot.mapping import (
 )
 
 from vla_zenoh.errors import SpecError, WorkerError
-from vla_zenoh.interop.action_semantics import read_meaning
+from vla_zenoh.interop.action_semantics import read_action_semantics
 from vla_zenoh.interop.joints import Forward, make_forward
 from vla_zenoh.policy import (
     ActionSteps,
@@ -68,8 +68,8 @@ class LeRobot:
         resize: how a picture of another size becomes one of this.
         device: as torch names it; ``auto``: a GPU where there is one.
         profile: of the robot: its gripper, and its arm.
-        meaning: of the actions, see vla_zenoh/interop/meaning.py. `horizon` is, unless told
-            otherwise, as many steps as the policy was made to carry out.
+        meaning: of the actions, see vla_zenoh/interop/action_semantics.py. `horizon` defaults to
+            the number of steps that the policy was made to execute.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class LeRobot:
         kind = config["type"]
         self._one_by_one = one_by_one(config)
         steps = 1 if self._one_by_one else horizon(config, meaning.get("horizon", ""))
-        self._meaning = read_meaning({**meaning, "horizon": str(steps)})
+        self._meaning = read_action_semantics({**meaning, "horizon": str(steps)})
         one_of("resize", resize, get_args(Resize))
         self._profile = load_profile(profile)
         self._max_width_m = self._profile.robot.gripper.max_width_m

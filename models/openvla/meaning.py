@@ -8,7 +8,7 @@ import numpy as np
 from vla_zenoh_model_openvla.statistics import AXES, Range
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.interop.action_semantics import ActionSemantics, read_meaning
+from vla_zenoh.interop.action_semantics import ActionSemantics, read_action_semantics
 from vla_zenoh.interop.presets import OSC
 
 USUAL: Mapping[str, str] = {
@@ -45,7 +45,7 @@ def data_meaning(told: Mapping[str, str], key: str, trained: Range, chunk: int) 
     """
     data = next((known for begin, known in DATA.items() if key.startswith(begin)), {})
     known = {**USUAL, **data, "horizon": str(chunk)}
-    found = read_meaning(told, known, f"data set {key!r}", normalisation=key)
+    found = read_action_semantics(told, known, f"data set {key!r}", normalisation=key)
     if found.needs_joints:
         raise WorkerError("action: joints are not read by this worker; use delta or absolute")
     parts = found.parts(0)

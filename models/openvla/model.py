@@ -68,8 +68,8 @@ class OpenVLA:
         chunk: OFT: steps of a chunk; known for LIBERO and Bridge.
         state: OFT: what the numbers of the robot's state are, see `vla_zenoh.policy.state_vector`.
         profile: of the robot; OFT: its gripper and arm, for the state.
-        meaning: of the numbers in the units of the data, see vla_zenoh/interop/meaning.py; known
-            for some data sets. `horizon` is, unless told otherwise, the whole chunk.
+        meaning: of the numbers in the units of the data, known for some data sets, see
+            vla_zenoh/interop/action_semantics.py. `horizon` defaults to the whole chunk.
     """
 
     def __init__(

@@ -79,7 +79,7 @@ class Keys:
         return self._at("camera", chunk(camera, "camera name"), "jpeg")
 
     def camera_fitted(self, camera: str, form: str) -> str:
-        """A JPEG as a model wants it, made where the camera is; see `form_of`."""
+        """A JPEG as a model wants it, made where the camera is; see `size_variant`."""
         return self._at("camera", chunk(camera, "camera name"), "fitted", chunk(form, "form"))
 
     @property

@@ -22,7 +22,7 @@ from vla_zenoh.lab.check.report import MEANINGS, CheckReport
 from vla_zenoh.policy import (
     ActionSpec,
     CameraSpec,
-    GripperMeaning,
+    GripperSemantics,
     ModelSpec,
     ObservationSpec,
     check_steps,
@@ -347,7 +347,7 @@ def test_deltas_are_held_against_the_limits(row: list[float], wanted: set[tuple[
     ],
 )
 def test_the_gripper_is_held_against_its_meaning(
-    meaning: GripperMeaning, fits: tuple[float, ...], breaks: tuple[float, ...]
+    meaning: GripperSemantics, fits: tuple[float, ...], breaks: tuple[float, ...]
 ) -> None:
     action = ActionSpec(horizon=1, dt_s=0.1, gripper=meaning)
     for value in fits:

@@ -28,7 +28,7 @@ CONFIG: dict[str, Any] = {
     "output_features": {"action": {"type": "ACTION", "shape": [7]}},
 }
 WRIST = "observation.images.gripper_cam=camera:wrist"
-MEANING = {
+ACTION_OPTIONS = {
     "action": "delta",
     "rotation": "rpy",
     "gripper": "open_fraction",
@@ -41,7 +41,9 @@ MEANING = {
 
 def make(folder: Path, config: Mapping[str, Any] = CONFIG, /, **options: str) -> Policy:
     (folder / "config.json").write_text(json.dumps(config))
-    return make_policy(find_model("lerobot"), {"checkpoint": str(folder), **MEANING, **options})
+    return make_policy(
+        find_model("lerobot"), {"checkpoint": str(folder), **ACTION_OPTIONS, **options}
+    )
 
 
 def test_the_spec_says_what_the_options_say(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.nodes.worker.inference_debug import InferenceView
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
-from vla_zenoh.policy.scripted_motions import parse_hard
+from vla_zenoh.policy.scripted_motions import parse_scripted
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Event, Header, NodeStatus, Seen
 
@@ -162,7 +162,7 @@ def _options(data: bytes) -> None:
 def _prompt(data: bytes) -> None:
     words = settings.decode_text(data)
     with suppress(SpecError):
-        parse_hard(words)
+        parse_scripted(words)
     parse_prompt(words)
 
 

@@ -22,7 +22,7 @@ from typer.main import get_command
 
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import PeerError
-from vla_zenoh.interop.action_semantics import MEANING, read_meaning
+from vla_zenoh.interop.action_semantics import ACTION_OPTIONS, read_action_semantics
 from vla_zenoh.interop.options import DEFAULTS, read_map
 from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, ORIGAMI
 from vla_zenoh.lab.lockstep import Lockstep
@@ -36,7 +36,7 @@ from vla_zenoh.policy import (
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.policy.state_vector import COORDINATES, PARTS, read_parts
 from vla_zenoh.profile import load_profile
-from vla_zenoh.profile.fit import workers_of
+from vla_zenoh.profile.profile import workers_of
 from vla_zenoh.simulation.world import build_world
 
 ROOT = Path(__file__).parents[2]
@@ -276,9 +276,9 @@ def test_its_checkpoints_are_told_what_they_need_to_be_told() -> None:
     assert len([model for model, _ in lines if model == "lerobot"]) >= 4
     assert len([model for model, _ in lines if model == "openvla"]) >= 6
     for model, told in lines:
-        meaning = {name: value for name, value in told.items() if name in MEANING}
+        meaning = {name: value for name, value in told.items() if name in ACTION_OPTIONS}
         assert set(told) - set(meaning) <= parameters(model), (model, told)
         if model == "lerobot":
-            assert read_meaning({"horizon": "1", **meaning})
+            assert read_action_semantics({"horizon": "1", **meaning})
             assert read_parts(told["state"])
             read_map(told.get("map", ""))

@@ -16,7 +16,7 @@ from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import message, records
 from vla_zenoh.codec.image import decode_raw
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.camera.rendered import IDLE_PERIOD_S
+from vla_zenoh.nodes.camera.sim_cameras import IDLE_PERIOD_S
 from vla_zenoh.profile import load_profile
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.simulation.world import build_world

@@ -25,9 +25,9 @@ from vla_zenoh.lab.doctor.access_check import check_access
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
-from vla_zenoh.policy.observation import form_for, form_of, prepare
+from vla_zenoh.policy.observation import host_variant, prepare_image, size_variant
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.profile.schema import CameraProfile, HostProfile, PicturesProfile
+from vla_zenoh.profile.schema import CameraProfile, HostImagesProfile, HostProfile
 from vla_zenoh.profile.session import second_link
 from vla_zenoh.security.roles import Act
 from vla_zenoh.security.rules import access_control
@@ -188,12 +188,12 @@ def test_each_host_gets_pictures_as_its_link_bears(tmp_path: Path) -> None:
     hosts = {
         "near": HostProfile(nodes=("worker",)),
         "far": HostProfile(
-            nodes=("worker",), pictures=PicturesProfile(quality=30, rate_hz=5, width=160)
+            nodes=("worker",), pictures=HostImagesProfile(quality=30, rate_hz=5, width=160)
         ),
     }
     with camera_rig({"front": camera}, hosts=hosts) as rig:
         jpegs, _jpeg = rig.listen(rig.profile.keys.camera_jpeg("front"))
-        fars, _far = rig.listen(rig.profile.keys.camera_fitted("front", form_for("far")))
+        fars, _far = rig.listen(rig.profile.keys.camera_fitted("front", host_variant("far")))
         until("pictures of both", lambda: len(fars) >= 6 and len(jpegs) >= 30)
         stamps = [frame.header.stamp_wall_ns for frame in fars]
         assert (len(stamps) - 1) / ((stamps[-1] - stamps[0]) / 1e9) < 6.0  # of 50
@@ -217,14 +217,14 @@ def test_a_worker_listens_to_what_travels_to_its_host() -> None:
     ):
         out = {
             form: camera.declare_publisher(profile.keys.camera_fitted("front", form))
-            for form in (form_for("gpu"), form_for("robot"))
+            for form in (host_variant("gpu"), host_variant("robot"))
         }
         policy = make_policy(find_model("scripted"), {})
         worker = WorkerNode(profile, session, policy, "scripted", images="jpeg", host="gpu")
-        heard = out[form_for("gpu")]
+        heard = out[host_variant("gpu")]
         until("a worker that listens", lambda: listened_to(heard))
-        assert not listened_to(out[form_for("robot")])
-        for seat in worker.seats:
+        assert not listened_to(out[host_variant("robot")])
+        for seat in worker.sessions:
             seat.close()
 
 
@@ -237,7 +237,7 @@ def test_a_model_on_another_host_gets_pictures_in_its_own_size(tmp_path: Path) -
     )
     camera = CameraProfile(source=f"file:{chart(tmp_path)}", rate_hz=50, fit_for_workers=True)
     with camera_rig({"front": camera}) as rig:
-        form = form_of(wanted)
+        form = size_variant(wanted)
         assert form == "224x224-pad"
         whole, _whole = rig.listen(rig.profile.keys.camera_jpeg("front"))
         fitted, _fitted = rig.listen(rig.profile.keys.camera_fitted("front", form))
@@ -250,8 +250,8 @@ def test_a_model_on_another_host_gets_pictures_in_its_own_size(tmp_path: Path) -
         image = decode_jpeg(fitted[-1].payload)
         assert image.rgb.shape == (224, 224, 3)
         # What the worker makes of it is what it would have made of the whole picture.
-        from_whole = prepare(decode_jpeg(whole[-1].payload), wanted)
-        from_fitted = prepare(Image(image.rgb), wanted)
+        from_whole = prepare_image(decode_jpeg(whole[-1].payload), wanted)
+        from_fitted = prepare_image(Image(image.rgb), wanted)
         assert np.median(np.abs(from_whole.astype(int) - from_fitted)) < JPEG_TOLERANCE
         assert len(fitted[-1].payload) < len(whole[-1].payload)
 

@@ -18,12 +18,12 @@ from vla_zenoh.bus.node import Node, Stream
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.keys import Kind
+from vla_zenoh.nodes.camera import fitted_streams as asked
 from vla_zenoh.nodes.camera import node as camera_node
-from vla_zenoh.nodes.camera import requested_sizes as asked
 from vla_zenoh.nodes.camera.fitted_streams import MAX_SIZES
-from vla_zenoh.nodes.worker.camera_subscriber import CameraInput, listen_to
+from vla_zenoh.nodes.worker.camera_subscriber import CameraSubscriber, subscribe_to_camera
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
-from vla_zenoh.policy.observation import form_for, form_of
+from vla_zenoh.policy.observation import host_variant, size_variant
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Image
@@ -88,7 +88,7 @@ def stage(folder: Path) -> Iterator[tuple[Rig, Models, Callable[[int], list[Any]
         models, kept = Models(rig), []
 
         def listen(width: int) -> list[Any]:
-            form = form_of(sized(width))
+            form = size_variant(sized(width))
             assert form is not None
             frames, subscriber = rig.listen(rig.profile.keys.camera_fitted("front", form))
             kept.append(subscriber)
@@ -176,7 +176,7 @@ def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer(
         own = camera.stream(keys.camera_fitted("front", "32x32-pad"), Kind.FRAME)
         plain = camera.stream(keys.camera_jpeg("front"), Kind.FRAME)
         changed = threading.Condition()
-        ears = CameraInput(
+        ears = CameraSubscriber(
             worker, "front", own.key, plain.key, patience_s=PATIENCE_S, changed=changed
         )
 
@@ -205,7 +205,7 @@ def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer(
     ("host", "own", "plain"),
     [
         ("gpu", "32x32-pad", None),
-        ("edge", form_for("edge", "32x32-pad"), form_for("edge")),
+        ("edge", host_variant("edge", "32x32-pad"), host_variant("edge")),
     ],
 )
 def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all(
@@ -213,7 +213,7 @@ def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all(
 ) -> None:
     with two_nodes() as (camera, worker):
         keys = worker.keys
-        sizes = [own, "32x32-pad", form_for("edge", "32x32-pad")]
+        sizes = [own, "32x32-pad", host_variant("edge", "32x32-pad")]
         outs = {
             size: camera.stream(keys.camera_fitted("front", size), Kind.FRAME) for size in sizes
         }
@@ -221,7 +221,7 @@ def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all(
         for_all = camera.stream(key, Kind.FRAME)
         wanted = CameraSpec(camera="front", width=32, height=32, resize="pad")
         changed = threading.Condition()
-        ears = listen_to(wanted, worker, jpeg=True, host=host, changed=changed)
+        ears = subscribe_to_camera(wanted, worker, jpeg=True, host=host, changed=changed)
         until("its own", lambda: outs[own].wanted)
         assert not any(out.wanted for size, out in outs.items() if size != own)
 

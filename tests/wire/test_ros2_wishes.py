@@ -15,8 +15,8 @@ from ros2_rig import write_profile
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.interop.ros2.activation_filter import QUIET_S, ActivationFilter
 from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.switch import QUIET_S, Switch
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.ros2.estop_order import EstopOrder
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
@@ -114,7 +114,7 @@ def test_true_is_obeyed_once_and_what_is_repeated_is_told_once(rig: Rig) -> None
 
 
 def test_true_that_was_said_before_a_stop_is_not_obeyed_after_it(rig: Rig) -> None:
-    rig.wishes._switch = Switch(0)  # it was quiet for long
+    rig.wishes._switch = ActivationFilter(0)  # it was quiet for long
     rig.say(True)
     until("it waits", lambda: rig.wishes._switches._arrivals)
     rig.stop()

@@ -23,7 +23,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop import openpi
-from vla_zenoh.interop.served_policy import make_offer
+from vla_zenoh.interop.served_policy import make_served_policy
 from vla_zenoh.policy import ModelSpec, example_observation
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
@@ -193,7 +193,7 @@ def spec() -> ModelSpec:
 
 def offer(names: str = "") -> Any:
     robot = load_profile("panda_sim").robot
-    return make_offer(spec(), names, robot.arm_joints, robot.gripper.max_width_m)
+    return make_served_policy(spec(), names, robot.arm_joints, robot.gripper.max_width_m)
 
 
 def test_the_names_of_an_offer_can_be_those_of_liberos_clients() -> None:

@@ -11,14 +11,8 @@ from rich.table import Table
 from vla_zenoh.cli.options import HostOption
 from vla_zenoh.cli.output import console, errors, fail, print_json, styled
 from vla_zenoh.errors import MissingExtraError, ProfileError, RecordError, ResourceError
-from vla_zenoh.profile import (
-    Profile,
-    advice,
-    load_profile,
-    profile_file,
-    profile_names,
-    to_yaml,
-)
+from vla_zenoh.profile import Profile, load_profile, profile_file, profile_names, to_yaml
+from vla_zenoh.profile.advice import advice
 
 profile_app = typer.Typer(
     help="Profiles: what there is, what one comes to, and whether it is right.",

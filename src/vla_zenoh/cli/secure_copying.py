@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.files import FileUse, Needed, needed_files
+from vla_zenoh.profile.files import FileUse, NeededFiles, needed_files
 from vla_zenoh.security.store import Store
 
 SEARCHED = "vla-zenoh"
@@ -51,7 +51,7 @@ def _certificates(profile: Profile, store: Store, host: str) -> Iterator[str]:
     yield f"  scp -rp {shlex.quote(str(store.folder / host))} {host}:{target}/"
 
 
-def _files(needed: Needed, file: Path, host: str) -> Iterator[str]:
+def _files(needed: NeededFiles, file: Path, host: str) -> Iterator[str]:
     beside = needed.beside
     if all("/" not in name and (beside.base / name).is_file() for name in beside.names):
         paths = [file if name == needed.profile else beside.base / name for name in beside.names]

@@ -18,7 +18,7 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import console
 from vla_zenoh.cli.worker_choice import chosen_worker
 from vla_zenoh.interop.openpi import PORT
-from vla_zenoh.interop.served_policy import make_offer
+from vla_zenoh.interop.served_policy import make_served_policy
 from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.runtime.environments import run_in_own_environment
 from vla_zenoh.runtime.process import stop_on_signals
@@ -74,7 +74,7 @@ def openpi(
     from vla_zenoh.nodes.openpi_server import OpenPiServer
 
     policy = make_policy(chosen.model, chosen.options, profile=profile)
-    offer = make_offer(policy.spec, names, robot.arm_joints, robot.gripper.max_width_m)
+    offer = make_served_policy(policy.spec, names, robot.arm_joints, robot.gripper.max_width_m)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     getattr(policy, "load", lambda: None)()
     stop = stop_on_signals()

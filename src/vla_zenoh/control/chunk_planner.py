@@ -31,7 +31,7 @@ from vla_zenoh.control.reachability import Bounded, ReachabilityFilter
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import Pose, between, distance
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec
-from vla_zenoh.profile import REFUSE_FACTOR, Profile
+from vla_zenoh.profile import REJECT_FACTOR, Profile
 from vla_zenoh.types import (
     QUATERNION_NORM_TOLERANCE,
     ActionChunk,
@@ -331,15 +331,15 @@ class ChunkPlanner:
             most_rad = 2.0 * np.arccos(np.clip(np.abs(turns[:, 3]) - ROUNDING, 0.0, 1.0))
         else:  # three turns, or one: together at most as far as this
             most_rad = np.abs(turns).sum(axis=1)
-        far = np.linalg.norm(ways_m, axis=1) > limits.step_m * REFUSE_FACTOR * (1 - ROUNDING)
-        far |= most_rad > limits.step_rad * REFUSE_FACTOR * (1 - ROUNDING)
+        far = np.linalg.norm(ways_m, axis=1) > limits.step_m * REJECT_FACTOR * (1 - ROUNDING)
+        far |= most_rad > limits.step_rad * REJECT_FACTOR * (1 - ROUNDING)
         for index in far.nonzero()[0]:
             asked = step_pose(action, steps[index], before.pose)
             for hit in bound_step(limits, before.pose, asked)[1]:
                 if hit.fatal:
                     return Rejection(
                         hit.name,
-                        f"a step of {hit.value:.4g} is over {REFUSE_FACTOR:g} times its "
+                        f"a step of {hit.value:.4g} is over {REJECT_FACTOR:g} times its "
                         "limit; is its unit right?",
                         hit.value,
                         hit.limit,
@@ -348,7 +348,7 @@ class ChunkPlanner:
 
     def _out_of_the_world(self, positions_m: FloatArray) -> Rejection | None:
         """Why absolute targets are no targets of this arm."""
-        box, most_m = self._limits.workspace, REFUSE_FACTOR * self._limits.step_m
+        box, most_m = self._limits.workspace, REJECT_FACTOR * self._limits.step_m
         low, high = np.array([box.x_m, box.y_m, box.z_m]).T
         away_m = np.linalg.norm(positions_m - np.clip(positions_m, low, high), axis=1)
         for index in (away_m > most_m).nonzero()[0]:

@@ -25,7 +25,7 @@ import numpy as np
 
 from vla_zenoh.control.smoothing import ROTATION_BOX
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, norm3, orthonormal
-from vla_zenoh.profile import REFUSE_FACTOR, Limits
+from vla_zenoh.profile import REJECT_FACTOR, Limits
 from vla_zenoh.types import FloatArray
 
 APPROACH = "approach"
@@ -93,7 +93,7 @@ def _bound_norm(name: str, vector: FloatArray, limit: float) -> tuple[FloatArray
         return vector, []
     if not math.isfinite(norm):  # a product of numbers that were finite each
         return np.zeros(3), [LimitHit(name, math.inf, limit, fatal=True)]
-    return vector * (limit / norm), [LimitHit(name, norm, limit, norm > REFUSE_FACTOR * limit)]
+    return vector * (limit / norm), [LimitHit(name, norm, limit, norm > REJECT_FACTOR * limit)]
 
 
 def workspace_corners(limits: Limits) -> tuple[FloatArray, FloatArray]:

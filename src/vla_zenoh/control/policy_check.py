@@ -1,7 +1,7 @@
 """Static checks of a model against a profile: does its spec fit, and are its chunks plausible?
 
 No model runs here. Wrong units show in the size of the numbers: a step in millimetres or degrees is
-far above what an arm may do, and above `vla_zenoh.profile.REFUSE_FACTOR` times a limit the command
+far above what an arm may do, and above `vla_zenoh.profile.REJECT_FACTOR` times a limit the command
 node rejects the chunk.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, CameraSpec, ModelSpec
-from vla_zenoh.profile import POSE_JOINTS, REACH_M, REFUSE_FACTOR, Limits, Profile
+from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
 from vla_zenoh.types import QUATERNION_NORM_TOLERANCE
 
 SHAPE_TOLERANCE = 0.02
@@ -230,10 +230,10 @@ def _position(
                 f"z {box.z_m}: is it in the base frame?",
             )
         return
-    if longest_m > REFUSE_FACTOR * limits.step_m:
+    if longest_m > REJECT_FACTOR * limits.step_m:
         yield error(
             "position_units",
-            f"a step of {longest_m:.4g} m, over {REFUSE_FACTOR:g} times the limit of "
+            f"a step of {longest_m:.4g} m, over {REJECT_FACTOR:g} times the limit of "
             f"{limits.step_m:g} m; are these metres, and was the output unnormalised? "
             f"position_scale_m is {spec.position_scale_m:g}",
         )
@@ -261,10 +261,10 @@ def _rotation(spec: ActionSpec, rotation: NDArray[np.float64], limits: Limits) -
 
 
 def _turn(largest_rad: float, spec: ActionSpec, limits: Limits) -> Iterator[Finding]:
-    if largest_rad > REFUSE_FACTOR * limits.step_rad:
+    if largest_rad > REJECT_FACTOR * limits.step_rad:
         yield error(
             "rotation_units",
-            f"a step of {largest_rad:.4g} rad, over {REFUSE_FACTOR:g} times the limit of "
+            f"a step of {largest_rad:.4g} rad, over {REJECT_FACTOR:g} times the limit of "
             f"{limits.step_rad:g} rad; are these radians, and was the output unnormalised?",
         )
         return
@@ -297,7 +297,7 @@ def _quaternion(
     turns = 2 * np.arccos(np.clip(np.abs(rotation[:, 3]), 0.0, 1.0))
     swapped = 2 * np.arccos(np.clip(np.abs(rotation[:, 0]), 0.0, 1.0))
     largest = float(turns.max())
-    if largest > REFUSE_FACTOR * limits.step_rad >= float(swapped.max()):
+    if largest > REJECT_FACTOR * limits.step_rad >= float(swapped.max()):
         yield error(
             "quaternion",
             f"a step of {largest:.4g} rad, which would be {float(swapped.max()):.4g} rad read as "

@@ -31,15 +31,15 @@ from pydantic import ValidationError
 
 from vla_zenoh.errors import SpecError
 from vla_zenoh.interop.joints import Forward, poses_of
-from vla_zenoh.policy import ActionSpec, Frame, GripperMeaning, Rotation
+from vla_zenoh.policy import ActionSpec, Frame, GripperSemantics, Rotation
 from vla_zenoh.policy.model_options import number, one_of, whole_number
 from vla_zenoh.pydantic_errors import in_words
 from vla_zenoh.types import JointState
 
 Action = Literal["delta", "absolute", "joint_delta", "joint_position"]
-TheirRotation = Literal["rpy", "rotvec", "quat_xyzw", "quat_wxyz"]
+ForeignRotation = Literal["rpy", "rotvec", "quat_xyzw", "quat_wxyz"]
 
-MEANING: Mapping[str, str] = {
+ACTION_OPTIONS: Mapping[str, str] = {
     "action": "",
     "frame": "base",
     "rotation": "",
@@ -59,8 +59,8 @@ QUATERNION_SLACK = 0.1
 """A network's quaternion this far from unit length is brought to it; further is something else."""
 _ASKED: Mapping[str, str] = {
     "action": " or ".join(get_args(Action)),
-    "rotation": " or ".join(get_args(TheirRotation)),
-    "gripper": " or ".join(get_args(GripperMeaning)),
+    "rotation": " or ".join(get_args(ForeignRotation)),
+    "gripper": " or ".join(get_args(GripperSemantics)),
     "gripper_open": "high or low: is the gripper open where its number is large?",
     "dt_s": "seconds of a step, 1 / fps of the data",
     "horizon": "how many steps of an answer are taken",
@@ -69,7 +69,7 @@ _ASKED: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class ActionSemantics:
-    """See the module. Made by `read_meaning`.
+    """See the module. Made by `read_action_semantics`.
 
     Args:
         spec: what our side is told: metres and radians.
@@ -81,7 +81,7 @@ class ActionSemantics:
 
     spec: ActionSpec
     action: Action
-    rotation: TheirRotation
+    rotation: ForeignRotation
     clip: float
     scales: tuple[float, float, float]
 
@@ -144,7 +144,7 @@ def _of_joints(action: str) -> bool:
     return action in ("joint_delta", "joint_position")
 
 
-def read_meaning(
+def read_action_semantics(
     told: Mapping[str, str],
     known: Mapping[str, str] | None = None,
     whose: str = "",
@@ -154,7 +154,7 @@ def read_meaning(
     """The meaning that options give.
 
     Args:
-        told: by a person, any of `MEANING`.
+        told: by a person, any of `ACTION_OPTIONS`.
         known: options that a preset or the name of a data set stands for; `told` overrides them.
             Another `action` is another meaning: then nothing but `horizon` is left of them.
         whose: they are, for messages.
@@ -163,20 +163,22 @@ def read_meaning(
     Raises:
         SpecError: an option is not known, cannot be, or is missing; names what is allowed.
     """
-    unknown = [name for name in told if name not in MEANING]
+    unknown = [name for name in told if name not in ACTION_OPTIONS]
     if unknown:
-        raise SpecError(f"no option {', '.join(map(repr, unknown))}; known: {', '.join(MEANING)}")
-    known = {name: value for name, value in (known or {}).items() if name in MEANING}
+        raise SpecError(
+            f"no option {', '.join(map(repr, unknown))}; known: {', '.join(ACTION_OPTIONS)}"
+        )
+    known = {name: value for name, value in (known or {}).items() if name in ACTION_OPTIONS}
     action = told.get("action") or known.get("action", "")
     other = bool(known.get("action")) and action != known["action"]
     if other:
         known = {name: value for name, value in known.items() if name == "horizon"}
-    chosen = {**MEANING, **known, **told, "action": action}
+    chosen = {**ACTION_OPTIONS, **known, **told, "action": action}
     for name, allowed in (
         ("action", get_args(Action)),
-        ("rotation", get_args(TheirRotation)),
+        ("rotation", get_args(ForeignRotation)),
         ("frame", get_args(Frame)),
-        ("gripper", get_args(GripperMeaning)),
+        ("gripper", get_args(GripperSemantics)),
         ("gripper_open", OPEN),
     ):
         if chosen[name]:
@@ -187,7 +189,7 @@ def read_meaning(
     return ActionSemantics(
         spec=_spec(chosen, rotation, normalisation),
         action=cast(Action, action),
-        rotation=cast(TheirRotation, rotation),
+        rotation=cast(ForeignRotation, rotation),
         clip=number("clip", chosen["clip"] or "0"),
         scales=(
             number("position_scale_m", chosen["position_scale_m"]),
@@ -221,7 +223,7 @@ def _spec(chosen: Mapping[str, str], rotation: str, normalisation: str | None) -
             kind="delta" if action == "delta" else "absolute",
             frame=cast(Frame, "base" if _of_joints(action) else chosen["frame"]),
             rotation="quaternion" if quaternion else cast(Rotation, rotation),
-            gripper=cast(GripperMeaning, chosen["gripper"]),
+            gripper=cast(GripperSemantics, chosen["gripper"]),
             gripper_open_is_high=chosen["gripper_open"] != "low",
             gripper_threshold=number(
                 "gripper_threshold", chosen["gripper_threshold"], least=-math.inf

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop.backoff import Backoff
 from vla_zenoh.interop.joints import Forward, make_forward
-from vla_zenoh.interop.options import read_layout, read_timeout
+from vla_zenoh.interop.options import read_field_mapping, read_timeout
 from vla_zenoh.interop.presets import Presets
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
 from vla_zenoh.profile import load_profile
@@ -56,7 +56,7 @@ class Adapter(ABC):
         where: str,
         presets: Presets,
         preset: str,
-        layout: Mapping[str, str],
+        mapping: Mapping[str, str],
         *,
         timeout_s: str,
         profile: str,
@@ -65,17 +65,17 @@ class Adapter(ABC):
     ) -> None:
         self.where, self.timeout_s = where, read_timeout(timeout_s)
         self._profile = load_profile(profile)
-        self.layout = read_layout(
+        self.mapping = read_field_mapping(
             name,
             presets,
             preset,
-            layout,
+            mapping,
             max_width_m=self._profile.robot.gripper.max_width_m,
             normalisation=normalisation,
         )
-        if self.layout.meaning.needs_joints and not self.joints:
+        if self.mapping.semantics.needs_joints and not self.joints:
             raise SpecError("action: joints are not read by this adapter; use delta or absolute")
-        self.spec: ModelSpec = self.layout.spec
+        self.spec: ModelSpec = self.mapping.spec
         self._forward: Forward | None = None
         self._clock_s, self._backoff = clock_s, Backoff()
         self._begins = True
@@ -112,7 +112,7 @@ class Adapter(ABC):
     # -- what a worker asks -------------------------------------------------------------------
     def load(self) -> None:
         """Kinematics, where they are needed; the server is asked with the first observation."""
-        if self.layout.meaning.needs_joints:
+        if self.mapping.semantics.needs_joints:
             self._forward = make_forward(self._profile)
 
     def reset(self) -> None:
@@ -129,7 +129,7 @@ class Adapter(ABC):
         if wait_s > 0:
             raise PeerError("peer_gone", f"{self.where} was lost; tried again in {wait_s:.1f} s")
         try:
-            return self.layout.read(self._answer(observation), observation, self._forward)
+            return self.mapping.read(self._answer(observation), observation, self._forward)
         except Exception as error:  # whatever it was: what is left on the wire is never read
             self._drop(answers=isinstance(error, PeerError) and error.reason in ANSWERED)
             told = self._told(error)
@@ -150,7 +150,7 @@ class Adapter(ABC):
         wrong = self._connect()
         if wrong:
             raise PeerError("peer_mismatch", f"{self.where} does not fit: {'; '.join(wrong)}")
-        answer = self._ask(self.layout.request(observation), begins=self._begins)
+        answer = self._ask(self.mapping.request(observation), begins=self._begins)
         self._begins = False
         self._backoff.succeeded()
         return answer

@@ -36,7 +36,7 @@ class FieldSource:
 
 @dataclass(frozen=True, slots=True)
 class FieldMapping:
-    """See the module. Made by `read_layout`.
+    """See the module. Made by `read_field_mapping`.
 
     Args:
         fields: the server's name -> what it is filled with.
@@ -51,7 +51,7 @@ class FieldMapping:
     spec: ModelSpec
     keys: tuple[str, ...]
     columns: tuple[int, ...] | None
-    meaning: ActionSemantics
+    semantics: ActionSemantics
     max_width_m: float
 
     @property
@@ -59,7 +59,7 @@ class FieldMapping:
         """Columns of an answer, None where only the arm knows how many joints it has."""
         if self.columns is not None:
             return len(self.columns)
-        return None if self.meaning.needs_joints else sum(self.meaning.parts(0).values())
+        return None if self.semantics.needs_joints else sum(self.semantics.parts(0).values())
 
     # -- out ----------------------------------------------------------------------------------
     def request(self, observation: Observation) -> dict[str, Any]:
@@ -133,7 +133,7 @@ class FieldMapping:
         """
         rows = self.gather(answer)
         try:
-            return self.meaning.steps(rows, observation.joint, forward)
+            return self.semantics.steps(rows, observation.joint, forward)
         except SpecError as error:
             hint = "; choose them with columns=" if error.reason == "shape" else ""
             raise PeerError("peer_reply", f"{error}{hint}") from error

@@ -174,14 +174,14 @@ def read_actions(payload: bytes) -> dict[str, Any]:
     return {str(name).removeprefix(ACTION): value for name, value in answer.items()}
 
 
-def mismatches(modalities: Any, layout: FieldMapping) -> list[str]:
+def mismatches(modalities: Any, mapping: FieldMapping) -> list[str]:
     """What the server's modalities and the layout differ in: one sentence each."""
     if not isinstance(modalities, dict):
         return []
     out: list[str] = []
     for kind, prefix in (("video", VIDEO), ("state", STATE)):
         asked = _names(modalities, kind, prefix)
-        given = {name.removeprefix(prefix) for name in layout.fields if name.startswith(prefix)}
+        given = {name.removeprefix(prefix) for name in mapping.fields if name.startswith(prefix)}
         if asked is None:
             continue
         if asked - given:
@@ -192,11 +192,11 @@ def mismatches(modalities: Any, layout: FieldMapping) -> list[str]:
         if isinstance(times, list) and len(times) != 1:
             out.append(f"it wants {len(times)} {kind} entries in time, only the newest is sent")
     gives = _names(modalities, "action", ACTION)
-    if gives is not None and set(layout.keys) - gives:
-        missing = ", ".join(sorted(set(layout.keys) - gives))
+    if gives is not None and set(mapping.keys) - gives:
+        missing = ", ".join(sorted(set(mapping.keys) - gives))
         out.append(f"it gives no action {missing}, but {', '.join(sorted(gives))}; see keys=")
     language = _names(modalities, "language", "")
-    prompts = {name for name, source in layout.fields.items() if source.prompt}
+    prompts = {name for name, source in mapping.fields.items() if source.prompt}
     if language is not None and language != prompts:
         out.append(f"its prompt is called {', '.join(sorted(language))}; see map=")
     return out

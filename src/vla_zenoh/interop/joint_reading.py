@@ -28,7 +28,7 @@ RESTARTED_NS = 1_000_000_000
 set; a smaller step back is a message that was overtaken."""
 
 
-class Newness:
+class StampFilter:
     """Refuses what came before: a stamp that stands still is a robot, or camera, that does."""
 
     def __init__(self) -> None:
@@ -67,7 +67,7 @@ class JointReading:
         self._middle_rad = (lower_rad + upper_rad) / 2
         self._furthest_rad = BEYOND * (upper_rad - lower_rad) / 2
         self._fastest_rad_s = BEYOND * kinematics.velocity_rad_s[at]
-        self._arm_newness, self._finger_newness = Newness(), Newness()
+        self._arm_newness, self._finger_newness = StampFilter(), StampFilter()
         self._joints: JointState | None = None
         self.stamp_ns = 0
         self.width_m: float | None = None

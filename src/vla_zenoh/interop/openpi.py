@@ -90,25 +90,25 @@ def _read(frame: bytes | str) -> Any:
     return found
 
 
-def mismatches(metadata: Mapping[str, Any], layout: FieldMapping) -> list[str]:
+def mismatches(metadata: Mapping[str, Any], mapping: FieldMapping) -> list[str]:
     """What the server says of itself and the layout does not: one sentence each.
 
     openpi's own server says nothing of its actions; vllm-omni's and ours do.
     """
     out: list[str] = []
-    wanted = layout.width
+    wanted = mapping.width
     dim = metadata.get("action_dim")
     if isinstance(dim, int):
-        if layout.columns is not None and max(layout.columns) >= dim:
-            out.append(f"it gives {dim} columns, column {max(layout.columns)} is wanted")
-        elif layout.columns is None and wanted is not None and dim != wanted:
+        if mapping.columns is not None and max(mapping.columns) >= dim:
+            out.append(f"it gives {dim} columns, column {max(mapping.columns)} is wanted")
+        elif mapping.columns is None and wanted is not None and dim != wanted:
             out.append(f"it gives {dim} columns, {wanted} are wanted (columns=)")
     space = metadata.get("action_space")
-    if isinstance(space, str) and space.startswith("joint") is not layout.meaning.needs_joints:
-        out.append(f"its action_space is {space}, action={layout.meaning.action} is set")
+    if isinstance(space, str) and space.startswith("joint") is not mapping.semantics.needs_joints:
+        out.append(f"its action_space is {space}, action={mapping.semantics.action} is set")
     size = metadata.get("image_resolution")
     if isinstance(size, list) and len(size) == 2:
-        for camera in layout.spec.observation.cameras:
+        for camera in mapping.spec.observation.cameras:
             if camera.height is not None and [camera.height, camera.width] != size:
                 out.append(
                     f"it wants pictures of {size[1]}x{size[0]}, size="
@@ -117,7 +117,7 @@ def mismatches(metadata: Mapping[str, Any], layout: FieldMapping) -> list[str]:
                 break
     theirs = metadata.get(SPEC)
     if isinstance(theirs, dict):
-        ours = layout.spec.action.model_dump(mode="json")
+        ours = mapping.spec.action.model_dump(mode="json")
         out += [
             f"its {name} is {shown(theirs[name])}, {shown(ours[name])} is set"
             for name in _MEANING

@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from typing import Literal, cast
 
 from vla_zenoh.errors import SpecError
-from vla_zenoh.interop.action_semantics import MEANING, as_spec_error, read_meaning
+from vla_zenoh.interop.action_semantics import ACTION_OPTIONS, as_spec_error, read_action_semantics
 from vla_zenoh.interop.field_mapping import FieldMapping, FieldSource
 from vla_zenoh.policy import CameraSpec, ModelSpec, ObservationSpec, Resize, StatePart
 from vla_zenoh.policy.model_options import number
@@ -34,7 +34,7 @@ DEFAULTS: Mapping[str, str] = {
     "colour": "rgb",
     "keys": "actions",
     "columns": "",
-    **MEANING,
+    **ACTION_OPTIONS,
 }
 NONE = "none"
 """The preset that says nothing."""
@@ -43,7 +43,7 @@ _SLICE = re.compile(r"([0-9]{1,4}):([0-9]{1,4})")
 MAX_KEYS = 256
 
 
-def read_layout(
+def read_field_mapping(
     name: str,
     presets: Mapping[str, Mapping[str, str]],
     preset: str,
@@ -79,17 +79,17 @@ def read_layout(
     fields = {theirs: source for theirs, source in entries.items() if source is not None}
     if not fields:
         raise SpecError("map is empty: say which of the server's names is filled with what")
-    told = {name: value for name, value in options.items() if name in MEANING}
+    told = {name: value for name, value in options.items() if name in ACTION_OPTIONS}
     whose = f"preset {preset}"
-    meaning = read_meaning(told, presets[preset], whose, normalisation=normalisation)
+    semantics = read_action_semantics(told, presets[preset], whose, normalisation=normalisation)
     with as_spec_error():
-        observation = _observation(fields, chosen, meaning.needs_joints)
+        observation = _observation(fields, chosen, semantics.needs_joints)
     return FieldMapping(
         fields=fields,
-        spec=ModelSpec(name=name, observation=observation, action=meaning.spec),
+        spec=ModelSpec(name=name, observation=observation, action=semantics.spec),
         keys=_keys(chosen["keys"]),
         columns=read_columns(chosen["columns"]),
-        meaning=meaning,
+        semantics=semantics,
         max_width_m=max_width_m,
     )
 

@@ -70,21 +70,25 @@ def read_answer(payload: bytes, operation: Operation, request_id: str) -> Any:
     return answer[part]
 
 
-def mismatches(metadata: Any, layout: FieldMapping) -> list[str]:
+def mismatches(metadata: Any, mapping: FieldMapping) -> list[str]:
     """What the server says of itself and the layout does not: one sentence each."""
     if not isinstance(metadata, dict):
         return [f"its metadata is no map: {shown(metadata)}"]
     out: list[str] = []
     dim, kind, units = (metadata.get(n) for n in ("action_dim", "action_type", "action_units"))
     if isinstance(dim, int):
-        if layout.columns is not None and max(layout.columns) >= dim:
-            out.append(f"it gives {dim} columns, column {max(layout.columns)} is wanted")
-        elif layout.columns is None and layout.width not in (None, dim):
-            out.append(f"it gives {dim} columns, {layout.width} are wanted (columns=)")
-    if kind == "absolute_joint_position" and layout.meaning.action != "joint_position":
-        out.append(f"its actions are joint positions, action={layout.meaning.action} is set")
+        if mapping.columns is not None and max(mapping.columns) >= dim:
+            out.append(f"it gives {dim} columns, column {max(mapping.columns)} is wanted")
+        elif mapping.columns is None and mapping.width not in (None, dim):
+            out.append(f"it gives {dim} columns, {mapping.width} are wanted (columns=)")
+    if kind == "absolute_joint_position" and mapping.semantics.action != "joint_position":
+        out.append(f"its actions are joint positions, action={mapping.semantics.action} is set")
     if kind == "absolute_joint_position" and units not in (None, "radians"):
         out.append(f"its joints are in {shown(units)}, wanted radians")
-    if isinstance(kind, str) and kind != "absolute_joint_position" and layout.meaning.needs_joints:
-        out.append(f"its actions are {kind}, action={layout.meaning.action} is set")
+    if (
+        isinstance(kind, str)
+        and kind != "absolute_joint_position"
+        and mapping.semantics.needs_joints
+    ):
+        out.append(f"its actions are {kind}, action={mapping.semantics.action} is set")
     return out

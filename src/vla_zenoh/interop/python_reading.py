@@ -19,7 +19,7 @@ FAULT_NS = 200_000_000
 could be passed over."""
 
 
-class Taken(NamedTuple):
+class ValidReading(NamedTuple):
     """A reading that holds.
 
     Args:
@@ -49,7 +49,7 @@ class PythonReading:
         self._names = profile.robot.arm_joints
         self._state = JointReading(profile, kinematics)
 
-    def take(self, reading: Reading, stamp_ns: int, asked_m: float) -> Taken:
+    def take(self, reading: Reading, stamp_ns: int, asked_m: float) -> ValidReading:
         """All of it, or nothing.
 
         Args:
@@ -79,7 +79,7 @@ class PythonReading:
         taken = self._state.take(joints, stamp_ns)
         assert taken is not None
         tcp, twist = self._state.tcp()
-        return Taken(stamp_ns, taken, tcp, pose_state(tcp, twist, wrench, None), gripper)
+        return ValidReading(stamp_ns, taken, tcp, pose_state(tcp, twist, wrench, None), gripper)
 
 
 class Fault:

@@ -12,7 +12,7 @@ from vla_zenoh.errors import PeerError, RecordError, SpecError
 from vla_zenoh.interop.field_mapping import FieldSource
 from vla_zenoh.interop.options import read_map
 from vla_zenoh.policy import ModelSpec, Observation
-from vla_zenoh.policy.observation import prepare
+from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.policy.state_vector import ROTATIONS, parts_of, read_parts, state_of
 from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task, shown
 
@@ -69,7 +69,7 @@ class ServedPolicy:
                 elif source.camera:
                     if not isinstance(value, np.ndarray):
                         raise PeerError("peer_request", f"{name} is no array: {shown(value)}")
-                    images[source.camera] = prepare(Image(value), cameras[source.camera])
+                    images[source.camera] = prepare_image(Image(value), cameras[source.camera])
                 else:
                     numbers = np.asarray(value, np.float64)
                     state |= state_of(source.parts, numbers, len(self.joints), self.max_width_m)
@@ -96,7 +96,7 @@ class ServedPolicy:
         return out
 
 
-def make_offer(
+def make_served_policy(
     spec: ModelSpec, map_option: str, joints: tuple[str, ...], max_width_m: float
 ) -> ServedPolicy:
     """The offer of a model; `map_option` names things otherwise than ``observation/...``.

@@ -45,7 +45,7 @@ class History:
 
 
 @dataclass(frozen=True, slots=True)
-class NotYet:
+class NotReady:
     """Why there is no observation now; `waiting`: it is early, and nothing is wrong."""
 
     why: str
@@ -61,7 +61,7 @@ def assemble(
     not_before_ns: int,
     now_ns: int,
     robot: str = "",
-) -> Observation | NotYet:
+) -> Observation | NotReady:
     """The newest observation that fits the spec, or why there is none.
 
     Args:
@@ -75,15 +75,15 @@ def assemble(
         robot: whose observation it is.
 
     Raises:
-        SpecError: a picture does not have the size the spec wants, see `prepare`.
+        SpecError: a picture does not have the size the spec wants, see `prepare_image`.
     """
     wanted = spec.observation
     if wanted.prompt and not task.prompt:
-        return NotYet("there is no prompt", waiting=True)
+        return NotReady("there is no prompt", waiting=True)
     missing = [f"camera {c.camera!r}" for c in wanted.cameras if c.camera not in images]
     missing += [f"state/{p}" for p in wanted.state if p not in states or not states[p].entries]
     if missing:
-        return NotYet(f"nothing heard yet of {', '.join(missing)}")
+        return NotReady(f"nothing heard yet of {', '.join(missing)}")
     oldest = _oldest([images[camera.camera] for camera in wanted.cameras])
     if oldest is None and wanted.state:
         oldest = _oldest([states[part].entries[-1] for part in wanted.state])
@@ -91,34 +91,34 @@ def assemble(
     seq = oldest.header.seq if oldest else 0
     age_s = (now_ns - stamp_ns) / 1e9
     if age_s > wanted.max_age_s:
-        return NotYet(
+        return NotReady(
             f"the newest observation is {age_s:.2f} s old, at most {wanted.max_age_s:g} s"
         )
     if age_s < -CLOCK_TOLERANCE_S:
-        return NotYet(
+        return NotReady(
             f"the newest observation is {-age_s:.2f} s in the future; synchronise the clocks "
             "of camera, robot and worker (chrony or ptp)"
         )
     if stamp_ns < not_before_ns:
-        return NotYet("no observation since the last chunk", waiting=True)
+        return NotReady("no observation since the last chunk", waiting=True)
     parts: dict[str, Any] = {}
     for part in wanted.state:
         near = states[part].nearest(stamp_ns)
         assert near is not None
         skew_s = abs(near.header.stamp_wall_ns - stamp_ns) / 1e9
         if skew_s > wanted.max_skew_s:
-            return NotYet(f"state/{part} is {skew_s:.3f} s apart from the pictures")
+            return NotReady(f"state/{part} is {skew_s:.3f} s apart from the pictures")
         parts[part] = near.record
     for camera in wanted.cameras:
         skew_s = (images[camera.camera].header.stamp_wall_ns - stamp_ns) / 1e9
         if skew_s > wanted.max_skew_s:
-            return NotYet(f"camera {camera.camera!r} is {skew_s:.3f} s apart from the others")
+            return NotReady(f"camera {camera.camera!r} is {skew_s:.3f} s apart from the others")
     return Observation(
         stamp_wall_ns=stamp_ns,
         seq=seq,
         task=task,
         robot=robot,
-        images={c.camera: prepare(images[c.camera].record, c) for c in wanted.cameras},
+        images={c.camera: prepare_image(images[c.camera].record, c) for c in wanted.cameras},
         **parts,
     )
 
@@ -127,19 +127,19 @@ def _oldest(entries: Sequence[Stamped[Any]]) -> Stamped[Any] | None:
     return min(entries, key=lambda entry: entry.header.stamp_wall_ns, default=None)
 
 
-def form_of(spec: CameraSpec) -> str | None:
+def size_variant(spec: CameraSpec) -> str | None:
     """Name of the size and resize rule a model wants; None: any size will do."""
     if spec.width is None or spec.height is None or spec.resize == "none":
         return None
     return f"{spec.width}x{spec.height}-{spec.resize}"
 
 
-def form_for(host: str, form: str | None = None) -> str:
+def host_variant(host: str, form: str | None = None) -> str:
     """Name of what travels to a host with a say in it, in a model's size or as it comes."""
     return f"{form or 'whole'}-for-{host}"
 
 
-def prepare(image: Image, spec: CameraSpec) -> NDArray[np.uint8]:
+def prepare_image(image: Image, spec: CameraSpec) -> NDArray[np.uint8]:
     """A picture in the size and channel order the model declared.
 
     Raises:

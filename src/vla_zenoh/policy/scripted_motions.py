@@ -17,7 +17,7 @@ STEP_M, STEP_RAD, STEP_WIDTH_M = 0.01, 0.05, 0.05
 MAX_COUNT = 100_000
 
 
-class HardMotion(NamedTuple):
+class ScriptedMotion(NamedTuple):
     """One step of a motion.
 
     Args:
@@ -31,19 +31,19 @@ class HardMotion(NamedTuple):
     step: float
 
 
-HARD: dict[str, HardMotion] = {
+HARD: dict[str, ScriptedMotion] = {
     motion.name: motion
     for motion in (
-        HardMotion("go up", 2, STEP_M),
-        HardMotion("go down", 2, -STEP_M),
-        HardMotion("roll right", 3, STEP_RAD),
-        HardMotion("roll left", 3, -STEP_RAD),
-        HardMotion("pitch down", 4, STEP_RAD),
-        HardMotion("pitch up", 4, -STEP_RAD),
-        HardMotion("yaw left", 5, STEP_RAD),
-        HardMotion("yaw right", 5, -STEP_RAD),
-        HardMotion("open gripper", 6, STEP_WIDTH_M),
-        HardMotion("close gripper", 6, -STEP_WIDTH_M),
+        ScriptedMotion("go up", 2, STEP_M),
+        ScriptedMotion("go down", 2, -STEP_M),
+        ScriptedMotion("roll right", 3, STEP_RAD),
+        ScriptedMotion("roll left", 3, -STEP_RAD),
+        ScriptedMotion("pitch down", 4, STEP_RAD),
+        ScriptedMotion("pitch up", 4, -STEP_RAD),
+        ScriptedMotion("yaw left", 5, STEP_RAD),
+        ScriptedMotion("yaw right", 5, -STEP_RAD),
+        ScriptedMotion("open gripper", 6, STEP_WIDTH_M),
+        ScriptedMotion("close gripper", 6, -STEP_WIDTH_M),
     )
 }
 _PROMPT = re.compile(
@@ -53,7 +53,7 @@ _PROMPT = re.compile(
 )
 
 
-class HardPrompt(NamedTuple):
+class ScriptedPrompt(NamedTuple):
     """A prompt that was understood.
 
     Args:
@@ -62,7 +62,7 @@ class HardPrompt(NamedTuple):
         within: turn back before this distance (m or rad) from the start; None: never.
     """
 
-    motion: HardMotion | None
+    motion: ScriptedMotion | None
     steps: int | None
     within: float | None = None
 
@@ -84,7 +84,7 @@ class HardPrompt(NamedTuple):
         return along if turn % 2 == 0 else leg - along
 
 
-def parse_hard(prompt: str) -> HardPrompt:
+def parse_scripted(prompt: str) -> ScriptedPrompt:
     """Read ``HARD: go up``, ``HARD: rol left x20`` (so spelt in the thesis too) or ``hold``.
 
     Raises:
@@ -95,11 +95,11 @@ def parse_hard(prompt: str) -> HardPrompt:
     count = int(match["count"]) if match and match["count"] else None
     within = float(match["within"]) if match and match["within"] else None
     if match is not None and name == "hold":
-        return HardPrompt(None, count)
+        return ScriptedPrompt(None, count)
     if match is None or name not in HARD or (count or 0) > MAX_COUNT or within == 0.0:
         raise SpecError(
             f"the scripted model does not know the prompt {prompt!r}; it knows: 'hold', "
             + ", ".join(f"'HARD: {known}'" for known in HARD)
             + "; a count and a range may follow, as in 'HARD: go down x50 within 0.1'"
         )
-    return HardPrompt(HARD[name], count, within)
+    return ScriptedPrompt(HARD[name], count, within)

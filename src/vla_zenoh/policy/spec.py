@@ -35,7 +35,7 @@ Resize = Literal["none", "stretch", "pad", "crop"]
 Frame = Literal["base", "tcp"]
 Rotation = Literal["rpy", "rotvec", "quaternion"]
 MotionKind = Literal["delta", "absolute"]
-GripperMeaning = Literal["none", "delta_m", "absolute_m", "open_fraction", "binary"]
+GripperSemantics = Literal["none", "delta_m", "absolute_m", "open_fraction", "binary"]
 
 ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
 
@@ -138,7 +138,7 @@ class ActionSpec(_Spec):
     frame: Frame = "base"
     rotation: Rotation = "rpy"
     position_scale_m: float = Field(default=1.0, gt=0, le=10)
-    gripper: GripperMeaning = "absolute_m"
+    gripper: GripperSemantics = "absolute_m"
     gripper_open_is_high: bool = True
     # Adding zero makes -0.0 zero: they mean the same, and must have the same hash.
     gripper_threshold: Annotated[float, AfterValidator(lambda value: value + 0.0)] = 0.5

@@ -1,8 +1,13 @@
 """Profiles: one YAML file says everything about a robot, its lab and its limits."""
 
-from vla_zenoh.profile.advice import advice
-from vla_zenoh.profile.joint_limits import JointLimits
-from vla_zenoh.profile.limits import REACH_M, REFUSE_FACTOR, ContactLimits, Limits, ReachLimits
+from vla_zenoh.profile.limits import (
+    REACH_M,
+    REJECT_FACTOR,
+    ContactLimits,
+    JointLimits,
+    Limits,
+    ReachLimits,
+)
 from vla_zenoh.profile.load import (
     as_robot,
     load_profile,
@@ -20,7 +25,7 @@ from vla_zenoh.profile.session import SessionProfile
 __all__ = [
     "POSE_JOINTS",
     "REACH_M",
-    "REFUSE_FACTOR",
+    "REJECT_FACTOR",
     "CameraProfile",
     "Composition",
     "ContactLimits",
@@ -34,7 +39,6 @@ __all__ = [
     "RobotProfile",
     "SessionProfile",
     "Timing",
-    "advice",
     "as_robot",
     "load_profile",
     "override",

@@ -8,7 +8,6 @@ from pathlib import Path
 from vla_zenoh import resources
 from vla_zenoh.errors import MissingExtraError, ResourceError, WorkerError
 from vla_zenoh.policy.loader import find_worker
-from vla_zenoh.profile.fit import cameras_of, workers_of
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.robot import POSE_JOINTS
 from vla_zenoh.profile.session import ANYWHERE, address_of, is_loopback
@@ -70,9 +69,9 @@ def _placement(profile: Profile) -> Iterator[str]:
         (
             "cameras",
             tuple(profile.cameras),
-            {c for host in hosts for c in cameras_of(profile, host)},
+            {c for host in hosts for c in profile.cameras_of(host)},
         ),
-        ("workers", profile.workers, {w for host in hosts for w in workers_of(profile, host)}),
+        ("workers", profile.workers, {w for host in hosts for w in profile.workers_of(host)}),
     ):
         from_ros2 = {n for n, c in profile.cameras.items() if c.source.startswith("ros2:")}
         idle = [name for name in known if name not in used and name not in from_ros2]

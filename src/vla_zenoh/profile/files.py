@@ -14,9 +14,7 @@ from pathlib import Path
 
 from vla_zenoh import resources
 from vla_zenoh.errors import ResourceError
-from vla_zenoh.profile.fit import workers_of
-from vla_zenoh.profile.load import SUFFIXES, followed, load_profile
-from vla_zenoh.profile.paths import below, paths_in
+from vla_zenoh.profile.load import SUFFIXES, below, followed, load_profile, paths_in
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.yaml_text import read
 
@@ -39,7 +37,7 @@ class FileUse:
 
 
 @dataclass(frozen=True, slots=True)
-class Needed:
+class NeededFiles:
     """What another computer has to have.
 
     Args:
@@ -59,7 +57,7 @@ class Needed:
     missing: tuple[str, ...]
 
 
-def needed_files(name: str) -> Needed:
+def needed_files(name: str) -> NeededFiles:
     """What has to be copied with the profile called `name`, or at that path.
 
     Raises:
@@ -79,7 +77,7 @@ def _by_name(profile: Profile) -> Iterator[tuple[str, str]]:
     for host in profile.hosts.values():
         if {"sim", "camera"} & set(host.nodes):
             yield "sim", profile.sim.scene
-        for worker in workers_of(profile, host):
+        for worker in profile.workers_of(host):
             model = profile.models.get(worker, worker)
             if not resources.is_path(model):
                 yield "models", model
@@ -150,7 +148,7 @@ class _Found:
         if path.parent != resources.shipped(kind):
             self.add(str(path.parent.parent.absolute()), path.absolute())
 
-    def needed(self, own: Path) -> Needed:
+    def needed(self, own: Path) -> NeededFiles:
         """All of it. What lies outside of the folder that it is looked for in counts as missing."""
         beside = list(self.files.pop(BESIDE))
         base = Path(os.path.commonpath([file.parent for file in beside]))
@@ -158,7 +156,7 @@ class _Found:
         searched = [
             self._part(Path(folder), list(files)) for folder, files in sorted(self.files.items())
         ]
-        return Needed(
+        return NeededFiles(
             str(own.relative_to(base)),
             self._part(base, beside),
             tuple(searched),

@@ -2,16 +2,57 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from vla_zenoh.profile.joint_limits import JointLimits
-from vla_zenoh.profile.section import Range, Section, refuse
+from vla_zenoh.profile.section import Range, Section, reject
+
+
+def _one_for_all(value: Any) -> Any:
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return (value,)
+    return value
+
+
+def _not_empty(values: tuple[float, ...]) -> tuple[float, ...]:
+    if not values:
+        raise ValueError("is empty: give one number for all joints, or one each")
+    return values
+
+
+_PerJoint = (
+    Field(strict=False, max_length=64),
+    BeforeValidator(_one_for_all),
+    AfterValidator(_not_empty),
+)
+Velocity = Annotated[float, Field(gt=0, le=2.61)]
+Acceleration = Annotated[float, Field(gt=0, le=20)]
+Jerk = Annotated[float, Field(gt=0, le=10_000)]
+
+
+class JointLimits(Section):
+    """One number for all joints, or one for each in the order of ``robot.arm_joints``.
+
+    Args:
+        velocity_rad_s: of the commanded motion.
+        acceleration_rad_s2: likewise.
+        jerk_rad_s3: likewise, and of the robot's own stop.
+    """
+
+    velocity_rad_s: Annotated[tuple[Velocity, ...], *_PerJoint] = (1.0875,)
+    acceleration_rad_s2: Annotated[tuple[Acceleration, ...], *_PerJoint] = (2.25,)
+    jerk_rad_s3: Annotated[tuple[Jerk, ...], *_PerJoint] = (187.5,)
+
+    def of(self, name: str, joints: int) -> tuple[float, ...]:
+        """The limit called `name`, one number for each of so many joints."""
+        values: tuple[float, ...] = getattr(self, name)
+        return values * joints if len(values) == 1 else values
+
 
 REACH_M = 3.0
 """No arm that fits a table reaches further: a workspace beyond it is in other units."""
-REFUSE_FACTOR = 4.0
+REJECT_FACTOR = 4.0
 """A step this many times over its limit is a mistake (a wrong unit), not a motion: refused."""
 
 
@@ -74,7 +115,7 @@ class ReachLimits(Section):
 
     @model_validator(mode="after")
     def _a_stop_lies_behind_its_slow(self) -> ReachLimits:
-        refuse(
+        reject(
             [
                 ((stop,), f"is {at:g}, which must not be above {slow} ({before:g})")
                 for slow, before, stop, at in (
@@ -125,7 +166,7 @@ class ContactLimits(Section):
 
     @model_validator(mode="after")
     def _a_stop_lies_above_its_slow(self) -> ContactLimits:
-        refuse(
+        reject(
             [
                 ((slow,), f"is {before}, which must be below {stop} ({at})")
                 for slow, before, stop, at in (
@@ -153,7 +194,7 @@ class Limits(Section):
         step_rad: largest rotation of one model step.
         approach_m_s: an absolute target further away than a step is gone to at this speed.
         approach_rad_s: likewise.
-        out_of_bounds: ``clamp`` shortens to the bound and tells, ``refuse`` drops the whole chunk.
+        out_of_bounds: ``clamp`` shortens to the bound and tells, ``reject`` drops the whole chunk.
         lead_m: leash: the goal may run ahead of the commanded pose by this much.
         lead_rad: likewise.
         tracking_m: leash: commanded minus measured pose; more brakes the arm (it is blocked), and
@@ -182,7 +223,7 @@ class Limits(Section):
 
     @model_validator(mode="after")
     def _a_step_fits_the_leash(self) -> Limits:
-        refuse(
+        reject(
             [
                 ((step,), f"is {value:g}, longer than the leash {lead} ({limit:g})")
                 for step, value, lead, limit in (

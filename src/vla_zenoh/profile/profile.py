@@ -1,18 +1,335 @@
-"""The profile as a whole: its sections fit each other."""
+"""The profile of one robot and its lab, checked as a whole."""
 
 from __future__ import annotations
 
-from pydantic import model_validator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
 
-from vla_zenoh.profile import fit
-from vla_zenoh.profile.schema import ProfileFields
-from vla_zenoh.profile.section import refuse
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+
+from vla_zenoh import keys
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.keys import Keys
+from vla_zenoh.profile.limits import Limits
+from vla_zenoh.profile.robot import ArmProfile, Options, RobotProfile
+from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Gripper, Ros2Profile
+from vla_zenoh.profile.schema import (
+    SIMULATED,
+    CameraProfile,
+    Composition,
+    HostProfile,
+    SimProfile,
+    TaskProfile,
+    Timing,
+)
+from vla_zenoh.profile.section import Fault, Name, Names, Place, Section, Text, Word, reject
+from vla_zenoh.profile.session import (
+    TRUSTED_PROTOCOLS,
+    SessionProfile,
+    endpoint_faults,
+    is_loopback,
+)
+from vla_zenoh.pydantic_errors import nearest
+from vla_zenoh.resources import is_path
+
+ONLY_ONE = {
+    "command": "the robot obeys one command node",
+    "sim": "there is one simulated robot",
+    "ros2": "the robot has one driver",
+    "arm": "the robot has one driver",
+}
 
 
-class Profile(ProfileFields):
-    __doc__ = ProfileFields.__doc__
+def _root(value: str) -> str:
+    try:
+        for part in value.split("/"):
+            keys.chunk(part, "root")
+    except ProfileError as error:
+        raise ValueError(str(error)) from error
+    return value
+
+
+def _no_paths(names: Any) -> Any:
+    for name in names if isinstance(names, (list, tuple)) else ():
+        if isinstance(name, str) and is_path(name):
+            called = Path(name).stem
+            raise ValueError(
+                f"{name!r} is a path: give that model a name, as models: {{{called}: {name}}}, "
+                f"and write {called} here"
+            )
+    return names
+
+
+class Profile(Section):
+    """Everything about one robot and its lab.
+
+    Args:
+        workers: worker names; each is also the name of its model, unless `models` gives another.
+        models: worker -> its model: a path, or the name of another model.
+        serves: worker -> the robots it serves, this one among them and all of the same kind; a
+            worker that is not listed serves this robot only.
+        options: worker -> options of its model as ``--set`` gives them, name -> text.
+        ros2: required for a robot or camera of ROS 2.
+        arm: required for a robot that is driven by a Python file.
+    """
+
+    name: Name
+    about: Text = ""
+    root: Annotated[Word, AfterValidator(_root)] = keys.DEFAULT_ROOT
+    robot: RobotProfile
+    limits: Limits = Limits()
+    timing: Timing = Timing()
+    composition: Composition = Composition()
+    cameras: dict[Name, CameraProfile] = Field(default_factory=dict)
+    sim: SimProfile = SimProfile()
+    workers: Annotated[Names, BeforeValidator(_no_paths)] = ("scripted",)
+    models: dict[Name, Word] = Field(default_factory=dict)
+    serves: dict[Name, Annotated[Names, Field(min_length=1)]] = Field(default_factory=dict)
+    options: dict[Name, Options] = Field(default_factory=dict)
+    task: TaskProfile = TaskProfile()
+    session: SessionProfile = SessionProfile()
+    hosts: dict[Name, HostProfile] = Field(
+        default_factory=lambda: {"here": HostProfile(nodes=SIMULATED)}
+    )
+    ros2: Ros2Profile | None = None
+    arm: ArmProfile | None = None
+
+    @property
+    def keys(self) -> Keys:
+        """The keys of this profile's robot."""
+        return Keys(self.robot.name, self.root)
 
     @model_validator(mode="after")
-    def _parts_fit(self) -> Profile:
-        refuse(fit.faults(self))
+    def _sections_are_consistent(self) -> Profile:
+        reject(
+            [
+                *_robot(self),
+                *_cameras(self),
+                *_ros2(self),
+                *_task(self),
+                *_serves(self),
+                *_unknown(("models",), self.models, "workers", self.workers),
+                *_unknown(("options",), self.options, "workers", self.workers),
+                *_hosts(self),
+            ]
+        )
         return self
+
+    # -- which node runs where ----------------------------------------------------------------
+    def cameras_of(self, host: HostProfile) -> tuple[str, ...]:
+        """Names of the cameras that the camera node of `host` serves."""
+        if "camera" not in host.nodes:
+            return ()
+        return tuple(self.cameras) if host.cameras is None else host.cameras
+
+    def workers_of(self, host: HostProfile) -> tuple[str, ...]:
+        """Names of the workers that run on `host`."""
+        if "worker" not in host.nodes:
+            return ()
+        return self.workers if host.workers is None else host.workers
+
+    def node_name(self, host: str, kind: str) -> str:
+        """Name on the bus of the node of this kind on `host`; unique if several hosts run one."""
+        hosts = [name for name, part in self.hosts.items() if kind in part.nodes]
+        return kind if len(hosts) < 2 else f"{kind}-{host}"
+
+    def camera_servers(self) -> dict[str, str]:
+        """Camera -> name of the node that serves it.
+
+        A camera that no host runs belongs to a ``vla-zenoh camera`` started by hand.
+        """
+        servers = dict.fromkeys(self.cameras, "camera")
+        for host, part in self.hosts.items():
+            for camera in self.cameras_of(part):
+                servers[camera] = self.node_name(host, "camera")
+        from_ros2 = (
+            name for name, camera in self.cameras.items() if camera.source.startswith("ros2:")
+        )
+        return servers | dict.fromkeys(from_ros2, "ros2")
+
+
+# -- checks across sections: (place, sentence) of every fault -------------------------------------
+def _robot(profile: Profile) -> Iterator[Fault]:
+    if profile.robot.driver == "ros2" and profile.ros2 is None:
+        yield ("ros2",), "is missing: robot.driver is ros2"
+    if profile.robot.driver == "arm" and profile.arm is None:
+        yield ("arm",), "is missing: robot.driver is arm. Name the Python file, as arm: {file: ...}"
+    joints = len(profile.robot.arm_joints)
+    for name, values in profile.limits.joint:
+        if len(values) not in (1, joints):
+            yield (
+                ("limits", "joint", name),
+                f"has {len(values)} numbers for {joints} arm_joints: give one for all, or one each",
+            )
+
+
+def _cameras(profile: Profile) -> Iterator[Fault]:
+    for name, camera in profile.cameras.items():
+        place = ("cameras", name, "source")
+        if camera.source.startswith("ros2:") and profile.ros2 is None:
+            yield place, f"is {camera.source!r}, which needs a section ros2"
+        if camera.source.startswith("ros2:") and camera.fit_for_workers:
+            yield ("cameras", name, "fit_for_workers"), "cannot be done for a camera of ROS 2"
+        if camera.source.startswith("sim:") and profile.robot.driver != "sim":
+            yield (
+                place,
+                f"is {camera.source!r}, and robot.driver is {profile.robot.driver}: nothing is "
+                f"simulated. Give another source, or leave an inherited camera out: {name}: null",
+            )
+    if profile.ros2 is not None:
+        yield from _unknown(("ros2", "cameras"), profile.ros2.cameras, "cameras", profile.cameras)
+
+
+def _ros2(profile: Profile) -> Iterator[Fault]:
+    ros2, robot = profile.ros2, profile.robot
+    if ros2 is None:
+        return
+    wanted = f"{robot.command}_command"
+    if robot.driver == "ros2" and getattr(ros2, wanted) is None:
+        yield ("ros2",), f"lacks {wanted}: robot.command is {robot.command}"
+    for name, camera in ros2.cameras.items():
+        source = profile.cameras[name].source if name in profile.cameras else ""
+        if source.startswith("ros2:") and source.removeprefix("ros2:") != camera.topic:
+            yield ("ros2", "cameras", name, "topic"), f"is not that of cameras.{name}: {source!r}"
+    yield from _way_to_ros2(profile)
+    joints = ros2.joint_command
+    if joints is not None and joints.type not in JOINT_COMMANDS:
+        wanted = " or ".join(JOINT_COMMANDS)
+        yield ("ros2", "joint_command", "type"), f"is {joints.type}: joints are sent as {wanted}"
+    gripper = ros2.gripper
+    if gripper is not None and gripper.grasp and gripper.type != "franka_msgs/action/Move":
+        yield ("ros2", "gripper", "grasp"), "goes with type franka_msgs/action/Move only"
+    if gripper is not None:
+        yield from _gripper_position(gripper, robot.gripper.joint_ends is not None)
+
+
+def _gripper_position(gripper: Ros2Gripper, has_ends: bool) -> Iterator[Fault]:
+    """A number that the gripper takes for another one opens it where it should close."""
+    place = ("ros2", "gripper", "position")
+    ends = "joint_open_rad and joint_shut_rad (_m where it slides) in robot.gripper"
+    if gripper.says_width and gripper.position is not None:
+        yield place, f"is not for {gripper.type}, which takes the width"
+    elif gripper.position == "joint" and not has_ends:
+        yield place, f"is joint, which needs {ends}"
+    elif not (gripper.says_width or gripper.position or has_ends):
+        yield (
+            place,
+            f"is missing: does the driver take the m between the fingers (width), those of one "
+            f"finger (finger), or what its joint goes by (joint, with {ends})?",
+        )
+
+
+def _way_to_ros2(profile: Profile) -> Iterator[Fault]:
+    """Whoever speaks to the bridge moves the robot past our command node."""
+    assert profile.ros2 is not None
+    places, secured = profile.ros2.connect, profile.session.security is not None
+    used = any("ros2" in host.nodes for host in profile.hosts.values())
+    if places is None and secured and used:
+        yield (
+            ("ros2", "connect"),
+            "is missing: in a secured lab the bridge has a router of its own. On the computer that "
+            "runs the node ros2: connect: [tcp/127.0.0.1:7450]; on another one, where it takes "
+            "this lab's certificates: connect: [tls/ADDRESS:7450]",
+        )
+    trusted = [endpoint.partition("/")[0] in TRUSTED_PROTOCOLS for endpoint in places or ()]
+    for index, endpoint in enumerate(places or ()):
+        why = ""
+        if trusted[index] and not secured:
+            why = "needs certificates: make them with `vla-zenoh secure init`"
+        elif secured and not trusted[index] and (any(trusted) or not is_loopback(endpoint)):
+            why = "lets everybody on the way command the robot: write tls/, or tcp/127.0.0.1:7450"
+        if why:
+            yield ("ros2", "connect", str(index)), why
+
+
+def _task(profile: Profile) -> Iterator[Fault]:
+    if profile.task.worker not in profile.workers:
+        yield (
+            ("task", "worker"),
+            f"{profile.task.worker!r} is not among workers"
+            f"{nearest(profile.task.worker, profile.workers)} "
+            f"Known: {', '.join(profile.workers) or 'none'}",
+        )
+
+
+def _serves(profile: Profile) -> Iterator[Fault]:
+    yield from _unknown(("serves",), profile.serves, "workers", profile.workers)
+    for worker, robots in profile.serves.items():
+        if profile.robot.name not in robots:
+            yield (
+                ("serves", worker),
+                f"lacks {profile.robot.name}, the robot of this profile: name all that the worker "
+                "serves, or leave it out",
+            )
+
+
+def _hosts(profile: Profile) -> Iterator[Fault]:
+    if not profile.hosts:
+        yield ("hosts",), "is empty: name at least one host and its nodes"
+    runs: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for name, host in profile.hosts.items():
+        place = ("hosts", name)
+        yield from _unknown((*place, "cameras"), host.cameras or (), "cameras", profile.cameras)
+        yield from _unknown((*place, "workers"), host.workers or (), "workers", profile.workers)
+        for kind in ("sim", "arm"):
+            if kind in host.nodes and profile.robot.driver != kind:
+                yield (*place, "nodes"), f"has {kind}, and robot.driver is {profile.robot.driver}"
+        if "ros2" in host.nodes and profile.ros2 is None:
+            yield (*place, "nodes"), "has ros2, which needs a section ros2"
+        if host.pictures is not None and not profile.workers_of(host):
+            yield (*place, "pictures"), "is for workers, and this host runs none"
+        elif host.pictures is not None and "camera" in host.nodes:
+            yield (*place, "pictures"), "is for cameras elsewhere, and this host has its own"
+        for kind in host.nodes:
+            if kind in ONLY_ONE:
+                runs["nodes", kind].append(name)
+        for camera in profile.cameras_of(host):
+            runs["cameras", camera].append(name)
+        for worker in profile.workers_of(host):
+            runs["workers", worker].append(name)
+        yield from _endpoints(profile, name, host)
+    yield from _routers(profile)
+    for (what, name), hosts in runs.items():
+        if len(hosts) > 1:
+            why = ONLY_ONE.get(name) if what == "nodes" else "each key has one writer"
+            hint = "" if what == "nodes" else f". Say on each host which {what} it runs"
+            yield (
+                ("hosts", hosts[-1], what),
+                f"{name} runs on {' and '.join(hosts)}: {why}{hint}",
+            )
+
+
+def _endpoints(profile: Profile, name: str, host: HostProfile) -> Iterator[Fault]:
+    for what in ("connect", "listen", "link"):
+        endpoints = getattr(host, what)
+        for index, why in endpoint_faults(
+            endpoints or (), profile.session, listen=what == "listen"
+        ):
+            yield ("hosts", name, what, str(index)), why
+        if endpoints is not None and what != "connect" and "router" not in host.nodes:
+            yield ("hosts", name, what), "is for a router, and this host runs none"
+
+
+def _routers(profile: Profile) -> Iterator[Fault]:
+    """Every router but one has to be told of another: they do not find each other."""
+    alone = [n for n, host in profile.hosts.items() if "router" in host.nodes and not host.link]
+    for name in alone[1:]:
+        yield (
+            ("hosts", name, "link"),
+            f"is missing: routers do not find each other, and {alone[0]} runs one as well. Name "
+            "its address, as link: [tcp/10.0.0.2:7447]",
+        )
+
+
+def _unknown(
+    place: Place, named: Iterable[str], what: str, known: Iterable[str]
+) -> Iterator[Fault]:
+    for name in named:
+        if name not in known:
+            yield (
+                place,
+                f"{name!r} is not among {what}{nearest(name, known)} "
+                f"Known: {', '.join(known) or 'none'}",
+            )

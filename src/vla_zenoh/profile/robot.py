@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from vla_zenoh.profile.section import Name, Section, Word, Words, refuse
+from vla_zenoh.profile.section import Name, Section, Text, Word, Words, reject
 
 POSE_JOINTS = 6
 """So many joints, at least, has an arm whose TCP can take any pose around it."""
@@ -76,7 +76,7 @@ class GripperProfile(Section):
         if all(any(value is not None for _, value in pair) for pair in (turning, sliding)):
             why = "is for a joint that slides, joint_open_rad for one that turns: give one of them"
             faults.append((("joint_open_m",), why))
-        refuse(faults)
+        reject(faults)
         return self
 
 
@@ -132,5 +132,27 @@ class RobotProfile(Section):
                 f"must be less than max_width_m ({self.gripper.max_width_m:g}): nothing would move"
             )
             faults.append((("gripper", "dead_band_m"), why))
-        refuse(faults)
+        reject(faults)
         return self
+
+
+def _option(value: str) -> str:
+    if not value.isidentifier():
+        raise ValueError(f"{value[:80]!r} cannot be the name of an option")
+    return value
+
+
+Options = dict[Annotated[str, AfterValidator(_option)], Text]
+"""Given by name, as text, to the constructor of a class in a file."""
+
+
+class ArmProfile(Section):
+    """A robot that is moved by a class of one's own, see `vla_zenoh.robot`.
+
+    Args:
+        file: the Python file.
+        options: for its constructor.
+    """
+
+    file: Word
+    options: Options = Field(default_factory=dict)

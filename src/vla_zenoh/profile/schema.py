@@ -5,18 +5,10 @@ Defaults are the safe choice, so a profile that says nothing about limits has li
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from vla_zenoh import keys
-from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import Keys
-from vla_zenoh.profile.arm import ArmProfile, Options
-from vla_zenoh.profile.limits import Limits
-from vla_zenoh.profile.robot import RobotProfile
-from vla_zenoh.profile.ros2 import Ros2Profile
 from vla_zenoh.profile.section import (
     Distinct,
     Name,
@@ -24,10 +16,9 @@ from vla_zenoh.profile.section import (
     Section,
     Text,
     Word,
-    refuse,
+    reject,
 )
-from vla_zenoh.profile.session import Endpoints, SessionProfile
-from vla_zenoh.resources import is_path
+from vla_zenoh.profile.session import Endpoints
 
 NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker"]
 NODE_KINDS: tuple[NodeKind, ...] = (
@@ -52,26 +43,6 @@ def _source(value: str) -> str:
     if kind in ("rtsp", "rtsps") and not rest.removeprefix("//"):
         raise ValueError(f"{value!r} lacks the host: write rtsp://HOST/PATH")
     return value
-
-
-def _root(value: str) -> str:
-    try:
-        for part in value.split("/"):
-            keys.chunk(part, "root")
-    except ProfileError as error:
-        raise ValueError(str(error)) from error
-    return value
-
-
-def _no_paths(names: Any) -> Any:
-    for name in names if isinstance(names, (list, tuple)) else ():
-        if isinstance(name, str) and is_path(name):
-            called = Path(name).stem
-            raise ValueError(
-                f"{name!r} is a path: give that model a name, as models: {{{called}: {name}}}, "
-                f"and write {called} here"
-            )
-    return names
 
 
 class Timing(Section):
@@ -104,7 +75,7 @@ class Timing(Section):
 
     @model_validator(mode="after")
     def _patience_outlasts_the_rate(self) -> Timing:
-        refuse(
+        reject(
             [
                 ((name,), f"is {wait_s:g}, less than {MIN_PERIODS} periods of {rate} ({rate_hz:g})")
                 for name, wait_s, rate, rate_hz in (
@@ -234,7 +205,7 @@ class TaskProfile(Section):
     speed_percent: float = Field(default=100.0, ge=0, le=100)
 
 
-class PicturesProfile(Section):
+class HostImagesProfile(Section):
     """What of every camera travels to the workers of a host that has no cameras.
 
     Args:
@@ -270,44 +241,4 @@ class HostProfile(Section):
     link: Endpoints | None = None
     cameras: Names | None = None
     workers: Names | None = None
-    pictures: PicturesProfile | None = None
-
-
-class ProfileFields(Section):
-    """Everything about one robot and its lab; not yet checked as a whole, see `Profile`.
-
-    Args:
-        workers: their names; each is that of a model, unless `models` says which one it runs.
-        models: worker -> its model: a path, or the name of another one.
-        serves: worker -> the robots it serves, this one among them, all like this one; a worker
-            that is not named here serves this one alone.
-        options: worker -> what ``--set`` would give it, name -> text.
-        ros2: needed by a robot or camera of ROS 2.
-        arm: needed by a robot that a Python file moves.
-    """
-
-    name: Name
-    about: Text = ""
-    root: Annotated[Word, AfterValidator(_root)] = keys.DEFAULT_ROOT
-    robot: RobotProfile
-    limits: Limits = Limits()
-    timing: Timing = Timing()
-    composition: Composition = Composition()
-    cameras: dict[Name, CameraProfile] = Field(default_factory=dict)
-    sim: SimProfile = SimProfile()
-    workers: Annotated[Names, BeforeValidator(_no_paths)] = ("scripted",)
-    models: dict[Name, Word] = Field(default_factory=dict)
-    serves: dict[Name, Annotated[Names, Field(min_length=1)]] = Field(default_factory=dict)
-    options: dict[Name, Options] = Field(default_factory=dict)
-    task: TaskProfile = TaskProfile()
-    session: SessionProfile = SessionProfile()
-    hosts: dict[Name, HostProfile] = Field(
-        default_factory=lambda: {"here": HostProfile(nodes=SIMULATED)}
-    )
-    ros2: Ros2Profile | None = None
-    arm: ArmProfile | None = None
-
-    @property
-    def keys(self) -> Keys:
-        """The keys of this profile's robot."""
-        return Keys(self.robot.name, self.root)
+    pictures: HostImagesProfile | None = None

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import types
+import typing
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.types import MAX_TEXT
+from vla_zenoh.pydantic_errors import in_words, nearest
+from vla_zenoh.types import MAX_TEXT, shown
 
 Place = tuple[str, ...]
+"""Keys from the top of the profile down to a value."""
+Fault = tuple[Place, str]
+"""Where something is wrong, and a sentence that continues ``PLACE: ``."""
+Lines = dict[Place, str]
+"""Place -> ``file:line``."""
 
 
 class Section(BaseModel):
@@ -23,22 +31,22 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
 
-class Misfit(ValueError):
+class InconsistentSections(ValueError):
     """Values that are right each for itself and do not fit each other.
 
     Args:
         faults: (place below the section that raises this, sentence).
     """
 
-    def __init__(self, faults: Sequence[tuple[Place, str]]) -> None:
+    def __init__(self, faults: Sequence[Fault]) -> None:
         self.faults = tuple(faults)
         super().__init__("; ".join(f"{'.'.join(place)} {why}" for place, why in faults))
 
 
-def refuse(faults: Sequence[tuple[Place, str]]) -> None:
-    """Raise `Misfit` where there are faults."""
+def reject(faults: Sequence[Fault]) -> None:
+    """Raise `InconsistentSections` where there are faults."""
     if faults:
-        raise Misfit(faults)
+        raise InconsistentSections(faults)
 
 
 def _key_part(value: str) -> str:
@@ -68,3 +76,66 @@ Names = Annotated[tuple[Name, ...], Field(strict=False, max_length=64), AfterVal
 Words = Annotated[tuple[Word, ...], Field(strict=False, max_length=64), AfterValidator(_differ)]
 Range = Annotated[tuple[float, float], Field(strict=False), AfterValidator(_ordered)]
 Distinct = AfterValidator(_differ)
+
+
+_NO_VALUE_SHOWN = {"missing", "extra_forbidden", "too_long", "too_short", "value_error"}
+
+
+def explain(error: ValidationError, lines: Lines, model: type[Section]) -> list[str]:
+    """One line for each fault."""
+    said: list[str] = []
+    for fault in error.errors(include_url=False):
+        place = tuple(str(part) for part in fault["loc"] if part != "[key]")
+        cause = fault.get("ctx", {}).get("error")
+        if isinstance(cause, InconsistentSections):
+            said += [_line((*place, *below), why, lines) for below, why in cause.faults]
+        else:
+            said.append(_line(place, _why(fault, place, model), lines))
+    return said
+
+
+def _line(place: Place, why: str, lines: Lines) -> str:
+    known = place
+    while known not in lines and known:
+        known = known[:-1]
+    name = ".".join(place) or "the profile"
+    where = lines.get(known)
+    return f"{where}: {name}: {why}" if where else f"{name}: {why}"
+
+
+def _why(fault: Any, place: Place, model: type[Section]) -> str:
+    words, given = in_words(fault), fault.get("input")
+    if fault["type"] == "extra_forbidden":
+        allowed = field_names(model, place[:-1])
+        return f"unknown key{nearest(place[-1], allowed)} Known here: {', '.join(allowed)}"
+    if fault["type"] == "missing" and place == ("robot",):
+        return "is missing: describe the robot, or begin with another profile: extends: NAME"
+    if fault["type"] == "missing" and place[-1].isdigit():
+        return "is missing: the list is too short"
+    if fault["type"] in ("dict_type", "model_type"):
+        names = field_names(model, place)
+        words = f"wants a map of: {', '.join(names)}" if names else words
+    if fault["type"] == "string_type" and isinstance(given, (bool, int, float)):
+        words = "wants text; put it in quotes"
+    if fault["type"] in _NO_VALUE_SHOWN or isinstance(given, (dict, BaseModel)):
+        return words
+    return f"{words} (given: {shown(given)})"
+
+
+def field_names(model: Any, place: Place) -> list[str]:
+    """What the section at `place` may hold; empty where that is free or not a section."""
+    for part in place:
+        if _is_section(model):
+            field = model.model_fields.get(part)
+            model = field.annotation if field else None
+        elif typing.get_origin(model) is dict:
+            model = typing.get_args(model)[1]
+        else:
+            model = None
+        if typing.get_origin(model) in (typing.Union, types.UnionType):
+            model = next((arg for arg in typing.get_args(model) if _is_section(arg)), None)
+    return sorted(model.model_fields) if _is_section(model) else []
+
+
+def _is_section(model: Any) -> bool:
+    return isinstance(model, type) and issubclass(model, BaseModel)

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from vla_zenoh.profile.section import Distinct, Name, Section, Word, refuse
+from vla_zenoh.profile.section import Distinct, Name, Section, Word, reject
 from vla_zenoh.pydantic_errors import nearest
 
 IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
@@ -184,5 +184,5 @@ class SessionProfile(Section):
             ]
         if self.security is not None and self.insecure:
             faults.append((("insecure",), "is true, beside a section security: leave one out"))
-        refuse(faults)
+        reject(faults)
         return self

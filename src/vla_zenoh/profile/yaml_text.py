@@ -12,15 +12,13 @@ from typing import Any
 import yaml
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.profile.section import Place
+from vla_zenoh.profile.section import Lines, Place
 from vla_zenoh.types import shown
 
 MAX_PROFILE_BYTES = 100_000
 MAX_NODES = 5_000
 """What a file may hold once its aliases are followed."""
 MAX_DEPTH = 32
-
-Lines = dict[Place, str]
 
 _PREFIX = "tag:yaml.org,2002:"
 _SCALARS = {

@@ -20,7 +20,6 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import NodeError, ProfileError, SessionError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
-from vla_zenoh.profile.fit import node_name, workers_of
 from vla_zenoh.runtime.certificate_expiry import Expiry
 from vla_zenoh.runtime.hang_detection import LastStatus, hanging
 from vla_zenoh.runtime.supervisor import NodeCommand, Supervisor
@@ -93,9 +92,9 @@ def node_commands(
     common = ("--profile", str(profile_file))
     commands: list[NodeCommand] = []
     for kind in sorted(part.nodes, key=START_ORDER.index):
-        name = node_name(profile, host, kind)
+        name = profile.node_name(host, kind)
         if kind == "worker":
-            for worker in workers_of(profile, part):
+            for worker in profile.workers_of(part):
                 arguments = ["worker", worker, *common, "--host", host, *worker_arguments]
                 for option in (worker_options or {}).get(worker, ()):
                     arguments += ["--set", option]

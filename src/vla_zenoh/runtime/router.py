@@ -16,7 +16,6 @@ from vla_zenoh.bus.session import config, open_session
 from vla_zenoh.bus.tcp_user_timeout import TcpUserTimeout
 from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.fit import node_name
 from vla_zenoh.profile.session import is_loopback
 from vla_zenoh.runtime.certificate_expiry import Expiry
 from vla_zenoh.security.rules import access_control
@@ -134,7 +133,7 @@ def _placed(profile: Profile, host: str | None) -> tuple[Profile, str, tuple[str
     if part.listen is not None:
         session = profile.session.model_copy(update={"listen": part.listen})
         profile = profile.model_copy(update={"session": session})
-    return profile, node_name(profile, host, "router"), part.link or ()
+    return profile, profile.node_name(host, "router"), part.link or ()
 
 
 def _access(profile: Profile, also: Sequence[Profile]) -> Mapping[str, Any] | None:

@@ -11,7 +11,6 @@ from enum import Enum
 from vla_zenoh.errors import ProfileError, SecurityError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.fit import cameras_of, node_name, workers_of
 
 
 class Role(Enum):
@@ -142,14 +141,14 @@ def _nodes(profile: Profile, host: str) -> list[Identity]:
         if role is Role.WORKER:
             found += [
                 Identity(role, worker_node(worker), host, worker=worker)
-                for worker in workers_of(profile, part)
+                for worker in profile.workers_of(part)
             ]
             continue
         cameras = {
-            Role.CAMERA: tuple(c for c in cameras_of(profile, part) if c not in from_ros2),
+            Role.CAMERA: tuple(c for c in profile.cameras_of(part) if c not in from_ros2),
             Role.ROBOT: from_ros2 if kind == "ros2" else (),
         }
-        name = node_name(profile, host, kind)
+        name = profile.node_name(host, kind)
         offers = kind == "ros2" and profile.ros2 is not None and profile.ros2.services is not None
         people = (Role.OPERATOR,) if offers else ()
         found.append(Identity(role, name, host, cameras=cameras.get(role, ()), speaks_for=people))

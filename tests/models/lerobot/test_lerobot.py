@@ -32,7 +32,7 @@ pytestmark = pytest.mark.models
 
 ATOL = 1e-6
 """Metres and radians, of float32."""
-MEANING = {
+ACTION_OPTIONS = {
     "action": "delta",
     "rotation": "rpy",
     "gripper": "open_fraction",
@@ -56,7 +56,7 @@ def folder(whole: Path, tmp_path: Path) -> Path:
 
 
 def make(folder: Path, **options: str) -> Any:
-    given = {"checkpoint": str(folder), "device": "cpu", **MEANING, **options}
+    given = {"checkpoint": str(folder), "device": "cpu", **ACTION_OPTIONS, **options}
     return make_policy(find_model("lerobot"), given)
 
 

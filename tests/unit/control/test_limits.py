@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from vla_zenoh.control.limits import bound_step, into_workspace, leash
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, norm3
-from vla_zenoh.profile import REFUSE_FACTOR, Limits
+from vla_zenoh.profile import REJECT_FACTOR, Limits
 
 LIMITS = Limits()
 RTOL = 1e-5  # steps travel as float32
@@ -61,7 +61,7 @@ def test_a_step_of_exactly_the_limit_in_float32_is_within_it() -> None:
     assert hits == []
 
 
-@pytest.mark.parametrize("factor", [REFUSE_FACTOR * 1.01, 1e3, 1e30, np.inf, np.nan])
+@pytest.mark.parametrize("factor", [REJECT_FACTOR * 1.01, 1e3, 1e30, np.inf, np.nan])
 def test_a_step_many_times_its_limit_is_fatal(factor: float) -> None:
     way = np.array([0.0, 0.0, LIMITS.step_m * factor])
     _, hits = bound_step(LIMITS, BEFORE, Pose(BEFORE.position_m + way, BEFORE.rotation))

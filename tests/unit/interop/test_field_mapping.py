@@ -14,7 +14,7 @@ from vla_zenoh.interop import groot, openpi, options, origami
 from vla_zenoh.interop.backoff import FIRST_S, LONGEST_S, Backoff
 from vla_zenoh.interop.field_mapping import FieldMapping
 from vla_zenoh.interop.joints import make_forward
-from vla_zenoh.interop.options import DEFAULTS, read_columns, read_layout
+from vla_zenoh.interop.options import DEFAULTS, read_columns, read_field_mapping
 from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, ORIGAMI, Presets
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
 from vla_zenoh.policy import Observation, example_observation
@@ -37,7 +37,7 @@ ALL: dict[str, tuple[Presets, str]] = {
 
 
 def layout(presets: Presets = OPENPI, /, preset: str = "libero", **options: str) -> FieldMapping:
-    return read_layout("x", presets, preset, options, max_width_m=WIDTH_M)
+    return read_field_mapping("x", presets, preset, options, max_width_m=WIDTH_M)
 
 
 def seen(of: FieldMapping, rotvec: Any = (0.1, -0.2, 0.3), width_m: float = 0.06) -> Observation:

@@ -15,11 +15,22 @@ from panda_arm import ARM_JOINTS, HOME_RAD, panda
 from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.arm_guard import Measured
 from vla_zenoh.guard.held_reference import MOVED_M, MOVED_RAD, SETTLE_NS, HeldReference
-from vla_zenoh.interop.joint_reading import BEYOND, RESTARTED_NS, JointReading, Newness, pose_state
-from vla_zenoh.interop.ros2.frames import FURTHEST_M, MAX_CHAIN, MAX_FRAMES, Frames
-from vla_zenoh.interop.ros2.goals import GoalKeeper, Step
+from vla_zenoh.interop.joint_reading import (
+    BEYOND,
+    RESTARTED_NS,
+    JointReading,
+    StampFilter,
+    pose_state,
+)
+from vla_zenoh.interop.ros2.action_goals import GoalSequencer, GoalStep
 from vla_zenoh.interop.ros2.robot_clock import RobotClock
 from vla_zenoh.interop.ros2.samples import Joints, Transform
+from vla_zenoh.interop.ros2.transform_buffer import (
+    FURTHEST_M,
+    MAX_CHAIN,
+    MAX_FRAMES,
+    TransformBuffer,
+)
 from vla_zenoh.kinematics.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperCommand
@@ -170,7 +181,7 @@ def test_the_twist_of_the_tcp_follows_the_joints(arm: JointReading) -> None:
 
 
 def test_a_stamp_that_stands_still_is_a_frozen_robot() -> None:
-    newness = Newness()
+    newness = StampFilter()
     newness.check(1000 * MS)
     assert reason(newness.check, 1000 * MS) == "frozen"
     assert reason(newness.check, 999 * MS) == "out_of_order"
@@ -205,7 +216,7 @@ def transform(
 
 
 def test_a_chain_of_frames_is_followed_up_and_dated_by_its_oldest() -> None:
-    frames = Frames()
+    frames = TransformBuffer()
     half_turn = (0, 0, math.pi)
     frames.take([transform("base", "arm", 7, turn=half_turn), transform("arm", "hand", 5)],
                 static=False)  # fmt: skip
@@ -219,7 +230,7 @@ def test_a_chain_of_frames_is_followed_up_and_dated_by_its_oldest() -> None:
 
 
 def test_frames_that_are_not_connected_are_not_found() -> None:
-    frames = Frames()
+    frames = TransformBuffer()
     frames.take([transform("base", "arm"), transform("a", "b"), transform("b", "a")], static=False)
     assert frames.find("base", "tcp") is None
     assert frames.find("base", "a") is None
@@ -227,7 +238,7 @@ def test_frames_that_are_not_connected_are_not_found() -> None:
 
 
 def test_an_older_transform_does_not_replace_a_newer_one() -> None:
-    frames = Frames()
+    frames = TransformBuffer()
     frames.take([transform("base", "tcp", 9)], static=False)
     frames.take([transform("base", "tcp", 8, shift=(5, 0, 0))], static=False)
     found = frames.find("base", "tcp")
@@ -236,7 +247,7 @@ def test_an_older_transform_does_not_replace_a_newer_one() -> None:
 
 
 def test_a_transform_that_is_older_by_far_is_of_a_clock_that_was_set() -> None:
-    frames = Frames()
+    frames = TransformBuffer()
     now_ns = 10**18
     frames.take([transform("base", "tcp", now_ns)], static=False)
     before_ns = now_ns - RESTARTED_NS
@@ -253,7 +264,7 @@ def test_a_transform_that_is_older_by_far_is_of_a_clock_that_was_set() -> None:
 
 
 def test_transforms_that_are_none_and_floods_of_frames_are_refused() -> None:
-    frames = Frames()
+    frames = TransformBuffer()
     bad = transform("base", "tcp")
     for entry in (
         bad._replace(quat_xyzw=np.zeros(4)),
@@ -269,7 +280,7 @@ def test_transforms_that_are_none_and_floods_of_frames_are_refused() -> None:
 
 
 def test_the_longest_chain_of_the_furthest_frames_is_finite() -> None:
-    frames = Frames()
+    frames = TransformBuffer()
     turned = (0.3, 0.2, 0.1)
     frames.take(
         [
@@ -310,36 +321,36 @@ def wish(width_m: float) -> GripperCommand:
 
 
 def test_a_newer_wish_cancels_and_is_sent_when_the_goal_has_ended() -> None:
-    keeper = GoalKeeper(5.0, STROKE_M)
+    keeper = GoalSequencer(5.0, STROKE_M)
     keeper.want(wish(0.0))
-    assert keeper.step(0) is Step.SEND
+    assert keeper.step(0) is GoalStep.SEND
     keeper.want(wish(0.02))
     keeper.want(wish(0.08))
     assert keeper.step(1) is None, "nothing is cancelled that was not accepted"
     goal = keeper.goal
     assert goal is not None
     keeper.accepted(goal.number, 2)
-    assert keeper.step(3) is Step.CANCEL
+    assert keeper.step(3) is GoalStep.CANCEL
     assert keeper.step(4) is None, "and that once"
     assert keeper.ended(goal.number)
-    assert keeper.step(5) is Step.SEND
+    assert keeper.step(5) is GoalStep.SEND
     assert keeper.goal is not None
     assert keeper.goal.command.width_m == 0.08, "the newest wins"
 
 
 def test_a_goal_of_which_nothing_is_heard_is_given_up() -> None:
-    keeper = GoalKeeper(1.0, STROKE_M)
+    keeper = GoalSequencer(1.0, STROKE_M)
     keeper.want(wish(0.0))
     keeper.step(0)
     keeper.want(wish(0.05))
     assert keeper.step(900 * MS) is None
-    assert keeper.step(1001 * MS) is Step.SEND
+    assert keeper.step(1001 * MS) is GoalStep.SEND
     assert keeper.timeouts == 1
     assert not keeper.ended(1), "what is heard of it later is not heard"
 
 
 def test_slow_fingers_have_the_time_they_need_and_who_is_silent_has_not() -> None:
-    keeper = GoalKeeper(1.0, STROKE_M)
+    keeper = GoalSequencer(1.0, STROKE_M)
     keeper.want(GripperCommand(0.0, 0.01, 10.0))
     keeper.step(0)
     assert keeper.goal is not None
@@ -353,12 +364,12 @@ def test_slow_fingers_have_the_time_they_need_and_who_is_silent_has_not() -> Non
     assert keeper.goal is not None
     keeper.accepted(keeper.goal.number, 10_000 * MS)
     keeper.want(wish(0.08))
-    assert keeper.step(10_000 * MS) is Step.CANCEL
-    assert keeper.step(11_001 * MS) is Step.SEND, "a cancelled one ends at once"
+    assert keeper.step(10_000 * MS) is GoalStep.CANCEL
+    assert keeper.step(11_001 * MS) is GoalStep.SEND, "a cancelled one ends at once"
 
 
 def test_a_wish_that_is_forgotten_is_not_sent_and_the_goal_in_flight_goes_on() -> None:
-    keeper = GoalKeeper(1.0, STROKE_M)
+    keeper = GoalSequencer(1.0, STROKE_M)
     keeper.want(wish(0.0))
     keeper.step(0)
     keeper.want(wish(0.08))
@@ -374,14 +385,14 @@ def test_a_wish_that_is_forgotten_is_not_sent_and_the_goal_in_flight_goes_on() -
 
 @given(st.lists(st.sampled_from(["want", "accept", "end", "step", "late end"]), max_size=60))
 def test_there_are_never_two_goals_and_the_last_wish_is_never_lost(steps: list[str]) -> None:
-    keeper = GoalKeeper(1e6, STROKE_M)
+    keeper = GoalSequencer(1e6, STROKE_M)
     running: set[int] = set()
     sent: list[float] = []
     wishes: list[float] = []
     now_ns = 0
 
     def step() -> None:
-        if keeper.step(now_ns) is Step.SEND:
+        if keeper.step(now_ns) is GoalStep.SEND:
             assert keeper.goal is not None
             assert not running
             running.add(keeper.goal.number)

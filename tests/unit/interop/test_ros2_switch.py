@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.interop.ros2.switch import QUIET_S, Switch
+from vla_zenoh.interop.ros2.activation_filter import QUIET_S, ActivationFilter
 
 SECOND_NS = 1_000_000_000
 QUIET_NS = int(QUIET_S * SECOND_NS)
@@ -17,7 +17,7 @@ class Topic:
     """A topic, listened to since time 0, and a clock."""
 
     def __init__(self) -> None:
-        self.switch, self.now_ns = Switch(0), 0
+        self.switch, self.now_ns = ActivationFilter(0), 0
 
     def say(self, word: bool, after_ns: int) -> bool:
         self.now_ns += after_ns

@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 
 from vla_zenoh.errors import PeerError
 from vla_zenoh.interop import groot, npy, openpi, openvla_rest, origami
-from vla_zenoh.interop.options import read_layout
+from vla_zenoh.interop.options import read_field_mapping
 from vla_zenoh.interop.presets import GROOT, OPENPI
 from vla_zenoh.policy import ActionSpec
 
@@ -142,8 +142,8 @@ ANSWERS: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
 }
 
 
-LAYOUT = read_layout("x", OPENPI, "libero", {"keys": "actions"}, max_width_m=0.08)
-NAMED = read_layout("x", GROOT, "libero", {"keys": "x"}, max_width_m=0.08)
+LAYOUT = read_field_mapping("x", OPENPI, "libero", {"keys": "actions"}, max_width_m=0.08)
+NAMED = read_field_mapping("x", GROOT, "libero", {"keys": "x"}, max_width_m=0.08)
 MAX_MESSAGE = 1500
 
 

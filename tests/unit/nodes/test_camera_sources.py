@@ -17,11 +17,12 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes.camera import v4l2
-from vla_zenoh.nodes.camera.choose_source import choose_cameras, make_source
-from vla_zenoh.nodes.camera.file import FileSource, natural, open_reel
-from vla_zenoh.nodes.camera.frame import fit, to_rgb
-from vla_zenoh.nodes.camera.rate_limiter import EARLY, LATE, Pace
-from vla_zenoh.nodes.camera.rtsp import RtspSource, without_password
+from vla_zenoh.nodes.camera.camera_publisher import resize, to_rgb
+from vla_zenoh.nodes.camera.file import FileSource, natural, open_frames
+from vla_zenoh.nodes.camera.fitted_streams import EARLY, LATE, RateLimiter
+from vla_zenoh.nodes.camera.grabber import choose_cameras, make_source
+from vla_zenoh.nodes.camera.rtsp import RtspSource
+from vla_zenoh.nodes.camera.source import without_password
 from vla_zenoh.nodes.camera.v4l2 import V4l2Source, captured_ns
 from vla_zenoh.profile import load_profile
 from vla_zenoh.profile.schema import CameraProfile
@@ -32,7 +33,7 @@ PACE_TOLERANCE_S = 0.03
 RED_BGR, RED_RGB = (10, 60, 240), (240, 60, 10)
 
 
-def passed(pace: Pace, times_ns: list[int]) -> list[int]:
+def passed(pace: RateLimiter, times_ns: list[int]) -> list[int]:
     return [now_ns for now_ns in times_ns if pace.due(now_ns)]
 
 
@@ -42,18 +43,18 @@ def test_a_pace_lets_a_steady_source_through_up_to_its_rate(
     source_hz: int, expected_hz: int
 ) -> None:
     times = [i * SECOND_NS // source_hz for i in range(10 * source_hz)]
-    assert len(passed(Pace(30.0), times)) == pytest.approx(10 * expected_hz, abs=1)
+    assert len(passed(RateLimiter(30.0), times)) == pytest.approx(10 * expected_hz, abs=1)
 
 
 def test_every_other_picture_of_a_source_of_nearly_twice_the_rate_goes_out() -> None:
     """The simulator's scene comes every 17 ms; 30 Hz of it has to be even."""
-    out = passed(Pace(30.0), [i * 17_000_000 for i in range(1000)])
+    out = passed(RateLimiter(30.0), [i * 17_000_000 for i in range(1000)])
     assert set(np.diff(out).tolist()) == {34_000_000}
 
 
 @given(st.lists(st.integers(0, 200_000_000), min_size=2, max_size=200))
 def test_two_pictures_never_follow_closer_than_the_pace_allows(gaps_ns: list[int]) -> None:
-    out = passed(Pace(20.0), np.cumsum(gaps_ns).tolist())
+    out = passed(RateLimiter(20.0), np.cumsum(gaps_ns).tolist())
     closest_ns = (1 - EARLY - LATE) * SECOND_NS / 20
     assert all(gap >= closest_ns - 1 for gap in np.diff(out))
 
@@ -61,20 +62,20 @@ def test_two_pictures_never_follow_closer_than_the_pace_allows(gaps_ns: list[int
 @given(st.lists(st.integers(0, 200_000_000), min_size=2, max_size=200))
 def test_the_rate_is_a_maximum_over_any_stretch_of_time(gaps_ns: list[int]) -> None:
     times = np.cumsum(gaps_ns).tolist()
-    out = passed(Pace(20.0), times)
+    out = passed(RateLimiter(20.0), times)
     allowed = (times[-1] - times[0]) / SECOND_NS * 20 + 1 + EARLY + LATE
     assert len(out) <= allowed
 
 
 def test_after_a_stall_there_is_no_burst() -> None:
-    pace = Pace(10.0)
+    pace = RateLimiter(10.0)
     assert pace.due(0)
     backlog = [5 * SECOND_NS + i * 1_000_000 for i in range(20)]
     assert passed(pace, backlog) == backlog[:1]
 
 
 def test_a_clock_that_was_set_back_does_not_silence_the_camera() -> None:
-    pace = Pace(30.0)
+    pace = RateLimiter(30.0)
     assert pace.due(100 * SECOND_NS)
     assert pace.due(SECOND_NS)
 
@@ -111,13 +112,13 @@ def test_what_is_no_picture_is_refused(picture: np.ndarray) -> None:
 
 def test_a_larger_picture_is_averaged_not_sampled() -> None:
     board = np.indices((40, 40)).sum(axis=0) % 2 * 255
-    assert (fit(board.astype(np.uint8), 20, 20) == 128).all()
+    assert (resize(board.astype(np.uint8), 20, 20) == 128).all()
 
 
 def test_a_picture_of_the_right_size_is_left_alone() -> None:
     picture = np.zeros((20, 30, 3), np.uint8)
-    assert fit(picture, 30, 20) is picture
-    assert fit(picture, 60, 50).shape == (50, 60, 3)
+    assert resize(picture, 30, 20) is picture
+    assert resize(picture, 60, 50).shape == (50, 60, 3)
 
 
 # -- files ----------------------------------------------------------------------------------------
@@ -140,7 +141,7 @@ def test_a_folder_shows_its_pictures_and_skips_other_files(tmp_path: Path) -> No
     write_grey(tmp_path, "1.png", "2.bmp", "10.jpg")
     (tmp_path / "3.txt").write_text("not a picture")
     (tmp_path / "4.png").mkdir()
-    reel = open_reel(tmp_path)
+    reel = open_frames(tmp_path)
     levels = []
     while reel.step():
         picture = reel.picture()
@@ -308,7 +309,7 @@ def test_what_opencv_says_of_broken_sources_does_not_reach_the_terminal(tmp_path
     program = f"""
 import threading
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.camera.choose_source import make_source
+from vla_zenoh.nodes.camera.grabber import make_source
 from vla_zenoh.nodes.camera.opencv import prepare
 from vla_zenoh.profile.schema import CameraProfile
 prepare()

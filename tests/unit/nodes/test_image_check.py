@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from vla_zenoh.nodes.camera.file import FileSource
-from vla_zenoh.nodes.camera.image_check import ImageFault, PictureCheck
+from vla_zenoh.nodes.camera.image_check import ImageCheck, ImageFault
 from vla_zenoh.nodes.camera.v4l2 import V4l2Source, is_virtual
 from vla_zenoh.profile.schema import CameraCheck, CameraProfile
 
@@ -57,7 +57,7 @@ def judged(
     shots: Iterator[Shot], seconds: float = 3.0, same_s: float = 1.0, **limits: float
 ) -> tuple[float, ImageFault] | None:
     """When, in seconds from the first picture, what was found; None: nothing."""
-    check = PictureCheck("wrist", CameraCheck(**limits), same_s)
+    check = ImageCheck("wrist", CameraCheck(**limits), same_s)
     for nth in range(round(seconds * RATE_HZ)):
         picture, stamp_ns = next(shots)
         found = check.look(picture, round(nth * 1e9 / RATE_HZ), stamp_ns)
@@ -106,7 +106,7 @@ def test_a_hand_that_passes_by_is_no_covered_lens() -> None:
 
 
 def test_a_picture_that_comes_twice_of_a_slow_camera_is_no_lie() -> None:
-    check = PictureCheck("wrist", CameraCheck(), 1.0)
+    check = ImageCheck("wrist", CameraCheck(), 1.0)
     one, other = noisy(scene()), noisy(scene())
     for nth, picture in enumerate([one, one, other, other, one]):
         assert check.look(picture, nth * 2_000_000_000) is None
@@ -199,7 +199,7 @@ def test_a_driver_that_says_no_time_is_not_judged_by_it() -> None:
 
 
 def test_a_camera_that_is_good_again_is_said_to_be() -> None:
-    check = PictureCheck("wrist", CameraCheck(), 1.0)
+    check = ImageCheck("wrist", CameraCheck(), 1.0)
     lie = noisy(scene())
     for nth in range(30):
         check.look(lie, nth * 100_000_000)

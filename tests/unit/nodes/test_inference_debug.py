@@ -10,7 +10,7 @@ import pytest
 
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, RecordError
-from vla_zenoh.nodes.worker.inference_debug import MAX_WAITING, SeenImages
+from vla_zenoh.nodes.worker.inference_debug import MAX_WAITING, PendingImages
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.types import Seen
 from vla_zenoh.types.seen import plain_raw
@@ -88,7 +88,7 @@ def test_foreign_bytes_are_refused() -> None:
 
 
 def test_a_worker_that_names_more_cameras_than_a_model_can_have_is_refused() -> None:
-    kept = SeenImages(Counter())
+    kept = PendingImages(Counter())
     for number in range(MAX_CAMERAS):
         kept.add("liar", 1, f"cam{number}", b"jpeg")
     with pytest.raises(CodecError, match="more than 16"):
@@ -102,7 +102,7 @@ def test_a_worker_that_names_more_cameras_than_a_model_can_have_is_refused() -> 
 
 def test_pictures_without_a_record_are_counted_and_fill_nothing() -> None:
     left_out: Counter[str] = Counter()
-    kept = SeenImages(left_out, limit=1000)
+    kept = PendingImages(left_out, limit=1000)
     for seq in range(MAX_WAITING + 2):
         kept.add("worker", seq, "front", b"x")
     assert left_out == {"no_record": 2}

@@ -9,7 +9,7 @@ import pytest
 
 from vla_zenoh.errors import SpecError
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, Observation, ObservationSpec
-from vla_zenoh.policy.observation import History, NotYet, assemble, prepare
+from vla_zenoh.policy.observation import History, NotReady, assemble, prepare_image
 from vla_zenoh.types import GripperState, Header, Image, PoseState, Stamped, Task
 
 MS = 1_000_000
@@ -52,13 +52,13 @@ def look(
     *ago_ms: float,
     task: Task = TASK,
     not_before_ns: int = 0,
-) -> Observation | NotYet:
+) -> Observation | NotReady:
     states = {"pose": history(*ago_ms), "gripper": grippers(*ago_ms)}
     return assemble(wanted, task, images, states, not_before_ns=not_before_ns, now_ns=NOW_NS)
 
 
-def refused(answer: Observation | NotYet) -> NotYet:
-    assert isinstance(answer, NotYet)
+def refused(answer: Observation | NotReady) -> NotReady:
+    assert isinstance(answer, NotReady)
     return answer
 
 
@@ -162,14 +162,14 @@ def camera(**fields: Any) -> CameraSpec:
 
 def test_a_picture_without_a_wanted_size_comes_as_it_is() -> None:
     image = striped(48, 60)
-    np.testing.assert_array_equal(prepare(image, camera()), image.rgb)
-    same = prepare(image, camera(width=60, height=48, resize="none"))
+    np.testing.assert_array_equal(prepare_image(image, camera()), image.rgb)
+    same = prepare_image(image, camera(width=60, height=48, resize="none"))
     np.testing.assert_array_equal(same, image.rgb)
 
 
 def test_another_size_needs_a_rule() -> None:
     with pytest.raises(SpecError, match="sends 60x48, the spec asks for 32x32 and says"):
-        prepare(striped(48, 60), camera(width=32, height=32))
+        prepare_image(striped(48, 60), camera(width=32, height=32))
 
 
 @pytest.mark.parametrize("size", [(48, 60), (60, 48), (33, 97), (480, 640), (8, 8)])
@@ -178,7 +178,7 @@ def test_another_size_needs_a_rule() -> None:
 def test_every_rule_gives_the_size_that_was_asked_for(
     size: tuple[int, int], wanted: tuple[int, int], rule: str
 ) -> None:
-    given = prepare(striped(*size), camera(height=wanted[0], width=wanted[1], resize=rule))
+    given = prepare_image(striped(*size), camera(height=wanted[0], width=wanted[1], resize=rule))
     assert given.shape == (*wanted, 3)
     assert given.dtype == np.uint8
     assert given.flags.c_contiguous
@@ -187,20 +187,20 @@ def test_every_rule_gives_the_size_that_was_asked_for(
 def test_stretch_keeps_the_corners_pad_adds_black_and_crop_cuts_the_longer_side() -> None:
     image = striped(30, 90)
     wanted = {"width": 30, "height": 30}
-    stretched = prepare(image, camera(**wanted, resize="stretch"))
+    stretched = prepare_image(image, camera(**wanted, resize="stretch"))
     assert list(stretched[0, 0]) == [255, 0, 0]
     assert list(stretched[-1, -1]) == [0, 0, 255]
-    padded = prepare(image, camera(**wanted, resize="pad"))
+    padded = prepare_image(image, camera(**wanted, resize="pad"))
     assert padded[:10].max() == 0
     assert padded[20:].max() == 0
     assert list(padded[15, 0]) == [255, 0, 0]
     assert list(padded[15, -1]) == [0, 0, 255]
-    cropped = prepare(image, camera(**wanted, resize="crop"))
+    cropped = prepare_image(image, camera(**wanted, resize="crop"))
     assert (cropped == [0, 255, 0]).all()
 
 
 def test_bgr_is_the_same_picture_with_channels_turned() -> None:
     image = striped(30, 90)
-    given = prepare(image, camera(colour="bgr"))
+    given = prepare_image(image, camera(colour="bgr"))
     assert list(given[0, 0]) == [0, 0, 255]
     assert given.flags.c_contiguous

@@ -9,8 +9,8 @@ import pytest
 
 from vla_zenoh import resources
 from vla_zenoh.profile import load_profile
-from vla_zenoh.profile.files import FileUse, Needed, needed_files
-from vla_zenoh.profile.paths import paths_in
+from vla_zenoh.profile.files import FileUse, NeededFiles, needed_files
+from vla_zenoh.profile.load import paths_in
 
 MODEL = "class Lift: ...\n"
 URDF = """\
@@ -137,7 +137,7 @@ def test_what_the_package_ships_is_not_copied(tmp_path: Path) -> None:
     mine = write(tmp_path / "mine.yaml", "extends: panda_sim_two_hosts\n")
     nothing = FileUse(Path("/"), ())
     home = FileUse(Path.home(), ())
-    assert needed_files(str(mine)) == Needed(
+    assert needed_files(str(mine)) == NeededFiles(
         "mine.yaml", FileUse(tmp_path, ("mine.yaml",)), (), home, nothing, ()
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.policy import CameraSpec, ModelSpec, Observation, example_observation
-from vla_zenoh.policy.observation import prepare
+from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import GripperState, Image, JointState, PoseState
 
@@ -155,7 +155,7 @@ class ExampleMaker:
             picture = look.picture(*self._size(camera))
             if look.swapped:
                 picture = np.ascontiguousarray(picture[..., ::-1])
-            prepared = np.array(prepare(Image(picture), camera))
+            prepared = np.array(prepare_image(Image(picture), camera))
             prepared.setflags(write=False)
             out[camera.camera] = prepared
         return out

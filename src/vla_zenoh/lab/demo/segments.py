@@ -10,7 +10,7 @@ import numpy as np
 
 from vla_zenoh.kinematics.so3 import Pose, log3
 from vla_zenoh.lab.statistics import percentiles
-from vla_zenoh.policy.scripted_motions import HardMotion, HardPrompt, parse_hard
+from vla_zenoh.policy.scripted_motions import ScriptedMotion, ScriptedPrompt, parse_scripted
 from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray
 
 TOUR: tuple[tuple[str, int], ...] = (
@@ -41,7 +41,7 @@ class DemoSegment:
 
     prompt: str
     steps: int
-    motion: HardMotion | None
+    motion: ScriptedMotion | None
     within: float | None = None
 
     @property
@@ -72,7 +72,7 @@ class DemoSegment:
         """Gripper width asked for, after `before_m`."""
         width_m = before_m
         if self.motion is not None and self.motion.axis == 6:
-            asked = HardPrompt(self.motion, self.steps, self.within)
+            asked = ScriptedPrompt(self.motion, self.steps, self.within)
             for index in range(self.steps):
                 width_m = min(max(width_m + asked.step(index), 0.0), max_width_m)
         return width_m
@@ -80,7 +80,7 @@ class DemoSegment:
     def _asked(self) -> FloatArray:
         asked = np.zeros(7)
         if self.motion is not None:
-            asked[self.motion.axis] = HardPrompt(self.motion, self.steps, self.within).offset(
+            asked[self.motion.axis] = ScriptedPrompt(self.motion, self.steps, self.within).offset(
                 self.steps
             )
         return asked
@@ -92,7 +92,7 @@ def make_segment(prompt: str, steps: int) -> DemoSegment:
     Raises:
         SpecError: not a prompt the scripted model knows.
     """
-    asked = parse_hard(prompt)
+    asked = parse_scripted(prompt)
     name = f"HARD: {asked.motion.name}" if asked.motion else "hold"
     return DemoSegment(
         name, steps if asked.steps is None else asked.steps, asked.motion, asked.within

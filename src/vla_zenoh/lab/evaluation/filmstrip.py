@@ -13,7 +13,7 @@ from vla_zenoh.errors import CodecError, SpecError
 from vla_zenoh.lab.evaluation.result import CameraView
 from vla_zenoh.lab.recording.run import RecordedImage, Run, pictures, seen_pictures
 from vla_zenoh.policy import CameraSpec
-from vla_zenoh.policy.observation import prepare
+from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.types import ActionChunk, Image
 
 HEIGHT_PX = 150
@@ -79,7 +79,7 @@ def _views(
             seen = image_codec.decode_jpeg(given.jpeg).rgb
             out.append(CameraView(t_s, camera, _small(seen), model=True))
         elif asked is not None and asked.width is not None:
-            seen = prepare(image, asked.model_copy(update={"colour": "rgb"}))
+            seen = prepare_image(image, asked.model_copy(update={"colour": "rgb"}))
             out.append(CameraView(t_s, camera, _small(seen), model=True))
     except (CodecError, SpecError):
         return []  # no picture that can be shown

@@ -7,7 +7,7 @@ import numpy as np
 from vla_zenoh.errors import SpecError
 from vla_zenoh.lab.evaluation.result import PromptSegment
 from vla_zenoh.lab.evaluation.trajectory import path_m, rotvecs, turned_rad
-from vla_zenoh.policy.scripted_motions import HardPrompt, parse_hard
+from vla_zenoh.policy.scripted_motions import ScriptedPrompt, parse_scripted
 from vla_zenoh.types import FloatArray
 
 
@@ -56,9 +56,9 @@ def segment(
     )
 
 
-def _asked(prompt: str) -> HardPrompt | None:
+def _asked(prompt: str) -> ScriptedPrompt | None:
     try:
-        return parse_hard(prompt)
+        return parse_scripted(prompt)
     except SpecError:
         return None
 

@@ -9,7 +9,7 @@ from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.lockstep.records import Delays
 from vla_zenoh.policy import Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
-from vla_zenoh.policy.observation import History, NotYet, assemble
+from vla_zenoh.policy.observation import History, NotReady, assemble
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
@@ -89,7 +89,7 @@ class LockstepWorker:
             not_before_ns=self._not_before_ns,
             now_ns=wall_ns,
         )
-        if isinstance(observation, NotYet):
+        if isinstance(observation, NotReady):
             return None
         answer = self._continuation.infer(observation)
         steps = check_steps(self.spec.action, answer.steps)

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
+import cv2
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
@@ -15,11 +16,10 @@ from numpy.typing import NDArray
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec.image import encode_jpeg, encode_raw, raw_schema
+from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.camera.fitted_streams import Forms, narrowed
-from vla_zenoh.nodes.camera.frame import fit, to_rgb
-from vla_zenoh.nodes.camera.image_check import ImageFault, PictureCheck
-from vla_zenoh.nodes.camera.rate_limiter import Pace
+from vla_zenoh.nodes.camera.fitted_streams import FittedStreams, RateLimiter, shrink
+from vla_zenoh.nodes.camera.image_check import ImageCheck, ImageFault
 from vla_zenoh.nodes.camera.source import Pixels
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Event, Image
@@ -53,14 +53,14 @@ class CameraPublisher:
         self.backend = ""
         self.state, self.why = WAITING, "it is being opened"
         self.bad: ImageFault | None = None
-        self._check = PictureCheck(name, profile.check, same_s)
+        self._check = ImageCheck(name, profile.check, same_s)
         self.counts: Counter[str] = Counter()
-        self.pace = Pace(profile.rate_hz)
+        self.pace = RateLimiter(profile.rate_hz)
         self._shown, self._clock, self._tell = shown[:_SOURCE_LIMIT], node.clock, tell
         self._raw = node.stream(node.keys.camera_raw(name), Kind.FRAME)
         self._jpeg = node.stream(node.keys.camera_jpeg(name), Kind.FRAME)
-        self.forms = Forms(name, profile, node, tell)
-        self._jpeg_pace = None if profile.jpeg_rate_hz is None else Pace(profile.jpeg_rate_hz)
+        self.forms = FittedStreams(name, profile, node, tell)
+        self._jpeg_pace = RateLimiter(profile.jpeg_rate_hz)
         self._seq = 0
         self._newest_mono_ns: int | None = None
         self._sizes: set[tuple[int, ...]] = set()
@@ -121,7 +121,7 @@ class CameraPublisher:
     def opened(self, backend: str, same_s: float) -> None:
         """Its source is open, anew: its pictures have nothing to do with those before."""
         self.backend = backend
-        self._check = PictureCheck(self.name, self.profile.check, same_s)
+        self._check = ImageCheck(self.name, self.profile.check, same_s)
 
     def look(self, picture: Pixels, mono_ns: int, stamp_ns: int | None = None) -> None:
         """Judge the camera by a picture of this time, and by the time its driver says."""
@@ -150,15 +150,14 @@ class CameraPublisher:
         if picture.shape[:2] != (height, width):
             self._count_size(picture.shape[:2])
         stamp_ns = self._clock.wall_ns() - (time.monotonic_ns() - mono_ns)
-        self.put_rgb(to_rgb(fit(picture, width, height)), mono_ns, stamp_ns)
+        self.put_rgb(to_rgb(resize(picture, width, height)), mono_ns, stamp_ns)
 
     def put_rgb(self, rgb: NDArray[np.uint8], mono_ns: int, stamp_wall_ns: int) -> None:
         """Write a finished picture, in each form that somebody listens to."""
         raw, jpeg = self._raw.wanted, self._jpeg.wanted
         fitted = self.forms.due(mono_ns)
-        thinned = self._jpeg_pace is not None
-        if jpeg and self._jpeg_pace is not None and not self._jpeg_pace.due(mono_ns):
-            jpeg = False
+        thinned = self.profile.jpeg_rate_hz is not None
+        jpeg = jpeg and self._jpeg_pace.due(mono_ns)
         if not (raw or jpeg or fitted):
             return
         image = Image(rgb)
@@ -170,13 +169,13 @@ class CameraPublisher:
         if jpeg:
             # Where not all of them go out, those that do have numbers of their own.
             self._jpeg.put(
-                encode_jpeg(narrowed(image, self.profile.jpeg_width), self.profile.jpeg_quality),
+                encode_jpeg(shrink(image, self.profile.jpeg_width), self.profile.jpeg_quality),
                 stamp_wall_ns=stamp_wall_ns,
                 seq=None if thinned else self._seq,
                 encoding=zenoh.Encoding.IMAGE_JPEG,
             )
         for form in fitted:
-            self.forms.put(form, image, stamp_wall_ns)
+            self.forms.publish(form, image, stamp_wall_ns)
         self._seq += 1
         with self._lock:
             self._latency_ms.add((time.monotonic_ns() - mono_ns) / 1e6)
@@ -219,3 +218,33 @@ class CameraPublisher:
         """For status, named after the camera."""
         counts = dict(self.counts) | {"raw": self._raw.seq, "jpeg": self._jpeg.seq}
         return {f"{self.name}.{what}": count for what, count in counts.items()}
+
+
+_TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
+
+
+def resize(picture: Pixels, width: int, height: int) -> Pixels:
+    """Stretch to (height, width): averaging when it shrinks, linear when it grows."""
+    had_height, had_width = picture.shape[:2]
+    if (had_height, had_width) == (height, width):
+        return picture
+    shrinks = width * height < had_width * had_height
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return cv2.resize(picture, (width, height), interpolation=method)
+
+
+def to_rgb(picture: Pixels) -> NDArray[np.uint8]:
+    """Grey, BGR or BGRA of 8 or 16 bits to RGB uint8 (H, W, 3).
+
+    Raises:
+        NodeError: it is none of these.
+    """
+    channels = 1 if picture.ndim == 2 else picture.shape[2] if picture.ndim == 3 else 0
+    if channels not in _TO_RGB or picture.dtype not in (np.uint8, np.uint16):
+        raise NodeError(
+            f"a picture of shape {picture.shape} and type {picture.dtype} cannot be shown; "
+            "wanted 1, 3 or 4 channels of 8 or 16 bits"
+        )
+    if picture.dtype == np.uint16:
+        picture = (picture >> 8).astype(np.uint8)
+    return np.asarray(cv2.cvtColor(picture, _TO_RGB[channels]), np.uint8)

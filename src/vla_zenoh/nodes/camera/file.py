@@ -21,7 +21,7 @@ LOOK_S = 0.5
 MAX_VIDEO_HZ = 1000.0
 
 
-class Reel(Protocol):
+class FrameReader(Protocol):
     """Pictures in order, once."""
 
     backend: str
@@ -92,7 +92,7 @@ def natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts]
 
 
-def open_reel(path: Path) -> Reel:
+def open_frames(path: Path) -> FrameReader:
     """What lies at `path`.
 
     Raises:
@@ -126,7 +126,7 @@ class FileSource:
     def __init__(self, path: str, rate_hz: float, loop: bool) -> None:
         self._path = Path(path).expanduser()
         self._rate_hz, self._loop = rate_hz, loop
-        self._reel: Reel | None = None
+        self._reel: FrameReader | None = None
         self._identity: tuple[int, int] = (0, 0)
         self._next_s = self._look_s = 0.0
         self._period_s = 1.0 / rate_hz
@@ -137,7 +137,7 @@ class FileSource:
 
     def open(self) -> None:
         self.close()
-        self._reel = open_reel(self._path)
+        self._reel = open_frames(self._path)
         self._identity = self._who()
         self._period_s = 1.0 / (self._reel.rate_hz or self._rate_hz)
         self._next_s = time.monotonic()
@@ -169,7 +169,7 @@ class FileSource:
         if not self._loop:
             return False
         self.close()
-        self._reel = open_reel(self._path)
+        self._reel = open_frames(self._path)
         if not self._reel.step():
             raise NodeError(f"there is no picture in {self._path}")
         return True

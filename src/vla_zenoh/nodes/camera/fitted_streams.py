@@ -1,4 +1,4 @@
-"""The forms in which one camera's pictures are made for others: in a model's size, for a host."""
+"""Additional JPEG streams of one camera: in a model's input size, or reduced for one host."""
 
 from __future__ import annotations
 
@@ -11,162 +11,232 @@ import zenoh
 from vla_zenoh.bus.node import Node, Stream
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.camera.rate_limiter import Pace
-from vla_zenoh.policy import CameraSpec
-from vla_zenoh.policy.observation import form_for, prepare
+from vla_zenoh.policy import CameraSpec, ModelSpec
+from vla_zenoh.policy.observation import host_variant, prepare_image, size_variant
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Event, Image
 
+EARLY, LATE = 0.25, 0.2
+"""Periods by which an image may be early, and by which lateness is carried over."""
 MAX_SIZES = 8
-"""Sizes in which pictures are made for models; those of more models take what all get."""
+"""Model input sizes served for one camera; further models use the common streams."""
+SILENCE_S = 5.0
+"""A worker publishes its spec once a second; after this silence it counts as gone."""
+MAX_MODELS = 64
+
+
+class RateLimiter:
+    """Lets at most `rate_hz` images a second through, evenly spaced and never in a burst.
+
+    An image may be `EARLY` periods early, so that a source of exactly this rate loses none to
+    jitter. At most `LATE` periods of lateness are carried over. The two add up to less than half a
+    period, so a source of twice the rate always passes every other image.
+
+    Args:
+        rate_hz: None: every image passes.
+    """
+
+    def __init__(self, rate_hz: float | None) -> None:
+        self._period_ns = None if rate_hz is None else 1e9 / rate_hz
+        self._next_ns: float | None = None
+
+    def due(self, now_ns: int) -> bool:
+        """Whether the image of this time, on any one clock, passes."""
+        if self._period_ns is None:
+            return True
+        ahead_ns = 0.0 if self._next_ns is None else self._next_ns - now_ns
+        if ahead_ns > 2 * self._period_ns:  # the clock was set back
+            self._next_ns, ahead_ns = None, 0.0
+        if ahead_ns > EARLY * self._period_ns:
+            return False
+        start_ns = now_ns if self._next_ns is None else self._next_ns
+        self._next_ns = max(start_ns, now_ns - LATE * self._period_ns) + self._period_ns
+        return True
+
+
+class RequestedSizes:
+    """Image sizes that live workers ask for, from the newest spec of each."""
+
+    def __init__(self) -> None:
+        self._specs: dict[str, tuple[float, ModelSpec]] = {}
+
+    def add(self, worker: str, spec: ModelSpec, now_s: float) -> bool:
+        """Keep a spec; False if there are `MAX_MODELS` of other workers already.
+
+        Args:
+            worker: whose it is, by its key.
+            spec: as published.
+            now_s: monotonic clock.
+        """
+        self._forget(now_s)
+        if worker not in self._specs and len(self._specs) >= MAX_MODELS:
+            return False
+        self._specs[worker] = (now_s, spec)
+        return True
+
+    def sizes(self, camera: str, now_s: float) -> dict[str, CameraSpec]:
+        """Variant name -> spec of the camera, in the order in which workers appeared."""
+        self._forget(now_s)
+        wanted = (
+            one
+            for _, spec in self._specs.values()
+            for one in spec.observation.cameras
+            if one.camera == camera
+        )
+        variants = ((size_variant(one), one) for one in wanted)
+        return {variant: one for variant, one in variants if variant is not None}
+
+    def _forget(self, now_s: float) -> None:
+        for worker, (received_s, _) in list(self._specs.items()):
+            if now_s - received_s > SILENCE_S:
+                del self._specs[worker]
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
-    """A way in which pictures are made for others.
+class FittedStream:
+    """One JPEG stream.
 
     Args:
-        stream: where they go.
-        quality: of JPEG.
-        pace: None: all of them.
-        spec: whose size they have, None: their own.
-        width: wider ones are made smaller.
+        stream: publishes it.
+        quality: of JPEG, 1 to 100.
+        limiter: of its rate.
+        spec: images are prepared for this model input; None: they keep their size.
+        width: without a `spec`, wider images are scaled down to this.
     """
 
     stream: Stream
     quality: int
-    pace: Pace | None
+    limiter: RateLimiter
     spec: CameraSpec | None = None
     width: int | None = None
 
-    def made_of(self, image: Image) -> bytes:
-        """The JPEG file of a picture."""
+    def encode(self, image: Image) -> bytes:
+        """JPEG file of an image in this stream's size."""
         if self.spec is None:
-            return encode_jpeg(narrowed(image, self.width), self.quality)
-        return encode_jpeg(Image(prepare(image, self.spec)), self.quality)
+            return encode_jpeg(shrink(image, self.width), self.quality)
+        return encode_jpeg(Image(prepare_image(image, self.spec)), self.quality)
 
 
-def narrowed(image: Image, widest: int | None) -> Image:
-    """The picture, made smaller where it is wider than `widest`; its aspect ratio stays."""
+def shrink(image: Image, max_width: int | None) -> Image:
+    """The image scaled down to `max_width`, with its aspect ratio, if it is wider."""
     height, width = image.rgb.shape[:2]
-    if widest is None or width <= widest:
+    if max_width is None or width <= max_width:
         return image
     smaller = CameraSpec(
-        camera="any", width=widest, height=max(8, round(height * widest / width)), resize="stretch"
+        camera="any",
+        width=max_width,
+        height=max(8, round(height * max_width / width)),
+        resize="stretch",
     )
-    return Image(prepare(image, smaller))
+    return Image(prepare_image(image, smaller))
 
 
-class Forms:
-    """See the module. One thread draws, another one says in which sizes.
+class FittedStreams:
+    """Fitted streams of one camera. One thread publishes images, another sets the sizes.
 
     Args:
         camera: its name.
-        profile: what the profile says of it.
-        node: on whose behalf.
-        tell: writes an event; may be called from any thread.
+        profile: its section of the profile.
+        node: publishes the streams.
+        emit: emits an event; callable from any thread.
     """
 
     def __init__(
-        self, camera: str, profile: CameraProfile, node: Node, tell: Callable[[Event], None]
+        self, camera: str, profile: CameraProfile, node: Node, emit: Callable[[Event], None]
     ) -> None:
-        self._camera, self._profile, self._node, self._tell = camera, profile, node, tell
-        self._lock = threading.Lock()  # nobody draws for a stream that is being taken away
+        self._camera, self._profile, self._node, self._emit = camera, profile, node, emit
+        self._lock = threading.Lock()  # no image is published on a stream that is being removed
         self._hosts = {
             host: part.pictures
             for host, part in node.profile.hosts.items()
             if part.pictures is not None
         }
-        self._whole = [
-            Form(self._stream(form_for(host)), one.quality, _pace(one.rate_hz), width=one.width)
+        self._of_hosts = [
+            FittedStream(
+                self._stream(host_variant(host)),
+                one.quality,
+                RateLimiter(one.rate_hz),
+                width=one.width,
+            )
             for host, one in self._hosts.items()
         ]
-        self._sizes: dict[str, list[Form]] = {}
+        self._of_sizes: dict[str, list[FittedStream]] = {}
         self._left_out: frozenset[str] = frozenset()
 
-    # -- for who draws ------------------------------------------------------------------------
+    # -- called by the capture thread ---------------------------------------------------------
     @property
     def wanted(self) -> bool:
-        """Somebody listens."""
+        """Whether any of the streams has a subscriber."""
         with self._lock:
-            return any(form.stream.wanted for form in self._all())
+            return any(one.stream.wanted for one in self._all())
 
-    def due(self, mono_ns: int) -> list[Form]:
-        """Those in which somebody wants the picture of this time."""
+    def due(self, mono_ns: int) -> list[FittedStream]:
+        """Streams that have a subscriber and are due for the image of this time."""
         with self._lock:
-            return [
-                form
-                for form in self._all()
-                if form.stream.wanted and (form.pace is None or form.pace.due(mono_ns))
-            ]
+            return [one for one in self._all() if one.stream.wanted and one.limiter.due(mono_ns)]
 
-    def put(self, form: Form, image: Image, stamp_wall_ns: int) -> None:
-        """Write a picture in one of them; nowhere, if that was given back meanwhile."""
-        jpeg, encoding = form.made_of(image), zenoh.Encoding.IMAGE_JPEG
+    def publish(self, fitted: FittedStream, image: Image, stamp_wall_ns: int) -> None:
+        """Publish an image on one of the streams, unless it was removed in the meantime."""
+        jpeg, encoding = fitted.encode(image), zenoh.Encoding.IMAGE_JPEG
         with self._lock:
-            if any(form is one for one in self._all()):
-                form.stream.put(jpeg, stamp_wall_ns=stamp_wall_ns, encoding=encoding)
+            if any(fitted is one for one in self._all()):
+                fitted.stream.put(jpeg, stamp_wall_ns=stamp_wall_ns, encoding=encoding)
 
-    def _all(self) -> list[Form]:
-        return [*self._whole, *(form for forms in self._sizes.values() for form in forms)]
+    def _all(self) -> list[FittedStream]:
+        return [*self._of_hosts, *(one for some in self._of_sizes.values() for one in some)]
 
-    # -- for who hears models -----------------------------------------------------------------
-    def serve(self, asked: Mapping[str, CameraSpec]) -> None:
-        """Make pictures in the sizes that models ask for now, of no more than `MAX_SIZES`.
+    # -- called by the thread that receives specs ---------------------------------------------
+    def serve(self, requested: Mapping[str, CameraSpec]) -> None:
+        """Serve these sizes, at most `MAX_SIZES`.
 
-        A size that nobody asks for or listens to is given back, and one that is only listened to
-        where another one is asked for and there is no room.
+        A size that is neither requested nor subscribed to is removed. One that is only subscribed
+        to is removed if a requested one needs its place.
 
         Args:
-            asked: form -> what a model says of it.
+            requested: variant name -> spec of the camera, see `RequestedSizes.sizes`.
         """
-        missing = [name for name in asked if name not in self._sizes]
+        missing = [name for name in requested if name not in self._of_sizes]
         with self._lock:
-            heard = {
-                name: any(form.stream.wanted for form in forms)
-                for name, forms in self._sizes.items()
-                if name not in asked
+            unrequested = {
+                name: any(one.stream.wanted for one in streams)
+                for name, streams in self._of_sizes.items()
+                if name not in requested
             }
-        ended = [name for name, listened in heard.items() if not listened]
-        short = len(self._sizes) - len(ended) + len(missing) - MAX_SIZES
-        ended += [name for name, listened in heard.items() if listened][: max(short, 0)]
+        ended = [name for name, subscribed in unrequested.items() if not subscribed]
+        short = len(self._of_sizes) - len(ended) + len(missing) - MAX_SIZES
+        ended += [name for name, subscribed in unrequested.items() if subscribed][: max(short, 0)]
         for name in ended:
-            self._end(name)
-        room = MAX_SIZES - len(self._sizes)
+            self._remove(name)
+        room = MAX_SIZES - len(self._of_sizes)
         for name in missing[:room]:
-            self._begin(name, asked[name])
-        self._tell_of(missing[room:])
+            self._add(name, requested[name])
+        self._report_left_out(missing[room:])
 
-    def _begin(self, name: str, spec: CameraSpec) -> None:
+    def _add(self, name: str, spec: CameraSpec) -> None:
         rgb, ours = spec.model_copy(update={"colour": "rgb"}), self._profile
-        forms = [Form(self._stream(name), ours.jpeg_quality, _pace(ours.jpeg_rate_hz), rgb)]
-        forms += [
-            Form(self._stream(form_for(host, name)), one.quality, _pace(one.rate_hz), rgb)
-            for host, one in self._hosts.items()
-        ]
+        limiter = RateLimiter(ours.jpeg_rate_hz)
+        streams = [FittedStream(self._stream(name), ours.jpeg_quality, limiter, rgb)]
+        for host, one in self._hosts.items():
+            stream = self._stream(host_variant(host, name))
+            streams.append(FittedStream(stream, one.quality, RateLimiter(one.rate_hz), rgb))
         with self._lock:
-            self._sizes[name] = forms
+            self._of_sizes[name] = streams
 
-    def _end(self, name: str) -> None:
+    def _remove(self, name: str) -> None:
         with self._lock:
-            forms = self._sizes.pop(name)
-            for form in forms:
-                self._node.end(form.stream)
-        why = f"pictures are no longer made as {name}: no living model asks for it"
-        self._tell(Event("info", "notice", f"{self._camera}:size_given_back", why))
+            for one in self._of_sizes.pop(name):
+                self._node.end(one.stream)
+        why = f"images are no longer published as {name}: no live model requests this size"
+        self._emit(Event("info", "notice", f"{self._camera}:size_given_back", why))
 
-    def _tell_of(self, left_out: list[str]) -> None:
+    def _report_left_out(self, left_out: list[str]) -> None:
         before, self._left_out = self._left_out, frozenset(left_out)
         if self._left_out - before:
             why = (
-                f"pictures are made in {MAX_SIZES} sizes for models at most; those who want "
-                f"{', '.join(left_out)} take what all get"
+                f"images are published in at most {MAX_SIZES} model sizes; models that request "
+                f"{', '.join(left_out)} receive the common stream"
             )
-            self._tell(Event("warning", "notice", f"{self._camera}:too_many_sizes", why[:1000]))
+            self._emit(Event("warning", "notice", f"{self._camera}:too_many_sizes", why[:1000]))
 
-    def _stream(self, form: str) -> Stream:
-        return self._node.stream(self._node.keys.camera_fitted(self._camera, form), Kind.FRAME)
-
-
-def _pace(rate_hz: float | None) -> Pace | None:
-    return None if rate_hz is None else Pace(rate_hz)
+    def _stream(self, variant: str) -> Stream:
+        return self._node.stream(self._node.keys.camera_fitted(self._camera, variant), Kind.FRAME)

@@ -47,7 +47,7 @@ class ImageFault(NamedTuple):
     limit: float
 
 
-class PictureCheck:
+class ImageCheck:
     """Judges the pictures of one camera from `open` to `close` of its source, one after the other.
 
     Args:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import zenoh
 
@@ -13,13 +14,9 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.writer_filter import SingleWriterFilter
 from vla_zenoh.keys import last
 from vla_zenoh.nodes.camera.camera_publisher import ENDED, OK, CameraPublisher
-from vla_zenoh.nodes.camera.choose_source import SIM, choose_cameras, make_source
-from vla_zenoh.nodes.camera.grabber import Grabber
-from vla_zenoh.nodes.camera.opencv import prepare
-from vla_zenoh.nodes.camera.rendered import SimCameras
-from vla_zenoh.nodes.camera.requested_sizes import MAX_MODELS, RequestedSizes
-from vla_zenoh.nodes.camera.rtsp import without_password
-from vla_zenoh.nodes.camera.source import STALL_S
+from vla_zenoh.nodes.camera.fitted_streams import MAX_MODELS, RequestedSizes
+from vla_zenoh.nodes.camera.grabber import SIM, Grabber, choose_cameras, make_source
+from vla_zenoh.nodes.camera.source import STALL_S, without_password
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Event, SceneState, Stamped
@@ -54,7 +51,6 @@ class CameraNode:
         cameras: tuple[str, ...] | None = None,
     ) -> None:
         chosen = choose_cameras(profile, cameras)
-        prepare()
         self.node = Node(name, profile, session)
         self._scene_speaker = SingleWriterFilter(STALL_S)
         self._voice = threading.Lock()  # a Node speaks for one thread at a time
@@ -66,7 +62,7 @@ class CameraNode:
             for camera, settings in chosen.items()
         }
         self._told: tuple[tuple[str, ...], tuple[bool, ...]] = ((), ())
-        self._sim: SimCameras | None = None
+        self._sim: Any = None
         self._threads = [
             self._thread(camera, Grabber(make_source(settings), self._outlets[camera]).run)
             for camera, settings in chosen.items()
@@ -83,6 +79,8 @@ class CameraNode:
             if settings.source.startswith(SIM)
         ]
         if views:
+            from vla_zenoh.nodes.camera.sim_cameras import SimCameras
+
             slot = self.node.listen(self.node.keys.sim_scene, LatestSample())
             self._sim = SimCameras(profile, views, slot, self._read_scene, self._refuse)
             self._threads.append(self._thread("sim", self._sim.run))
@@ -131,7 +129,7 @@ class CameraNode:
             worker = last(str(arrival.sample.key_expr))
             with self._voice:
                 stamped = self.node.read(ModelSpec, arrival)
-                if stamped is not None and not self._asked.hear(worker, stamped.record, now_s):
+                if stamped is not None and not self._asked.add(worker, stamped.record, now_s):
                     why = f"specs of {MAX_MODELS} workers are known; that of {worker!r} is not read"
                     self.node.refuse("too_many_models", why)
         if now_s - self._sized_s < SIZES_PERIOD_S:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import threading
 import time
 
@@ -10,10 +9,8 @@ import cv2
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes.camera.opencv import Capture
-from vla_zenoh.nodes.camera.source import STALL_S, Pixels
+from vla_zenoh.nodes.camera.source import STALL_S, Pixels, without_password
 
-_USER = re.compile(r"(?<=://)[^/]*@")
-_SECRET = re.compile(r"(?i)(password|passwd|pass|pwd|token)=[^&/?]*")
 OPEN_S = 10.0
 """To log in and wait for a picture to begin with: cameras send one in several seconds."""
 INSTANT_S = 0.015
@@ -26,11 +23,6 @@ _OPTIONS = (
     # Each further decoding thread keeps one more picture back.
     *(cv2.CAP_PROP_N_THREADS, 1),
 )
-
-
-def without_password(url: str) -> str:
-    """`url` without user and password, in front or among its parameters: fit for logs."""
-    return _SECRET.sub(r"\1=***", _USER.sub("", url))
 
 
 class RtspSource:

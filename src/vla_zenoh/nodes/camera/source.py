@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from typing import Any, Protocol
 
@@ -14,6 +15,9 @@ LOOK_S = 0.5
 """A picture is looked at this often even when nobody wants it: a broken camera is to be seen."""
 STALL_S = 2.0
 """A source that gives no picture for this long is closed and opened again."""
+
+_USER = re.compile(r"(?<=://)[^/]*@")
+_SECRET = re.compile(r"(?i)(password|passwd|pass|pwd|token)=[^&/?]*")
 
 
 class Source(Protocol):
@@ -61,3 +65,8 @@ class Source(Protocol):
     def close(self) -> None:
         """Give the device back; harmless when it is not open."""
         ...
+
+
+def without_password(url: str) -> str:
+    """`url` without user and password, in front or among its parameters: fit for logs."""
+    return _SECRET.sub(r"\1=***", _USER.sub("", url))

@@ -15,7 +15,6 @@ from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.policy import ModelSpec
-from vla_zenoh.profile.servers import camera_servers
 from vla_zenoh.types import NodeStatus
 
 MAX_WORKERS, MAX_HOLDERS = 32, 32
@@ -38,7 +37,7 @@ class PeerMonitor:
         self._spec_sources: dict[str, str] = {}
         self._voices: dict[str, str] = {}
         self._complaints: dict[str, str] = {}
-        self._servers = camera_servers(node.profile)
+        self._servers = node.profile.camera_servers()
         self._cameras: dict[str, tuple[float, int]] = {}
         self._camera_faults: dict[str, str] = {}
         self._places: dict[str, HostId] = {}

@@ -12,7 +12,7 @@ from vla_zenoh.bus.writer_filter import SingleWriterFilter
 from vla_zenoh.codec.image import MAX_PICTURE_BYTES
 from vla_zenoh.keys import Kind
 from vla_zenoh.policy import CameraSpec
-from vla_zenoh.policy.observation import form_for, form_of
+from vla_zenoh.policy.observation import host_variant, size_variant
 from vla_zenoh.types import Event
 
 STREAM_PATIENCE_S = 0.5
@@ -35,7 +35,7 @@ class _Ear(NamedTuple):
     speaker: SingleWriterFilter
 
 
-class CameraInput:
+class CameraSubscriber:
     """See the module. While what was asked for comes, nothing else travels.
 
     Args:
@@ -105,9 +105,9 @@ class CameraInput:
         return _Ear(key, slot, SingleWriterFilter(STREAM_PATIENCE_S))
 
 
-def listen_to(
+def subscribe_to_camera(
     camera: CameraSpec, node: Node, *, jpeg: bool, host: str | None, changed: threading.Condition
-) -> CameraInput:
+) -> CameraSubscriber:
     """Listen where the pictures are that a model wants.
 
     Args:
@@ -125,12 +125,12 @@ def listen_to(
     key, plain, rates_hz = keys.camera_raw(name), None, [settings.rate_hz if settings else None]
     if jpeg:
         key = keys.camera_jpeg(name)
-        size = form_of(camera) if settings is not None and settings.fit_for_workers else None
+        size = size_variant(camera) if settings is not None and settings.fit_for_workers else None
         rates_hz.append(settings.jpeg_rate_hz if settings else None)
         if host is not None and part is not None and part.pictures is not None:
-            key, rates_hz[1] = keys.camera_fitted(name, form_for(host)), part.pictures.rate_hz
-            size = None if size is None else form_for(host, size)
+            key, rates_hz[1] = keys.camera_fitted(name, host_variant(host)), part.pictures.rate_hz
+            size = None if size is None else host_variant(host, size)
         if size is not None:
             key, plain = keys.camera_fitted(name, size), key
     patience_s = max([PATIENCE_S, *(PERIODS / rate for rate in rates_hz if rate)])
-    return CameraInput(node, name, key, plain, patience_s=patience_s, changed=changed)
+    return CameraSubscriber(node, name, key, plain, patience_s=patience_s, changed=changed)

@@ -119,7 +119,7 @@ class InferenceView:
     jpegs: Mapping[str, bytes]
 
 
-class SeenImages:
+class PendingImages:
     """Pictures that wait for the record of their inference, up to a bound.
 
     Args:
@@ -169,7 +169,7 @@ class InferenceDebugSubscriber:
         self._lock = threading.Lock()
         self._samples: deque[zenoh.Sample] = deque()
         self._samples_bytes = 0
-        self._pictures = SeenImages(self.left_out)
+        self._pictures = PendingImages(self.left_out)
         selectors = (
             (keys.all_seen_records, keys.all_seen)
             if worker is None

@@ -73,19 +73,19 @@ class WorkerNode:
         profiles = [as_robot(profile, robot) for robot in robots] or [profile]
         self.policy, self.name, self.spec = policy, name, policy.spec
         self._policies = policies
-        self.seats: list[RobotSession] = []
+        self.sessions: list[RobotSession] = []
         try:
             for number, part in enumerate(profiles):
                 mind = policies[number % len(policies)]
                 seat = RobotSession(
                     part, session, mind, name, images=images, host=host, changed=self._changed
                 )
-                self.seats.append(seat)
+                self.sessions.append(seat)
         except BaseException:
-            for seat in self.seats:
+            for seat in self.sessions:
                 seat.close()
             raise
-        self.node = self.seats[0].node
+        self.node = self.sessions[0].node
 
     def _one_for_each(
         self, policy: Policy, count: int, another: Callable[[], Policy] | None
@@ -104,7 +104,7 @@ class WorkerNode:
     # -- running ------------------------------------------------------------------------------
     def run(self, stop: threading.Event) -> None:
         """Load the model, then infer until `stop` is set."""
-        for seat in self.seats:
+        for seat in self.sessions:
             seat.report(now=True)
         began = time.monotonic()
         for policy in self._policies:
@@ -112,13 +112,13 @@ class WorkerNode:
             if callable(load):
                 load()
         took_s = time.monotonic() - began
-        for seat in self.seats:
+        for seat in self.sessions:
             if callable(getattr(self.policy, "load", None)):
                 seat.node.tell(Event("info", "notice", "loaded", f"in {took_s:.1f} s"))
             seat.complaint, seat.due_s = "", time.monotonic()
         while not stop.is_set():
             self._turn(stop)
-        for seat in self.seats:
+        for seat in self.sessions:
             seat.close()
         for policy in self._policies:
             close = getattr(policy, "close", None)
@@ -128,15 +128,15 @@ class WorkerNode:
     def _turn(self, stop: threading.Event) -> None:
         now_s = time.monotonic()
         due = sorted(
-            (seat for seat in self.seats if seat.due_s <= now_s), key=lambda seat: seat.due_s
+            (seat for seat in self.sessions if seat.due_s <= now_s), key=lambda seat: seat.due_s
         )
-        for seat in self.seats:
+        for seat in self.sessions:
             if seat not in due:
                 seat.listen()
         ready = self._look(due)
         if ready:
             self._infer(ready)
-        for seat in self.seats:
+        for seat in self.sessions:
             seat.report()
         if not ready:
             self._rest(due, stop)
@@ -157,7 +157,7 @@ class WorkerNode:
     def _rest(self, due: Sequence[RobotSession], stop: threading.Event) -> None:
         """Sleep until somebody is due, or brings news, or a little while."""
         now_s = time.monotonic()
-        others_s = [seat.due_s - now_s for seat in self.seats if seat not in due]
+        others_s = [seat.due_s - now_s for seat in self.sessions if seat not in due]
         if not due:
             stop.wait(max(0.0, min(*others_s, LOOK_PERIOD_S)))
         elif all(seat.sees for seat in due):
@@ -166,7 +166,7 @@ class WorkerNode:
                     if self._changed.wait_for(lambda: any(seat.news for seat in due), NAP_S):
                         return
                 # States that are decoded while nothing else is to do need no time afterwards.
-                for seat in self.seats:
+                for seat in self.sessions:
                     seat.listen_to_states()
                 if others_s and min(others_s) <= time.monotonic() - now_s:
                     return

@@ -24,11 +24,15 @@ from vla_zenoh.codec.image import MAX_PICTURE_BYTES
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError
 from vla_zenoh.keys import Kind, worker_node
-from vla_zenoh.nodes.worker.camera_subscriber import STREAM_PATIENCE_S, ReceivedImage, listen_to
+from vla_zenoh.nodes.worker.camera_subscriber import (
+    STREAM_PATIENCE_S,
+    ReceivedImage,
+    subscribe_to_camera,
+)
 from vla_zenoh.nodes.worker.inference_debug import InferenceDebugPublisher
 from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
-from vla_zenoh.policy.observation import History, NotYet, assemble
+from vla_zenoh.policy.observation import History, NotReady, assemble
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
@@ -92,7 +96,7 @@ class RobotSession:
         self._task_slot = node.listen(keys.task, LatestSample(SMALL_BYTES))
         self._jpeg = images == "jpeg"
         self._cameras = {
-            one.camera: listen_to(one, node, jpeg=self._jpeg, host=host, changed=changed)
+            one.camera: subscribe_to_camera(one, node, jpeg=self._jpeg, host=host, changed=changed)
             for one in self.spec.observation.cameras
         }
         self._state_slots = {
@@ -219,7 +223,7 @@ class RobotSession:
         except ValueError as error:
             self.complaint = str(error)
             return None
-        if isinstance(observation, NotYet):
+        if isinstance(observation, NotReady):
             if not observation.waiting:
                 self.complaint = observation.why
             return None

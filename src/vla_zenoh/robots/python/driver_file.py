@@ -10,7 +10,7 @@ from typing import Any
 from vla_zenoh.errors import NodeError
 from vla_zenoh.interop.python_reading import MAX_WORDS
 from vla_zenoh.policy.loader import make_robot
-from vla_zenoh.profile.arm import ArmProfile
+from vla_zenoh.profile.robot import ArmProfile
 from vla_zenoh.robot import Command, Reading
 from vla_zenoh.sanitize import one_line
 

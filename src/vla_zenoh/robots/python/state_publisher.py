@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from vla_zenoh.bus.node import Node
-from vla_zenoh.interop.python_reading import Taken
+from vla_zenoh.interop.python_reading import ValidReading
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
 from vla_zenoh.types import FloatArray, GripperState
@@ -33,7 +33,7 @@ class ArmStates:
 
     def tell(
         self,
-        taken: Taken,
+        taken: ValidReading,
         held: tuple[Pose | None, FloatArray | None],
         mode: str,
         fault: str,

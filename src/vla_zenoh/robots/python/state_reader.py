@@ -7,7 +7,7 @@ import time
 
 from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
-from vla_zenoh.interop.python_reading import MAX_WORDS, Fault, PythonReading, Taken
+from vla_zenoh.interop.python_reading import MAX_WORDS, Fault, PythonReading, ValidReading
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.robot import Reading
 from vla_zenoh.robots.python.driver_file import ArmFile
@@ -35,7 +35,7 @@ class ArmHearing:
         self._reading = PythonReading(node.profile, kinematics)
         self._fault = Fault()
         self._measured_ns = 0
-        self.newest: Taken | None = None
+        self.newest: ValidReading | None = None
         self.rate = RateMeter()
 
     @property
@@ -49,7 +49,7 @@ class ArmHearing:
         age_s = (time.monotonic_ns() - self._measured_ns) / 1e9
         return age_s > self._node.profile.timing.state_timeout_s
 
-    def read(self, mono_ns: int, asked_m: float) -> Taken | None:
+    def read(self, mono_ns: int, asked_m: float) -> ValidReading | None:
         """Ask the robot; None where it says nothing new, or nothing that holds.
 
         Args:

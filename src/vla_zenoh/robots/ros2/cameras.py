@@ -9,13 +9,12 @@ from collections.abc import Callable
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
-from vla_zenoh.interop.joint_reading import Newness
+from vla_zenoh.interop.joint_reading import StampFilter
 from vla_zenoh.interop.ros2 import table
 from vla_zenoh.interop.ros2.messages import MAX_PICTURE_BYTES, Messages
 from vla_zenoh.interop.ros2.qos import SENSOR
 from vla_zenoh.interop.ros2.samples import RosImage
-from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
-from vla_zenoh.nodes.camera.frame import fit
+from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher, resize
 from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S
 from vla_zenoh.profile.ros2 import Ros2Camera
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
@@ -57,7 +56,7 @@ class Camera:
             name, node.profile.cameras[name], topic.topic, node, tell, SAME_S
         )
         self.outlet.backend = topic.type
-        self._newness = Newness()
+        self._newness = StampFilter()
         self._looked_s = -LOOK_S
         self._slot = link.read(topic.topic, topic.type, LatestSample(MAX_PICTURE_BYTES), SENSOR)
 
@@ -96,7 +95,7 @@ class Camera:
         outlet.change(OK)
         if due and outlet.wanted:
             settings = outlet.profile
-            rgb = fit(picture.rgb, settings.width, settings.height)
+            rgb = resize(picture.rgb, settings.width, settings.height)
             stamp_ns = picture.stamp_ns or self._node.clock.wall_at(arrival.mono_ns)
             outlet.put_rgb(rgb, arrival.mono_ns, stamp_ns)
         return True

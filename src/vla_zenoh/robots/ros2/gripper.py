@@ -14,7 +14,7 @@ from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.gripper_guard import GripperGuard
 from vla_zenoh.interop.ros2 import gripper_actions, table
-from vla_zenoh.interop.ros2.goals import ActionGoal, GoalKeeper, Step
+from vla_zenoh.interop.ros2.action_goals import ActionGoal, GoalSequencer, GoalStep
 from vla_zenoh.interop.ros2.gripper_actions import GRASP
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.names import get_result_of, request_of, response_of, send_goal_of
@@ -52,7 +52,7 @@ class Gripper:
         self._measured_m, self._sent_m = width, node.profile.robot.gripper.max_width_m
         self._orders = node.listen(node.keys.command_gripper, CallbackRing(16, SMALL_BYTES))
         self._guard = GripperGuard(node.profile.robot.gripper)
-        self._keeper = GoalKeeper(GIVE_UP_S, node.profile.robot.gripper.max_width_m)
+        self._keeper = GoalSequencer(GIVE_UP_S, node.profile.robot.gripper.max_width_m)
         self._news: deque[Callable[[], None]] = deque()
         self._goal_id = b""
         self._action = ""
@@ -113,9 +113,9 @@ class Gripper:
         step = self._keeper.step(self._mono_ns)
         self._node.counters["ros2.gripper_timeouts"] = self._keeper.timeouts
         goal = self._keeper.goal
-        if step is Step.SEND and goal is not None:
+        if step is GoalStep.SEND and goal is not None:
             self._send(goal)
-        elif step is Step.CANCEL and goal is not None:
+        elif step is GoalStep.CANCEL and goal is not None:
             self._cancel()
 
     def _end_wish(self) -> None:

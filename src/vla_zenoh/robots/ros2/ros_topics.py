@@ -14,9 +14,9 @@ from vla_zenoh.bus.client import Client
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.ros2 import table
+from vla_zenoh.interop.ros2.activation_filter import QUIET_S, ActivationFilter
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.services import ACTIVE_TOPIC, PROMPT_TOPIC
-from vla_zenoh.interop.ros2.switch import QUIET_S, Switch
 from vla_zenoh.interop.ros2.topics import plain
 from vla_zenoh.robots.ros2.estop_order import EstopOrder
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
@@ -56,7 +56,7 @@ class RosTopics:
         self._prefix = prefix
         self._prompts = link.read(f"{prefix}/{PROMPT_TOPIC}", plain.TEXT, CallbackRing(WAITING))
         self._switches = link.read(f"{prefix}/{ACTIVE_TOPIC}", plain.TRUTH, CallbackRing(WAITING))
-        self._switch = Switch(time.monotonic_ns())
+        self._switch = ActivationFilter(time.monotonic_ns())
         self._put_ns = 0
         self._told = False
         self._prompt: str | None = None

@@ -13,13 +13,13 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.joint_reading import JointReading
 from vla_zenoh.interop.ros2 import table
-from vla_zenoh.interop.ros2.frames import Frames
 from vla_zenoh.interop.ros2.graph import TF, TF_STATIC
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.qos import SENSOR, STATIC_TRANSFORMS
 from vla_zenoh.interop.ros2.robot_clock import RobotClock
 from vla_zenoh.interop.ros2.samples import Wrench
 from vla_zenoh.interop.ros2.topics import joint_state, transforms, wrench
+from vla_zenoh.interop.ros2.transform_buffer import TransformBuffer
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile.ros2 import Ros2Profile
@@ -60,7 +60,7 @@ class StateSubscriber:
         self.rate = RateMeter()
         self._heard_ns: int | None = None
         self._wrench: Wrench | None = None
-        self._frames = Frames() if ros2.tcp == "tf" else None
+        self._frames = TransformBuffer() if ros2.tcp == "tf" else None
         topics = dict.fromkeys((ros2.joint_states, ros2.finger_states or ros2.joint_states))
         self._joint_slots = [
             link.read(topic, joint_state.TYPE, CallbackRing(INBOX), SENSOR) for topic in topics
@@ -153,7 +153,7 @@ class StateSubscriber:
                 stamp_ns = found.stamp_ns or self._node.wall_of(arrival)
                 self._wrench = found._replace(stamp_ns=stamp_ns)
 
-    def _tcp_of(self, frames: Frames, stamp_ns: int) -> Pose | None:
+    def _tcp_of(self, frames: TransformBuffer, stamp_ns: int) -> Pose | None:
         profile = self._node.profile
         found = frames.find(profile.robot.base_frame, profile.robot.tcp_frame)
         if found is None:

@@ -17,12 +17,48 @@ from numpy.typing import NDArray
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
 from vla_zenoh.errors import MissingExtraError, NodeError, RecordError, VlaZenohError
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
-from vla_zenoh.nodes.camera.render_budget import Coarseness
 from vla_zenoh.nodes.camera.source import STALL_S
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.types import SceneState, Stamped
+
+COARSEST = 4
+TOO_SLOW, WITH_EASE = 0.5, 0.25
+"""Share of a camera's period that drawing may take before it gets coarser, and to get finer."""
+MEMORY = 0.8
+
+
+class RenderBudget:
+    """Every how many pixels one is drawn, for one camera; the rest is interpolated.
+
+    Args:
+        rate_hz: pictures per second that are wanted.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_s = 1.0 / rate_hz
+        self._mean_s: float | None = None
+        self.step = 1
+
+    def took(self, seconds: float) -> None:
+        """A picture took this long to draw."""
+        mean_s = seconds if self._mean_s is None else self._mean_s
+        mean_s = MEMORY * mean_s + (1 - MEMORY) * seconds
+        self._mean_s = mean_s
+        if mean_s > TOO_SLOW * self._period_s and self.step < COARSEST:
+            self._change(self.step + 1)
+        elif self.step > 1:
+            finer = self.step - 1
+            if mean_s * (self.step / finer) ** 2 < WITH_EASE * self._period_s:
+                self._change(finer)
+
+    def _change(self, step: int) -> None:
+        # What was measured says nothing of the new step; scaled by pixels it is a fair guess.
+        if self._mean_s is not None:
+            self._mean_s *= (self.step / step) ** 2
+        self.step = step
+
 
 RAYCAST = "raycast"
 WAKE_S = 0.1
@@ -54,7 +90,7 @@ class SimCameras:
         self._read, self._refuse = read, refuse
         self._drawn_ns = {outlet.name: 0 for _, outlet in self._views}
         self._coarseness = {
-            outlet.name: Coarseness(outlet.profile.rate_hz) for _, outlet in self._views
+            outlet.name: RenderBudget(outlet.profile.rate_hz) for _, outlet in self._views
         }
         self._heard_ns = time.monotonic_ns()
         self._seed: int | None = None

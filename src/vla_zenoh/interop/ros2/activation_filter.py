@@ -7,7 +7,7 @@ QUIET_S = 2.0
 is told otherwise, people press more slowly."""
 
 
-class Switch:
+class ActivationFilter:
     """What may be switched off by every ``false``, and on by a person's ``true`` alone.
 
     An arm that was lost or stopped must not begin anew because some program has gone on saying

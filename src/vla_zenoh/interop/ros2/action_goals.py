@@ -13,7 +13,7 @@ from typing import NamedTuple
 from vla_zenoh.types import GripperCommand
 
 
-class Step(Enum):
+class GoalStep(Enum):
     """What is to be done now."""
 
     SEND = "send"
@@ -27,7 +27,7 @@ class ActionGoal(NamedTuple):
     command: GripperCommand
 
 
-class GoalKeeper:
+class GoalSequencer:
     """Decides when a goal is sent or cancelled. Time is given in ns of any clock.
 
     Args:
@@ -66,8 +66,8 @@ class GoalKeeper:
         self.goal = None
         return True
 
-    def step(self, now_ns: int) -> Step | None:
-        """What to do now: `Step.SEND` the `goal` that was just made, or `Step.CANCEL` it."""
+    def step(self, now_ns: int) -> GoalStep | None:
+        """Next action: `GoalStep.SEND` for the new `goal`, `GoalStep.CANCEL` for the old one."""
         if self.goal is not None and now_ns - self._since_ns > self._patience_ns(self.goal):
             self.timeouts += 1
             self.goal = None
@@ -78,10 +78,10 @@ class GoalKeeper:
             self.goal, self._wish = ActionGoal(self._number, self._wish), None
             self._accepted = self._cancelling = False
             self._since_ns = now_ns
-            return Step.SEND
+            return GoalStep.SEND
         if self._accepted and not self._cancelling:
             self._cancelling, self._since_ns = True, now_ns
-            return Step.CANCEL
+            return GoalStep.CANCEL
         return None
 
     def travel_s(self, goal: ActionGoal) -> float:

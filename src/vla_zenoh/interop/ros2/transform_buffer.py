@@ -16,7 +16,7 @@ FURTHEST_M = 1e9
 """Frames of the whole Earth are nearer to each other; a chain of such stays finite."""
 
 
-class Frames:
+class TransformBuffer:
     """The newest transform to every child frame."""
 
     def __init__(self) -> None:
