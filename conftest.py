@@ -41,6 +41,6 @@ def chain(shared_chain: Chain) -> Chain:
     """The file's robot: inactive, standing, nothing recorded, no event unread."""
     shared_chain.settle()
     shared_chain.recorder.forget()
-    shared_chain.client.take_events()
+    shared_chain.client.pop_events()
     assert not shared_chain.failure, shared_chain.failure
     return shared_chain

@@ -281,11 +281,11 @@ class Chain:
         """Whatever was before: inactive, standing, prompt ``hold``, worker ``scripted``."""
         client = self.client
         if self.state() in ("stopped", "fault"):
-            client.put(client.keys.reset, "")
-        client.put(client.keys.active, "false")
-        client.put(client.keys.worker, "scripted")
-        client.put(client.keys.prompt, "hold")
-        client.put(client.keys.speed, "100")
+            client.publish(client.keys.reset, "")
+        client.publish(client.keys.active, "false")
+        client.publish(client.keys.worker, "scripted")
+        client.publish(client.keys.prompt, "hold")
+        client.publish(client.keys.speed, "100")
         client.set_rate(self.profile.task.rate_hz, END_PATIENCE_S)
 
         def settled() -> bool:
@@ -456,7 +456,7 @@ def running_chain(
         if failure:
             raise failure[0]
         with open_session(profile.session) as session:
-            client = Client(profile, session).follow()
+            client = Client(profile, session).subscribe()
             recorder = Recorder(session, profile.keys)
             yield Chain(profile, path, hosts[0], session, client, recorder, lines, told, failure)
     finally:

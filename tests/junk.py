@@ -95,7 +95,7 @@ def samples_of(chain: Chain, seconds: float = 1.2) -> dict[str, tuple[bytes, byt
         )
 
     subscriber = chain.session.declare_subscriber(
-        chain.profile.keys.everything, zenoh.handlers.Callback(keep, indirect=False)
+        chain.profile.keys.all_keys, zenoh.handlers.Callback(keep, indirect=False)
     )
     time.sleep(seconds)
     subscriber.undeclare()

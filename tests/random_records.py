@@ -25,6 +25,7 @@ from vla_zenoh.types import (
     GripperState,
     Header,
     Image,
+    InferenceDebug,
     JointCommand,
     JointState,
     NodeStatus,
@@ -32,7 +33,6 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
     SceneState,
-    Seen,
     Task,
 )
 from vla_zenoh.types.reports import EVENT_KINDS, EVENT_LEVELS
@@ -238,8 +238,8 @@ RECORDS: dict[type, st.SearchStrategy[Any]] = {
     SceneState: st.builds(SceneState, texts, st.integers(0, 40).flatmap(vectors)),
     ObjectPoses: object_poses(),
     ModelSpec: model_specs,
-    Seen: st.builds(
-        Seen,
+    InferenceDebug: st.builds(
+        InferenceDebug,
         texts,
         counts,
         texts,

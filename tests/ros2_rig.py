@@ -14,7 +14,7 @@ from camera_rig import PATIENCE_S, free_endpoint, until
 from ros2_peer import KinematicPanda, Ros2Peer
 
 from vla_zenoh.bus.clock import Clock
-from vla_zenoh.bus.node import Stream
+from vla_zenoh.bus.node import Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
@@ -90,10 +90,10 @@ class Ros2Rig:
     def happened(self, what: str) -> list[Event]:
         return [event for event in self.events if event.what == what]
 
-    def stream(self, key: str, source: str = "command#1") -> Stream:
+    def stream(self, key: str, source: str = "command#1") -> Publisher:
         """A writer of commands; waits until the node hears it."""
-        stream = Stream(self.session, key, Kind.CONTROL, source, Clock())
-        until(f"the node listens to {key}", lambda: stream.wanted)
+        stream = Publisher(self.session, key, Kind.CONTROL, source, Clock())
+        until(f"the node listens to {key}", lambda: stream.has_subscribers)
         return stream
 
 

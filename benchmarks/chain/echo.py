@@ -41,7 +41,7 @@ def serve(endpoint: str, *, listen: bool, stop: threading.Event) -> None:
         while not stop.is_set():
             if not pictures.wait(POLL_S):
                 continue
-            arrival = pictures.take()
+            arrival = pictures.pop()
             if arrival is not None:
                 np.frombuffer(arrival.sample.payload.to_bytes(), np.uint8)
                 out.put(answer)
@@ -80,11 +80,11 @@ class EchoClient:
         Raises:
             TimeoutError: none came.
         """
-        self._answers.take()
+        self._answers.pop()
         self._out.put(rgb.tobytes())
         if not self._answers.wait(TIMEOUT_S):
             raise TimeoutError
-        arrival = self._answers.take()
+        arrival = self._answers.pop()
         assert arrival is not None
         return np.frombuffer(arrival.sample.payload.to_bytes(), np.float32)
 

@@ -106,11 +106,11 @@ class Chain:
         self._node = Node("camera", self.profile, session)
         self._up.callback(self._node.close)
         camera = self.profile.cameras[CAMERA]
-        self._outlet = CameraPublisher(CAMERA, camera, "benchmark", self._node, self._node.tell)
+        self._outlet = CameraPublisher(CAMERA, camera, "benchmark", self._node, self._node.emit)
         self._outlet.change(OK)
         keys = self._node.keys
-        self._chunks = self._node.listen(keys.delta(WORKER), LatestSample())
-        self._poses = self._node.listen(keys.command_pose, CallbackRing(4096))
+        self._chunks = self._node.subscribe(keys.delta(WORKER), LatestSample())
+        self._poses = self._node.subscribe(keys.command_pose, CallbackRing(4096))
         self._activate(client)
 
     def _activate(self, client: Client) -> None:
@@ -124,7 +124,7 @@ class Chain:
             self._report()
             if not self._chunks.wait(0.1):
                 continue
-            self._chunks.take()
+            self._chunks.pop()
             if client.status("command") is None:
                 continue
             try:
@@ -143,7 +143,7 @@ class Chain:
 
     # -- one request --------------------------------------------------------------------------
     def _report(self) -> None:
-        self._node.report(OK, detail={"cameras": {CAMERA: {"state": OK, "age_s": 0.0}}})
+        self._node.publish_status(OK, detail={"cameras": {CAMERA: {"state": OK, "age_s": 0.0}}})
 
     def _publish(self, rgb: NDArray[np.uint8]) -> tuple[int, int]:
         """Returns when, on the monotonic and on the wall clock."""
@@ -158,8 +158,8 @@ class Chain:
         Raises:
             TimeoutError: no chunk or no pose command came of it.
         """
-        self._poses.take_all()
-        self._chunks.take()
+        self._poses.drain()
+        self._chunks.pop()
         began_ns, stamp_ns = self._publish(rgb)
         self._await_chunk(stamp_ns, began_ns)
         chunk_ns = time.monotonic_ns()
@@ -177,8 +177,8 @@ class Chain:
         while (left_ns := give_up_ns - time.monotonic_ns()) > 0:
             if not self._chunks.wait(left_ns / 1e9):
                 break
-            arrival = self._chunks.take()
-            chunk = self._node.read(ActionChunk, arrival) if arrival else None
+            arrival = self._chunks.pop()
+            chunk = self._node.decode(ActionChunk, arrival) if arrival else None
             if chunk is not None and chunk.record.observation_stamp_ns == stamp_ns:
                 return
         raise TimeoutError
@@ -187,8 +187,8 @@ class Chain:
         """The first pose command of the picture, and when it was heard on the monotonic clock."""
         give_up = time.monotonic() + POSE_PATIENCE_S
         while time.monotonic() < give_up:
-            for arrival in self._poses.take_all():
-                pose = self._node.read(PoseCommand, arrival)
+            for arrival in self._poses.drain():
+                pose = self._node.decode(PoseCommand, arrival)
                 cause = pose.record.cause if pose else None
                 if pose is not None and cause and cause.observation_stamp_ns == stamp_ns:
                     return pose, arrival.mono_ns

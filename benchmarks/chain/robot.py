@@ -41,21 +41,23 @@ def play_robot(profile_file: str, stop: threading.Event, *, follows: bool) -> No
         node = Node(robot.driver, profile, session)
         orders = LatestSample(SMALL_BYTES)
         if follows:
-            node.listen(node.keys.command_pose, orders)
-        poses = node.stream(node.keys.state_pose, Kind.STATE)
-        arms = node.stream(node.keys.state_joint, Kind.STATE)
-        grippers = node.stream(node.keys.state_gripper, Kind.STATE)
+            node.subscribe(node.keys.command_pose, orders)
+        poses = node.declare_publisher(node.keys.state_pose, Kind.STATE)
+        arms = node.declare_publisher(node.keys.state_joint, Kind.STATE)
+        grippers = node.declare_publisher(node.keys.state_gripper, Kind.STATE)
         pace, rate = FixedRate(profile.timing.state_hz), RateMeter()
         while not stop.is_set():
             pace.wait()
-            arrival = orders.take()
-            order = node.read(PoseCommand, arrival) if arrival is not None else None
+            arrival = orders.pop()
+            order = node.decode(PoseCommand, arrival) if arrival is not None else None
             if order is not None:
                 told = order.record
                 pose = PoseState(told.position_m, told.quat_xyzw, told.twist)
-            header = poses.put(pose)
-            arms.put(joints, stamp_wall_ns=header.stamp_wall_ns, seq=header.seq)
-            grippers.put(gripper, stamp_wall_ns=header.stamp_wall_ns, seq=header.seq)
+            header = poses.publish(pose)
+            arms.publish(joints, stamp_wall_ns=header.stamp_wall_ns, seq=header.seq)
+            grippers.publish(gripper, stamp_wall_ns=header.stamp_wall_ns, seq=header.seq)
             rate.tick()
-            node.report("following" if follows else "standing", rates_hz={"state": rate.rate_hz})
+            node.publish_status(
+                "following" if follows else "standing", rates_hz={"state": rate.rate_hz}
+            )
         node.close()

@@ -25,7 +25,7 @@ from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.metrics import Percentiles
 from vla_zenoh.bus.payload_limits import bytes_of, header_of
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.codec.image import MAX_PICTURE_BYTES
+from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.bench.cpu_time import cpu_s
@@ -99,7 +99,7 @@ class Load:
         file = self._file(profile)
         self._servers[name] = self._stack.enter_context(Server("follower", str(file)))
         self._start(f"command {name}", ("command", "--profile", str(file)))
-        self._clients[name] = Client(profile, self._session).follow()
+        self._clients[name] = Client(profile, self._session).subscribe()
 
     def _activate(self, name: str, give_up_s: float) -> bool:
         """Whether a robot can be had to move by then."""
@@ -238,7 +238,7 @@ class Load:
         if self._stop.wait(seconds):
             raise NodeError("interrupted")
         for supervisor in self._supervisors.values():
-            if not supervisor.watch():
+            if not supervisor.poll():
                 raise NodeError("a node dies again and again; what it wrote stands above")
 
     def _pids(self) -> Mapping[str, list[int]]:
@@ -276,7 +276,7 @@ class _Pictures:
         now_ns = time.time_ns()
         try:
             header = header_of(sample)
-            bytes_of(sample.payload, MAX_PICTURE_BYTES)  # a reader copies it, as a worker does
+            bytes_of(sample.payload, MAX_IMAGE_BYTES)  # a reader copies it, as a worker does
         except CodecError:
             return
         self.count += 1

@@ -56,7 +56,7 @@ def main(config: str, robot: str, worker: str) -> None:
 
         handler = zenoh.handlers.Callback(take, indirect=False)
         front = (keys.camera_raw("front"), keys.camera_jpeg("front"))
-        wishes = (keys.everything, *front, keys.state_pose, keys.command_pose, keys.prompt)
+        wishes = (keys.all_keys, *front, keys.state_pose, keys.command_pose, keys.prompt)
         listening = [session.declare_subscriber(key, handler) for key in wishes]
         _seize(session, keys)
         for number in range(20):

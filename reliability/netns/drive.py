@@ -30,7 +30,7 @@ EARLY = "refused.activate_refused"
 def main(name: str, direction: str, count: int) -> None:
     profile = load_profile(name)
     with open_session(profile.session, wait_s=READY_PATIENCE_S) as session:
-        client = Client(profile, session).follow()
+        client = Client(profile, session).subscribe()
         recorder = Recorder(session, profile.keys)
         reasons = [""]
 

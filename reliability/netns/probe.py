@@ -140,7 +140,7 @@ class Probe:
                 lost[f"{node} {key}"] = value
         news = [
             [node, event.what, event.why]
-            for node, _, event in self._client.take_events()
+            for node, _, event in self._client.pop_events()
             if event.kind == "transition" and node in ("command", "sim")
         ]
         return {"refused": refused, "lost": lost, "news": news, "alive": sorted(self._client.alive)}
@@ -204,7 +204,7 @@ class Probe:
 def main(name: str) -> None:
     profile = load_profile(name)
     with open_session(profile.session, wait_s=READY_PATIENCE_S) as session:
-        client = Client(profile, session).follow()
+        client = Client(profile, session).subscribe()
         probe = Probe(client)
         client.wait_for(lambda: client.status("command"), READY_PATIENCE_S)
         probe.newest()

@@ -19,7 +19,7 @@ from netns.attack import MARK, MOTION, RATE
 from netns.lab import needs_namespaces
 from netns.site import HERE, Site, secured_site
 
-from vla_zenoh.bus.session import config
+from vla_zenoh.bus.session import session_config
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.security.identity import Identity, Role
 from vla_zenoh.security.store import Store
@@ -69,14 +69,14 @@ def test_three_hosts_with_certificates_carry_out_the_motion(site: Site) -> None:
 
 def plain_tcp(site: Site) -> dict[str, Any]:
     profile = load_profile("panda_sim")
-    return config(profile.session, connect=(f"tcp/{site.hosts['robot'].address}:{PORT}",))
+    return session_config(profile.session, connect=(f"tcp/{site.hosts['robot'].address}:{PORT}",))
 
 
 def with_files(site: Site, store: Store, host: str, node: str) -> dict[str, Any]:
     """The configuration that shows this certificate."""
     lab_profile = load_profile(str(site.folder / "plain_secure.yaml"))
     changes = {"session": {"security": {"folder": str(store.folder), "host": host}}}
-    return config(override(lab_profile, changes).session, identity=node)
+    return session_config(override(lab_profile, changes).session, identity=node)
 
 
 def no_certificate(site: Site) -> dict[str, Any]:

@@ -24,7 +24,7 @@ RATE_HZ = 10.0
 def main(name: str) -> None:
     profile = load_profile(name)
     with open_session(profile.session, wait_s=READY_PATIENCE_S) as session:
-        client = Client(profile, session).follow()
+        client = Client(profile, session).subscribe()
         listener = StreamListener(session, profile.keys, profile.task.worker, keep=4096)
         run = DemoRunner(client, listener, threading.Event(), lambda: None, lambda *_: None)
         try:

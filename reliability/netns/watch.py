@@ -20,7 +20,7 @@ from chain import READY_PATIENCE_S, Recorder
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
-from vla_zenoh.keys import last, worker_node
+from vla_zenoh.keys import last_chunk, worker_node
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Task
 
@@ -45,13 +45,15 @@ def main(name: str, mark: str) -> None:
             tasks[task.prompt, task.worker, task.rate_hz, task.active] = None
 
     def note(into: set[str]) -> zenoh.handlers.Callback[zenoh.Sample]:
-        return zenoh.handlers.Callback(lambda s: into.add(last(str(s.key_expr))), indirect=False)
+        return zenoh.handlers.Callback(
+            lambda s: into.add(last_chunk(str(s.key_expr))), indirect=False
+        )
 
     with (
         open_session(profile.session, wait_s=READY_PATIENCE_S) as session,
         open_session(profile.session, identity="command") as commands,
     ):
-        client = Client(profile, session).follow()
+        client = Client(profile, session).subscribe()
         recorder = Recorder(session, keys)
         until("a pose", recorder.newest_state)
         until("a task", lambda: client.task)
@@ -59,11 +61,11 @@ def main(name: str, mark: str) -> None:
         assert first is not None
         until("its worker", lambda: worker_node(first.worker) in client.alive, READY_PATIENCE_S)
         until("the simulator", lambda: client.status("sim"))
-        client.take_events()
+        client.pop_events()
         before = client.snapshot()["sim"][0].counters.get(RESETS, 0)
         taking = zenoh.handlers.Callback(take, indirect=False)
         listening = [
-            session.declare_subscriber(keys.everything, taking),
+            session.declare_subscriber(keys.all_keys, taking),
             session.liveliness().declare_subscriber(keys.all_alive, note(alive), history=True),
             commands.liveliness().declare_subscriber(keys.all_holding, note(held), history=True),
         ]
@@ -75,7 +77,7 @@ def main(name: str, mark: str) -> None:
         track = recorder.track().between(began_ns)
         for one in listening:
             one.undeclare()
-        news = [[node, event.what] for node, _, event in client.take_events()]
+        news = [[node, event.what] for node, _, event in client.pop_events()]
         print(
             json.dumps(
                 {

@@ -219,7 +219,7 @@ class Soak:
             if time.monotonic() > give_up_s:
                 raise NodeError(f"the arm does not obey again in {RECOVER_S:g} s")
             if chain.state() in ("stopped", "fault"):
-                chain.client.put(chain.client.keys.reset, "")
+                chain.client.publish(chain.client.keys.reset, "")
             elif chain.state() not in ("active", "holding") and self._all_fresh():
                 with suppress(SessionError):  # preflight says what is missing
                     chain.client.activate()

@@ -31,10 +31,10 @@ class Kind(Enum):
     STATE = "state"  # small, fast, newest only, may be dropped
     CONTROL = "control"  # small, real-time priority, express, may be dropped: a newer one follows
     ORDER = "order"  # small, real-time priority, express, must arrive
-    NEWS = "news"  # status and events
+    TELEMETRY = "news"  # status and events
 
 
-def chunk(name: str, what: str) -> str:
+def key_chunk(name: str, what: str) -> str:
     """Check that `name` can stand between two slashes of a key.
 
     Raises:
@@ -62,9 +62,9 @@ class Keys:
     root: str = DEFAULT_ROOT
 
     def __post_init__(self) -> None:
-        chunk(self.robot, "robot name")
+        key_chunk(self.robot, "robot name")
         for part in self.root.split("/"):
-            chunk(part, "root")
+            key_chunk(part, "root")
 
     def _at(self, *parts: str) -> str:
         return "/".join((self.root, self.robot, *parts))
@@ -72,15 +72,17 @@ class Keys:
     # -- streams of the robot side ------------------------------------------------------------
     def camera_raw(self, camera: str) -> str:
         """Pixels, C-contiguous RGB uint8 (H, W, 3); written while someone listens."""
-        return self._at("camera", chunk(camera, "camera name"), "raw")
+        return self._at("camera", key_chunk(camera, "camera name"), "raw")
 
     def camera_jpeg(self, camera: str) -> str:
         """A plain JPEG file, encoding image/jpeg; written while someone listens."""
-        return self._at("camera", chunk(camera, "camera name"), "jpeg")
+        return self._at("camera", key_chunk(camera, "camera name"), "jpeg")
 
     def camera_fitted(self, camera: str, form: str) -> str:
         """A JPEG as a model wants it, made where the camera is; see `size_variant`."""
-        return self._at("camera", chunk(camera, "camera name"), "fitted", chunk(form, "form"))
+        return self._at(
+            "camera", key_chunk(camera, "camera name"), "fitted", key_chunk(form, "form")
+        )
 
     @property
     def state_joint(self) -> str:
@@ -110,7 +112,7 @@ class Keys:
 
     def holding(self, holder: str) -> str:
         """Liveliness token of whoever lets the arm obey only for as long as he is there himself."""
-        return self._at("holding", chunk(holder, "holder"))
+        return self._at("holding", key_chunk(holder, "holder"))
 
     @property
     def worker(self) -> str:
@@ -150,19 +152,19 @@ class Keys:
 
     def delta(self, worker: str) -> str:
         """`ActionChunk` of one worker: the delta key."""
-        return self._at("delta", chunk(worker, "worker name"))
+        return self._at("delta", key_chunk(worker, "worker name"))
 
     def spec(self, worker: str) -> str:
         """The worker's `ModelSpec`, once a second and on request."""
-        return self._at("spec", chunk(worker, "worker name"))
+        return self._at("spec", key_chunk(worker, "worker name"))
 
     def seen(self, worker: str, camera: str) -> str:
         """JPEG of exactly what the model saw; written while someone listens."""
-        return self._at("seen", chunk(worker, "worker name"), chunk(camera, "camera name"))
+        return self._at("seen", key_chunk(worker, "worker name"), key_chunk(camera, "camera name"))
 
     def seen_record(self, worker: str) -> str:
-        """`Seen`: prompt, raw output and steps of the same inference; likewise."""
-        return self._at("seen", chunk(worker, "worker name"))
+        """`InferenceDebug`: prompt, raw output and steps of the same inference; likewise."""
+        return self._at("seen", key_chunk(worker, "worker name"))
 
     # -- command node -------------------------------------------------------------------------
     @property
@@ -183,19 +185,19 @@ class Keys:
     # -- every node ---------------------------------------------------------------------------
     def status(self, node: str) -> str:
         """`NodeStatus`, 2 Hz and on change."""
-        return self._at("status", chunk(node, "node name"))
+        return self._at("status", key_chunk(node, "node name"))
 
     def event(self, node: str) -> str:
         """`Event`."""
-        return self._at("event", chunk(node, "node name"))
+        return self._at("event", key_chunk(node, "node name"))
 
     def alive(self, node: str) -> str:
         """Liveliness token."""
-        return self._at("alive", chunk(node, "node name"))
+        return self._at("alive", key_chunk(node, "node name"))
 
     def clock(self, node: str) -> str:
         """Query: the four stamps of NTP; the node answers with when it heard and when it spoke."""
-        return self._at("clock", chunk(node, "node name"))
+        return self._at("clock", key_chunk(node, "node name"))
 
     # -- the simulator's own ------------------------------------------------------------------
     @property
@@ -220,22 +222,22 @@ class Keys:
 
     # -- selectors ----------------------------------------------------------------------------
     @property
-    def everything(self) -> str:
+    def all_keys(self) -> str:
         """All keys of this robot."""
         return self._at("**")
 
     @property
-    def without_pictures(self) -> tuple[str, ...]:
+    def without_images(self) -> tuple[str, ...]:
         """The same without pictures; two-part keys that are added later are among them, too."""
         return (self._at("*"), self._at("*", "*"))
 
     @property
-    def without_raw_pictures(self) -> tuple[str, ...]:
+    def without_raw_images(self) -> tuple[str, ...]:
         """The same with JPEG alone: who listens to raw pictures makes cameras send 1 MB each."""
-        return (*self.without_pictures, self._at("camera", "*", "jpeg"), self._at("seen", "*", "*"))
+        return (*self.without_images, self._at("camera", "*", "jpeg"), self._at("seen", "*", "*"))
 
     @property
-    def all_raw_pictures(self) -> str:
+    def all_raw_images(self) -> str:
         """The raw pictures of every camera."""
         return self._at("camera", "*", "raw")
 
@@ -257,7 +259,7 @@ class Keys:
 
     def all_seen_of(self, worker: str) -> str:
         """The pictures of one worker."""
-        return self._at("seen", chunk(worker, "worker name"), "*")
+        return self._at("seen", key_chunk(worker, "worker name"), "*")
 
     @property
     def all_status(self) -> str:
@@ -284,7 +286,7 @@ class Keys:
         """`key` without the root and robot, as people say it; other keys as they are."""
         return key.removeprefix(f"{self.root}/{self.robot}/")
 
-    def whole(self, key: str) -> str:
+    def full(self, key: str) -> str:
         """The way back of `short`; what begins with the root is taken as whole already."""
         return key if key.startswith(f"{self.root}/") else self._at(key)
 
@@ -310,10 +312,10 @@ class Keys:
 
 def origami_key(operation: str) -> str:
     """Where a policy of another system answers queries; see interop/origami.py."""
-    return f"origami-zenoh-v1/{chunk(operation, 'operation')}"
+    return f"origami-zenoh-v1/{key_chunk(operation, 'operation')}"
 
 
-def last(key: str) -> str:
+def last_chunk(key: str) -> str:
     """The last part of a key: the node, worker or camera it is about."""
     return key.rsplit("/", 1)[-1]
 
@@ -336,7 +338,7 @@ def _covers(wide: list[str], narrow: list[str]) -> bool:
     return wide[0] in ("*", narrow[0]) and _covers(wide[1:], narrow[1:])
 
 
-NOT_SEEN = "is not there (a liveliness token on the key holding/NAME)"
+NO_DEADMAN_TOKEN = "is not there (a liveliness token on the key holding/NAME)"
 """Said of the one who is to hold the arm active."""
 
 

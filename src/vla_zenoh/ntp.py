@@ -58,7 +58,7 @@ class Exchange:
 
 
 @dataclass(frozen=True, slots=True)
-class Offset:
+class ClockOffset:
     """The other one's wall clock minus ours.
 
     Args:
@@ -71,7 +71,7 @@ class Offset:
     uncertainty_s: float
     round_trip_s: float
 
-    def beyond(self, bound_s: float) -> bool:
+    def exceeds(self, bound_s: float) -> bool:
         """Whether the clock is off by more than is reckoned with."""
         return _beyond(self.offset_s, bound_s)
 
@@ -85,7 +85,7 @@ def _beyond(offset_s: float, bound_s: float) -> bool:
     return abs(offset_s) > bound_s
 
 
-class OffsetFilter:
+class ClockOffsetFilter:
     """Makes one offset of many exchanges, and a steady one to translate stamps by.
 
     Args:
@@ -108,7 +108,7 @@ class OffsetFilter:
         self._best = min(self._window, key=lambda one: self._uncertainty_ns(one, exchange.got))
         return True
 
-    def offset(self, wall_minus_mono_ns: int, now_mono_ns: int) -> Offset | None:
+    def offset(self, wall_minus_mono_ns: int, now_mono_ns: int) -> ClockOffset | None:
         """What is known now; None before the first exchange.
 
         Args:
@@ -118,7 +118,7 @@ class OffsetFilter:
         best = self._best
         if best is None:
             return None
-        return Offset(
+        return ClockOffset(
             (best.ahead_ns - wall_minus_mono_ns) / 1e9,
             self._uncertainty_ns(best, now_mono_ns) / 1e9,
             self._window[-1].round_trip_ns / 1e9,
@@ -150,7 +150,7 @@ class OffsetFilter:
         return apart_ns > self._uncertainty_ns(one, other.got) + other.round_trip_ns // 2 + 1
 
 
-def shifted(header: Header, record: Record, ahead_ns: int) -> tuple[Header, Record]:
+def shift_stamps(header: Header, record: Record, ahead_ns: int) -> tuple[Header, Record]:
     """Header and record with their stamps on our clock.
 
     A stamp at an end of what a record takes ("at once", "for ever") stays within it: whether that

@@ -32,7 +32,7 @@ _WORDS = {
 _QUOTED = re.compile(r"'([^']*)'")
 
 
-def in_words(fault: Any) -> str:
+def describe_fault(fault: Any) -> str:
     """One entry of ``ValidationError.errors()``, as what is to be said after a field's name."""
     context = fault.get("ctx", {})
     if fault["type"] == "literal_error":

@@ -13,7 +13,7 @@ import zenoh
 from pydantic import BaseModel, ValidationError
 
 from vla_zenoh import resources
-from vla_zenoh.bus.session import config
+from vla_zenoh.bus.session import session_config
 from vla_zenoh.profile import Profile, load_profile, to_yaml
 from vla_zenoh.profile.advice import advice
 
@@ -70,7 +70,7 @@ def test_a_shipped_profile_is_not_questionable(profile: Profile) -> None:
 def test_zenoh_takes_the_session_of_every_host(profile: Profile) -> None:
     for host in profile.hosts.values():
         for mode in ("client", "router"):
-            settings = config(profile.session, mode=mode, connect=host.connect)
+            settings = session_config(profile.session, mode=mode, connect=host.connect)
             zenoh.Config.from_json5(json.dumps(settings))
 
 

@@ -59,7 +59,7 @@ def go(chain: Chain, prompt: str) -> None:
     chain.until("it moves", chain.moves, FOUND_AGAIN_S)
     time.sleep(RUN_S)
     chain.until("it moves still", chain.moves)
-    chain.client.take_events()
+    chain.client.pop_events()
 
 
 def watchdog_s(chain: Chain) -> float:

@@ -123,7 +123,7 @@ def test_a_flood_of_stops_stops_the_arm_and_not_the_command_loop(
         assert status is not None
         rate_hz = status.rates_hz["loop"]
         # Whoever resets is overruled as long as somebody says stop.
-        chain.client.put(chain.client.keys.reset, "")
+        chain.client.publish(chain.client.keys.reset, "")
         time.sleep(1.0)
         assert chain.state() == "stopped"
     assert chain.recorder.track().time_to_stand_s(began_ns) < SPREAD_S
@@ -131,7 +131,7 @@ def test_a_flood_of_stops_stops_the_arm_and_not_the_command_loop(
     assert stranger.sent_hz > LEAST_SHARE * FLOOD_HZ, "this machine cannot make the flood"
     assert late["max"] < chain.profile.timing.watchdog_s * 1e6
     assert rate_hz > LOOP_SHARE * chain.profile.timing.command_hz
-    chain.client.put(chain.client.keys.reset, "")
+    chain.client.publish(chain.client.keys.reset, "")
     chain.until("it is reset", lambda: chain.state() == "inactive")
     chain.activate_when_ready()
     chain.settle()

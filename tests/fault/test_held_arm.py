@@ -85,7 +85,7 @@ def test_ctrl_c_brakes_first_and_says_so(ready: Chain) -> None:
 
 def test_a_stop_by_somebody_else_ends_it_with_the_reason(ready: Chain) -> None:
     with holding(ready) as process:
-        ready.client.put(ready.client.keys.stop, "stop")
+        ready.client.publish(ready.client.keys.stop, "stop")
         said, _ = process.communicate(timeout=ENDS_S)
         assert process.returncode == 1
         assert "the arm obeys no more: emergency stop" in said

@@ -15,7 +15,7 @@ RESTART_S = 12.0
 
 
 def test_a_command_node_that_is_started_again_is_still_stopped(chain: Chain) -> None:
-    chain.client.put(chain.client.keys.stop, "stop")
+    chain.client.publish(chain.client.keys.stop, "stop")
     chain.until("it stops", lambda: chain.state() == "stopped")
     old_pid = chain.pid("command")
     os.kill(old_pid, signal.SIGKILL)
@@ -30,23 +30,23 @@ def test_a_command_node_that_is_started_again_is_still_stopped(chain: Chain) -> 
     )
     with pytest.raises(SessionError, match="stopped before this node was started"):
         chain.client.activate()
-    chain.client.put(chain.client.keys.reset, "reset")
+    chain.client.publish(chain.client.keys.reset, "reset")
     chain.until("it is reset", lambda: chain.state() == "inactive")
     chain.activate_when_ready()
 
 
 def test_refusals_while_stopped_do_not_pile_up(chain: Chain) -> None:
-    chain.client.put(chain.client.keys.stop, "stop")
+    chain.client.publish(chain.client.keys.stop, "stop")
     chain.until("it stops", lambda: chain.state() == "stopped")
     pid = chain.pid("command")
     for _ in range(3000):
-        chain.client.put(chain.client.keys.active, "true")
+        chain.client.publish(chain.client.keys.active, "true")
     status = chain.client.status("command")
     assert status is not None
     assert len(status.detail["why"]) < 200
     assert chain.pid("command") == pid
     assert chain.state() == "stopped"
-    chain.client.put(chain.client.keys.reset, "reset")
+    chain.client.publish(chain.client.keys.reset, "reset")
     chain.until("it is reset", lambda: chain.state() == "inactive")
 
 

@@ -62,7 +62,7 @@ def keep_moving(chain: Chain, seconds: float, work: Callable[[], None]) -> float
     while time.monotonic() < end:
         if time.monotonic() > turn_s:
             turn_s, down = time.monotonic() + 2.0, not down
-            chain.client.put(chain.client.keys.prompt, f"HARD: go {'down' if down else 'up'}")
+            chain.client.publish(chain.client.keys.prompt, f"HARD: go {'down' if down else 'up'}")
         work()
         looks += 1
         active += chain.state() == "active"
@@ -136,7 +136,7 @@ def be_a_nuisance(chain: Chain, seconds: float) -> None:
     chain.until("stopped", lambda: chain.state() == "stopped")
     chain.wait_still()
     assert chain.recorder.track().time_to_stand_s(stopped_ns) < BRAKE_S
-    chain.client.put(chain.client.keys.reset, "")
+    chain.client.publish(chain.client.keys.reset, "")
     chain.until("reset", lambda: chain.state() == "inactive")
     chain.activate_when_ready()
     direction, sign = ("up", 1) if chain.height_m() < 0.4 else ("down", -1)  # away from the table
@@ -208,7 +208,7 @@ def test_a_flood_does_not_slow_the_command_loop(chain: Chain) -> None:
     pid = chain.pid("command")
     missed = chain.counter("command.missed_ticks")
     chain.recorder.forget()
-    chain.client.put(keys.prompt, "HARD: go up x8")
+    chain.client.publish(keys.prompt, "HARD: go up x8")
     began, sent = time.monotonic(), 0
     began_ns = time.time_ns()
     while time.monotonic() - began < FLOOD_S:

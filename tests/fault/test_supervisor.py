@@ -104,7 +104,7 @@ def up(*arguments: str) -> Iterator[Up]:
 def client_of(path: Path) -> Iterator[tuple[Client, Recorder]]:
     profile = load_profile(str(path))
     with open_session(profile.session, wait_s=READY_PATIENCE_S) as session:
-        yield Client(profile, session).follow(), Recorder(session, profile.keys)
+        yield Client(profile, session).subscribe(), Recorder(session, profile.keys)
 
 
 def get_moving(client: Client, recorder: Recorder) -> None:
@@ -295,7 +295,7 @@ def test_a_spared_node_that_dies_again_and_again_is_left_alone_while_others_run(
         end = f"worker-a died {GIVE_UP_AFTER} times in a row; it is left alone"
 
         def left() -> bool:
-            assert supervisor.watch(spare=("worker",))
+            assert supervisor.poll(spare=("worker",))
             return any(each.startswith(end) for each in told)
 
         until("it is left alone", left, READY_PATIENCE_S)
@@ -315,7 +315,7 @@ def test_when_nothing_else_is_left_or_can_be_spared_it_is_given_up(kind: str) ->
     supervisor, told = begin(broken("last", kind))
     try:
         lose(supervisor, "last")
-        until("given up", lambda: not supervisor.watch(spare=("worker",)), READY_PATIENCE_S)
+        until("given up", lambda: not supervisor.poll(spare=("worker",)), READY_PATIENCE_S)
         assert supervisor.given_up is supervisor.children[0]
         assert told[-1] == f"last died {GIVE_UP_AFTER} times in a row; giving up"
     finally:

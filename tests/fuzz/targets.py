@@ -45,7 +45,7 @@ from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.policy.scripted_motions import parse_scripted
 from vla_zenoh.profile import load_profile
-from vla_zenoh.types import Event, Header, NodeStatus, Seen
+from vla_zenoh.types import Event, Header, InferenceDebug, NodeStatus
 
 CORPUS = Path(__file__).parent / "corpus"
 """Inputs that once broke a reader, or nearly: a folder for each target."""
@@ -148,7 +148,7 @@ def _event_told(data: bytes) -> None:
 
 
 def _sight(data: bytes) -> None:
-    sight = InferenceView(records.decode(Seen, data), {"front": data})
+    sight = InferenceView(records.decode(InferenceDebug, data), {"front": data})
     assert _display(cli_seen.table({"w": sight})) < MAX_SHOWN
 
 
@@ -216,7 +216,9 @@ def examples() -> dict[type, Any]:
         t.Event("info", "notice", "loaded", "in 1 s"),
         t.SceneState("table", np.zeros(9)),
         t.ObjectPoses(("red",), np.zeros((1, 3)), down[None]),
-        t.Seen("w", 1, "0" * 16, 1, 2, "up", np.zeros((2, 7), np.float32), 1.0, {"a": 1}, False),
+        t.InferenceDebug(
+            "w", 1, "0" * 16, 1, 2, "up", np.zeros((2, 7), np.float32), 1.0, {"a": 1}, False
+        ),
     )
     return {type(record): record for record in made}
 
@@ -455,7 +457,7 @@ def _targets() -> Iterator[Target]:
     )
     yield Target("cli-told", _told, codec, lambda: [records.encode(status)])
     yield Target("cli-event", _event_told, codec, lambda: [records.encode(examples()[Event])])
-    yield Target("cli-seen", _sight, codec, lambda: [records.encode(examples()[Seen])])
+    yield Target("cli-seen", _sight, codec, lambda: [records.encode(examples()[InferenceDebug])])
     yield Target("cli-options", _options, own, lambda: [b"horizon=4", b"1,2.5,3"])
 
 

@@ -60,6 +60,7 @@ ALLOWED = {
             "lab/compare/listener.py",
             "lab/demo/runner.py",
             "lab/doctor/access_check.py",
+            "lab/episode.py",
             "lab/recording/recorder.py",
             "lab/recording/replay.py",
             "lab/recording/stream_listener.py",

@@ -107,7 +107,7 @@ class Lab:
         self.witness.wait_still()
         self.witness.forget()
         self.chain.recorder.forget()
-        self.chain.client.take_events()
+        self.chain.client.pop_events()
         assert not self.chain.failure, self.chain.failure
 
     def activate_at_rest(self) -> FloatArray:

@@ -118,7 +118,7 @@ def test_a_dds_client_stops_and_resets(lab: Lab) -> None:
 @pytest.mark.slow
 def test_a_robot_that_falls_silent_is_noticed_within_the_watchdog(lab: Lab) -> None:
     lab.move()
-    lab.chain.client.take_events()
+    lab.chain.client.pop_events()
     lab.robot.freeze()
     silent_ns = time.time_ns()
     try:

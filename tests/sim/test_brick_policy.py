@@ -93,7 +93,7 @@ def carry_out(stage: Stage, episode: TaskEpisode, limit_s: float = LIMIT_S) -> V
         loop.run(0.1)
         world = stage.world
         width_m = world.gripper_state().width_m
-        verdict = judge.see(stage.objects(), width_m, time_s, world.tcp()[0])
+        verdict = judge.update(stage.objects(), width_m, time_s, world.tcp()[0])
         if verdict is not None:
             return verdict
     return judge.end()

@@ -199,7 +199,7 @@ def test_a_robot_that_is_switched_off_and_on_moves_again_only_when_it_is_told() 
     assert way_m(loop, since) < SILENT_WAY_M
     loop.put("active", True)
     loop.run(0.3)
-    loop.guard.restart()
+    loop.guard.reset()
     loop.alive.add(SIM)
     loop.tamper = None
     loop.run(0.5)

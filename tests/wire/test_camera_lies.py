@@ -97,7 +97,7 @@ def test_a_camera_that_lies_ends_the_activation_by_name(chain: Chain, what: str)
     lie, said, check = LIES[what]
     folder = chain.profile_file.with_name("show")
     chain.move()
-    chain.client.take_events()
+    chain.client.pop_events()
     show(folder, lie())
     chain.until("it ends", lambda: chain.events("active->inactive"), FOUND_S)
     (ended,) = chain.events("active->inactive")

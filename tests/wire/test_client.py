@@ -19,7 +19,7 @@ from vla_zenoh.codec.image import MAX_JPEG_BYTES
 from vla_zenoh.nodes.worker.inference_debug import MAX_SAMPLES, InferenceDebugSubscriber
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.types import Event, Header, NodeStatus, Seen
+from vla_zenoh.types import Event, Header, InferenceDebug, NodeStatus
 
 STRANGERS = 2000
 TOKENS = 300
@@ -42,7 +42,7 @@ def test_names_of_strangers_neither_fill_a_client_nor_hide_a_node(profile: Profi
     keys, ghost = profile.keys, records.encode(NodeStatus("sim", "ok", "h", 1, 2))
     who = header_codec.encode(Header(1, 2, "stranger#1"))
     with open_session(profile.session) as here, open_session(profile.session) as there:
-        client = Client(profile, here).follow()
+        client = Client(profile, here).subscribe()
         tokens = [
             there.liveliness().declare_token(keys.alive(f"ghost{number}"))
             for number in range(TOKENS)
@@ -51,9 +51,9 @@ def test_names_of_strangers_neither_fill_a_client_nor_hide_a_node(profile: Profi
             there.put(
                 keys.status(f"ghost{number}"), ghost, attachment=who, congestion_control=SURELY
             )
-        until("all have come", lambda: client.left_out > STRANGERS - 2 * MAX_OTHERS)
+        until("all have come", lambda: client.dropped > STRANGERS - 2 * MAX_OTHERS)
         node = Node("sim", profile, there)
-        node.report("running", now=True)
+        node.publish_status("running", now=True)
         until("the node is there", lambda: "sim" in client.alive and client.status("sim"))
         found = client.snapshot()
         assert found["sim"][0].state == "running"
@@ -70,15 +70,15 @@ def test_names_of_strangers_neither_fill_a_client_nor_hide_a_node(profile: Profi
 @pytest.mark.slow
 def test_a_flood_of_long_events_is_kept_short(profile: Profile) -> None:
     with open_session(profile.session) as here, open_session(profile.session) as there:
-        client = Client(profile, here).follow()
+        client = Client(profile, here).subscribe()
         node = Node("sim", profile, there)
 
         def told() -> bool:
-            node.tell(Event("warning", "notice", "w" * 4096, "w" * 4096))
+            node.emit(Event("warning", "notice", "w" * 4096, "w" * 4096))
             return bool(client.events)
 
         until("an event has come", told)
-        ((_, _, event), *_) = client.take_events()
+        ((_, _, event), *_) = client.pop_events()
         assert len(event.why) == MAX_WHY
         node.close()
 
@@ -95,7 +95,9 @@ def test_nobody_shows_what_another_worker_saw_nor_names_a_folder_elsewhere(
 
         def shown() -> bool:
             for worker in ("../../scripted", "other", "scripted"):
-                record = Seen(worker, 1, "0" * 16, 1, 2, "up", np.zeros((1, 7), np.float32), 1.0)
+                record = InferenceDebug(
+                    worker, 1, "0" * 16, 1, 2, "up", np.zeros((1, 7), np.float32), 1.0
+                )
                 there.put(key, records.encode(record), attachment=who)
                 there.put(f"{key}/..", b"", attachment=who)
             seen.extend(sight.record.worker for sight in listener.take())

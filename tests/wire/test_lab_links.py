@@ -65,9 +65,9 @@ def set_ahead(node: Node, by_ns: int) -> None:
 def asked(node: Node, other: str) -> Any:
     def known() -> Any:
         node.clocks.tick()
-        return node.clocks.known().get(other)
+        return node.clocks.offsets().get(other)
 
-    node.clocks.follow(other)
+    node.clocks.track(other)
     return until(f"the clock of {other}", known)
 
 
@@ -84,18 +84,18 @@ def test_a_clock_that_is_ahead_is_measured_within_its_uncertainty() -> None:
 def test_stamps_of_another_host_are_read_on_the_own_clock() -> None:
     with two_nodes() as (near, far):
         set_ahead(far, AHEAD_NS)
-        slot = near.listen(near.keys.task, LatestSample())
+        slot = near.subscribe(near.keys.task, LatestSample())
         asked(near, "sim")
-        out = far.stream(far.keys.task, Kind.ORDER)
-        until("a listener", lambda: out.wanted)
+        out = far.declare_publisher(far.keys.task, Kind.ORDER)
+        until("a listener", lambda: out.has_subscribers)
 
         def exchange() -> Stamped[Task] | None:
-            out.put(Task(0, False, "hold", "scripted", 5.0))
+            out.publish(Task(0, False, "hold", "scripted", 5.0))
             assert slot.wait(1.0)
-            arrival = slot.take()
+            arrival = slot.pop()
             assert arrival is not None
             near.clocks.tick()
-            stamped = near.read(Task, arrival)
+            stamped = near.decode(Task, arrival)
             assert stamped is not None
             late_s = (stamped.received_ns - stamped.header.stamp_wall_ns) / 1e9
             return stamped if abs(late_s) < STAMP_TOLERANCE_S else None
@@ -107,7 +107,7 @@ def test_a_clock_beyond_the_bound_is_told_and_its_stamps_stay() -> None:
     with two_nodes() as (near, far):
         set_ahead(far, 2_000_000_000)
         found = asked(near, "sim")
-        peers = PeerSnapshot(frozenset({"sim"}), clocks=near.clocks.known())
+        peers = PeerSnapshot(frozenset({"sim"}), clocks=near.clocks.offsets())
         reasons = reasons_not_to_activate(
             near.profile, "scripted", "hold", peers, None, None, None, time.time_ns()
         )
@@ -120,11 +120,11 @@ def test_a_clock_beyond_the_bound_is_told_and_its_stamps_stay() -> None:
 def test_a_source_that_cannot_be_a_node_is_not_asked() -> None:
     with two_nodes() as (near, _):
         for name in ("", "a/b", "**", "x" * 100, "\n", "sim/../..", "command"):
-            near.clocks.here(Header(0, 0, f"{name}#1"), None)
+            near.clocks.to_local_clock(Header(0, 0, f"{name}#1"), None)
         near.clocks.tick()
         assert near.clocks._peers == {}
         for number in range(500):
-            near.clocks.here(Header(0, 0, f"stranger{number}#1"), None)
+            near.clocks.to_local_clock(Header(0, 0, f"stranger{number}#1"), None)
         assert len(near.clocks._peers) == MAX_HEARD
 
 
@@ -140,13 +140,13 @@ def test_commands_and_pictures_travel_on_links_of_their_own() -> None:
         open_session(profile.session) as here,
     ):
         camera, worker = Node("camera", profile, there), Node("worker-far", profile, here)
-        pictures = camera.stream(profile.keys.camera_jpeg("front"), Kind.FRAME)
-        news = camera.stream(profile.keys.state_pose, Kind.STATE)
-        seen = worker.listen(pictures.key, LatestSample(), Kind.FRAME)
-        heard = worker.listen(news.key, LatestSample())
-        until("a reader of both", lambda: pictures.wanted and news.wanted)
+        pictures = camera.declare_publisher(profile.keys.camera_jpeg("front"), Kind.FRAME)
+        news = camera.declare_publisher(profile.keys.state_pose, Kind.STATE)
+        seen = worker.subscribe(pictures.key, LatestSample(), Kind.FRAME)
+        heard = worker.subscribe(news.key, LatestSample())
+        until("a reader of both", lambda: pictures.has_subscribers and news.has_subscribers)
         for stream, slot in ((pictures, seen), (news, heard)):
-            stream.put(b"something")
+            stream.publish(b"something")
             assert slot.wait(2.0)
         port, own = endpoint.removeprefix("tcp/"), second_link(endpoint).removeprefix("tcp/")
         for node in (camera, worker):
@@ -242,9 +242,9 @@ def test_a_model_on_another_host_gets_pictures_in_its_own_size(tmp_path: Path) -
         whole, _whole = rig.listen(rig.profile.keys.camera_jpeg("front"))
         fitted, _fitted = rig.listen(rig.profile.keys.camera_fitted("front", form))
         node = Node("worker-far", rig.profile, rig.watcher)
-        out = node.stream(node.keys.spec("far"), Kind.NEWS)
-        until("the camera node", lambda: out.wanted)
-        out.put(spec)
+        out = node.declare_publisher(node.keys.spec("far"), Kind.TELEMETRY)
+        until("the camera node", lambda: out.has_subscribers)
+        out.publish(spec)
         until("fitted pictures", lambda: len(fitted) > 5 and len(whole) > 5)
         node.close()
         image = decode_jpeg(fitted[-1].payload)

@@ -83,7 +83,7 @@ def test_a_mailbox_keeps_the_newest_in_order_and_no_more_than_it_holds() -> None
     ):
         box = ZenohRing(3)
         subscriber = reader.declare_subscriber("test/box", box.channel())
-        box.take_from(subscriber.try_recv)
+        box.receive_from(subscriber.try_recv)
         await_match(writer, "test/box")
         last = reader.declare_subscriber("test/end", ZenohRing(1).channel())
         await_match(writer, "test/end")
@@ -91,9 +91,9 @@ def test_a_mailbox_keeps_the_newest_in_order_and_no_more_than_it_holds() -> None
             writer.put("test/box", str(number))
         writer.put("test/end", "")
         until("the end", last.try_recv)
-        taken = [arrival.sample.payload.to_string() for arrival in box.take_all()]
+        taken = [arrival.sample.payload.to_string() for arrival in box.drain()]
         assert taken == ["7", "8", "9"]
-        assert box.take_all() == []
+        assert box.drain() == []
 
 
 @pytest.mark.parametrize("make", [LatestSample, partial(CallbackRing, 4), partial(ZenohRing, 4)])
@@ -112,7 +112,7 @@ def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
     ):
         node = Node("reader", profile, reader)
         key = node.keys.prompt
-        slot = node.listen(key, make(limit))
+        slot = node.subscribe(key, make(limit))
         events = CallbackRing(8)
         writer.declare_subscriber(
             node.keys.event("reader"), zenoh.handlers.Callback(events, indirect=False)
@@ -125,15 +125,15 @@ def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
 
         def take() -> list[ReceivedSample]:
             if isinstance(slot, LatestSample):
-                arrival = slot.take()
+                arrival = slot.pop()
                 return [] if arrival is None else [arrival]
-            return slot.take_all()
+            return slot.drain()
 
         taken = until("the one that fits", take)
         assert [len(arrival.sample.payload) for arrival in taken] == [limit]
-        node.report("running", now=True)
+        node.publish_status("running", now=True)
         assert node.counters["refused.oversize"] == 2
-        told = until("the event", events.take_all)
+        told = until("the event", events.drain)
         words = b"prompt: %d bytes, at most %d are taken" % (limit + 1, limit)
         assert words in told[-1].sample.payload.to_bytes()
         node.close()
@@ -154,7 +154,7 @@ def test_what_deletes_is_not_taken_for_what_is_put(
     ):
         node = Node("reader", profile, reader)
         key = node.keys.reset
-        slot = node.listen(key, make())  # pyright: ignore[reportArgumentType]
+        slot = node.subscribe(key, make())  # pyright: ignore[reportArgumentType]
         await_match(writer, key)
         for _ in range(3):
             writer.delete(key)
@@ -162,13 +162,13 @@ def test_what_deletes_is_not_taken_for_what_is_put(
 
         def take() -> list[ReceivedSample]:
             if isinstance(slot, LatestSample):
-                arrival = slot.take()
+                arrival = slot.pop()
                 return [] if arrival is None else [arrival]
-            return slot.take_all()
+            return slot.drain()
 
         (taken,) = until("the one that was put", take)
         assert taken.sample.kind == zenoh.SampleKind.PUT
-        node.report("running", now=True)
+        node.publish_status("running", now=True)
         assert node.counters["refused.deleted"] == 3
         node.close()
 
@@ -183,11 +183,11 @@ def test_zenoh_itself_passes_over_what_nobody_could_read() -> None:
     ):
         box = ZenohRing(4, MAX_MESSAGE_BYTES)
         subscriber = reader.declare_subscriber("test/box", box.channel())
-        box.take_from(subscriber.try_recv)
+        box.receive_from(subscriber.try_recv)
         await_match(writer, "test/box")
         writer.put("test/box", bytes(MAX_MESSAGE_BYTES + 1))
         writer.put("test/box", b"after")
-        taken = until("the small one", box.take_all)
+        taken = until("the small one", box.drain)
         assert [arrival.sample.payload.to_bytes() for arrival in taken] == [b"after"]
 
 
@@ -200,8 +200,8 @@ def test_a_wall_clock_that_is_set_is_noticed_once_and_followed(
     before_ns = clock.wall_ns()
     monkeypatch.setattr(time, "time_ns", lambda: true() + int(step_s * 1e9))
     assert clock.wall_ns() - before_ns < 1e9, "it does not jump by itself"
-    assert clock.follow() == pytest.approx(step_s, abs=STEP_TOLERANCE_S)
-    assert clock.follow() == 0.0
+    assert clock.adopt_system_time() == pytest.approx(step_s, abs=STEP_TOLERANCE_S)
+    assert clock.adopt_system_time() == 0.0
     assert (clock.wall_ns() - true()) / 1e9 == pytest.approx(step_s, abs=STEP_TOLERANCE_S)
 
 
@@ -209,7 +209,7 @@ def test_a_slewing_clock_is_followed_silently(monkeypatch: pytest.MonkeyPatch) -
     clock = Clock()
     true: Callable[[], int] = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: true() + int(0.5 * ADOPT_S * 1e9))
-    assert clock.follow() == 0.0
+    assert clock.adopt_system_time() == 0.0
     assert clock.wall_ns() - true() > 0.4 * ADOPT_S * 1e9
 
 

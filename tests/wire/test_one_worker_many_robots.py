@@ -210,7 +210,7 @@ def test_a_robot_that_falls_silent_or_fails_holds_up_no_other(
         until("nobody asks for the silent one", lambda: "a" not in model.batches[-1])
 
         with open_session(profile.session) as session:
-            looker = Client(override(profile, {"robot": {"name": "b"}}), session).follow()
+            looker = Client(override(profile, {"robot": {"name": "b"}}), session).subscribe()
             b.asked(prompt="fail")
             until("c goes on", c.more(5))
             counters = until("its status", lambda: looker.status("worker-together")).counters

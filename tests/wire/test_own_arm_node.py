@@ -146,7 +146,7 @@ def test_a_fault_of_the_robot_stops_it_until_it_is_gone_and_reset(lab: Lab, what
     lab.trouble("")
     chain.until("the robot is well", lambda: chain.state("arm") == "running")
     assert chain.state() == "fault"
-    chain.client.put(chain.client.keys.reset, "")
+    chain.client.publish(chain.client.keys.reset, "")
     chain.activate_when_ready()
 
 

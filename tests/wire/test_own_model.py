@@ -53,11 +53,11 @@ options: {up: {step_m: "0.01"}, down: {step_m: "-0.01"}}
                 f"{worker} infers", lambda w=worker: chain.state(f"worker-{w}") == "inferring"
             )
             assert chain.detail("spec", f"worker-{worker}") == hash_
-        chain.client.put(chain.client.keys.worker, "up")
+        chain.client.publish(chain.client.keys.worker, "up")
         chain.activate_when_ready()
         chain.until("the arm moves", chain.moves)
         assert chain.recorder.track().twist[-1][2] > MOVING_M_S / 2
-        chain.client.put(chain.client.keys.worker, "down")
+        chain.client.publish(chain.client.keys.worker, "down")
         chain.until("it goes down", lambda: chain.recorder.track().twist[-1][2] < -MOVING_M_S / 2)
 
 

@@ -14,7 +14,7 @@ import pytest
 import zenoh
 from camera_rig import Rig, camera_rig, free_endpoint, grey, until
 
-from vla_zenoh.bus.node import Node, Stream
+from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.keys import Kind
@@ -52,14 +52,16 @@ class Models:
     def __init__(self, rig: Rig) -> None:
         node = Node("worker-test", rig.profile, rig.watcher)
         self._node, self._widths = node, dict[str, int]()
-        self._outs: dict[str, Stream] = {}
+        self._outs: dict[str, Publisher] = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def come(self, worker: str, width: int) -> None:
-        out = self._outs.get(worker) or self._node.stream(self._node.keys.spec(worker), Kind.NEWS)
-        until("the camera node", lambda: out.wanted)
+        out = self._outs.get(worker) or self._node.declare_publisher(
+            self._node.keys.spec(worker), Kind.TELEMETRY
+        )
+        until("the camera node", lambda: out.has_subscribers)
         self._outs[worker] = out
         self._widths[worker] = width
 
@@ -69,7 +71,7 @@ class Models:
     def _run(self) -> None:
         while not self._stop.wait(TURN_S / 3):
             for worker, width in list(self._widths.items()):
-                self._outs[worker].put(spec(width))
+                self._outs[worker].publish(spec(width))
 
     def close(self) -> None:
         self._stop.set()
@@ -173,16 +175,16 @@ def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer(
     jpeg = encode_jpeg(Image(grey(50)), 90)
     with two_nodes() as (camera, worker):
         keys = worker.keys
-        own = camera.stream(keys.camera_fitted("front", "32x32-pad"), Kind.FRAME)
-        plain = camera.stream(keys.camera_jpeg("front"), Kind.FRAME)
+        own = camera.declare_publisher(keys.camera_fitted("front", "32x32-pad"), Kind.FRAME)
+        plain = camera.declare_publisher(keys.camera_jpeg("front"), Kind.FRAME)
         changed = threading.Condition()
         ears = CameraSubscriber(
             worker, "front", own.key, plain.key, patience_s=PATIENCE_S, changed=changed
         )
 
-        def comes(stream: Stream) -> bool:
+        def comes(stream: Publisher) -> bool:
             """Whether a picture that is put there is what is taken next."""
-            stream.put(jpeg, encoding=zenoh.Encoding.IMAGE_JPEG)
+            stream.publish(jpeg, encoding=zenoh.Encoding.IMAGE_JPEG)
             heard = ears.take()
             if heard is None:
                 return False
@@ -191,13 +193,13 @@ def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer(
             heard.speaker.heard(header, heard.arrival.mono_ns)
             return str(heard.arrival.sample.key_expr) == stream.key
 
-        until("a reader", lambda: own.wanted)
-        assert not plain.wanted
+        until("a reader", lambda: own.has_subscribers)
+        assert not plain.has_subscribers
         plain.seq = 1000  # its numbers are its own, and far ahead
         until("a plain one", lambda: comes(plain))
         until("the next", lambda: comes(plain))
         until("its own", lambda: comes(own))
-        until("plain ones do not travel any more", lambda: comes(own) and not plain.wanted)
+        until("plain ones do not travel any more", lambda: comes(own) and not plain.has_subscribers)
         until("plain ones once more", lambda: comes(plain))
 
 
@@ -215,10 +217,11 @@ def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all(
         keys = worker.keys
         sizes = [own, "32x32-pad", host_variant("edge", "32x32-pad")]
         outs = {
-            size: camera.stream(keys.camera_fitted("front", size), Kind.FRAME) for size in sizes
+            size: camera.declare_publisher(keys.camera_fitted("front", size), Kind.FRAME)
+            for size in sizes
         }
         key = keys.camera_jpeg("front") if plain is None else keys.camera_fitted("front", plain)
-        for_all = camera.stream(key, Kind.FRAME)
+        for_all = camera.declare_publisher(key, Kind.FRAME)
         wanted = CameraSpec(camera="front", width=32, height=32, resize="pad")
         changed = threading.Condition()
         ears = subscribe_to_camera(wanted, worker, jpeg=True, host=host, changed=changed)
@@ -227,6 +230,6 @@ def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all(
 
         def takes_plain() -> bool:
             assert ears.take() is None
-            return for_all.wanted
+            return for_all.has_subscribers
 
         until("plain ones", takes_plain)

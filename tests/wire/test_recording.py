@@ -22,7 +22,7 @@ from chain import READY_PATIENCE_S, Chain, command_line
 from recording_rig import assert_same, ghost_of, recording
 from rosbags.rosbag2 import Reader
 
-from vla_zenoh.bus.node import Stream
+from vla_zenoh.bus.node import Publisher
 from vla_zenoh.codec import records
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Keys, Kind
@@ -241,10 +241,10 @@ def test_what_the_queue_cannot_take_is_counted_and_said(chain: Chain, tmp_path: 
     ghost, path = ghost_of(chain, "fast"), tmp_path / "a.mcap"
     recorder = Recorder(ghost, chain.session, path, queue_bytes=200).start()
     key = ghost.keys.event("camera")
-    stream = Stream(chain.session, key, Kind.ORDER, "camera#1", recorder.node.clock)
+    stream = Publisher(chain.session, key, Kind.ORDER, "camera#1", recorder.node.clock)
     small = Event("info", "notice", "x")
     for event in (small, Event("info", "notice", "x", "y" * 400), small):
-        stream.put(event)
+        stream.publish(event)
         time.sleep(0.4)
     recorded = recorder.close()
     # What it says of itself is larger than this queue, and is missing as well.
@@ -315,6 +315,6 @@ def test_the_recorder_says_how_it_goes(chain: Chain, tmp_path: Path) -> None:
     assert status.state == "recording"
     assert status.counters["dropped"] == 0
     assert set(result["samples"]) == {
-        *(chain.profile.keys.whole(f"state/{part}") for part in ("joint", "pose", "gripper")),
+        *(chain.profile.keys.full(f"state/{part}") for part in ("joint", "pose", "gripper")),
         chain.profile.keys.status("recorder"),
     }

@@ -14,7 +14,7 @@ from ros2_peer import Ros2Peer
 from ros2_rig import write_profile
 
 from vla_zenoh.bus.clock import Clock
-from vla_zenoh.bus.node import Node, Stream
+from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.guard.gripper_guard import OLDEST_NS
 from vla_zenoh.interop.ros2.gripper_actions import SUCCEEDED
@@ -44,7 +44,9 @@ ORDER = GripperCommand(0.02, 0.05, 10.0)
 class Rig:
     """A gripper that is turned by hand, and the robot's side of its action."""
 
-    def __init__(self, node: Node, gripper: Gripper, command: Stream, stranger: Stream) -> None:
+    def __init__(
+        self, node: Node, gripper: Gripper, command: Publisher, stranger: Publisher
+    ) -> None:
         self.node, self.gripper = node, gripper
         self.command, self.stranger = command, stranger
         self.goals: list[Any] = []
@@ -80,7 +82,7 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
         link = RosGraph(ours, profile.ros2, messages, "vla_panda")
         gripper = Gripper(node, link, messages, profile.ros2.gripper, lambda: rig.width_m)
         streams = [
-            Stream(theirs, profile.keys.command_gripper, Kind.ORDER, source, Clock())
+            Publisher(theirs, profile.keys.command_gripper, Kind.ORDER, source, Clock())
             for source in ("command#1", "stranger#1")
         ]
         peer = Ros2Peer(theirs, "ros2dds")
@@ -105,7 +107,7 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
         serve(MOVE, "Move")
         serve(GRASP, "Grasp")
         serve(f"{KNUCKLE}/_action", "GripperCommand", "control_msgs")
-        until("the gripper listens", lambda: all(stream.wanted for stream in streams))
+        until("the gripper listens", lambda: all(stream.has_subscribers for stream in streams))
         yield rig
         rig.over.set()
         peer.close()
@@ -117,21 +119,21 @@ def test_strangers_and_orders_that_come_again_move_nothing_and_none_goes_beyond_
     rig: Rig,
 ) -> None:
     most = rig.node.profile.robot.gripper
-    rig.command.put(GripperCommand(1.0, 10.0, 1000.0))
+    rig.command.publish(GripperCommand(1.0, 10.0, 1000.0))
     rig.turn_until("the first goal", "ros2.gripper_goals", 1)
     until("the robot hears it", lambda: rig.goals)
     assert (rig.goals[0].width, rig.goals[0].speed) == (most.max_width_m, most.speed_m_s)
     assert rig.node.counters["gripper_bounded"] == 1
     time.sleep(FORGOTTEN_S)
-    rig.command.put(ORDER, seq=0)
+    rig.command.publish(ORDER, seq=0)
     rig.turn_until("it came again", "refused.replayed", 1)
-    rig.stranger.put(ORDER)
+    rig.stranger.publish(ORDER)
     rig.turn_until("it is a stranger's", "refused.foreign", 1)
     assert rig.gripper.wanted_m == most.max_width_m
 
 
 def test_a_wall_clock_that_is_set_does_not_give_up_a_goal(rig: Rig) -> None:
-    rig.command.put(ORDER)
+    rig.command.publish(ORDER)
     rig.turn_until("the goal", "ros2.gripper_goals", 1)
     for now_ns in (time.time_ns() + HOUR_NS, time.time_ns() - HOUR_NS):
         rig.gripper.turn(now_ns, "command#1", leads=True)
@@ -153,7 +155,7 @@ def test_what_closes_the_fingers_from_where_they_are_is_a_grasp_and_nothing_else
         (None, 0.02, "Grasp"),
     ):
         rig.width_m = at_m
-        rig.command.put(GripperCommand(to_m, 0.05, 10.0))
+        rig.command.publish(GripperCommand(to_m, 0.05, 10.0))
         expected.append(action)
         rig.turn_until("the goal", "ros2.gripper_goals", len(expected))
         until("the robot hears it", lambda: len(rig.actions) == len(expected))
@@ -161,9 +163,9 @@ def test_what_closes_the_fingers_from_where_they_are_is_a_grasp_and_nothing_else
 
 
 def test_a_wish_that_waits_for_the_gripper_is_not_sent_after_a_stop(rig: Rig) -> None:
-    rig.command.put(GripperCommand(0.0, 0.05, 10.0))
+    rig.command.publish(GripperCommand(0.0, 0.05, 10.0))
     rig.turn_until("the goal, which hangs", "ros2.gripper_goals", 1)
-    rig.command.put(GripperCommand(0.08, 0.05, 10.0))
+    rig.command.publish(GripperCommand(0.08, 0.05, 10.0))
     rig.turn_until("the wish waits", "ros2.gripper_cancelled", 1)
     rig.turn(leads=False)  # the command node brakes
     rig.turn(writer="", leads=False)
@@ -181,7 +183,7 @@ def test_a_wish_that_waits_for_the_gripper_is_not_sent_after_a_stop(rig: Rig) ->
 
 
 def test_an_order_that_waited_while_this_side_stood_still_moves_nothing(rig: Rig) -> None:
-    rig.command.put(ORDER, stamp_wall_ns=time.time_ns() - 2 * OLDEST_NS)
+    rig.command.publish(ORDER, stamp_wall_ns=time.time_ns() - 2 * OLDEST_NS)
     rig.turn_until("it is refused", "refused.stale", 1)
     assert not rig.gripper.busy
 
@@ -190,7 +192,7 @@ def test_an_order_that_waited_while_this_side_stood_still_moves_nothing(rig: Rig
 def test_who_holds_something_is_told_by_the_fingers_and_not_by_the_grasp(rig: Rig) -> None:
     rig.over.set()
     rig.width_m = 0.08
-    rig.command.put(GripperCommand(0.0, 0.05, 10.0))
+    rig.command.publish(GripperCommand(0.0, 0.05, 10.0))
     rig.turn_until("the goal", "ros2.gripper_goals", 1)
     assert not rig.gripper.holding
 
@@ -212,7 +214,7 @@ def test_a_gripper_that_turns_is_sent_the_angle_of_its_opening(rig: Rig) -> None
     for number, (width_m, angle_rad) in enumerate(
         ((0.08, 0.0), (0.02, 0.75 * SHUT_RAD), (0.0, SHUT_RAD)), 1
     ):
-        rig.command.put(GripperCommand(width_m, 0.05, 10.0))
+        rig.command.publish(GripperCommand(width_m, 0.05, 10.0))
         rig.turn_until("the goal", "ros2.gripper_goals", number)
         until("the robot hears it", lambda count=number: len(rig.goals) == count)
         assert rig.goals[-1].command.position == pytest.approx(angle_rad)

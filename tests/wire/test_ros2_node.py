@@ -15,7 +15,7 @@ import zenoh
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 from ros2_rig import CAMERA, HEIGHT, WIDTH, Ros2Rig, ros2_rig
 
-from vla_zenoh.bus.node import Stream
+from vla_zenoh.bus.node import Publisher
 from vla_zenoh.codec.image import decode_raw
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.types import (
@@ -219,7 +219,7 @@ class Commander:
     """A command stream upwards at `SPEED_M_S`, from where the robot is."""
 
     def __init__(self, rig: Ros2Rig) -> None:
-        self._stream: Stream = rig.stream(rig.profile.keys.command_pose, f"command#{id(self)}")
+        self._stream: Publisher = rig.stream(rig.profile.keys.command_pose, f"command#{id(self)}")
         held: PoseState = rig.newest(PoseState)
         self._quat_xyzw = held.quat_xyzw
         at_m = held.reference_position_m
@@ -238,7 +238,7 @@ class Commander:
     def put(self, at_m: Any, speed_m_s: float = 0.0) -> None:
         twist = np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
         quat = self._quat_xyzw
-        self._stream.put(PoseCommand(at_m, quat, twist, np.zeros(6), at_m, quat, "active"))
+        self._stream.publish(PoseCommand(at_m, quat, twist, np.zeros(6), at_m, quat, "active"))
 
     def end(self) -> None:
         self._stop.set()
@@ -283,7 +283,7 @@ def test_a_stream_that_begins_elsewhere_is_refused(rig: Ros2Rig) -> None:
     order = PoseCommand(away, quat, np.zeros(6), np.zeros(6), away, quat, "active")
 
     def shout() -> bool:
-        stream.put(order)
+        stream.publish(order)
         time.sleep(0.05)
         return rig.counted("refused.pose_jump") > before
 
@@ -343,11 +343,11 @@ def test_the_newest_gripper_goal_wins_and_never_two_run_at_once(rig: Ros2Rig) ->
     peer.serve(f"{MOVE}/cancel_goal", "action_msgs/srv/CancelGoal", cancel)
     stream = rig.stream(rig.profile.keys.command_gripper)
     time.sleep(0.3)  # the services are declared on their way
-    stream.put(GripperCommand(0.01, 0.1, 20.0))
+    stream.publish(GripperCommand(0.01, 0.1, 20.0))
     rig.wait("the first goal", lambda: widths)
     rig.wait("the gripper moves", lambda: rig.newest(GripperState).moving)
     for width_m in (0.02, 0.03, 0.04):
-        stream.put(GripperCommand(width_m, 0.1, 20.0))
+        stream.publish(GripperCommand(width_m, 0.1, 20.0))
     rig.wait("the newest goal", lambda: widths[-1] == 0.04)
     rig.wait("it is done", lambda: not running and not rig.newest(GripperState).moving)
     assert most[0] == 1
@@ -476,7 +476,7 @@ def test_the_tcp_may_come_from_tf_and_the_gripper_take_widths(tmp_path: Path) ->
         stream = rig.stream(rig.profile.keys.command_gripper)
 
         def ask() -> bool:
-            stream.put(GripperCommand(0.06, 0.1, 10.0))
+            stream.publish(GripperCommand(0.06, 0.1, 10.0))
             time.sleep(0.05)
             return bool(widths)
 
@@ -489,7 +489,7 @@ def test_the_tcp_may_come_from_tf_and_the_gripper_take_widths(tmp_path: Path) ->
         def order() -> bool:
             send()
             at, quat = pose.position_m, pose.quat_xyzw
-            poses.put(PoseCommand(at, quat, np.zeros(6), np.zeros(6), at, quat, "active"))
+            poses.publish(PoseCommand(at, quat, np.zeros(6), np.zeros(6), at, quat, "active"))
             return bool(targets)
 
         rig.wait("a target", order)
@@ -512,7 +512,7 @@ def test_an_arm_that_takes_joints_is_sent_trajectories_of_one_point(tmp_path: Pa
         still = np.zeros(len(ARM_JOINTS))
 
         def order() -> bool:
-            stream.put(JointCommand(ARM_JOINTS, HOME_RAD, still, still, "active"))
+            stream.publish(JointCommand(ARM_JOINTS, HOME_RAD, still, still, "active"))
             time.sleep(PERIOD_S)
             return bool(goals)
 
@@ -523,7 +523,7 @@ def test_an_arm_that_takes_joints_is_sent_trajectories_of_one_point(tmp_path: Pa
         before = rig.counted("refused.joint_jump")
 
         def jump() -> bool:
-            stream.put(JointCommand(ARM_JOINTS, HOME_RAD + 0.5, still, still, "active"))
+            stream.publish(JointCommand(ARM_JOINTS, HOME_RAD + 0.5, still, still, "active"))
             time.sleep(PERIOD_S)
             return rig.counted("refused.joint_jump") > before
 

@@ -104,7 +104,7 @@ def test_a_real_zenohd_lets_each_do_its_part_and_no_more(tmp_path: Path) -> None
                 session.put(key, "not mine")
             own.put("mine")
             until("the chunk", lambda: heard._arrivals)
-            said = [arrival.sample.payload.to_string() for arrival in heard.take_all()]
+            said = [arrival.sample.payload.to_string() for arrival in heard.drain()]
             assert said == ["mine"]
             own.undeclare()
             reader.undeclare()

@@ -100,7 +100,7 @@ class Heard:
 
     def __post_init__(self) -> None:
         self._subscribers: list[Any] = []
-        self.listen(*self.keys.without_raw_pictures)
+        self.listen(*self.keys.without_raw_images)
 
     def listen(self, *keys: str) -> None:
         """To these as well."""

@@ -82,7 +82,7 @@ def test_who_comes_late_learns_the_task(chain: Chain) -> None:
     chain.client.set_prompt("HARD: yaw left x2")
     chain.client.set_rate(7.0)
     with open_session(chain.profile.session) as session:
-        late = Client(chain.profile, session).follow()
+        late = Client(chain.profile, session).subscribe()
         task = until("the task", lambda: late.task)
     assert (task.prompt, task.rate_hz, task.active) == ("HARD: yaw left x2", 7.0, False)
 
@@ -99,7 +99,7 @@ def test_the_speed_reaches_the_task_and_status_and_slower_never_raises_it(chain:
     assert chain.client.set_speed(50.0).speed_percent == 50.0
     began = chain.refused().get("command.invalid", 0)
     for text in ("fast", "101", "-1"):
-        chain.client.put(chain.client.keys.speed, text)
+        chain.client.publish(chain.client.keys.speed, text)
     chain.until("told", lambda: chain.refused().get("command.invalid", 0) == began + 3)
     assert value_of(chain, "speed") == "50"
 
@@ -114,7 +114,7 @@ def test_what_is_refused_changes_nothing_and_is_said(chain: Chain) -> None:
         (keys.worker, "../../etc"),
         (keys.prompt, "\x1b[2J"),
     ):
-        chain.client.put(key, text)
+        chain.client.publish(key, text)
     chain.until(
         "four refusals",
         lambda: chain.refused().get("command.invalid", 0) == began.get("command.invalid", 0) + 4,
@@ -137,7 +137,7 @@ def test_a_stop_is_obeyed_at_once_and_latched_until_reset(chain: Chain) -> None:
     assert stood_s < STOP_S + BUSY_S
     with pytest.raises(SessionError, match="put anything on reset"):
         chain.client.activate()
-    chain.client.put(chain.client.keys.active, "false")
+    chain.client.publish(chain.client.keys.active, "false")
     time.sleep(0.2)
     assert chain.state() == "stopped"
     chain.session.put(chain.profile.keys.reset, b"")
@@ -158,11 +158,11 @@ def test_settings_are_taken_in_the_order_they_were_put(chain: Chain) -> None:
     """In motion a worker that is not there is refused; after deactivation it may be named."""
     chain.activate_when_ready()
     for _ in range(10):
-        chain.client.take_events()
-        chain.client.put(chain.client.keys.active, "false")
-        chain.client.put(chain.client.keys.worker, "nobody")
-        chain.client.put(chain.client.keys.worker, "scripted")
-        chain.client.put(chain.client.keys.active, "true")
+        chain.client.pop_events()
+        chain.client.publish(chain.client.keys.active, "false")
+        chain.client.publish(chain.client.keys.worker, "nobody")
+        chain.client.publish(chain.client.keys.worker, "scripted")
+        chain.client.publish(chain.client.keys.active, "true")
         chain.until("active again", lambda: chain.events("inactive->active"))
         assert not chain.events("worker_refused")
 
@@ -205,7 +205,7 @@ def objects_of(chain: Chain) -> np.ndarray:
 def test_the_simulator_places_objects_by_seed_but_not_under_a_moving_arm(chain: Chain) -> None:
     def reset(seed: str) -> np.ndarray:
         count = chain.counter("sim.resets", "sim")
-        chain.client.put(chain.client.keys.sim_reset, seed)
+        chain.client.publish(chain.client.keys.sim_reset, seed)
         chain.until("a reset", lambda: chain.counter("sim.resets", "sim") == count + 1)
         time.sleep(0.5)
         return objects_of(chain)
@@ -216,7 +216,7 @@ def test_the_simulator_places_objects_by_seed_but_not_under_a_moving_arm(chain: 
     assert np.abs(first - second).max() > APART_M
     chain.move()
     refused = chain.refused().get("sim.reset_refused", 0)
-    chain.client.put(chain.client.keys.sim_reset, "9")
+    chain.client.publish(chain.client.keys.sim_reset, "9")
     chain.until("a refusal", lambda: chain.refused().get("sim.reset_refused", 0) == refused + 1)
     chain.until("it moves on", chain.moves)
 
@@ -237,14 +237,14 @@ def test_a_slow_reader_has_the_newest_and_holds_nobody_up(chain: Chain) -> None:
             time.sleep(SLOW_READER_S)
             for slot in slots.values():
                 assert slot.wait(1.0)
-                arrival = slot.take()
+                arrival = slot.pop()
                 assert arrival is not None
                 ages_s.append((time.monotonic_ns() - arrival.mono_ns) / 1e9)
         assert max(ages_s) < FRESH_S, ages_s
         put_ns = time.monotonic_ns()
         chain.session.put(keys.stop, b"")
         assert stop.wait(1.0)
-        arrival = stop.take()
+        arrival = stop.pop()
         assert arrival is not None
         assert (arrival.mono_ns - put_ns) / 1e9 < FRESH_S
         for subscriber in subscribers:

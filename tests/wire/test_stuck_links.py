@@ -13,7 +13,7 @@ import zenoh
 from camera_rig import free_endpoint, until
 
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.session import config, open_session
+from vla_zenoh.bus.session import open_session, session_config
 from vla_zenoh.bus.tcp_user_timeout import TcpUserTimeout
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import SessionProfile, load_profile, override
@@ -30,7 +30,7 @@ SOONER = 5
 
 def lease_ms(mode: str, *connect: str) -> int:
     """How long the other side waits for one of this kind."""
-    found = config(SessionProfile(lease_ms=LEASE_MS), mode=mode, connect=connect or None)
+    found = session_config(SessionProfile(lease_ms=LEASE_MS), mode=mode, connect=connect or None)
     return found["transport"]["link"]["tx"]["lease"]
 
 
@@ -42,9 +42,9 @@ def test_who_connects_waits_longer_than_who_is_connected_to() -> None:
 
 def test_a_client_does_not_close_a_stuck_link_before_its_router_does() -> None:
     closes_us = {
-        mode: config(SessionProfile(lease_ms=LEASE_MS), mode=mode)["transport"]["link"]["tx"][
-            "queue"
-        ]["congestion_control"]["block"]["wait_before_close"]
+        mode: session_config(SessionProfile(lease_ms=LEASE_MS), mode=mode)["transport"]["link"][
+            "tx"
+        ]["queue"]["congestion_control"]["block"]["wait_before_close"]
         for mode in ("client", "router")
     }
     assert closes_us["client"] >= 1000 * lease_ms("router")
@@ -55,17 +55,17 @@ def test_a_client_does_not_close_a_stuck_link_before_its_router_does() -> None:
 def test_the_kernel_ends_connections_whose_data_nobody_acknowledges() -> None:
     impatience = TcpUserTimeout(0.7)
     with socket.create_server(("127.0.0.1", 0)) as server:
-        before = impatience.look()
+        before = impatience.apply()
         near = socket.create_connection(server.getsockname())
         far, _ = server.accept()
         with near, far, socket.socket(socket.AF_INET, socket.SOCK_DGRAM):
-            assert impatience.look() == before + 2  # and not the datagrams
+            assert impatience.apply() == before + 2  # and not the datagrams
             for end in (near, far):
                 limit_ms = end.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
                 assert limit_ms == LEASE_MS
             near.sendall(b"still at work")
             assert far.recv(64) == b"still at work"
-        assert impatience.look() == before
+        assert impatience.apply() == before
 
 
 def state_delays_ms(*, separate: bool) -> list[float]:
@@ -83,8 +83,8 @@ def state_delays_ms(*, separate: bool) -> list[float]:
     ):
         camera, robot = Node("camera", profile, eye), Node("sim", profile, arm)
         reader = Node("worker-far", profile, far)
-        pictures = camera.stream(profile.keys.camera_raw("front"), Kind.FRAME)
-        states = robot.stream(profile.keys.state_pose, Kind.STATE)
+        pictures = camera.declare_publisher(profile.keys.camera_raw("front"), Kind.FRAME)
+        states = robot.declare_publisher(profile.keys.state_pose, Kind.STATE)
 
         def heard(sample: zenoh.Sample) -> None:
             delays_ms.append((time.monotonic_ns() - int(sample.payload.to_string())) / 1e6)
@@ -100,15 +100,15 @@ def state_delays_ms(*, separate: bool) -> list[float]:
 
         def show() -> None:
             while not stop.wait(1 / PICTURES_HZ):
-                pictures.put(PICTURE)
+                pictures.publish(PICTURE)
 
         threads = [threading.Thread(target=each) for each in (see, show)]
-        until("readers of both", lambda: pictures.wanted and states.wanted)
+        until("readers of both", lambda: pictures.has_subscribers and states.has_subscribers)
         for thread in threads:
             thread.start()
         end_s = time.monotonic() + MEASURED_S
         while time.monotonic() < end_s:
-            states.put(str(time.monotonic_ns()).encode())
+            states.publish(str(time.monotonic_ns()).encode())
             time.sleep(1 / STATES_HZ)
         stop.set()
         for thread in threads:

@@ -47,7 +47,7 @@ class Scene:
     def says(self, node: Node, age_s: Any) -> None:
         """A status of `node` that tells of the front camera, and is heard."""
         count = self.command.counters["refused.foreign_camera"]
-        node.report("running", detail={"cameras": {"front": {"age_s": age_s}}}, now=True)
+        node.publish_status("running", detail={"cameras": {"front": {"age_s": age_s}}}, now=True)
         if node is self.thief:
             until(
                 "it is refused",
@@ -103,7 +103,7 @@ def test_a_camera_is_believed_by_the_node_that_serves_it_and_by_no_other(scene: 
 def test_what_is_wrong_with_a_camera_is_its_own_nodes_word_until_it_is_good(scene: Scene) -> None:
     def says(node: Node, bad: Any) -> None:
         fields = {"age_s": 0.0, **({} if bad is None else {"bad": bad})}
-        node.report("running", detail={"cameras": {"front": fields}}, now=True)
+        node.publish_status("running", detail={"cameras": {"front": fields}}, now=True)
 
     says(scene.camera, {"why": "is black", "check": "clipped_share", "value": 1.0, "limit": 0.98})
     until("its word", lambda: scene.look().camera_faults == {"front": "is black"})
@@ -130,7 +130,7 @@ def test_a_worker_among_many_who_complain_says_when_it_is_well_again(scene: Scen
     until("all live", lambda: {node.name for node in workers} <= scene.look().alive)
 
     def complain(node: Node, complaint: str) -> None:
-        node.report("running", detail={"complaint": complaint}, now=True)
+        node.publish_status("running", detail={"complaint": complaint}, now=True)
 
     for node in workers[:-1]:  # one after the other: more at once find no room in a mailbox
         name = node.name.removeprefix("worker-")
@@ -156,7 +156,7 @@ def test_no_picture_is_younger_than_now(scene: Scene) -> None:
         until("an age", lambda: scene.look().camera_ages_s.get("front", 0.0) >= 7.0)
         scene.says(scene.camera, age_s)
         other = {"wrist": {"age_s": 100.0 * nth}}
-        scene.camera.report("running", detail={"cameras": other}, now=True)
+        scene.camera.publish_status("running", detail={"cameras": other}, now=True)
         until(
             "all of it is heard",
             lambda nth=nth: scene.look().camera_ages_s.get("wrist", 0.0) >= 100.0 * nth,
@@ -169,7 +169,7 @@ def test_made_up_names_do_not_keep_out_a_clock_that_is_there(scene: Scene) -> No
         NodeStatus("worker-scripted", "running", "gpu", 1, 1, {}, {}, {}, {}, {})
     )
     key = scene.thief.keys.status("worker-scripted")
-    scene.thief.report("running", now=True)
+    scene.thief.publish_status("running", now=True)
     until("its own voice", lambda: scene.look().hosts.get("worker-scripted"))
     for number in range(2 * MAX_PEERS):
         header = header_codec.encode(Header(time.time_ns(), number, f"ghost{number}#1"))
@@ -190,17 +190,17 @@ def test_a_reader_who_is_told_of_nobody_measures_who_lives_among_made_up_names(
     monkeypatch.setattr(offsets, "HEARD_PATIENCE_S", ROOM_S)
     reader, number = scene.thief, 0
     for number in range(2 * MAX_HEARD):
-        reader.clocks.here(Header(0, 0, f"ghost{number}#1"), None)
+        reader.clocks.to_local_clock(Header(0, 0, f"ghost{number}#1"), None)
 
     def measured() -> bool:
         nonlocal number
         number += 1
-        reader.clocks.here(Header(0, 0, f"ghost{number}#1"), None)
-        reader.clocks.here(Header(0, 0, scene.camera.source), None)
+        reader.clocks.to_local_clock(Header(0, 0, f"ghost{number}#1"), None)
+        reader.clocks.to_local_clock(Header(0, 0, scene.camera.source), None)
         reader.clocks.tick()
-        return "camera" in reader.clocks.known()
+        return "camera" in reader.clocks.offsets()
 
     until("the camera's clock", measured)
     for number in range(2 * MAX_HEARD):
-        reader.clocks.here(Header(0, 0, f"stranger{number}#1"), None)
-    assert "camera" in reader.clocks.known()
+        reader.clocks.to_local_clock(Header(0, 0, f"stranger{number}#1"), None)
+    assert "camera" in reader.clocks.offsets()

@@ -153,7 +153,7 @@ def test_an_arm_that_is_not_given_is_repaired_and_a_stopped_one_is_told(
     chain: Chain, tmp_path: Path
 ) -> None:
     out = tmp_path / "ab"
-    chain.client.put(chain.client.keys.stop, "")
+    chain.client.publish(chain.client.keys.stop, "")
     chain.until("stopped", lambda: chain.state() == "stopped")
     with trial(chain, out, *begin(ENDLESS), "--yes-setup") as process:
         assert process.stdin is not None
@@ -162,12 +162,12 @@ def test_an_arm_that_is_not_given_is_repaired_and_a_stopped_one_is_told(
         reading = threading.Thread(target=lambda: told.extend(process.stderr or ()))
         reading.start()
         until("it is told why", lambda: "emergency stop" in "".join(told), READY_PATIENCE_S)
-        chain.client.put(chain.client.keys.reset, "")
+        chain.client.publish(chain.client.keys.reset, "")
         chain.until("reset", lambda: chain.state() == "inactive")
         process.stdin.write("\n")
         process.stdin.flush()
         chain.until("it moves", chain.moves, READY_PATIENCE_S)
-        chain.client.put(chain.client.keys.stop, "")
+        chain.client.publish(chain.client.keys.stop, "")
         until("it is over", lambda: "stopped by an emergency stop" in "".join(told), END_S)
         process.stdin.write("n it was about to hit the box\n")
         process.stdin.close()

@@ -55,7 +55,7 @@ def test_models_on_another_host_get_jpeg_and_move_the_arm(tmp_path: Path) -> Non
         up(path, "robot") as robot,
         open_session(profile.session, wait_s=READY_PATIENCE_S) as session,
     ):
-        client = Client(profile, session).follow()
+        client = Client(profile, session).subscribe()
         recorder = Recorder(session, profile.keys)
         until(
             "the robot's nodes",

@@ -68,7 +68,7 @@ class Lab:
 
     def go_on(self) -> None:
         for client in self.clients.values():
-            client.put(client.keys.reset, "")
+            client.publish(client.keys.reset, "")
         until("nobody is stopped", lambda: not self.stopped(), PATIENCE_S)
 
     @contextmanager
@@ -128,7 +128,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
             clients = {}
             for profile in profiles:
                 session = stack.enter_context(open_session(profile.session, wait_s=PATIENCE_S))
-                clients[profile.robot.name] = Client(profile, session).follow()
+                clients[profile.robot.name] = Client(profile, session).subscribe()
             for name, client in clients.items():
                 until(f"{name} lives", lambda client=client: client.status("command"), PATIENCE_S)
             yield Lab(keys, clients)
@@ -161,7 +161,7 @@ def test_a_stop_where_the_certificates_of_all_hosts_lie_stops_the_robot(lab: Lab
 def test_a_computer_of_viewers_stops_with_the_certificate_of_an_operator_that_lies_there(
     lab: Lab,
 ) -> None:
-    Store(lab.folder).note_this_host("gpu")
+    Store(lab.folder).remember_host("gpu")
     done = lab.at("stop")
     assert done.exit_code == 0, done.stderr
     assert lab.stopped() == ["panda"]
@@ -179,7 +179,7 @@ def test_a_computer_of_viewers_stops_with_the_certificate_of_an_operator_that_li
 
 
 def test_a_stop_goes_on_to_the_next_certificate_where_one_is_of_no_use(lab: Lab) -> None:
-    Store(lab.folder).note_this_host("desk")
+    Store(lab.folder).remember_host("desk")
     key = lab.folder / "desk/operator.key"
     key.chmod(0o644)
     try:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from chain import MOVING_M_S, READY_PATIENCE_S, Chain, command_line
 
-from vla_zenoh.bus.host_id import own_boot
+from vla_zenoh.bus.host_id import own_boot_id
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.nodes.worker.inference_debug import InferenceDebugSubscriber, InferenceView
 from vla_zenoh.profile import override
@@ -120,7 +120,7 @@ def test_a_shadow_is_not_obeyed_and_takes_over_in_motion(chain: Chain, tmp_path:
         assert not chain.events("active->inactive")
 
         # Who is obeyed and dies brakes the arm, though another worker is there.
-        chain.client.take_events()
+        chain.client.pop_events()
         process.kill()
         chain.until("inactive", lambda: chain.state() == "inactive")
         assert chain.detail("why") == "node 'worker-riser' is gone"
@@ -142,7 +142,7 @@ def test_a_second_up_of_a_host_is_refused_and_leaves_the_arm_to_the_running_one(
     with Host(twin, None, log=lambda *_: None, tell=lambda *said: told.append(said)) as second:
 
         def ended() -> bool:
-            second.watch(spare=EXPENDABLE)
+            second.poll(spare=EXPENDABLE)
             return any("ended with code 1" in sentence for _, sentence in told)
 
         chain.until("its worker ends", ended, READY_PATIENCE_S)
@@ -152,15 +152,15 @@ def test_a_second_up_of_a_host_is_refused_and_leaves_the_arm_to_the_running_one(
     assert not chain.events("active->inactive")
     heard = chain.client.snapshot().values()
     places = {(said.host, said.boot) for said, _, alive in heard if alive}
-    assert places == {(chain.host.host, own_boot())}
+    assert places == {(chain.host.host, own_boot_id())}
 
 
 def test_a_worker_that_is_not_there_is_refused_in_motion_and_the_arm_goes_on(
     chain: Chain,
 ) -> None:
     chain.move()
-    chain.client.take_events()
-    chain.client.put(chain.client.keys.worker, "ghost")
+    chain.client.pop_events()
+    chain.client.publish(chain.client.keys.worker, "ghost")
     chain.until("a refusal", lambda: chain.events("worker_refused"))
     (event,) = chain.events("worker_refused")
     assert "worker 'ghost' is not alive; alive are: scripted" in event.why

@@ -202,7 +202,7 @@ def run(stage: Stage, args: argparse.Namespace, seed: int, family: str) -> Outco
         loop.run(LOOK_S)
         time_s = (loop.now_ns - begin_ns) / 1e9
         width_m = world.gripper_state().width_m
-        verdict = judge.see(poses_of(world), width_m, time_s, world.tcp()[0])
+        verdict = judge.update(poses_of(world), width_m, time_s, world.tcp()[0])
     return Outcome(episode, verdict or judge.end(), policy if isinstance(policy, Watched) else None)
 
 

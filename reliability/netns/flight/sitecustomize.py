@@ -48,14 +48,14 @@ def _note_states(heard_s: list[float]) -> None:
 def _install(node: str, path: str) -> None:
     import numpy as np
 
-    from vla_zenoh.bus.node import Stream
+    from vla_zenoh.bus.node import Publisher
 
     key_end, heard_s = RECORDED[node], [float("nan")]
     (_note_commands if node == "sim" else _note_states)(heard_s)
-    put = Stream.put
+    put = Publisher.publish
     file = open(path, "ab", buffering=0)  # noqa: SIM115  # as long as the process lives
 
-    def put_and_keep(self: Stream, record: Any, **named: Any) -> Any:
+    def put_and_keep(self: Publisher, record: Any, **named: Any) -> Any:
         header = put(self, record, **named)
         if self.key.endswith(key_end):
             if key_end == RECORDED["sim"]:
@@ -74,7 +74,7 @@ def _install(node: str, path: str) -> None:
             file.write(np.concatenate([[at_s], *parts, [asked_s, at_s - silent_s]]).tobytes())
         return header
 
-    Stream.put = put_and_keep
+    Publisher.publish = put_and_keep
 
 
 _node = sys.orig_argv[3] if sys.orig_argv[1:3] == ["-m", "vla_zenoh"] else ""

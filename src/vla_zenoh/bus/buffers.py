@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import zenoh
 
-from vla_zenoh.bus.payload_limits import check
+from vla_zenoh.bus.payload_limits import check_size
 from vla_zenoh.codec.records import MAX_RECORD_BYTES
 from vla_zenoh.errors import CodecError
 
@@ -63,7 +63,7 @@ class SampleBuffer:
 
     def _takes(self, sample: zenoh.Sample) -> bool:
         try:
-            check(sample, self._limit)
+            check_size(sample, self._limit)
         except CodecError as error:
             refused = self._refused
             known = refused.get(error.reason)
@@ -74,7 +74,7 @@ class SampleBuffer:
             return False
         return True
 
-    def take_refused(self) -> list[RejectedSample]:
+    def pop_rejected(self) -> list[RejectedSample]:
         """What was not taken since the last call, by reason."""
         if not self._refused:
             return []
@@ -113,11 +113,11 @@ class LatestSample(SampleBuffer):
         return self._count
 
     @property
-    def full(self) -> bool:
+    def has_new(self) -> bool:
         """Whether something untaken is there."""
         return self._taken != self._count
 
-    def take(self) -> ReceivedSample | None:
+    def pop(self) -> ReceivedSample | None:
         """The newest sample, once."""
         with self._changed:
             if self._taken == self._count:
@@ -149,7 +149,7 @@ class CallbackRing(SampleBuffer):
             self.dropped += 1
         self._arrivals.append(ReceivedSample(sample, time.monotonic_ns(), self._count))
 
-    def take_all(self) -> list[ReceivedSample]:
+    def drain(self) -> list[ReceivedSample]:
         """Everything that arrived, oldest first."""
         taken: list[ReceivedSample] = []
         while True:
@@ -175,11 +175,11 @@ class ZenohRing(SampleBuffer):
         """The handler to declare a subscriber with."""
         return zenoh.handlers.RingChannel(self._size)
 
-    def take_from(self, receive: Callable[[], zenoh.Sample | None]) -> None:
+    def receive_from(self, receive: Callable[[], zenoh.Sample | None]) -> None:
         """Where the subscriber's samples are had, one at a time, None when there is none."""
         self._receive = receive
 
-    def take_all(self) -> list[ReceivedSample]:
+    def drain(self) -> list[ReceivedSample]:
         """Everything that arrived, oldest first; no more than it holds, however fast they come."""
         taken: list[ReceivedSample] = []
         for _ in range(self._size):

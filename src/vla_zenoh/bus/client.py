@@ -17,9 +17,9 @@ from vla_zenoh.bus.node_registry import MAX_STATUS_BYTES, NodeRegistry
 from vla_zenoh.bus.payload_limits import bytes_of, header_of
 from vla_zenoh.bus.session import QOS
 from vla_zenoh.codec import records
-from vla_zenoh.codec.settings import encode_held
+from vla_zenoh.codec.settings import encode_deadman_activation
 from vla_zenoh.errors import CodecError, SessionError
-from vla_zenoh.keys import NOT_SEEN, Kind, last
+from vla_zenoh.keys import NO_DEADMAN_TOKEN, Kind, last_chunk
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.identity import identities
 from vla_zenoh.types import Event, Header, NodeStatus, Task
@@ -30,7 +30,7 @@ MAX_EVENTS, MAX_REFUSALS = 4096, 256
 MAX_EVENT_BYTES = 64 * 1024
 MAX_WHAT, MAX_WHY = 128, 1000
 """Characters of an event that are kept; nodes of ours write no more."""
-LEFT_OUT = (
+DROPPED_HINT = (
     "statuses or tokens left out, of more names than are kept or too large: somebody who is no "
     "node of ours writes them"
 )
@@ -55,7 +55,7 @@ class Client:
         self._subscriptions: list[Any] = []
         self._token: Any = None
 
-    def follow(self) -> Client:
+    def subscribe(self) -> Client:
         """Begin to listen to status, events, liveliness and the task."""
         liveliness = self.session.liveliness()
         self._subscriptions += [
@@ -87,7 +87,9 @@ class Client:
     def _on_status(self, sample: zenoh.Sample) -> None:
         found = self._decode(NodeStatus, sample, MAX_STATUS_BYTES)
         if found is not None:
-            self._nodes.said(last(str(sample.key_expr)), found[1], len(sample.payload))
+            self._nodes.status_received(
+                last_chunk(str(sample.key_expr)), found[1], len(sample.payload)
+            )
 
     def _on_event(self, sample: zenoh.Sample) -> None:
         found = self._decode(Event, sample, MAX_EVENT_BYTES)
@@ -95,7 +97,7 @@ class Client:
             header, event = found
             event = replace(event, what=event.what[:MAX_WHAT], why=event.why[:MAX_WHY])
             with self._lock:
-                self.events.append((last(str(sample.key_expr))[:MAX_WHAT], header, event))
+                self.events.append((last_chunk(str(sample.key_expr))[:MAX_WHAT], header, event))
                 if event.kind == "refusal":
                     self._refusals.append((time.monotonic(), event))
 
@@ -106,11 +108,11 @@ class Client:
                 self.task, self._task_heard_s = found[1], time.monotonic()
 
     def _on_alive(self, sample: zenoh.Sample) -> None:
-        name = last(str(sample.key_expr))
+        name = last_chunk(str(sample.key_expr))
         if sample.kind == zenoh.SampleKind.PUT:
-            self._nodes.came(name)
+            self._nodes.token_appeared(name)
             return
-        self._nodes.went(name)
+        self._nodes.token_gone(name)
         if name == "command":  # nobody keeps the task any more
             with self._lock:
                 self.task = None
@@ -122,9 +124,9 @@ class Client:
         return self._nodes.alive
 
     @property
-    def left_out(self) -> int:
+    def dropped(self) -> int:
         """How often strangers' names, or statuses, were not kept for their number or size."""
-        return self._nodes.left_out
+        return self._nodes.dropped
 
     def status(self, node: str) -> NodeStatus | None:
         """The newest status of a node, None before the first."""
@@ -135,7 +137,7 @@ class Client:
         """Node -> (status, seconds since it came, alive)."""
         return self._nodes.snapshot()
 
-    def take_events(self) -> list[tuple[str, Header, Event]]:
+    def pop_events(self) -> list[tuple[str, Header, Event]]:
         """Events since the last call, oldest first."""
         with self._lock:
             events = list(self.events)
@@ -152,7 +154,7 @@ class Client:
             time.sleep(POLL_S)
 
     # -- writing ------------------------------------------------------------------------------
-    def put(self, key: str, text: str) -> None:
+    def publish(self, key: str, text: str) -> None:
         """Put plain text, as any Zenoh client would."""
         self.session.put(key, text, encoding=zenoh.Encoding.TEXT_PLAIN, **QOS[Kind.ORDER])
 
@@ -205,7 +207,7 @@ class Client:
         """
         return self._activate("true", timeout_s)
 
-    def activate_while_here(self, what: str, timeout_s: float = 3.0) -> Task:
+    def activate_with_deadman(self, what: str, timeout_s: float = 3.0) -> Task:
         """Likewise, and only for as long as this process lives and is connected.
 
         Until `deactivate`. Whatever ends it, also kill -9 or a cable that is pulled, brakes the
@@ -218,17 +220,20 @@ class Client:
         Raises:
             SessionError: it was refused, with every reason.
         """
-        self.let_go()
+        self.release_deadman()
         holder = f"{what}-{secrets.token_hex(4)}"
         self._token = self.session.liveliness().declare_token(self.keys.holding(holder))
-        text, give_up_s = encode_held(holder).decode(), time.monotonic() + HOLD_PATIENCE_S
+        text, give_up_s = (
+            encode_deadman_activation(holder).decode(),
+            time.monotonic() + HOLD_PATIENCE_S,
+        )
         while True:
             try:
                 return self._activate(text, timeout_s)
             except SessionError as error:
                 # The token may be on its way still: it does not go before what is put after it.
-                if NOT_SEEN not in str(error) or time.monotonic() > give_up_s:
-                    self.let_go()
+                if NO_DEADMAN_TOKEN not in str(error) or time.monotonic() > give_up_s:
+                    self.release_deadman()
                     raise
 
     def _activate(self, text: str, timeout_s: float) -> Task:
@@ -236,7 +241,7 @@ class Client:
             self.keys.active, text, lambda task: task.active, "activate", timeout_s, undo="false"
         )
 
-    def latched(self) -> str:
+    def latch_reason(self) -> str:
         """Why nobody may activate before a person's reset, empty where there is no such reason."""
         status = self.status("command")
         if status is None or status.state not in ("stopped", "fault"):
@@ -246,12 +251,12 @@ class Client:
     def deactivate(self, timeout_s: float = 3.0) -> bool:
         """Deactivate; True when the arm stands within `timeout_s`."""
         began_s = time.monotonic()
-        self.put(self.keys.active, "false")
+        self.publish(self.keys.active, "false")
         stands = bool(self.wait_for(lambda: self._stands(began_s), timeout_s))
-        self.let_go()
+        self.release_deadman()
         return stands
 
-    def let_go(self) -> None:
+    def release_deadman(self) -> None:
         """Hold the arm active no more: if it still is, it brakes."""
         token, self._token = self._token, None
         if token is not None:
@@ -283,7 +288,7 @@ class Client:
         must not happen later.
         """
         began_s = time.monotonic()
-        self.put(key, text)
+        self.publish(key, text)
         self.wait_for(
             lambda: self._refused(what, began_s) or self._taken(taken, began_s), timeout_s
         )
@@ -295,7 +300,7 @@ class Client:
         if task is not None:
             return task
         if undo is not None:
-            self.put(key, undo)
+            self.publish(key, undo)
         if "command" not in self.alive:
             raise SessionError(f"{what}: no command node of robot {self.keys.robot!r} is alive")
         status = self.status("command")

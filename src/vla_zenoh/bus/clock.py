@@ -30,7 +30,7 @@ class Clock:
         """The same for a time of the monotonic clock."""
         return mono_ns + self._offset_ns
 
-    def follow(self) -> float:
+    def adopt_system_time(self) -> float:
         """Take over the system's wall clock; returns by how much it had been stepped (s), or 0."""
         offset_ns = time.time_ns() - time.monotonic_ns()
         step_s = (offset_ns - self._offset_ns) / 1e9

@@ -19,7 +19,7 @@ from vla_zenoh.bus.session import QOS
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.keys import Keys, Kind
-from vla_zenoh.ntp import Exchange, Offset, OffsetFilter, shifted
+from vla_zenoh.ntp import ClockOffset, ClockOffsetFilter, Exchange, shift_stamps
 from vla_zenoh.types import Header
 
 ASK_PERIOD_S = 1.0
@@ -39,7 +39,7 @@ Record = TypeVar("Record")
 @dataclass(slots=True)
 class _Peer:
     key: str
-    filter: OffsetFilter
+    filter: ClockOffsetFilter
     since_s: float
     told: bool
     asks: int = 0
@@ -74,7 +74,7 @@ class ClockSync:
         self._next_look_s = 0.0
 
     # -- asking -------------------------------------------------------------------------------
-    def follow(self, node: str) -> None:
+    def track(self, node: str) -> None:
         """From now on know the clock of `node`, which lives.
 
         What cannot be a node's name is left out.
@@ -94,7 +94,7 @@ class ClockSync:
         except ProfileError:
             return
         with self._lock:
-            self._peers[node] = _Peer(key, OffsetFilter(self._bound_s), time.monotonic(), told)
+            self._peers[node] = _Peer(key, ClockOffsetFilter(self._bound_s), time.monotonic(), told)
         self._next_look_s = 0.0
 
     def tick(self) -> None:
@@ -137,7 +137,7 @@ class ClockSync:
         )
 
     # -- knowing ------------------------------------------------------------------------------
-    def known(self) -> dict[str, Offset]:
+    def offsets(self) -> dict[str, ClockOffset]:
         """Node -> its clock minus ours, of those that answered lately."""
         now_ns, now_s = time.monotonic_ns(), time.monotonic()
         with self._lock:
@@ -148,13 +148,13 @@ class ClockSync:
             }
         return {node: offset for node, offset in found.items() if offset is not None}
 
-    def here(self, header: Header, record: Record) -> tuple[Header, Record]:
+    def to_local_clock(self, header: Header, record: Record) -> tuple[Header, Record]:
         """Header and record with their stamps on our own clock."""
         node = header.source.partition("#")[0]
         ahead_ns = self._ahead_ns(node)
         if not ahead_ns:
             return header, record
-        return shifted(header, record, ahead_ns)
+        return shift_stamps(header, record, ahead_ns)
 
     def _ahead_ns(self, node: str) -> int:
         peer = self._peers.get(node)
@@ -165,7 +165,7 @@ class ClockSync:
             return peer.filter.applied_ns(self._clock.offset_ns, time.monotonic_ns())
 
 
-def answer(clock: Clock, key: str, query: zenoh.Query) -> None:
+def reply_with_stamps(clock: Clock, key: str, query: zenoh.Query) -> None:
     """Tell when the question was heard, and when it is answered."""
     heard_ns = clock.wall_ns()
     reply = {"heard_ns": heard_ns, "said_ns": clock.wall_ns()}

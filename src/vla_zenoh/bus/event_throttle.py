@@ -37,7 +37,7 @@ class EventThrottle:
         self._held: Counter[Kind] = Counter()
         self._answers: dict[Kind, Event] = {}
 
-    def tell(self, event: Event, about: str = "") -> None:
+    def emit(self, event: Event, about: str = "") -> None:
         """Write an event, or count it.
 
         Args:

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from vla_zenoh.keys import chunk
+from vla_zenoh.keys import key_chunk
 from vla_zenoh.profile import SessionProfile
 from vla_zenoh.security.store import Store
 
@@ -35,7 +35,7 @@ class HostId(NamedTuple):
         return bool(self.boot) and self == other
 
 
-def own_place(session: SessionProfile, host: str | None = None) -> HostId:
+def own_host_id(session: SessionProfile, host: str | None = None) -> HostId:
     """Where this process runs.
 
     Args:
@@ -49,11 +49,11 @@ def own_place(session: SessionProfile, host: str | None = None) -> HostId:
     named = host or (security.host if security else None) or os.environ.get(HOST_VARIABLE)
     if not named and security is not None:
         named = Store(security.folder).known_host()
-    return HostId(chunk(named, "host") if named else socket.gethostname(), own_boot())
+    return HostId(key_chunk(named, "host") if named else socket.gethostname(), own_boot_id())
 
 
 @cache
-def own_boot() -> str:
+def own_boot_id() -> str:
     """The start of this computer; empty on systems that tell none."""
     try:
         return BOOT_FILE.read_text("ascii").strip()

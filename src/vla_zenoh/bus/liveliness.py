@@ -42,7 +42,7 @@ def alive_nodes(session: zenoh.Session, keys: Keys, name: str | None = None) -> 
     )
 
 
-def robots_alive(session: zenoh.Session, keys: Keys) -> list[str]:
+def alive_robots(session: zenoh.Session, keys: Keys) -> list[str]:
     """Robots below this root whose command node is alive, of those that one may know of.
 
     Args:

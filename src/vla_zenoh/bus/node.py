@@ -22,7 +22,7 @@ from vla_zenoh.bus.buffers import (
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.clock_sync import ClockSync
 from vla_zenoh.bus.event_throttle import EventThrottle
-from vla_zenoh.bus.host_id import own_place
+from vla_zenoh.bus.host_id import own_host_id
 from vla_zenoh.bus.liveliness import alive_nodes
 from vla_zenoh.bus.payload_limits import bytes_of, header_of
 from vla_zenoh.bus.session import QOS, open_session
@@ -40,10 +40,10 @@ STATUS_PERIOD_S = 0.5
 PICTURES_PATIENCE_S = 10.0
 
 Record = TypeVar("Record")
-AnySlot = TypeVar("AnySlot", LatestSample, CallbackRing, ZenohRing)
+AnyBuffer = TypeVar("AnyBuffer", LatestSample, CallbackRing, ZenohRing)
 
 
-class Stream:
+class Publisher:
     """Writes records on one key, each with its header."""
 
     def __init__(
@@ -56,11 +56,11 @@ class Stream:
         self.sent_bytes = 0
 
     @property
-    def wanted(self) -> bool:
+    def has_subscribers(self) -> bool:
         """Somebody listens."""
         return self._publisher.matching_status.matching  # pyright: ignore  # stub says bool
 
-    def put(
+    def publish(
         self,
         record: Any,
         *,
@@ -102,14 +102,14 @@ class Node:
         self, name: str, profile: Profile, session: zenoh.Session, *, host: str | None = None
     ) -> None:
         self.name, self.profile, self.session = name, profile, session
-        self.place = own_place(profile.session, host)
+        self.host_id = own_host_id(profile.session, host)
         self.keys = profile.keys
         self.clock = Clock()
         self.source = f"{name}#{secrets.token_hex(4)}"
         self.counters: Counter[str] = Counter()
         self.started_wall_ns = time.time_ns()
         self._declared: list[Any] = []
-        self._streams: list[Stream] = []
+        self._streams: list[Publisher] = []
         self._slots: list[SampleBuffer] = []
         self._subscribers: list[tuple[SampleBuffer, Any]] = []
         self._pictures: zenoh.Session | None = None
@@ -121,10 +121,12 @@ class Node:
             session, self.keys, self.clock, name, profile.timing.max_clock_offset_s
         )
         own_clock = self.keys.clock(name)
-        self.answer(own_clock, lambda query: offsets.answer(self.clock, own_clock, query))
+        self.serve(own_clock, lambda query: offsets.reply_with_stamps(self.clock, own_clock, query))
         self._token = session.liveliness().declare_token(self.keys.alive(name))
-        self._status = self.stream(self.keys.status(name), Kind.NEWS)
-        self._news = EventThrottle(self.stream(self.keys.event(name), Kind.NEWS).put)
+        self._status = self.declare_publisher(self.keys.status(name), Kind.TELEMETRY)
+        self._news = EventThrottle(
+            self.declare_publisher(self.keys.event(name), Kind.TELEMETRY).publish
+        )
 
     def _refuse_a_second_one(self) -> None:
         if alive_nodes(self.session, self.keys, self.name):
@@ -134,17 +136,17 @@ class Node:
             )
 
     # -- writing ------------------------------------------------------------------------------
-    def stream(self, key: str, kind: Kind) -> Stream:
+    def declare_publisher(self, key: str, kind: Kind) -> Publisher:
         """A writer for `key`.
 
         Raises:
             SessionError: it is for pictures, and the router does not answer at their port.
         """
-        made = Stream(self._session_for(kind), key, kind, self.source, self.clock)
+        made = Publisher(self._session_for(kind), key, kind, self.source, self.clock)
         self._streams.append(made)
         return made
 
-    def end(self, stream: Stream) -> None:
+    def undeclare(self, stream: Publisher) -> None:
         """Nothing is written there any more."""
         self._streams.remove(stream)
         stream.close()
@@ -155,16 +157,16 @@ class Node:
             return self.session
         if self._pictures is None:
             self._pictures = open_session(
-                self.profile.session, identity=self.name, pictures=True, wait_s=PICTURES_PATIENCE_S
+                self.profile.session, identity=self.name, images=True, wait_s=PICTURES_PATIENCE_S
             )
             self.traffic.add(self._pictures)
         return self._pictures
 
-    def tell(self, event: Event) -> None:
+    def emit(self, event: Event) -> None:
         """Write an event; a flood of the same is thinned out and counted, see `EventThrottle`."""
-        self._news.tell(event)
+        self._news.emit(event)
 
-    def refuse(self, reason: str, why: str, about: str = "") -> None:
+    def reject(self, reason: str, why: str, about: str = "") -> None:
         """Count a refusal by reason, and say why.
 
         Args:
@@ -173,9 +175,9 @@ class Node:
             about: what is refused; a flood of refusals of one thing does not silence another's.
         """
         self.counters[f"refused.{reason}"] += 1
-        self._news.tell(Event("warning", "refusal", reason, why[:1000]), about)
+        self._news.emit(Event("warning", "refusal", reason, why[:1000]), about)
 
-    def report(
+    def publish_status(
         self,
         state: str,
         *,
@@ -191,11 +193,11 @@ class Node:
         if not now and state == self._last_state and clock - self._last_status < STATUS_PERIOD_S:
             return
         self._last_status, self._last_state = clock, state
-        self._status.put(
+        self._status.publish(
             NodeStatus(
                 self.name,
                 state,
-                self.place.host,
+                self.host_id.host,
                 os.getpid(),
                 self.started_wall_ns,
                 ages_s or {},
@@ -203,7 +205,7 @@ class Node:
                 latency_ms or {},
                 dict(self.counters),
                 {**(detail or {}), "clocks": self._clocks_in_words(), "net": self._net()},
-                self.place.boot,
+                self.host_id.boot,
             )
         )
 
@@ -229,17 +231,17 @@ class Node:
                 "uncertainty_ms": round(found.uncertainty_s * 1e3, 3),
                 "round_trip_ms": round(found.round_trip_s * 1e3, 3),
             }
-            for node, found in self.clocks.known().items()
+            for node, found in self.clocks.offsets().items()
         }
 
-    def report_due(self, state: str) -> bool:
+    def status_due(self, state: str) -> bool:
         """Whether `report` would write now: lets a fast loop skip collecting what to report."""
         self._tick()
         due = time.monotonic() - self._last_status >= STATUS_PERIOD_S
         return due or state != self._last_state
 
     # -- reading ------------------------------------------------------------------------------
-    def listen(self, key: str, slot: AnySlot, kind: Kind = Kind.STATE) -> AnySlot:
+    def subscribe(self, key: str, buffer: AnyBuffer, kind: Kind = Kind.STATE) -> AnyBuffer:
         """Let samples on `key` fall into `slot`; of `kind` it matters whether they are pictures.
 
         Those that it does not take are counted and told with the next report.
@@ -248,35 +250,35 @@ class Node:
             SessionError: the router does not answer at the port of pictures.
         """
         session = self._session_for(kind)
-        self.watch(slot)
-        if isinstance(slot, ZenohRing):
-            subscriber = session.declare_subscriber(key, slot.channel())
-            slot.take_from(subscriber.try_recv)
-            self._subscribers.append((slot, subscriber))
-            return slot
-        handler = zenoh.handlers.Callback(slot, indirect=False)
-        self._subscribers.append((slot, session.declare_subscriber(key, handler)))
-        return slot
+        self.watch_buffer(buffer)
+        if isinstance(buffer, ZenohRing):
+            subscriber = session.declare_subscriber(key, buffer.channel())
+            buffer.receive_from(subscriber.try_recv)
+            self._subscribers.append((buffer, subscriber))
+            return buffer
+        handler = zenoh.handlers.Callback(buffer, indirect=False)
+        self._subscribers.append((buffer, session.declare_subscriber(key, handler)))
+        return buffer
 
-    def unlisten(self, slot: SampleBuffer) -> None:
+    def unsubscribe(self, buffer: SampleBuffer) -> None:
         """Let no more samples fall into `slot`."""
         for found, subscriber in self._subscribers:
-            if found is slot:
+            if found is buffer:
                 subscriber.undeclare()
-        self._subscribers = [pair for pair in self._subscribers if pair[0] is not slot]
+        self._subscribers = [pair for pair in self._subscribers if pair[0] is not buffer]
         self._tell_of_refused()
-        self._slots.remove(slot)
+        self._slots.remove(buffer)
 
-    def watch(self, slot: SampleBuffer) -> None:
+    def watch_buffer(self, buffer: SampleBuffer) -> None:
         """Count and tell what `slot` does not take."""
-        self._slots.append(slot)
+        self._slots.append(buffer)
 
     def _tell_of_refused(self) -> None:
         for slot in self._slots:
-            for found in slot.take_refused():
+            for found in slot.pop_rejected():
                 key = self.keys.short(found.key)
                 self.counters[f"refused.{found.reason}"] += found.times - 1
-                self.refuse(found.reason, f"{key}: {found.why}", key)
+                self.reject(found.reason, f"{key}: {found.why}", key)
 
     def on_alive(self, callback: Callable[[str, bool], None]) -> None:
         """Call back with (node name, alive) now and at every change, on Zenoh's thread."""
@@ -293,7 +295,7 @@ class Node:
             self.session.liveliness().declare_subscriber(expression, handler, history=True)
         )
 
-    def answer(self, key: str, reply: Callable[[zenoh.Query], None]) -> None:
+    def serve(self, key: str, reply: Callable[[zenoh.Query], None]) -> None:
         """Answer `get` on `key`; `reply` runs on Zenoh's thread."""
 
         def handle(query: zenoh.Query) -> None:
@@ -303,18 +305,21 @@ class Node:
         handler = zenoh.handlers.Callback(handle, indirect=False)
         self._declared.append(self.session.declare_queryable(key, handler, complete=True))
 
-    def follow_clock(self) -> None:
+    def adopt_system_time(self) -> None:
         """Take over the system's wall clock; that it was set is counted and told."""
-        step_s = self.clock.follow()
+        step_s = self.clock.adopt_system_time()
         if step_s:
-            self.refuse("clock_step", f"the wall clock was set by {step_s:+.3f} s")
+            self.reject("clock_step", f"the wall clock was set by {step_s:+.3f} s")
 
-    def wall_of(self, arrival: ReceivedSample) -> int:
+    def arrival_wall_ns(self, arrival: ReceivedSample) -> int:
         """Arrival time on this node's wall clock."""
         return self.clock.wall_ns() - (time.monotonic_ns() - arrival.mono_ns)
 
-    def read(
-        self, kind: type[Record], arrival: ReceivedSample, speaker: SingleWriterFilter | None = None
+    def decode(
+        self,
+        kind: type[Record],
+        arrival: ReceivedSample,
+        writer_filter: SingleWriterFilter | None = None,
     ) -> Stamped[Record] | None:
         """Decode a stream sample; a refusal is counted and told, and None is returned.
 
@@ -328,18 +333,18 @@ class Node:
         sample = arrival.sample
         try:
             header = self.header(arrival)
-            if speaker is not None:  # before the payload: who shouts nonsense costs least
-                speaker.check(header, arrival.mono_ns)
+            if writer_filter is not None:  # before the payload: who shouts nonsense costs least
+                writer_filter.check(header, arrival.mono_ns)
             record = records.decode(kind, bytes_of(sample.payload))
-            here, record = self.clocks.here(header, record)
+            here, record = self.clocks.to_local_clock(header, record)
         except CodecError as error:
             key = self.keys.short(str(sample.key_expr))
-            self.refuse(error.reason, f"{key}: {error}", key)
+            self.reject(error.reason, f"{key}: {error}", key)
             return None
-        if speaker is not None:
-            speaker.heard(header, arrival.mono_ns)
-        self.traffic.heard(str(sample.key_expr), header, arrival.nth)
-        return Stamped(here, record, self.wall_of(arrival))
+        if writer_filter is not None:
+            writer_filter.heard(header, arrival.mono_ns)
+        self.traffic.received(str(sample.key_expr), header, arrival.nth)
+        return Stamped(here, record, self.arrival_wall_ns(arrival))
 
     @staticmethod
     def header(arrival: ReceivedSample) -> Header:
@@ -350,7 +355,7 @@ class Node:
         """
         return header_of(arrival.sample)
 
-    def read_text(
+    def decode_text(
         self, decode: Callable[[bytes], Record], arrival: ReceivedSample
     ) -> Record | None:
         """Decode a plain setting likewise."""
@@ -358,7 +363,7 @@ class Node:
             return decode(bytes_of(arrival.sample.payload))
         except CodecError as error:
             key = self.keys.short(str(arrival.sample.key_expr))
-            self.refuse(error.reason, f"{key}: {error}", key)
+            self.reject(error.reason, f"{key}: {error}", key)
             return None
 
     def close(self) -> None:

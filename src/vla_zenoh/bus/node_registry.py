@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import chunk
+from vla_zenoh.keys import key_chunk
 from vla_zenoh.types import NodeStatus
 
 MAX_OTHERS = 256
@@ -57,11 +57,11 @@ class NodeRegistry:
             return frozenset(self._alive)
 
     @property
-    def left_out(self) -> int:
+    def dropped(self) -> int:
         """Statuses and tokens that were not kept, or had to go for others."""
         return self._left_out
 
-    def came(self, name: str) -> None:
+    def token_appeared(self, name: str) -> None:
         """A token appeared."""
         with self._lock:
             others = len(self._alive - self._expected)
@@ -70,12 +70,12 @@ class NodeRegistry:
                 return
             self._alive.add(name)
 
-    def went(self, name: str) -> None:
+    def token_gone(self, name: str) -> None:
         """A token went."""
         with self._lock:
             self._alive.discard(name)
 
-    def said(self, name: str, status: NodeStatus, size: int) -> None:
+    def status_received(self, name: str, status: NodeStatus, size: int) -> None:
         """A status came.
 
         Args:
@@ -116,7 +116,7 @@ class NodeRegistry:
     @staticmethod
     def _fit(name: str) -> bool:
         try:
-            return bool(chunk(name, "node"))
+            return bool(key_chunk(name, "node"))
         except ProfileError:
             return False
 

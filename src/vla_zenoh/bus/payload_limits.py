@@ -23,7 +23,7 @@ def bytes_of(payload: zenoh.ZBytes | None, limit: int = MAX_RECORD_BYTES) -> byt
     return payload.to_bytes()
 
 
-def check(sample: zenoh.Sample, limit: int) -> None:
+def check_size(sample: zenoh.Sample, limit: int) -> None:
     """Whether a sample may be taken. A deletion comes without bytes, and would pass for a setting.
 
     Raises:
@@ -38,13 +38,13 @@ def check(sample: zenoh.Sample, limit: int) -> None:
         raise CodecError("oversize", f"{size} bytes, at most {limit} are taken")
 
 
-def whole(sample: zenoh.Sample, limit: int) -> tuple[bytes, bytes | None]:
+def payload_and_attachment(sample: zenoh.Sample, limit: int) -> tuple[bytes, bytes | None]:
     """Payload and attachment.
 
     Raises:
         CodecError: as `check` says.
     """
-    check(sample, limit)
+    check_size(sample, limit)
     attachment = sample.attachment
     return sample.payload.to_bytes(), attachment.to_bytes() if attachment is not None else None
 

@@ -44,18 +44,18 @@ QOS: dict[Kind, dict[str, Any]] = {
         "priority": zenoh.Priority.REAL_TIME,
         "express": True,
     },
-    Kind.NEWS: {"congestion_control": _DROP, "priority": zenoh.Priority.DATA},
+    Kind.TELEMETRY: {"congestion_control": _DROP, "priority": zenoh.Priority.DATA},
 }
 
 
-def config(
+def session_config(
     profile: SessionProfile,
     *,
     mode: Mode = "client",
     connect: tuple[str, ...] | None = None,
     identity: str | None = None,
     access: Mapping[str, Any] | None = None,
-    pictures: bool = False,
+    images: bool = False,
 ) -> dict[str, Any]:
     """Zenoh's configuration as plain data, before it is handed to its strict parser.
 
@@ -78,7 +78,7 @@ def config(
         "mode": mode,
         "listen": {"endpoints": _listening(profile) if routes else []},
         "connect": {
-            "endpoints": [second_link(e) if pictures else e for e in targets],
+            "endpoints": [second_link(e) if images else e for e in targets],
             # A router waits for nobody, and goes on looking for the others.
             "timeout_ms": -1 if routes else 0,
             "exit_on_failure": not routes,
@@ -136,7 +136,7 @@ def open_session(
     connect: tuple[str, ...] | None = None,
     identity: str | None = None,
     access: Mapping[str, Any] | None = None,
-    pictures: bool = False,
+    images: bool = False,
     wait_s: float = 0.0,
     stop: threading.Event | None = None,
 ) -> zenoh.Session:
@@ -156,13 +156,13 @@ def open_session(
         SecurityError: the certificate is not there.
         SessionError: nobody answers there, or the address is taken; says what to do.
     """
-    settings = config(
+    settings = session_config(
         profile,
         mode=mode,
         connect=connect,
         identity=identity,
         access=access,
-        pictures=pictures,
+        images=images,
     )
     give_up = time.monotonic() + wait_s
     stop = stop or threading.Event()

@@ -30,7 +30,7 @@ class TcpUserTimeout:
         self._timeout_ms = round(timeout_s * 1e3)
         self._known: set[str] = set()
 
-    def look(self) -> int:
+    def apply(self) -> int:
         """Tell the kernel so of every connection that is new; how many there are in all."""
         if sys.platform != "linux":
             return 0

@@ -60,7 +60,7 @@ class Traffic:
         """Show the links of this one as well."""
         self._sessions.append(session)
 
-    def heard(self, key: str, header: Header, arrivals: int) -> None:
+    def received(self, key: str, header: Header, arrivals: int) -> None:
         """A record was read.
 
         What a slot dropped by itself is not lost: it arrived. Where several writers share a slot

@@ -20,7 +20,7 @@ def hold(aim: RobotTarget, client: Client, given: Task, stop: threading.Event) -
 
     Args:
         aim: as typed.
-        client: holds it active, see `Client.activate_while_here`.
+        client: holds it active, see `Client.activate_with_deadman`.
         given: the task it was activated with.
         stop: set by Ctrl-C.
     """

@@ -22,7 +22,7 @@ from vla_zenoh.cli.options import (
 )
 from vla_zenoh.cli.output import console, fail, styled
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.codec.image import MAX_PICTURE_BYTES
+from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 
 POLL_S = 0.02
 
@@ -44,7 +44,7 @@ def echo(
     """Print what is written on a key, decoded."""
     loaded = RobotTarget(profile, connect, host).load()
     whole = key if key.startswith(f"{loaded.root}/") else f"{loaded.root}/{loaded.robot.name}/{key}"
-    inbox, seen = CallbackRing(256, MAX_PICTURE_BYTES), 0
+    inbox, seen = CallbackRing(256, MAX_IMAGE_BYTES), 0
     with open_session(loaded.session) as session:
         try:
             subscriber = session.declare_subscriber(
@@ -54,7 +54,7 @@ def echo(
             fail(f"{whole!r} is not a key expression: {error}", 2)
         end = time.monotonic() + seconds if seconds is not None else None
         while (count is None or seen < count) and (end is None or time.monotonic() < end):
-            for arrival in inbox.take_all():
+            for arrival in inbox.drain():
                 _show(arrival.sample, as_json)
                 seen += 1
                 if count is not None and seen >= count:

@@ -125,9 +125,9 @@ def _listen(robot: Client, seconds: float, pictures: bool) -> list[KeyTraffic]:
 
 def _expressions(robot: Client, pictures: bool) -> Iterable[str]:
     if pictures:
-        return [robot.keys.everything]
+        return [robot.keys.all_keys]
     # One expression a group, without the pictures: listening makes cameras encode and send.
-    below = robot.keys.everything.removesuffix("**")
+    below = robot.keys.all_keys.removesuffix("**")
     groups = ("state/*", "command/*", "delta/*", "spec/*", "status/*", "event/*", "sim/*", "task")
     return [below + group for group in groups]
 

@@ -103,7 +103,7 @@ def net(
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
             for node in tuple(client.alive):
-                clocks.follow(node)
+                clocks.track(node)
             clocks.tick()
             time.sleep(POLL_S)
         statuses = {name: found for name, (found, _, alive) in client.snapshot().items() if alive}
@@ -137,7 +137,7 @@ def _own(
             round(found.uncertainty_s * 1e3, 3),
             links,
         )
-        for node, found in clocks.known().items()
+        for node, found in clocks.offsets().items()
         if node in statuses
     ]
 

@@ -128,10 +128,10 @@ def _brake(profile: Profile) -> list[str]:
     if profile.robot.driver == "sim":
         return []
     try:
-        from vla_zenoh.guard.braking_time import longest_brake_s
+        from vla_zenoh.guard.braking_time import max_braking_time_s
     except ImportError:
         return []  # the arm was not looked at either, which is told
-    brake_s = longest_brake_s(profile)
+    brake_s = max_braking_time_s(profile)
     if brake_s <= LONG_BRAKE_S:
         return []
     return [

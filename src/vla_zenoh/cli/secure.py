@@ -23,15 +23,15 @@ from vla_zenoh.profile.session import DEFAULT_FOLDER
 from vla_zenoh.resources import is_path
 from vla_zenoh.security.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
 from vla_zenoh.security.bridge import bridges
-from vla_zenoh.security.identity import PEOPLE, Role, identities, identities_of, people_at
+from vla_zenoh.security.identity import PEOPLE, Role, identities, identities_of, operator_identities
 from vla_zenoh.security.secure_profile import (
-    moved,
+    moved_hosts,
     profile_text,
     serving_addresses,
-    with_person,
+    with_operator,
 )
 from vla_zenoh.security.store import Entry, Store
-from vla_zenoh.security.unused_certificates import stale
+from vla_zenoh.security.unused_certificates import unused_certificates
 
 secure_app = typer.Typer(
     help="Certificates for a lab: nobody else is heard, and each role does only its part.",
@@ -82,7 +82,7 @@ def init(
         fail(f"{file} is there already and is not overwritten; give another one with --output")
     store, now = Store(folder or DEFAULT_FOLDER), _now()
     addresses = _places(at or ())
-    places = moved(plain, addresses)
+    places = moved_hosts(plain, addresses)
     text = profile_text(plain, _extends(profile, file), store.folder.absolute(), places)
     _write(file, text)
     try:
@@ -93,7 +93,7 @@ def init(
         made += store.add(everybody, now, days=days, addresses=serving)
         here = host or _this_host(plain, addresses)
         if here is not None:
-            store.note_this_host(here)
+            store.remember_host(here)
     except VlaZenohError:
         file.unlink()
         raise
@@ -136,10 +136,10 @@ def add(
     if role is not None:
         path = profile_file(profile)
         try:
-            new = with_person(path.read_text("utf-8"), host, Role(role))
+            new = with_operator(path.read_text("utf-8"), host, Role(role))
         except SecurityError as error:
             raise SecurityError(f"{path} {error}") from error
-        chosen = people_at(host, Role(role))
+        chosen = operator_identities(host, Role(role))
         if host in loaded.hosts and renew:
             names = {one.node for one in chosen}
             nodes = [one for one in identities_of(loaded, host) if one.role not in PEOPLE]
@@ -157,7 +157,7 @@ def add(
     out = console()
     for path in made:
         out.print(f"made {path}", highlight=False, soft_wrap=True)
-    for path, why in stale(loaded, store.entries(_now(), host)).items():
+    for path, why in unused_certificates(loaded, store.entries(_now(), host)).items():
         errors().print(f"{path} {why}", style="yellow", highlight=False, soft_wrap=True)
     here, file = store.known_host(), profile_file(profile)
     routers = [name for name, part in loaded.hosts.items() if "router" in part.nodes]
@@ -183,7 +183,7 @@ def here(
     if host not in store.hosts():
         known = ", ".join(store.hosts()) or "none"
         fail(f"{store.folder} has no certificates of {host!r}; it has those of: {known}")
-    console().print(f"this computer is {host}, says {store.note_this_host(host)}", soft_wrap=True)
+    console().print(f"this computer is {host}, says {store.remember_host(host)}", soft_wrap=True)
 
 
 @secure_app.command("show")
@@ -199,7 +199,7 @@ def show(
     now = _now()
     entries = store.entries(now)
     if security is not None and folder is None:
-        why = stale(loaded, entries)
+        why = unused_certificates(loaded, entries)
         entries = [
             entry if entry.faults else replace(entry, warning=why.get(entry.path, entry.warning))
             for entry in entries

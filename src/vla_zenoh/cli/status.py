@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from vla_zenoh.bus.client import LEFT_OUT, Client
+from vla_zenoh.bus.client import DROPPED_HINT, Client
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ConnectOption,
@@ -74,7 +74,7 @@ def status(
             if as_json:
                 print_json(_plain(client))
             else:
-                console().print(_now(client, client.take_events()))
+                console().print(_now(client, client.pop_events()))
             if not client.snapshot():
                 fail(aim.silent(client, "status"))
             return
@@ -85,7 +85,7 @@ def _live(robot: Client) -> None:
     events: list[tuple[str, Header, Event]] = []
     with Live(console=console(), auto_refresh=False, screen=False) as live:
         while True:
-            events = [*events, *robot.take_events()][-MAX_EVENTS:]
+            events = [*events, *robot.pop_events()][-MAX_EVENTS:]
             live.update(_now(robot, events), refresh=True)
             time.sleep(1.0 / REFRESH_HZ)
 
@@ -103,7 +103,7 @@ def _now(robot: Client, events: Sequence[tuple[str, Header, Event]]) -> Group:
         robot.snapshot(),
         events,
         insecure=robot.profile.session.insecure,
-        left_out=robot.left_out,
+        left_out=robot.dropped,
     )
 
 
@@ -142,7 +142,7 @@ def picture(
     warnings = _open_to_all(nodes, insecure=insecure)
     warnings += _ending(nodes)
     if left_out:
-        warnings.append(styled(f"{left_out} {LEFT_OUT}", "yellow"))
+        warnings.append(styled(f"{left_out} {DROPPED_HINT}", "yellow"))
     return Group(*warnings, table, *(line for line in lines if line), *news)
 
 

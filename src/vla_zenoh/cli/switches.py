@@ -9,7 +9,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.liveliness import robots_alive
+from vla_zenoh.bus.liveliness import alive_robots
 from vla_zenoh.cli.deadman import hold
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
@@ -48,7 +48,7 @@ def activate(
     aim = RobotTarget(profile, connect, host, robot)
     with aim.driver("activate") as client:
         stop = stop_on_signals() if while_here else None
-        task = client.activate() if stop is None else client.activate_while_here("person")
+        task = client.activate() if stop is None else client.activate_with_deadman("person")
         console().print(
             f"active: worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz, "
             f"{aim.named(client)}",
@@ -146,7 +146,7 @@ def stop(
     """Emergency stop: brake now, and stay stopped until `vla-zenoh reset`."""
     aim = RobotTarget(profile, connect, host, robot)
     with aim.client(stop=True) as client:
-        client.put(client.keys.stop, "stop")
+        client.publish(client.keys.stop, "stop")
         if every:
             _stop_all(aim, client)
             return
@@ -167,7 +167,7 @@ def reset(
     """Clear an emergency stop or a fault. The arm stays inactive."""
     aim = RobotTarget(profile, connect, host, robot)
     with aim.driver("reset") as client:
-        client.put(client.keys.reset, "reset")
+        client.publish(client.keys.reset, "reset")
         if not _heeded(client, lambda: _state(client) not in ("", "stopped", "fault")):
             status = client.status("command")
             if status is None or "command" not in client.alive:
@@ -211,15 +211,15 @@ def _stop_all(aim: RobotTarget, own: Client) -> None:
     robots: list[str] = []
     give_up = time.monotonic() + LOOK_S
     while time.monotonic() < give_up:
-        for robot in robots_alive(own.session, own.keys):
+        for robot in alive_robots(own.session, own.keys):
             if robot not in robots:
-                own.put(Keys(robot, own.keys.root).stop, "stop")
+                own.publish(Keys(robot, own.keys.root).stop, "stop")
                 robots.append(robot)
         time.sleep(POLL_S)
     if not robots:
         why = aim.powerless(own.profile, "stop")
         fail(f"no robot on this router is alive, as far as one may know here. {why}".rstrip(". "))
-    clients = [Client(as_robot(own.profile, robot), own.session).follow() for robot in robots]
+    clients = [Client(as_robot(own.profile, robot), own.session).subscribe() for robot in robots]
     done = [_stops(client) for client in clients]
     for client, stopped in zip(clients, done, strict=True):
         if stopped:

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import zenoh
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.liveliness import robots_alive
+from vla_zenoh.bus.liveliness import alive_robots
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import DEFAULT_PROFILE, PROFILE_VARIABLE, effective_profile
 from vla_zenoh.cli.output import errors, styled
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.profile import Profile, as_robot
-from vla_zenoh.security.identity import Role, person
-from vla_zenoh.security.operator_identity import people_hosts, role_here
+from vla_zenoh.security.identity import Role, operator_role
+from vla_zenoh.security.operator_identity import local_role, operator_hosts
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class RobotTarget:
         profile = effective_profile(self.profile, list(self.connect or ()), host=self.host)
         if self.robot is not None:
             profile = as_robot(profile, self.robot)
-        hosts = people_hosts(profile, stop=stop)
+        hosts = operator_hosts(profile, stop=stop)
         return [_with_host(profile, host) for host in hosts] or [profile]
 
     # -- sessions -----------------------------------------------------------------------------
@@ -86,7 +86,7 @@ class RobotTarget:
         """
         profile, session = _first(self._choices(stop=stop)[: None if stop else 1])
         with session:
-            yield Client(profile, session).follow()
+            yield Client(profile, session).subscribe()
 
     @contextmanager
     def driver(self, *command: str) -> Iterator[Client]:
@@ -135,20 +135,20 @@ class RobotTarget:
     def others(self, client: Client) -> list[str]:
         """Other robots whose command node is alive."""
         return [
-            name for name in robots_alive(client.session, client.keys) if name != client.keys.robot
+            name for name in alive_robots(client.session, client.keys) if name != client.keys.robot
         ]
 
     def powerless(self, profile: Profile, *command: str) -> str:
         """Why people here drive no robot, empty where they may, with what to type if that helps."""
-        role = role_here(profile)
+        role = local_role(profile)
         if role is None or role is Role.OPERATOR:
             return ""
         assert profile.session.security is not None
         who = f"{role.value}@{profile.session.security.host}"
         able = [
             host
-            for host in people_hosts(_with_host(profile, None), stop=True)
-            if person(profile, host) is Role.OPERATOR
+            for host in operator_hosts(_with_host(profile, None), stop=True)
+            if operator_role(profile, host) is Role.OPERATOR
         ]
         what = (
             f"here lies that of an operator: `{self.typed(*command, host=able[0])}`"

@@ -101,7 +101,7 @@ def robot_names(text: str | None) -> list[str]:
     names = [part.strip() for part in text.split(",")] if text is not None else []
     try:
         for name in names:
-            keys.chunk(name, "robot name")
+            keys.key_chunk(name, "robot name")
     except ProfileError as error:
         raise typer.BadParameter(f"--robots: {error}") from error
     if len(set(names)) != len(names):

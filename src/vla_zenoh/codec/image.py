@@ -19,7 +19,7 @@ MAX_SIDE = 8192
 MAX_PIXELS = 8192 * 4096
 """A few forged bytes of JPEG can ask for this many pixels; three bytes of memory each."""
 MAX_JPEG_BYTES = 32 * 1024 * 1024
-MAX_PICTURE_BYTES = 3 * MAX_PIXELS
+MAX_IMAGE_BYTES = 3 * MAX_PIXELS
 """Of any form."""
 DEFAULT_JPEG_QUALITY = 90
 

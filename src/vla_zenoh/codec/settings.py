@@ -69,7 +69,7 @@ def decode_activation(payload: bytes) -> bool | str:
     if len(words) != 3 or words[0].lower() not in TRUE_WORDS or words[1].lower() != WHILE:
         return decode_bool(payload)
     try:
-        return keys.chunk(words[2], "holder")
+        return keys.key_chunk(words[2], "holder")
     except ProfileError as error:
         raise CodecError("invalid", str(error)) from error
 
@@ -117,7 +117,7 @@ def decode_name(payload: bytes) -> str:
     """
     word = decode_text(payload)
     try:
-        return keys.chunk(word, "worker name")
+        return keys.key_chunk(word, "worker name")
     except ProfileError as error:
         raise CodecError("invalid", str(error)) from error
 
@@ -136,7 +136,7 @@ def decode_seed(payload: bytes) -> int | None:
     return int(word)
 
 
-def encode_held(holder: str) -> bytes:
+def encode_deadman_activation(holder: str) -> bytes:
     """An activation that lasts as long as the token `vla_zenoh.keys.Keys.holding` of `holder`."""
     return f"true {WHILE} {holder}".encode()
 

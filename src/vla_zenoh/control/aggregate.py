@@ -31,7 +31,7 @@ import numpy as np
 
 from vla_zenoh.control.limits import Slowdown
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
-from vla_zenoh.kinematics.so3 import Pose, between, exp3, log3, norm3, orthonormal
+from vla_zenoh.kinematics.so3 import Pose, exp3, interpolate, log3, norm3, orthonormal
 from vla_zenoh.profile import Composition
 from vla_zenoh.types import FloatArray
 
@@ -73,7 +73,7 @@ class PlanAggregator:
         if self._mode == "blend":
             mixed = waypoints[0].pose
             for older, plan, waypoint in zip(plans, plans[1:], waypoints[1:], strict=False):
-                mixed = between(mixed, waypoint.pose, self._weight(older, plan, now_ns))
+                mixed = interpolate(mixed, waypoint.pose, self._weight(older, plan, now_ns))
             return Goal(mixed, waypoints[-1].width_m, slowdown=_slowest(waypoints))
         same = len(waypoints) == len(self._waypoints) and all(
             ours is theirs for ours, theirs in zip(waypoints, self._waypoints, strict=True)

@@ -163,7 +163,7 @@ class DistanceConstraints:
         distances_m = collisions.distances(joints_rad)
         self._near = near = np.flatnonzero(distances_m < stop_m + NEAR_M)
         self._at_rad = joints_rad
-        self._rows = -collisions.slopes(joints_rad, near.tolist())
+        self._rows = -collisions.gradients(joints_rad, near.tolist())
         self._left_m = (distances_m - stop_m)[near]
 
     def hit(self, wall: int, left_m: float) -> LimitHit:

@@ -29,7 +29,7 @@ from vla_zenoh.control.limits import (
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.control.reachability import Bounded, ReachabilityFilter
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.so3 import Pose, between, distance
+from vla_zenoh.kinematics.so3 import Pose, interpolate, pose_distance
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec
 from vla_zenoh.profile import REJECT_FACTOR, Profile
 from vla_zenoh.types import (
@@ -254,7 +254,7 @@ class ChunkPlanner:
         index, pose, hits, slower, joints_rad = plan.bounded, step.pose, step.hits, None, None
         if found is not None:
             pose, joints_rad, slower = found.pose, found.joints_rad, found.slowdown
-            cut = sum(distance(pose, step.pose)) if found.hits else 0.0
+            cut = sum(pose_distance(pose, step.pose)) if found.hits else 0.0
             # What cuts most is told first.
             hits = [*found.hits, *hits] if cut > step.cut else [*hits, *found.hits]
             plan.made = index + 1 if found.hits else max(plan.made, index + 1)
@@ -282,7 +282,7 @@ class ChunkPlanner:
                 asked, slower = self._approach(plan, start.pose, asked)
             width_m = step_width(plan.action, numbers, start.width_m, self._max_width_m)
             pose, acted = bound_step(self._limits, start.pose, asked)
-            cut = sum(distance(pose, asked)) if acted else 0.0
+            cut = sum(pose_distance(pose, asked)) if acted else 0.0
             width_m = start.width_m if width_m is None else width_m
             step = _Step(start, None, pose, width_m, acted, cut, slower)
         if self._reach is not None:
@@ -294,7 +294,7 @@ class ChunkPlanner:
     def _approach(self, plan: ChunkPlan, start: Pose, target: Pose) -> tuple[Pose, Slowdown | None]:
         """How far a step goes to `target`, and how fast: straight and slowly while it is far."""
         limits = self._limits
-        far_m, far_rad = distance(start, target)
+        far_m, far_rad = pose_distance(start, target)
         steps = max(far_m / limits.step_m, far_rad / limits.step_rad)
         if steps <= 1 + ROUNDING:
             return target, None
@@ -309,7 +309,7 @@ class ChunkPlanner:
         share = min(max(full_s / needed_s, LEAST), 1.0)
         has_ns = plan.dt_ns if plan.bounded or plan.first_ns < 0 else plan.first_ns
         part = min(has_ns / 1e9 / needed_s, 1 / steps)
-        return between(start, target, part), Slowdown(APPROACH, share, far, step, "", BEHIND_S)
+        return interpolate(start, target, part), Slowdown(APPROACH, share, far, step, "", BEHIND_S)
 
     # -- the whole chunk ----------------------------------------------------------------------
     def _mistake(self, action: ActionSpec, steps: FloatArray, before: Goal) -> Rejection | None:

@@ -25,7 +25,7 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watchdog import Deadman, Watchdog
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.joint_check import JOINT_PATIENCE_S, reasons_joints_do_not_fit
+from vla_zenoh.kinematics.joint_check import JOINT_PATIENCE_S, joint_state_faults
 from vla_zenoh.kinematics.so3 import held_pose, pose_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
@@ -299,7 +299,7 @@ class Commander:
             self.task.rate_hz,
         )
         if self.reach is not None and self.pose is not None:
-            reasons += reasons_joints_do_not_fit(
+            reasons += joint_state_faults(
                 self.profile, self.reach.kinematics, self.joint, self.pose, now_ns
             )
         if self.joint is not None and self.pose is not None:

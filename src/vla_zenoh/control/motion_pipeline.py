@@ -29,10 +29,10 @@ from vla_zenoh.control.step_timing import StepTiming
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.so3 import (
     Pose,
-    distance,
     exp3,
     held_pose,
     log3,
+    pose_distance,
     pose_of,
     quat_from_rotation,
 )
@@ -167,7 +167,7 @@ class MotionPipeline:
             self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits), inside)
             self._timing = StepTiming(self._smoother.box)
         elif standing and not (
-            self.streaming and self._near(*distance(self._smoother.motion.pose, start))
+            self.streaming and self._near(*pose_distance(self._smoother.motion.pose, start))
         ):
             self._smoother.reset(start)
         if self._joints is not None and joint is not None:
@@ -195,7 +195,7 @@ class MotionPipeline:
             self._stands = None
             return
         held = held_pose(measured)
-        if self._stands is None or max(distance(held, self._stands[0])) > SETTLED:
+        if self._stands is None or max(pose_distance(held, self._stands[0])) > SETTLED:
             self._stands = held, now_ns
 
     def unsettled(self, now_ns: int) -> list[str]:
@@ -206,7 +206,7 @@ class MotionPipeline:
         if self._stands is None or self._smoother is None:
             return []
         held, since_ns = self._stands
-        apart_m, apart_rad = distance(self._smoother.motion.pose, held)
+        apart_m, apart_rad = pose_distance(self._smoother.motion.pose, held)
         if self._near(apart_m, apart_rad) or now_ns - since_ns > SETTLED_NS:
             return []
         return [

@@ -33,7 +33,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from vla_zenoh.control.limits import Slowdown, into_workspace
-from vla_zenoh.kinematics.so3 import Pose, between, orthonormal
+from vla_zenoh.kinematics.so3 import Pose, interpolate, orthonormal
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import Cause, FloatArray
 
@@ -162,7 +162,7 @@ class Plan:
             return self.goals[min(done, self.bounded) - 1]
         last, coming, share = self.goals[done - 1], self.goals[done], part_ns / self.dt_ns
         return Goal(
-            between(last.pose, coming.pose, share),
+            interpolate(last.pose, coming.pose, share),
             last.width_m + share * (coming.width_m - last.width_m),
         )
 

@@ -16,7 +16,7 @@ from vla_zenoh.control.joint_follower import FollowSettings, JointFollower, Join
 from vla_zenoh.control.limits import JointMotionLimits, into_workspace
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.kinematics.so3 import Pose, distance, exp3, log3
+from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Cause, FloatArray, JointCommand
 
@@ -210,7 +210,7 @@ class PoseToJoint:
 
     def _lag(self, here: Pose, pose: Pose) -> float:
         """How far the joints, whose TCP is here, are from a pose, in times of what is near."""
-        apart_m, apart_rad = distance(here, self._inside(here, pose))
+        apart_m, apart_rad = pose_distance(here, self._inside(here, pose))
         return max(apart_m / NEAR_M, apart_rad / NEAR_RAD)
 
     def _look(self) -> None:

@@ -11,7 +11,7 @@ from vla_zenoh.control import policy_check
 from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.errors import SpecError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.ntp import Offset
+from vla_zenoh.ntp import ClockOffset
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, GripperState, PoseState, Stamped
@@ -53,7 +53,7 @@ class PeerSnapshot:
     camera_nodes: Mapping[str, str] = field(default_factory=dict)
     hosts: Mapping[str, str] = field(default_factory=dict)
     same_host: frozenset[str] = frozenset()
-    clocks: Mapping[str, Offset] = field(default_factory=dict)
+    clocks: Mapping[str, ClockOffset] = field(default_factory=dict)
     holders: frozenset[str] = frozenset()
     camera_faults: Mapping[str, str] = field(default_factory=dict)
 
@@ -246,7 +246,7 @@ def _clocks(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
     bound_s, reasons = profile.timing.max_clock_offset_s, []
     for node in dict.fromkeys(nodes):
         found = peers.clocks.get(node)
-        if found is not None and found.beyond(bound_s):
+        if found is not None and found.exceeds(bound_s):
             reasons.append(
                 f"the clock of node {node!r} is {found.offset_s:+.3f} s off this one's "
                 f"(+-{found.uncertainty_s:.4f} s), at most {bound_s:g} s is allowed "

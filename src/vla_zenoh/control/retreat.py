@@ -20,7 +20,7 @@ import numpy as np
 
 from vla_zenoh.control.commander_io import Outputs
 from vla_zenoh.control.contact import Contact
-from vla_zenoh.kinematics.so3 import Pose, distance, norm3
+from vla_zenoh.kinematics.so3 import Pose, norm3, pose_distance
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
@@ -174,8 +174,8 @@ class Retreat:
         if self._contact.told and self._contact.quiet:
             self._finish(out, "no further than the brake, nothing presses any more")
             return None
-        apart_m, apart_rad = distance(commanded, measured)
-        braked_m, braked_rad = distance(begun.commanded, commanded)
+        apart_m, apart_rad = pose_distance(commanded, measured)
+        braked_m, braked_rad = pose_distance(begun.commanded, commanded)
         most_m = self._limits.tracking_m + braked_m + STRAY_M
         most_rad = self._limits.tracking_rad + braked_rad + STRAY_RAD
         if apart_m > most_m or apart_rad > most_rad:

@@ -6,8 +6,8 @@ from collections.abc import Set as AbstractSet
 
 from vla_zenoh.control.chunk_validation import Lease
 from vla_zenoh.control.preflight import CLOCK_TOLERANCE_S, PeerSnapshot
-from vla_zenoh.keys import NOT_SEEN, worker_node
-from vla_zenoh.kinematics.so3 import Pose, distance
+from vla_zenoh.keys import NO_DEADMAN_TOKEN, worker_node
+from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import GripperState, PoseState, Stamped
 
@@ -63,7 +63,7 @@ class Watchdog:
 
         Such an arm is given the way back: it is not blocked as long as it comes nearer.
         """
-        apart_m, apart_rad = distance(held, actual)
+        apart_m, apart_rad = pose_distance(held, actual)
         blocked = apart_m > self._limits.tracking_m or apart_rad > self._limits.tracking_rad
         self._excused = (apart_m, apart_rad) if blocked else (0.0, 0.0)
         return blocked
@@ -71,7 +71,7 @@ class Watchdog:
     def measure(self, commanded: Pose | None, actual: Pose) -> None:
         """How far the arm is from its command; `commanded` is None while nothing is streamed."""
         self.tracking_m, self.tracking_rad = (
-            (0.0, 0.0) if commanded is None else distance(commanded, actual)
+            (0.0, 0.0) if commanded is None else pose_distance(commanded, actual)
         )
 
     def blocked(self) -> str:
@@ -154,7 +154,7 @@ class Deadman:
         """
         reasons = []
         if holder and holder not in there:
-            reasons.append(f"{holder!r}, who is to hold the arm active, {NOT_SEEN}")
+            reasons.append(f"{holder!r}, who is to hold the arm active, {NO_DEADMAN_TOKEN}")
         if obeying and holder and self.name and holder != self.name:
             reasons.append(f"it obeys already, while {self.name!r} holds it; deactivate it first")
         return reasons

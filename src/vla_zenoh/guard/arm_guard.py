@@ -89,7 +89,7 @@ class ArmGuard:
         return self._writer if self.following else ""
 
     @property
-    def leads(self) -> bool:
+    def writer_active(self) -> bool:
         """Who is followed carries out what it is told; after a stop, for one, it only brakes."""
         return self.following and self._state in LEADING
 
@@ -189,15 +189,15 @@ class ArmGuard:
         self._poses.anchor(measured.pose)
         self._joints.anchor(measured.position_rad)
 
-    def stand(self) -> None:
+    def hold(self) -> None:
         """Follow nobody and stand where the reference is: the arm stopped there by itself."""
-        self._in_charge.stand()
+        self._in_charge.hold()
 
-    def restart(self) -> None:
+    def reset(self) -> None:
         """The robot was put elsewhere; follow nobody and stand there."""
         measured = self._measure()
-        self._poses.restart(measured.pose)
-        self._joints.restart(measured.position_rad)
+        self._poses.reset(measured.pose)
+        self._joints.reset(measured.position_rad)
 
 
 def make_arm_guard(

@@ -9,7 +9,7 @@ from vla_zenoh.guard.pose_guard import guard_limits
 from vla_zenoh.profile import Profile
 
 
-def longest_brake_s(profile: Profile) -> float:
+def max_braking_time_s(profile: Profile) -> float:
     """From the last command until the arm stands, whatever motion the robot's side followed.
 
     That may be faster than the profile's limits, by `BRAKE_MARGIN`, and still be gaining speed.

@@ -8,7 +8,7 @@ from typing import Generic
 import numpy as np
 
 from vla_zenoh.guard.command_stream import ACCELERATE_S, BRAKE_MARGIN
-from vla_zenoh.guard.reference_governor import GovernedPath, GovernorLimits, Space, Told
+from vla_zenoh.guard.reference_governor import GovernedPath, GovernorLimits, Reference, Space
 from vla_zenoh.types import FloatArray
 
 FADING_S = 0.07
@@ -16,7 +16,7 @@ FADING_S = 0.07
 has to be undone."""
 
 
-class Extrapolation(Generic[Told]):
+class Extrapolation(Generic[Reference]):
     """A motion from one command on, within the limits of the stream.
 
     For as long as there were between this command and the one before it the acceleration goes on
@@ -33,9 +33,9 @@ class Extrapolation(Generic[Told]):
 
     def __init__(
         self,
-        space: Space[Told],
-        command: Told,
-        before: Told | None,
+        space: Space[Reference],
+        command: Reference,
+        before: Reference | None,
         gap_s: float,
         brake: GovernorLimits,
     ) -> None:
@@ -68,7 +68,7 @@ class Extrapolation(Generic[Told]):
         steady_s[self._jerk * then.change < 0] = 0.0
         return then, steady_s, fading_s, -then.change / fading_s
 
-    def at(self, ahead_s: float) -> Told:
+    def at(self, ahead_s: float) -> Reference:
         """The motion `ahead_s` after the command."""
         if ahead_s <= self._gap_s:
             return self._space.beside(self._base, _on(self._first, self._jerk, ahead_s))
@@ -81,7 +81,7 @@ class Extrapolation(Generic[Told]):
         return self._space.beside(self._base, _on(way, 0.0, left_s))
 
 
-def _cut(space: Space[Told], values: FloatArray, limits: FloatArray) -> FloatArray:
+def _cut(space: Space[Reference], values: FloatArray, limits: FloatArray) -> FloatArray:
     return values / np.maximum(space.sizes(values / limits), 1.0)
 
 

@@ -30,8 +30,8 @@ class GripperGuard:
         self._newest: dict[str, int] = {}
         self.bounded = 0
 
-    def take(
-        self, order: Stamped[GripperCommand], writer: str, now_ns: int, *, leads: bool
+    def accept(
+        self, order: Stamped[GripperCommand], writer: str, now_ns: int, *, writer_active: bool
     ) -> GripperCommand:
         """The order as it may be carried out.
 
@@ -58,7 +58,7 @@ class GripperGuard:
         age_ns = now_ns - order.header.stamp_wall_ns
         if age_ns > OLDEST_NS:
             raise CodecError("stale", f"is {age_ns / 1e9:.1f} s old")
-        if writer and not leads:
+        if writer and not writer_active:
             raise CodecError("outlived", "came when who gave it had stopped")
         return self._within(order.record)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vla_zenoh.guard.arm_guard import Measured
-from vla_zenoh.kinematics.so3 import distance
+from vla_zenoh.kinematics.so3 import pose_distance
 
 SETTLE_NS = 500_000_000
 """After the last command the arm comes to rest within this time."""
@@ -31,22 +31,22 @@ class HeldReference:
         """What was sent last is what the controller holds."""
         return self._sent_ns is not None
 
-    def sent(self, now_ns: int) -> None:
+    def on_sent(self, now_ns: int) -> None:
         """A command was sent."""
         self._sent_ns, self._settled = now_ns, None
 
-    def lose(self) -> None:
+    def invalidate(self) -> None:
         """Nobody knows what became of the last commands: the robot is not heard."""
         self._sent_ns = self._settled = None
 
-    def look(self, measured: Measured, now_ns: int) -> bool:
+    def update(self, measured: Measured, now_ns: int) -> bool:
         """Whether `held` still; call it while nothing is sent."""
         if self._sent_ns is None or now_ns - self._sent_ns < SETTLE_NS:
             return self.held
         if self._settled is None:
             self._settled = measured
-        apart_m, apart_rad = distance(self._settled.pose, measured.pose)
+        apart_m, apart_rad = pose_distance(self._settled.pose, measured.pose)
         turned_rad = float(np.abs(measured.position_rad - self._settled.position_rad).max())
         if apart_m > MOVED_M or max(apart_rad, turned_rad) > MOVED_RAD:
-            self.lose()
+            self.invalidate()
         return self.held

@@ -98,7 +98,7 @@ class JointGuard(StreamGuard[JointReference]):
         brake = GovernorLimits(*limits.brake, axis=whole, beside=whole)
         super().__init__(JointSpace(), still, dt_s, limits.timeout_s, brake)
 
-    def restart(self, position_rad: FloatArray) -> None:
+    def reset(self, position_rad: FloatArray) -> None:
         """The robot was put elsewhere; follow nobody and stand."""
         self.anchor(position_rad)
         self._stream.forget()

@@ -125,7 +125,7 @@ class PoseGuard(StreamGuard[Motion]):
             PoseSpace(), _standing(pose), dt_s, limits.timeout_s, _governed(limits.brake)
         )
 
-    def restart(self, pose: Pose) -> None:
+    def reset(self, pose: Pose) -> None:
         """The robot was put elsewhere; follow nobody and stand."""
         self.anchor(pose)
         self._stream.forget()

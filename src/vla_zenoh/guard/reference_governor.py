@@ -55,7 +55,7 @@ SLACK, LEAST = 0.1, 0.25
 difference is planned anew; and so much the difference has at least."""
 GRID = 8
 
-Told = TypeVar("Told")
+Reference = TypeVar("Reference")
 
 
 class GovernedPath(NamedTuple):
@@ -66,22 +66,22 @@ class GovernedPath(NamedTuple):
     change: FloatArray
 
 
-class Space(Protocol[Told]):
+class Space(Protocol[Reference]):
     """Where references lie, and how one is a way (n,) beside another."""
 
-    def rest(self, motion: Told) -> Told:
+    def rest(self, motion: Reference) -> Reference:
         """Standing where `motion` is."""
         ...
 
-    def speed(self, motion: Told) -> GovernedPath:
+    def speed(self, motion: Reference) -> GovernedPath:
         """Rate and change of a motion; its value is zero."""
         ...
 
-    def beside(self, base: Told, way: GovernedPath) -> Told:
+    def beside(self, base: Reference, way: GovernedPath) -> Reference:
         """The motion that is `way` beside `base`, with its exact rate and change."""
         ...
 
-    def apart(self, motion: Told, base: Told) -> GovernedPath:
+    def apart(self, motion: Reference, base: Reference) -> GovernedPath:
         """The way `motion` is beside `base`: the inverse of `beside`."""
         ...
 
@@ -129,7 +129,7 @@ _EVEN = np.array([1.0, 1 / 2, 1 / 3])
 """Moments of a jerk of 1."""
 
 
-class ReferenceGovernor(Generic[Told]):
+class ReferenceGovernor(Generic[Reference]):
     """See the module.
 
     Args:
@@ -144,7 +144,7 @@ class ReferenceGovernor(Generic[Told]):
     """
 
     def __init__(
-        self, space: Space[Told], motion: Told, dt_s: float, brake: GovernorLimits
+        self, space: Space[Reference], motion: Reference, dt_s: float, brake: GovernorLimits
     ) -> None:
         self._space, self._dt_s = space, dt_s
         limits = np.array(brake[:3])
@@ -165,7 +165,7 @@ class ReferenceGovernor(Generic[Told]):
         self._taken = self._known = limits
         self.put(motion)
 
-    def put(self, motion: Told) -> None:
+    def put(self, motion: Reference) -> None:
         """Stand where `motion` is, whatever was before."""
         self.told = self.motion = self._space.rest(motion)
         self._way: GovernedPath | None = None
@@ -177,7 +177,7 @@ class ReferenceGovernor(Generic[Told]):
         """The reference is not at rest at what it goes to, or that moves."""
         return self._way is not None or bool(self._space.speed(self.told).rate.any())
 
-    def follow(self, told: Told, *, steady: bool) -> None:
+    def follow(self, told: Reference, *, steady: bool) -> None:
         """Go on as told.
 
         Args:
@@ -224,14 +224,14 @@ class ReferenceGovernor(Generic[Told]):
             self.put(self.motion)
 
     # -- what is told -------------------------------------------------------------------------
-    def _share_of(self, told: Told) -> FloatArray:
+    def _share_of(self, told: Reference) -> FloatArray:
         """The jerk (n,) that leads to `told`, in parts of its limit and not above it."""
         change = self._space.speed(told).change - self._space.speed(self.told).change
         share = change / self._reach[0]
         share = share / np.maximum(self._space.sizes(share), 1.0)
         return share if self._cramped is None else np.where(self._cramped, 0.0, share)
 
-    def _went_on(self, told: Told) -> tuple[Told, FloatArray]:
+    def _went_on(self, told: Reference) -> tuple[Reference, FloatArray]:
         """What was told a tick ago, gone on with the jerk that brings it nearest to `told`.
 
         Returns:
@@ -253,7 +253,7 @@ class ReferenceGovernor(Generic[Told]):
         return float(self._space.sizes(_TESTS @ moments).max()) <= 1.0
 
     # -- the difference -----------------------------------------------------------------------
-    def _advance(self, told: Told | None = None, share: FloatArray | None = None) -> None:
+    def _advance(self, told: Reference | None = None, share: FloatArray | None = None) -> None:
         """Let a tick pass for the difference.
 
         Args:

@@ -11,14 +11,14 @@ import numpy as np
 
 from vla_zenoh.guard.command_stream import CommandStream
 from vla_zenoh.guard.extrapolation import Extrapolation
-from vla_zenoh.guard.reference_governor import GovernorLimits, ReferenceGovernor, Space, Told
+from vla_zenoh.guard.reference_governor import GovernorLimits, Reference, ReferenceGovernor, Space
 from vla_zenoh.types import Header, Stamped
 
 STILL = 1e-4
 """m/s and rad/s: a stream that ends slower than this has ended on purpose."""
 
 
-class StreamGuard(Generic[Told]):
+class StreamGuard(Generic[Reference]):
     """Follows a stream of commands, and stops by itself when that falls silent in motion.
 
     Args:
@@ -30,18 +30,23 @@ class StreamGuard(Generic[Told]):
     """
 
     def __init__(
-        self, space: Space[Told], motion: Told, dt_s: float, timeout_s: float, brake: GovernorLimits
+        self,
+        space: Space[Reference],
+        motion: Reference,
+        dt_s: float,
+        timeout_s: float,
+        brake: GovernorLimits,
     ) -> None:
         self._space, self._dt_s, self._brake = space, dt_s, brake
-        self._stream: CommandStream[Told] = CommandStream(timeout_s)
+        self._stream: CommandStream[Reference] = CommandStream(timeout_s)
         self._governor = ReferenceGovernor(space, motion, dt_s, brake)
-        self._extrapolation: Extrapolation[Told] | None = None
+        self._extrapolation: Extrapolation[Reference] | None = None
         self.braking = False
         """The stream fell silent in motion, and the reference still moves."""
         self.silences = 0
 
     @property
-    def motion(self) -> Told:
+    def motion(self) -> Reference:
         """The reference now."""
         return self._governor.motion
 
@@ -55,11 +60,11 @@ class StreamGuard(Generic[Told]):
         """A stream is being followed, or what was followed last is still brought to rest."""
         return self.following or self._governor.moving
 
-    def stand(self) -> None:
+    def hold(self) -> None:
         """Follow nobody and stand where the reference is: the arm stopped there by itself."""
         self._put(self.motion)
 
-    def _put(self, motion: Told) -> None:
+    def _put(self, motion: Reference) -> None:
         self._stream.end()
         self.braking = False
         self._governor.put(motion)
@@ -69,11 +74,11 @@ class StreamGuard(Generic[Told]):
         return "braking" if objection is None and self.braking else objection
 
     @property
-    def _expected(self) -> Told:
+    def _expected(self) -> Reference:
         """Where a command is expected: where what was told leads, or where the robot stands."""
         return self._governor.told if self.following else self.motion
 
-    def _take(self, command: Stamped[Told]) -> None:
+    def _take(self, command: Stamped[Reference]) -> None:
         before = self._stream.newest
         self._stream.take(command)
         gap_s = 0.0
@@ -83,7 +88,7 @@ class StreamGuard(Generic[Told]):
             self._space, command.record, before and before.record, gap_s, self._brake
         )
 
-    def tick(self, now_ns: int) -> Told:
+    def tick(self, now_ns: int) -> Reference:
         """The reference to follow at `now_ns`."""
         governor = self._governor
         if self._stream.live(now_ns) is not None and self._extrapolation is not None:

@@ -33,7 +33,7 @@ from vla_zenoh.errors import SpecError
 from vla_zenoh.interop.joints import Forward, poses_of
 from vla_zenoh.policy import ActionSpec, Frame, GripperSemantics, Rotation
 from vla_zenoh.policy.model_options import number, one_of, whole_number
-from vla_zenoh.pydantic_errors import in_words
+from vla_zenoh.pydantic_errors import describe_fault
 from vla_zenoh.types import JointState
 
 Action = Literal["delta", "absolute", "joint_delta", "joint_position"]
@@ -243,7 +243,7 @@ def as_spec_error() -> Iterator[None]:
         yield
     except ValidationError as error:
         faults = "; ".join(
-            f"{'.'.join(map(str, fault['loc'])) or 'options'}: {in_words(fault)}"
+            f"{'.'.join(map(str, fault['loc'])) or 'options'}: {describe_fault(fault)}"
             for fault in error.errors(include_url=False)
         )
         raise SpecError(f"the options give no valid spec: {faults}") from error

@@ -95,7 +95,7 @@ class CollisionModel:
         pin.computeDistances(self._geometry, self._work)
         return np.array([result.min_distance for result in self._results])
 
-    def slopes(self, joints_rad: FloatArray, indices: Sequence[int]) -> FloatArray:
+    def gradients(self, joints_rad: FloatArray, indices: Sequence[int]) -> FloatArray:
         """(len(indices), n) m/rad: how these distances change with each joint.
 
         Only after `distances` of the same joints. Nothing for two that are inside each other.

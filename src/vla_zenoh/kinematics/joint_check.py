@@ -6,7 +6,7 @@ import numpy as np
 
 from vla_zenoh.errors import VlaZenohError
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.kinematics.so3 import distance, held_pose, pose_of
+from vla_zenoh.kinematics.so3 import held_pose, pose_distance, pose_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import JointState, PoseState, Stamped
 
@@ -17,7 +17,7 @@ HELD_RAD = 0.1
 """A joint may be so far from where its controller holds it."""
 
 
-def reasons_joints_do_not_fit(
+def joint_state_faults(
     profile: Profile,
     kinematics: Kinematics,
     joint: Stamped[JointState] | None,
@@ -42,7 +42,7 @@ def reasons_joints_do_not_fit(
         joints_rad = kinematics.joints_of(joint.record)
     except VlaZenohError as error:
         return [str(error)]
-    apart_m, apart_rad = distance(kinematics.forward(joints_rad), pose_of(pose.record))
+    apart_m, apart_rad = pose_distance(kinematics.forward(joints_rad), pose_of(pose.record))
     if apart_m <= SAME_TCP_M and apart_rad <= SAME_TCP_RAD:
         return _elbow_is_not_held(profile, joint.record, pose.record)
     return [
@@ -60,7 +60,7 @@ def _elbow_is_not_held(profile: Profile, joint: JointState, pose: PoseState) -> 
     """
     if profile.robot.command != "joint" or joint.reference_rad is None:
         return []
-    apart_m, apart_rad = distance(held_pose(pose), pose_of(pose))
+    apart_m, apart_rad = pose_distance(held_pose(pose), pose_of(pose))
     if apart_m > profile.limits.tracking_m or apart_rad > profile.limits.tracking_rad:
         return []
     away_rad = np.abs(joint.reference_rad - joint.position_rad)

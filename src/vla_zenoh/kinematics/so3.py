@@ -103,7 +103,7 @@ def angle_between(a: FloatArray, b: FloatArray) -> float:
     return norm3(log3(b @ a.T))
 
 
-def distance(a: Pose, b: Pose) -> tuple[float, float]:
+def pose_distance(a: Pose, b: Pose) -> tuple[float, float]:
     """How far two poses are apart: m and rad."""
     return norm3(a.position_m - b.position_m), angle_between(a.rotation, b.rotation)
 
@@ -120,7 +120,7 @@ def held_pose(measured: PoseState) -> Pose:
     return Pose(measured.reference_position_m, rotation_from_quat(measured.reference_quat_xyzw))
 
 
-def between(start: Pose, end: Pose, share: float) -> Pose:
+def interpolate(start: Pose, end: Pose, share: float) -> Pose:
     """The pose at `share` (0 to 1) of the way: a straight line and the shortest turn."""
     turn = log3(end.rotation @ start.rotation.T)
     return Pose(

@@ -27,7 +27,7 @@ from pydantic import (
 )
 
 from vla_zenoh.errors import SpecError
-from vla_zenoh.pydantic_errors import in_words
+from vla_zenoh.pydantic_errors import describe_fault
 from vla_zenoh.types import GripperState, JointState, PoseState, Task
 
 StatePart = Literal["joint", "pose", "gripper"]
@@ -184,7 +184,7 @@ class ModelSpec(_Spec):
             return ModelSpec.model_validate(data)
         except ValidationError as error:
             faults = "; ".join(
-                f"{'.'.join(map(str, fault['loc'])) or 'spec'}: {in_words(fault)}"[:300]
+                f"{'.'.join(map(str, fault['loc'])) or 'spec'}: {describe_fault(fault)}"[:300]
                 for fault in error.errors(include_url=False)[:MAX_FAULTS]
             )
             raise SpecError(f"not a valid model spec: {faults}") from error

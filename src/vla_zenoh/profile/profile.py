@@ -45,7 +45,7 @@ ONLY_ONE = {
 def _root(value: str) -> str:
     try:
         for part in value.split("/"):
-            keys.chunk(part, "root")
+            keys.key_chunk(part, "root")
     except ProfileError as error:
         raise ValueError(str(error)) from error
     return value

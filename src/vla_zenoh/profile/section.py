@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.pydantic_errors import in_words, nearest
+from vla_zenoh.pydantic_errors import describe_fault, nearest
 from vla_zenoh.types import MAX_TEXT, shown
 
 Place = tuple[str, ...]
@@ -51,7 +51,7 @@ def reject(faults: Sequence[Fault]) -> None:
 
 def _key_part(value: str) -> str:
     try:
-        return keys.chunk(value, "name")
+        return keys.key_chunk(value, "name")
     except ProfileError as error:
         raise ValueError(str(error)) from error
 
@@ -104,7 +104,7 @@ def _line(place: Place, why: str, lines: Lines) -> str:
 
 
 def _why(fault: Any, place: Place, model: type[Section]) -> str:
-    words, given = in_words(fault), fault.get("input")
+    words, given = describe_fault(fault), fault.get("input")
     if fault["type"] == "extra_forbidden":
         allowed = field_names(model, place[:-1])
         return f"unknown key{nearest(place[-1], allowed)} Known here: {', '.join(allowed)}"

@@ -54,7 +54,7 @@ class CommandFollower:
         self._mode = node.profile.robot.command
         keys = node.keys
         key = keys.command_joint if self._mode == "joint" else keys.command_pose
-        self._orders = node.listen(key, CallbackRing(INBOX, SMALL_BYTES))
+        self._orders = node.subscribe(key, CallbackRing(INBOX, SMALL_BYTES))
         self._guard: ArmGuard | None = None
         self._measured: Measured | None = None
         self._hold = HeldReference()
@@ -82,12 +82,12 @@ class CommandFollower:
                 self._stalled_until_ns = 0
             return
         if stall_s * 1e9 > SETTLE_NS:
-            self._hold.lose()  # somebody else may have moved the arm meanwhile
+            self._hold.invalidate()  # somebody else may have moved the arm meanwhile
         if self._guard is not None and self.sending:
-            self._guard.stand()
+            self._guard.hold()
             self._stalled_until_ns, self.stall_s = mono_ns + STALLED_NS, stall_s
             self.stalls += 1
-        for _ in self._orders.take_all():
+        for _ in self._orders.drain():
             self._refuse("stalled")
 
     def turn(self, now_ns: int, mono_ns: int, *, away: str = "", silent: bool = False) -> None:
@@ -100,7 +100,7 @@ class CommandFollower:
             silent: it is not known where the arm is.
         """
         guard = self._guard
-        for arrival in self._orders.take_all():
+        for arrival in self._orders.drain():
             if guard is None or self._deaf:
                 continue
             reason = away or ("stalled" if self.stalled else self._offer(guard, arrival, mono_ns))
@@ -109,24 +109,24 @@ class CommandFollower:
         if guard is not None and self._measured is not None:
             self._follow(guard, self._measured, now_ns, mono_ns, away)
         if silent or away:
-            self._hold.lose()
+            self._hold.invalidate()
 
     def _offer(self, guard: ArmGuard, arrival: ReceivedSample, mono_ns: int) -> str | None:
         if not (guard.following or guard.braking or self._hold.held):
             guard.anchor()  # nobody holds the arm at what was sent last: it is where it is
         # Silence is counted by a clock that nobody sets.
         if self._mode == "joint":
-            joints = self._node.read(JointCommand, arrival)
+            joints = self._node.decode(JointCommand, arrival)
             if joints is None:
                 return None
             return guard.offer_joint(replace(joints, received_ns=arrival.mono_ns), mono_ns)
-        pose = self._node.read(PoseCommand, arrival)
+        pose = self._node.decode(PoseCommand, arrival)
         if pose is None:
             return None
         return guard.offer_pose(replace(pose, received_ns=arrival.mono_ns), mono_ns)
 
     def _refuse(self, reason: str) -> None:
-        self._node.refuse(f"{self._mode}_{reason}", f"command/{self._mode}: {reason}")
+        self._node.reject(f"{self._mode}_{reason}", f"command/{self._mode}: {reason}")
 
     def _follow(
         self, guard: ArmGuard, measured: Measured, now_ns: int, mono_ns: int, away: str
@@ -136,10 +136,10 @@ class CommandFollower:
         was_moving = guard.moving
         reference = guard.tick(mono_ns)
         if guard.moving or was_moving:
-            self._hold.sent(mono_ns)
+            self._hold.on_sent(mono_ns)
             self._send(self._target(reference), now_ns)
         else:
-            self._hold.look(measured, mono_ns)
+            self._hold.update(measured, mono_ns)
 
     def _target(self, reference: PoseReference | JointReference) -> PoseCommand | JointCommand:
         if isinstance(reference, JointReference):
@@ -204,7 +204,7 @@ class CommandFollower:
     @property
     def leads(self) -> bool:
         """See `ArmGuard.leads`."""
-        return self._guard is not None and self._guard.leads
+        return self._guard is not None and self._guard.writer_active
 
     @property
     def silences(self) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from vla_zenoh.bus.clock import FixedRate, Tick
 from vla_zenoh.bus.node import Node
-from vla_zenoh.guard.braking_time import longest_brake_s
+from vla_zenoh.guard.braking_time import max_braking_time_s
 from vla_zenoh.robots.command_follower import CommandFollower
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event
@@ -28,7 +28,7 @@ class ShutdownBrake:
 
     def __init__(self, node: Node, lead: CommandFollower) -> None:
         self._node, self._lead = node, lead
-        self._patience_s = max(LEAST_S, longest_brake_s(node.profile) + SLACK_S)
+        self._patience_s = max(LEAST_S, max_braking_time_s(node.profile) + SLACK_S)
         self._until_ns = 0
 
     def over(self, mono_ns: int) -> bool:
@@ -72,4 +72,4 @@ class ShutdownBrake:
         return not self._lead.sending
 
     def _tell(self, why: str) -> None:
-        self._node.tell(Event("error", "fault", "not_braked", why))
+        self._node.emit(Event("error", "fault", "not_braked", why))

@@ -20,7 +20,7 @@ TELL_PERIOD_S = 24 * 3600.0
 
 
 @dataclass(frozen=True, slots=True)
-class Outlook:
+class ExpiryOutlook:
     """What a look at the certificates came to.
 
     Args:
@@ -34,7 +34,7 @@ class Outlook:
     unknown: str = ""
 
 
-def outlook(security: SecurityProfile, now: dt.datetime) -> Outlook:
+def outlook(security: SecurityProfile, now: dt.datetime) -> ExpiryOutlook:
     """Looks at the certificates of this computer.
 
     Args:
@@ -45,9 +45,9 @@ def outlook(security: SecurityProfile, now: dt.datetime) -> Outlook:
     try:
         entries = store.entries(now, store.this_host(security.host))
     except MissingExtraError as error:  # who only uses certificates need not be able to read them
-        return Outlook(unknown=f"nobody looks here when certificates end: {error}")
+        return ExpiryOutlook(unknown=f"nobody looks here when certificates end: {error}")
     except SecurityError as error:
-        return Outlook(unknown=str(error))
+        return ExpiryOutlook(unknown=str(error))
     wrong = tuple(
         f"{entry.path.name} {what}"
         for entry in entries
@@ -55,10 +55,10 @@ def outlook(security: SecurityProfile, now: dt.datetime) -> Outlook:
         if what
     )
     days = [entry.certificate.days_left(now) for entry in entries if entry.certificate]
-    return Outlook(min(days, default=None), wrong)
+    return ExpiryOutlook(min(days, default=None), wrong)
 
 
-class Expiry:
+class CertificateExpiry:
     """Looks once an hour; what is wrong is due when it is new, and once a day.
 
     Args:
@@ -75,10 +75,10 @@ class Expiry:
     ) -> None:
         self._security, self._clock, self._now = security, clock, now
         self._looked_s = self._told_s = -1e9
-        self._outlook = self._told = Outlook()
+        self._outlook = self._told = ExpiryOutlook()
 
     @property
-    def outlook(self) -> Outlook:
+    def outlook(self) -> ExpiryOutlook:
         """Not older than an hour."""
         if self._security is not None and self._clock() - self._looked_s >= LOOK_PERIOD_S:
             self._looked_s = self._clock()

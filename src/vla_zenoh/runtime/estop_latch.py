@@ -32,7 +32,7 @@ class EstopLatch:
         except OSError as error:
             return f"{self._path} cannot be read: {error}"
 
-    def keep(self, why: str | None) -> None:
+    def set(self, why: str | None) -> None:
         """Let it stand for a reason, or be gone; returns at once."""
         self._wanted.put(why)
 

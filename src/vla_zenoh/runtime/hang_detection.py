@@ -26,7 +26,7 @@ class LastStatus(NamedTuple):
     age_s: float
 
 
-def hanging(running: Mapping[str, tuple[str, int]], said: Mapping[str, LastStatus]) -> list[str]:
+def hung_nodes(running: Mapping[str, tuple[str, int]], said: Mapping[str, LastStatus]) -> list[str]:
     """Names of the nodes to end.
 
     Args:

@@ -14,16 +14,16 @@ from typing import Any
 
 import zenoh
 
-from vla_zenoh.bus.client import LEFT_OUT, Client
-from vla_zenoh.bus.host_id import HOST_VARIABLE, own_boot
+from vla_zenoh.bus.client import DROPPED_HINT, Client
+from vla_zenoh.bus.host_id import HOST_VARIABLE, own_boot_id
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import NodeError, ProfileError, SessionError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
-from vla_zenoh.runtime.certificate_expiry import Expiry
-from vla_zenoh.runtime.hang_detection import LastStatus, hanging
+from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
+from vla_zenoh.runtime.hang_detection import LastStatus, hung_nodes
 from vla_zenoh.runtime.supervisor import NodeCommand, Supervisor
-from vla_zenoh.security.identity import Role, person
+from vla_zenoh.security.identity import Role, operator_role
 
 START_ORDER = ("router", "sim", "ros2", "arm", "command", "camera", "worker")
 EXPENDABLE = ("worker",)
@@ -178,7 +178,7 @@ class Host:
             variables={HOST_VARIABLE: self.host},
         )
         self._own_router = own_router
-        self._expiry = Expiry(profile.session.security)
+        self._expiry = CertificateExpiry(profile.session.security)
         self._left_out, self._strangers_told_s = 0, -1e9
         self.session: zenoh.Session | None = None
         self.client: Client | None = None
@@ -216,7 +216,7 @@ class Host:
             else:
                 self.supervisor.start(["router"])
         self.session = open_session(self.profile.session, wait_s=ROUTER_PATIENCE_S)
-        self.client = Client(self.profile, self.session).follow()
+        self.client = Client(self.profile, self.session).subscribe()
         self.supervisor.start()
 
     def _router_answers(self) -> bool:
@@ -246,7 +246,7 @@ class Host:
         # Where people may only look on, the arm brakes because the nodes of this host end.
         may = (
             self.profile.session.security is None
-            or person(self.profile, self.host) is Role.OPERATOR
+            or operator_role(self.profile, self.host) is Role.OPERATOR
         )
         client = self.client
         if may and client is not None and "command" in client.alive and self._takes_part(client):
@@ -268,7 +268,7 @@ class Host:
             or (
                 name in alive
                 and (status := client.status(name)) is not None
-                and status.boot == own_boot()
+                and status.boot == own_boot_id()
                 and self.supervisor.owns(name, status.pid)
             )
             for name, (kind, _) in self.supervisor.running().items()
@@ -297,9 +297,9 @@ class Host:
             for sentence in self._expiry.due():
                 self._tell("up", sentence)
             self._tell_of_strangers()
-            self.watch(spare=EXPENDABLE)
+            self.poll(spare=EXPENDABLE)
 
-    def watch(self, spare: Sequence[str] = ()) -> None:
+    def poll(self, spare: Sequence[str] = ()) -> None:
         """Start again what died.
 
         Args:
@@ -308,16 +308,16 @@ class Host:
         Raises:
             NodeError: another node dies again and again.
         """
-        if not self.supervisor.watch(spare=spare):
+        if not self.supervisor.poll(spare=spare):
             given_up = self.supervisor.given_up
             name = given_up.command.name if given_up else "a node"
             raise NodeError(f"{name} dies again and again; its last lines above say why")
 
     def _tell_of_strangers(self) -> None:
-        left_out = self.client.left_out if self.client is not None else 0
+        left_out = self.client.dropped if self.client is not None else 0
         now_s = time.monotonic()
         if left_out > self._left_out and now_s - self._strangers_told_s > STRANGERS_PERIOD_S:
-            self._tell("up", f"{left_out} {LEFT_OUT}")
+            self._tell("up", f"{left_out} {DROPPED_HINT}")
             self._left_out, self._strangers_told_s = left_out, now_s
 
     def _end_what_hangs(self) -> None:
@@ -327,5 +327,7 @@ class Host:
             name: LastStatus(status.pid, age_s)
             for name, (status, age_s, _) in self.client.snapshot().items()
         }
-        for name in hanging(self.supervisor.running(), said):
-            self.supervisor.end(name, f"silent for {said[name].age_s:.0f} s; it hangs, ending it")
+        for name in hung_nodes(self.supervisor.running(), said):
+            self.supervisor.terminate(
+                name, f"silent for {said[name].age_s:.0f} s; it hangs, ending it"
+            )

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.session import config, open_session
+from vla_zenoh.bus.session import open_session, session_config
 from vla_zenoh.bus.tcp_user_timeout import TcpUserTimeout
 from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import is_loopback
-from vla_zenoh.runtime.certificate_expiry import Expiry
+from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.security.rules import access_control
 
 POLL_S = 0.25
@@ -55,18 +55,18 @@ def run_router(
         node = Node(name, profile, session, host=host)
         detail: dict[str, Any] = {
             "listen": list(profile.session.listen),
-            "security": security_of(profile),
+            "security": security_summary(profile),
         }
         impatience, expiry = (
             TcpUserTimeout(profile.session.lease_ms / 1e3),
-            Expiry(profile.session.security),
+            CertificateExpiry(profile.session.security),
         )
         while not stop.wait(POLL_S):
-            impatience.look()
+            impatience.apply()
             links_now = len(list(session.info.links()))
             if profile.session.security is not None:
                 detail["certificates"] = asdict(expiry.outlook)
-            node.report("routing", detail={**detail, "links": links_now})
+            node.publish_status("routing", detail={**detail, "links": links_now})
         node.close()
 
 
@@ -106,7 +106,7 @@ def router_config(
         SecurityError: the router's certificate is not there.
     """
     profile, name, links = _placed(profile, host)
-    return config(
+    return session_config(
         profile.session,
         mode="router",
         connect=links,
@@ -115,7 +115,7 @@ def router_config(
     )
 
 
-def security_of(profile: Profile) -> str:
+def security_summary(profile: Profile) -> str:
     """``tls``: only who has a certificate; ``loopback``: only this computer; ``insecure``: all."""
     if profile.session.security is not None:
         return "tls"

@@ -90,7 +90,7 @@ class Supervisor:
             if child.process is None and (kinds is None or child.command.kind in kinds):
                 self._spawn(child)
 
-    def watch(self, spare: Sequence[str] = ()) -> bool:
+    def poll(self, spare: Sequence[str] = ()) -> bool:
         """Restart what died. False: a node dies again and again, and it makes no sense to go on.
 
         Args:
@@ -169,7 +169,7 @@ class Supervisor:
         except (ProcessLookupError, OverflowError):
             return False
 
-    def end(self, name: str, why: str) -> None:
+    def terminate(self, name: str, why: str) -> None:
         """End a node at once; `watch` starts it again."""
         for child in self.children:
             if child.command.name == name and child.process is not None:

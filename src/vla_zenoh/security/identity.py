@@ -75,7 +75,7 @@ class Identity:
         return f"{self.node}@{self.host}"
 
 
-def person(profile: Profile, host: str) -> Role | None:
+def operator_role(profile: Profile, host: str) -> Role | None:
     """What a person at `host` may do; None: the profile does not know that computer."""
     security = profile.session.security
     if security is not None and host in security.people:
@@ -93,7 +93,7 @@ def identities_of(profile: Profile, host: str) -> list[Identity]:
         ProfileError: neither hosts nor session.security.people know it.
         SecurityError: a kind of node has no role.
     """
-    role = person(profile, host)
+    role = operator_role(profile, host)
     if role is None:
         known = ", ".join(sorted({*profile.hosts, *_people(profile)}))
         raise ProfileError(
@@ -102,10 +102,10 @@ def identities_of(profile: Profile, host: str) -> list[Identity]:
         )
     found = [*_nodes(profile, host)] if host in profile.hosts else []
     names = {identity.node for identity in found}
-    return [*found, *(one for one in people_at(host, role) if one.node not in names)]
+    return [*found, *(one for one in operator_identities(host, role) if one.node not in names)]
 
 
-def people_at(host: str, role: Role) -> list[Identity]:
+def operator_identities(host: str, role: Role) -> list[Identity]:
     """Who people at a computer are: themselves, and an operator the worker that drives by hand."""
     people = Identity(role, role.value, host)
     if role is not Role.OPERATOR:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.profile import Profile
-from vla_zenoh.security.identity import PEOPLE, Role, person
+from vla_zenoh.security.identity import PEOPLE, Role, operator_role
 from vla_zenoh.security.store import Store
 
 RANK = {Role.OPERATOR: 0, Role.VIEWER: 1}
 """Who plays recordings is chosen by name alone: that role may say everything."""
 
 
-def people_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
+def operator_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
     """Hosts whose people's certificates lie here, the one to show first.
 
     Args:
@@ -38,7 +38,7 @@ def people_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
     own = security.host or store.known_host()
     ranks: dict[str, int] = {}
     for host in dict.fromkeys([*profile.hosts, *security.people]):
-        role = person(profile, host)
+        role = operator_role(profile, host)
         if role in RANK and store.has(host, role.value):
             ranks[host] = RANK[role]
     if stop:
@@ -48,7 +48,7 @@ def people_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
     return found or ([own] if own is not None else [])
 
 
-def role_here(profile: Profile) -> Role | None:
+def local_role(profile: Profile) -> Role | None:
     """What the people of this computer may do; None: everything, or nobody knows."""
     security = profile.session.security
     if security is None:

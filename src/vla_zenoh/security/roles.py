@@ -131,7 +131,7 @@ TABLE = (
     Row("sim_step", answer=frozenset({ROBOT}), ask=frozenset({OPERATOR})),
 )
 
-NO_KEYS = ("everything", "short", "whole", "group", "on")
+NO_KEYS = ("short", "full", "group", "on")
 """Members of `Keys` that give text and no key of their own."""
 OWN = frozenset({Act.PUT, Act.ANSWER, Act.ANNOUNCE})
 """What a node does only in its own name."""

@@ -128,7 +128,7 @@ def wide(keys: Keys, identity: Identity) -> list[str]:
     all of a group, as ``state/*``, where it may read each of its keys.
     """
     if Role.OPERATOR in identity.roles:
-        return [keys.everything]
+        return [keys.all_keys]
     if identity.role is not Role.VIEWER:
         return []
     groups: dict[str, bool] = {}
@@ -137,7 +137,7 @@ def wide(keys: Keys, identity: Identity) -> list[str]:
             above, _, _ = key.rpartition("/")
             may = identity.role in row.subscribe
             groups[above] = groups.get(above, True) and may
-    top = keys.everything.removesuffix("/**")
+    top = keys.all_keys.removesuffix("/**")
     return [f"{group}/*" for group, may in groups.items() if may and group != top]
 
 

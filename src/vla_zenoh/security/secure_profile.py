@@ -22,7 +22,7 @@ HEAD = """\
 PEOPLE = "    people:"
 
 
-def secured(endpoint: str, places: Mapping[str, str] | None = None) -> str:
+def tls_endpoint(endpoint: str, places: Mapping[str, str] | None = None) -> str:
     """The endpoint with TLS in place of a plain protocol.
 
     Args:
@@ -35,7 +35,7 @@ def secured(endpoint: str, places: Mapping[str, str] | None = None) -> str:
     return f"{protocol if protocol in ('tls', 'quic') else 'tls'}/{rest}"
 
 
-def moved(profile: Profile, at: Mapping[str, str]) -> dict[str, str]:
+def moved_hosts(profile: Profile, at: Mapping[str, str]) -> dict[str, str]:
     """Where the routers are: ``HOST:PORT`` of the profile -> the same port at another address.
 
     Args:
@@ -82,7 +82,7 @@ def profile_text(
     shown = _with_tilde(folder)
 
     def secure(endpoints: Sequence[str]) -> list[str]:
-        return [secured(endpoint, places) for endpoint in endpoints]
+        return [tls_endpoint(endpoint, places) for endpoint in endpoints]
 
     session: dict[str, Any] = {
         "listen": secure(profile.session.listen),
@@ -97,7 +97,7 @@ def profile_text(
     }
     bridge = profile.ros2.connect if profile.ros2 is not None else None
     if not all(map(is_loopback, bridge or ())):
-        body["ros2"] = {"connect": [secured(endpoint) for endpoint in bridge or ()]}
+        body["ros2"] = {"connect": [tls_endpoint(endpoint) for endpoint in bridge or ()]}
     if any(host.connect or host.listen or host.link for host in profile.hosts.values()):
         # A profile's hosts are replaced whole, so all of them are written.
         body["hosts"] = {name: _host(host, secure) for name, host in profile.hosts.items()}
@@ -105,7 +105,7 @@ def profile_text(
     return HEAD.format(name=profile.name, folder=shown) + _people_on_lines(text)
 
 
-def with_person(text: str, host: str, role: Role) -> str:
+def with_operator(text: str, host: str, role: Role) -> str:
     """The text of a profile, with what a person at `host` may do.
 
     Raises:

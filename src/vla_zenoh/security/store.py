@@ -210,7 +210,7 @@ class Store:
             return noted
         return hosts[0] if len(hosts) == 1 else None
 
-    def note_this_host(self, host: str) -> Path:
+    def remember_host(self, host: str) -> Path:
         """Write down that this computer is `host`.
 
         Raises:

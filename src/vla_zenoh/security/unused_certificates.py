@@ -11,7 +11,7 @@ from vla_zenoh.security.identity import identities
 from vla_zenoh.security.store import Entry
 
 
-def stale(profile: Profile, entries: Iterable[Entry]) -> dict[Path, str]:
+def unused_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path, str]:
     """Those whose owner says what he likes: the router drops it. File -> what to do.
 
     So it is after people at a computer were given less, or a node was taken away.

@@ -29,7 +29,7 @@ from vla_zenoh.types.commands import (
 from vla_zenoh.types.image import Image
 from vla_zenoh.types.reports import Event, NodeStatus
 from vla_zenoh.types.scene import ObjectPoses, SceneState
-from vla_zenoh.types.seen import Seen
+from vla_zenoh.types.seen import InferenceDebug
 from vla_zenoh.types.stamped import Header, Stamped
 from vla_zenoh.types.states import GripperState, JointState, PoseState
 from vla_zenoh.types.task import Task
@@ -47,6 +47,7 @@ __all__ = [
     "GripperState",
     "Header",
     "Image",
+    "InferenceDebug",
     "JointCommand",
     "JointState",
     "NodeStatus",
@@ -54,7 +55,6 @@ __all__ = [
     "PoseCommand",
     "PoseState",
     "SceneState",
-    "Seen",
     "Stamped",
     "Task",
     "shown",

@@ -27,7 +27,7 @@ MAX_RAW_NUMBERS = 4096
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class InferenceDebug:
     """One inference, looked at from outside. Its pictures travel beside it, one key a camera.
 
     Args:
@@ -69,7 +69,7 @@ class Seen:
         set_field(self, "raw", details("raw", entries("raw", self.raw)))
 
 
-def plain_raw(raw: Mapping[str, Any] | None) -> dict[str, Any]:
+def plain_values(raw: Mapping[str, Any] | None) -> dict[str, Any]:
     """What a model tells of itself as text, numbers and lists, whatever it gave.
 
     Arrays of any library become lists; what is too large or has no such form is described.

@@ -44,7 +44,7 @@ class Task:
         return self.speed_percent / 100.0 if self.speed_percent >= LEAST_PERCENT else 0.0
 
     @property
-    def asked_hz(self) -> float:
+    def requested_hz(self) -> float:
         """Chunks per second asked of the worker now: at half the speed half as many, 0 where the
         arm stands. A worker that is not obeyed is asked at the full rate."""
         return self.rate_hz * (self.speed if self.active else 1.0)

@@ -71,7 +71,7 @@ class Oracle:
     def infer(self, observation: Observation) -> ActionSteps:
         assert observation.pose is not None
         assert observation.gripper is not None
-        arrival = self._truth.take()
+        arrival = self._truth.pop()
         if arrival is not None:
             self._objects = records.decode(ObjectPoses, arrival.sample.payload.to_bytes())
         position = observation.pose.position_m

@@ -29,19 +29,19 @@ class Desk:
 def test_a_flood_is_told_at_once_and_then_now_and_then_with_its_count() -> None:
     desk = Desk()
     for _ in range(100):
-        desk.news.tell(MALFORMED, "delta/a")
+        desk.news.emit(MALFORMED, "delta/a")
     assert desk.counts == [1]
     desk.now_s += PERIOD_S
-    desk.news.tell(MALFORMED, "delta/a")
+    desk.news.emit(MALFORMED, "delta/a")
     assert desk.counts == [1, 100]
 
 
 def test_a_flood_about_one_thing_does_not_silence_another_nor_a_transition() -> None:
     desk = Desk()
     for _ in range(3):
-        desk.news.tell(MALFORMED, "delta/a")
-        desk.news.tell(MALFORMED, "delta/b")
-        desk.news.tell(MOVED)
+        desk.news.emit(MALFORMED, "delta/a")
+        desk.news.emit(MALFORMED, "delta/b")
+        desk.news.emit(MOVED)
     assert desk.read.count(MOVED) == 3
     assert len(desk.read) == 5
 
@@ -49,15 +49,15 @@ def test_a_flood_about_one_thing_does_not_silence_another_nor_a_transition() -> 
 def test_every_reason_of_a_refused_setting_is_told() -> None:
     desk = Desk()
     other = Event("warning", "refusal", "activate_refused", "no camera")
-    desk.news.tell(REFUSED)
-    desk.news.tell(other)
+    desk.news.emit(REFUSED)
+    desk.news.emit(other)
     assert desk.read == [REFUSED, other]
 
 
 def test_who_asks_again_at_once_is_answered_a_little_later() -> None:
     desk = Desk()
     for _ in range(3):
-        desk.news.tell(REFUSED)
+        desk.news.emit(REFUSED)
         desk.news.tick()
     assert desk.counts == [1]
     desk.now_s += PERIOD_S
@@ -74,7 +74,7 @@ def test_in_the_end_every_refusal_of_a_setting_is_counted_once(acts: list[str]) 
     desk = Desk()
     for act in [*acts, "wait", "tick"]:
         if act == "ask":
-            desk.news.tell(REFUSED)
+            desk.news.emit(REFUSED)
         elif act == "tick":
             desk.news.tick()
         else:
@@ -87,7 +87,7 @@ def test_whoever_makes_up_kinds_fills_no_memory_and_breaks_no_count() -> None:
     for number in range(3 * KINDS):
         made_up = Event("warning", "refusal", "rate_refused", f"not {number}")
         for _ in range(2):
-            desk.news.tell(made_up)
+            desk.news.emit(made_up)
         desk.news.tick()
     desk.now_s += PERIOD_S
     desk.news.tick()

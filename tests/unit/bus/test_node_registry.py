@@ -28,39 +28,39 @@ def status(name: str = "n") -> NodeStatus:
 def test_a_node_is_alive_from_its_token_on_and_its_last_words_stay() -> None:
     seconds = [10.0]
     here = NodeRegistry(OURS, lambda: seconds[0])
-    here.said("sim", status("sim"), SMALL)
-    here.came("sim")
+    here.status_received("sim", status("sim"), SMALL)
+    here.token_appeared("sim")
     seconds[0] = 12.0
     assert here.snapshot() == {"sim": (status("sim"), 2.0, True)}
-    here.went("sim")
+    here.token_gone("sim")
     assert here.snapshot() == {"sim": (status("sim"), 2.0, False)}
     assert here.status("sim") == (status("sim"), 10.0)
     assert here.status("command") is None
-    assert here.left_out == 0
+    assert here.dropped == 0
 
 
 def test_a_flood_of_names_leaves_the_lab_s_own_nodes_and_is_counted() -> None:
     here = NodeRegistry(OURS)
     for number in range(FLOOD):
-        here.said(f"ghost{number}", status(), SMALL)
-        here.came(f"ghost{number}")
+        here.status_received(f"ghost{number}", status(), SMALL)
+        here.token_appeared(f"ghost{number}")
     assert len(here.snapshot()) <= MAX_OTHERS
     assert len(here.alive) <= MAX_OTHERS
-    assert here.left_out >= FLOOD
+    assert here.dropped >= FLOOD
     for name in OURS:
-        here.said(name, status(name), MAX_STATUS_BYTES)
-        here.came(name)
+        here.status_received(name, status(name), MAX_STATUS_BYTES)
+        here.token_appeared(name)
         assert here.snapshot()[name][2]
 
 
 def test_who_is_gone_makes_room_for_who_comes_and_who_lives_does_not() -> None:
     here = NodeRegistry()
-    here.came("teleop")
-    here.said("teleop", status(), SMALL)
+    here.token_appeared("teleop")
+    here.status_received("teleop", status(), SMALL)
     for number in range(FLOOD):
-        here.said(f"ghost{number}", status(), SMALL)
-    here.came("late")
-    here.said("late", status("late"), SMALL)
+        here.status_received(f"ghost{number}", status(), SMALL)
+    here.token_appeared("late")
+    here.status_received("late", status("late"), SMALL)
     assert {"teleop", "late", f"ghost{FLOOD - 1}"} <= set(here.snapshot())
     assert "ghost0" not in here.snapshot()
 
@@ -68,18 +68,18 @@ def test_who_is_gone_makes_room_for_who_comes_and_who_lives_does_not() -> None:
 def test_names_that_no_node_has_and_statuses_that_are_none_are_left_out() -> None:
     here = NodeRegistry(OURS)
     for name in ("", "x" * 1000, "a b", "[/x]", "..", "\x1b[2J", "ghost\n"):
-        here.came(name)
-        here.said(name, status(), SMALL)
-    here.said("sim", status("sim"), MAX_STATUS_BYTES + 1)
+        here.token_appeared(name)
+        here.status_received(name, status(), SMALL)
+    here.status_received("sim", status("sim"), MAX_STATUS_BYTES + 1)
     assert here.snapshot() == {}
     assert here.alive == frozenset()
-    assert here.left_out == 15
+    assert here.dropped == 15
 
 
 @given(
     st.lists(
         st.tuples(
-            st.sampled_from(["came", "went", "said"]),
+            st.sampled_from(["token_appeared", "token_gone", "said"]),
             st.sampled_from(["sim", *(f"n{number}" for number in range(300))]),
             st.integers(0, MAX_STATUS_BYTES + 1),
         ),
@@ -90,7 +90,7 @@ def test_whatever_comes_no_more_is_kept_than_there_is_room_for(acts) -> None:
     here = NodeRegistry(OURS)
     for act, name, size in acts:
         if act == "said":
-            here.said(name, dataclasses.replace(status(), pid=size), size)
+            here.status_received(name, dataclasses.replace(status(), pid=size), size)
         else:
             getattr(here, act)(name)
     others = [found.pid for name, (found, _, _) in here.snapshot().items() if name not in OURS]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.ntp import LAST_NS, Exchange, OffsetFilter, shifted
+from vla_zenoh.ntp import LAST_NS, ClockOffsetFilter, Exchange, shift_stamps
 from vla_zenoh.types import ActionChunk, Header
 
 MS = 1_000_000
@@ -29,7 +29,7 @@ ways = st.tuples(st.integers(0, 200 * MS), st.integers(0, 200 * MS), st.integers
 def test_the_truth_is_never_further_away_than_the_uncertainty(
     offset_ns: int, delays: list[tuple[int, int, int]]
 ) -> None:
-    found, now_ns = OffsetFilter(BOUND_S), 0
+    found, now_ns = ClockOffsetFilter(BOUND_S), 0
     for there_ns, back_ns, took_ns in delays:
         one = exchange(now_ns, offset_ns, there_ns, back_ns, took_ns)
         assert found.add(one)
@@ -43,7 +43,7 @@ def test_the_truth_is_never_further_away_than_the_uncertainty(
 
 
 def test_the_quickest_exchange_counts() -> None:
-    found = OffsetFilter(BOUND_S)
+    found = ClockOffsetFilter(BOUND_S)
     for delay_ms in (80, 2, 60):
         found.add(exchange(0, 30 * MS, delay_ms * MS, 0))
     said = found.offset(WALL_MINUS_MONO_NS, 80 * MS)
@@ -54,7 +54,7 @@ def test_the_quickest_exchange_counts() -> None:
 
 
 def test_stamps_do_not_tremble_with_every_exchange() -> None:
-    found, seen = OffsetFilter(BOUND_S), set()
+    found, seen = ClockOffsetFilter(BOUND_S), set()
     for second in range(60):
         jitter_ns = (second * 7919) % 200_000
         found.add(exchange(second * 10**9, 20 * MS, 300_000 + jitter_ns, 400_000))
@@ -64,13 +64,13 @@ def test_stamps_do_not_tremble_with_every_exchange() -> None:
 
 
 def test_a_clock_near_ours_is_left_as_it_is() -> None:
-    found = OffsetFilter(BOUND_S)
+    found = ClockOffsetFilter(BOUND_S)
     found.add(exchange(0, 100_000, 200_000, 200_000))
     assert found.applied_ns(WALL_MINUS_MONO_NS, MS) == 0
 
 
 def test_a_clock_beyond_the_bound_is_not_translated() -> None:
-    found = OffsetFilter(BOUND_S)
+    found = ClockOffsetFilter(BOUND_S)
     found.add(exchange(0, 2000 * MS, MS, MS))
     assert found.applied_ns(WALL_MINUS_MONO_NS, 3 * MS) == 0
     said = found.offset(WALL_MINUS_MONO_NS, 3 * MS)
@@ -82,14 +82,14 @@ def test_a_clock_beyond_the_bound_is_not_translated() -> None:
 def test_a_clock_is_refused_where_it_is_not_corrected_and_nowhere_else(
     offset_ns: int, delays: list[tuple[int, int, int]]
 ) -> None:
-    found, now_ns = OffsetFilter(BOUND_S), 0
+    found, now_ns = ClockOffsetFilter(BOUND_S), 0
     for there_ns, back_ns, took_ns in delays:
         found.add(exchange(now_ns, offset_ns, there_ns, back_ns, took_ns))
         now_ns += 10**9
     said = found.offset(WALL_MINUS_MONO_NS, now_ns)
     assert said is not None
     applied_ns = found.applied_ns(WALL_MINUS_MONO_NS, now_ns)
-    if said.beyond(BOUND_S):
+    if said.exceeds(BOUND_S):
         assert applied_ns == 0
     else:  # what is left as it is may be right as it is
         assert abs(said.offset_s - applied_ns / 1e9) <= said.uncertainty_s + 1e-9
@@ -103,18 +103,18 @@ def test_clocks_that_agree_are_never_refused_for_a_long_link(
     link_ms: tuple[int, int], jitters: list[tuple[float, float]]
 ) -> None:
     delay_ms, varying_ms = link_ms
-    found = OffsetFilter(BOUND_S)
+    found = ClockOffsetFilter(BOUND_S)
     for second, (there, back) in enumerate(jitters):
         there_ms, back_ms = delay_ms + varying_ms * there, delay_ms + varying_ms * back
         found.add(exchange(second * 10**9, 0, int(there_ms * MS), int(back_ms * MS)))
         said = found.offset(WALL_MINUS_MONO_NS, second * 10**9 + 500 * MS)
         assert said is not None
         assert abs(said.offset_s) <= varying_ms / 1e3 + ROUNDING_S
-        assert not said.beyond(BOUND_S)
+        assert not said.exceeds(BOUND_S)
 
 
 def test_a_clock_that_is_set_is_noticed_at_the_next_exchange() -> None:
-    found = OffsetFilter(BOUND_S)
+    found = ClockOffsetFilter(BOUND_S)
     for second in range(5):
         found.add(exchange(second * 10**9, 0, MS // 10, MS // 10))
     found.add(exchange(6 * 10**9, 50 * MS, MS, MS))
@@ -122,7 +122,7 @@ def test_a_clock_that_is_set_is_noticed_at_the_next_exchange() -> None:
 
 
 def test_our_own_clock_that_is_set_needs_no_new_exchange() -> None:
-    found = OffsetFilter(BOUND_S)
+    found = ClockOffsetFilter(BOUND_S)
     found.add(exchange(0, 0, MS, MS))
     later = found.offset(WALL_MINUS_MONO_NS + 30 * MS, 3 * MS)
     assert later is not None
@@ -130,14 +130,14 @@ def test_our_own_clock_that_is_set_needs_no_new_exchange() -> None:
 
 
 def test_what_cannot_be_is_left_out() -> None:
-    found = OffsetFilter(BOUND_S)
+    found = ClockOffsetFilter(BOUND_S)
     assert not found.add(Exchange(10 * MS, WALL_MINUS_MONO_NS, WALL_MINUS_MONO_NS - 1, 11 * MS))
     assert not found.add(Exchange(0, 0, 10 * MS, MS))
     assert found.offset(WALL_MINUS_MONO_NS, 0) is None
 
 
 def test_an_old_measurement_is_worth_less() -> None:
-    found = OffsetFilter(BOUND_S)
+    found = ClockOffsetFilter(BOUND_S)
     found.add(exchange(0, 0, MS, MS))
     young = found.offset(WALL_MINUS_MONO_NS, 2 * MS)
     old = found.offset(WALL_MINUS_MONO_NS, 100 * 10**9)
@@ -166,7 +166,7 @@ def test_any_stamp_that_a_record_takes_is_put_on_our_clock(
         inference_start_ns=began_ns,
         inference_end_ns=ended_ns,
     )
-    header, moved = shifted(Header(at_ns, 0, "worker-scripted#1"), chunk, ahead_ns)
+    header, moved = shift_stamps(Header(at_ns, 0, "worker-scripted#1"), chunk, ahead_ns)
     found_ns = (
         header.stamp_wall_ns,
         moved.observed_ns,

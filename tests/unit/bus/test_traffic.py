@@ -25,14 +25,14 @@ def traffic() -> Traffic:
 
 def hear(found: Traffic, key: str, source: str, *numbers: int, arrived: int = 0) -> None:
     for nth, seq in enumerate(numbers, arrived + 1):
-        found.heard(key, Header(0, seq, source), nth)
+        found.received(key, Header(0, seq, source), nth)
 
 
 def test_gaps_are_lost_and_what_the_slot_dropped_is_not() -> None:
     found = traffic()
     hear(found, POSE, "sim#1", 3, 4, 9)
-    found.heard(DELTA, Header(0, 0, "worker-scripted#1"), 1)
-    found.heard(DELTA, Header(0, 5, "worker-scripted#1"), 6)
+    found.received(DELTA, Header(0, 0, "worker-scripted#1"), 1)
+    found.received(DELTA, Header(0, 5, "worker-scripted#1"), 6)
     assert found.lost() == {POSE: 4}
 
 
@@ -55,9 +55,9 @@ def test_losses_of_who_was_forgotten_stay_with_their_key() -> None:
 def test_who_speaks_all_the_time_is_not_forgotten_for_those_who_spoke_once() -> None:
     found = traffic()
     for turn in range(2 * MAX_SENDERS):
-        found.heard(POSE, Header(0, turn, "sim#1"), turn + 1)
+        found.received(POSE, Header(0, turn, "sim#1"), turn + 1)
         hear(found, DELTA, f"worker-scripted#{turn}", 0)
-    found.heard(POSE, Header(0, 2 * MAX_SENDERS + 7, "sim#1"), 2 * MAX_SENDERS + 1)
+    found.received(POSE, Header(0, 2 * MAX_SENDERS + 7, "sim#1"), 2 * MAX_SENDERS + 1)
     assert found.lost() == {POSE: 7}
 
 

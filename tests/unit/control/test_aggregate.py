@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from vla_zenoh.control.aggregate import PlanAggregator, mean_pose
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
-from vla_zenoh.kinematics.so3 import Pose, angle_between, between, exp3
+from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, interpolate
 from vla_zenoh.profile import Composition
 from vla_zenoh.types import Cause
 
@@ -90,7 +90,7 @@ def test_a_blend_moves_over_smoothly_within_its_window_and_takes_the_new_width_a
     assert {one.width_m for one in followed} == {0.06}
     for one in followed:
         share = (height(one) - 0.3) / 0.04
-        exact = between(at(0.3).pose, at(0.34, 0.4).pose, share).rotation
+        exact = interpolate(at(0.3).pose, at(0.34, 0.4).pose, share).rotation
         assert angle_between(one.pose.rotation, exact) < ATOL_RAD
 
 

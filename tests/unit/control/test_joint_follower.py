@@ -13,7 +13,7 @@ from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.control.smoothing import Smoother, motion_limits
 from vla_zenoh.guard.joint_guard import joint_motion_limits
 from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.kinematics.so3 import Pose, distance, exp3
+from vla_zenoh.kinematics.so3 import Pose, exp3, pose_distance
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import FloatArray
 
@@ -53,7 +53,7 @@ class Arm:
         """One step of a chunk, and the time it has."""
         here = self.smoother.motion
         goal = Pose(self.goal.position_m + way_m, exp3(turn_rad) @ self.goal.rotation)
-        if distance(here.pose, goal)[0] < BASE.limits.lead_m:
+        if pose_distance(here.pose, goal)[0] < BASE.limits.lead_m:
             self.goal = goal
         self.smoother.target(self.goal, self.stage.shares(here, self.goal, self.smoother.box))
         for _ in range(ticks):
@@ -73,7 +73,7 @@ class Arm:
         self.acceleration = told.acceleration_rad_s2
 
     def lag(self) -> tuple[float, float]:
-        return distance(KINEMATICS.forward(self.joints_rad), self.smoother.motion.pose)
+        return pose_distance(KINEMATICS.forward(self.joints_rad), self.smoother.motion.pose)
 
     def speed_m_s(self) -> float:
         return float(np.linalg.norm((KINEMATICS.jacobian(self.joints_rad) @ self.rate_rad_s)[:3]))
@@ -162,7 +162,7 @@ def test_a_stop_of_the_joints_that_is_called_off_goes_on_from_where_they_are(tic
     furthest_m = 0.0
     for _ in range(500):
         arm.tick()
-        furthest_m = max(furthest_m, distance(arm.smoother.motion.pose, arm.goal)[0])
+        furthest_m = max(furthest_m, pose_distance(arm.smoother.motion.pose, arm.goal)[0])
     assert furthest_m < OVERSHOOT_M
     assert arm.smoother.at_rest
 
@@ -259,7 +259,7 @@ def test_slopes_of_distances_are_those_of_small_steps() -> None:
             HOME_RAD + 0.4 * random.normal(size=7), KINEMATICS.lower_rad, KINEMATICS.upper_rad
         )
         near = np.flatnonzero(np.abs(collisions.distances(joints_rad) - 0.05) < 0.04)
-        slopes = collisions.slopes(joints_rad, near)
+        slopes = collisions.gradients(joints_rad, near)
         for joint, unit in enumerate(np.eye(7) * 1e-5):
             apart = collisions.distances(joints_rad + unit) - collisions.distances(
                 joints_rad - unit

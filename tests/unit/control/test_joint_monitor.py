@@ -10,7 +10,7 @@ from vla_zenoh.control.joint_monitor import JointMonitor
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.kinematics.so3 import Pose, distance, quat_from_rotation
+from vla_zenoh.kinematics.so3 import Pose, pose_distance, quat_from_rotation
 from vla_zenoh.types import FloatArray
 
 PROFILE = profile()
@@ -122,7 +122,7 @@ def test_an_elbow_that_goes_astray_slows_the_arm_and_then_brakes_it(commands_joi
         slower = watching.watch.slowdown
         shares.append(slower.share if slower else 1.0)
         assert slower is None or slower.name == "elbow_rad"
-    assert distance(KINEMATICS.forward(joints_rad), here)[0] < 0.02
+    assert pose_distance(KINEMATICS.forward(joints_rad), here)[0] < 0.02
     assert hit is not None
     assert hit.name == "elbow_rad"
     assert hit.limit == 2 * LIMITS.elbow_rad

@@ -195,7 +195,7 @@ def test_a_restart_stands_where_the_robot_was_put(mode: Mode) -> None:
     assert (side.pose if mode == "pose" else side.joint)() is None
     elsewhere = Pose(np.array([0.3, 0.0, 0.5]), np.eye(3))
     side.measured = Measured(elsewhere, HOME_RAD + 0.2, np.zeros(7))
-    side.guard.restart()
+    side.guard.reset()
     assert not side.guard.following
     assert side.guard.mode == mode
     where = elsewhere.position_m if mode == "pose" else HOME_RAD + 0.2

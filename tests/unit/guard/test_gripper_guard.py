@@ -33,7 +33,7 @@ def take(
     *,
     leads: bool = True,
 ) -> GripperCommand:
-    return guard.take(given, writer, given.header.stamp_wall_ns + late_ns, leads=leads)
+    return guard.accept(given, writer, given.header.stamp_wall_ns + late_ns, writer_active=leads)
 
 
 def refusal(guard: GripperGuard, given: Stamped[GripperCommand], writer: str = "") -> str:

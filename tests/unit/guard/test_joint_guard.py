@@ -224,7 +224,7 @@ def test_a_side_that_was_woken_late_goes_on_from_what_it_sent_last(asleep_ms: in
 def test_a_side_that_slept_too_long_stands_where_it_sent_the_arm_last() -> None:
     guard, now_ns = in_motion()
     sent = guard.motion
-    guard.stand()
+    guard.hold()
     motion = guard.tick(now_ns + 10**10)
     np.testing.assert_array_equal(motion.position_rad, sent.position_rad)
     assert not motion.velocity_rad_s.any()
@@ -255,9 +255,9 @@ def test_a_joint_stays_within_its_range(end: float) -> None:
     near = HOME_RAD.copy()
     near[3] += end * 0.999
     guard = make_guard()
-    guard.restart(near)
+    guard.reset(near)
     assert refusal(guard, START_NS, still(outside)) == "out_of_range"
-    guard.restart(outside)  # pushed out by hand: it may come back
+    guard.reset(outside)  # pushed out by hand: it may come back
     assert guard.offer(stamped(still(outside), 0, START_NS), START_NS) is None
     further = outside.copy()
     further[3] += end * 0.01
@@ -381,7 +381,7 @@ def test_a_restart_forgets_the_writer_and_an_anchor_does_not() -> None:
     assert not guard.following
     assert np.array_equal(guard.tick(now_ns).position_rad, elsewhere)
     assert guard.offer(stamped(still(elsewhere), 3, now_ns), now_ns) == "replayed"
-    guard.restart(elsewhere)
+    guard.reset(elsewhere)
     assert guard.offer(stamped(still(elsewhere), 3, now_ns), now_ns) is None
 
 
@@ -389,7 +389,7 @@ def test_a_restart_in_a_brake_ends_it() -> None:
     guard, now_ns = in_motion()
     silence(guard, now_ns, LIMITS.timeout_s + 0.02)
     assert guard.braking
-    guard.restart(HOME_RAD)
+    guard.reset(HOME_RAD)
     assert not guard.braking
     assert not np.any(guard.tick(now_ns).velocity_rad_s)
 

@@ -333,7 +333,7 @@ def test_restart_follows_nobody_from_another_place() -> None:
     side, line = guard(), Line(0.4)
     side.offer(line.at(0), now(0))
     there = Pose(np.array([0.5, 0.2, 0.2]), START.rotation)
-    side.restart(there)
+    side.reset(there)
     motion = side.tick(now(MS))
     assert not side.following
     np.testing.assert_array_equal(motion.pose.position_m, there.position_m)
@@ -396,7 +396,7 @@ def test_a_side_that_slept_too_long_stands_where_it_sent_the_arm_last() -> None:
         if t % 4 == 0:
             side.offer(line.at(t * MS), now(t * MS))
         sent = side.tick(now(t * MS))
-    side.stand()
+    side.hold()
     for t in range(10_200, 10_500):
         motion = side.tick(now(t * MS))
     np.testing.assert_array_equal(motion.pose.position_m, sent.pose.position_m)

@@ -430,20 +430,20 @@ def at(x_m: float, elbow_rad: float = 0.0) -> Measured:
 
 def test_what_was_sent_last_counts_until_somebody_moves_the_arm() -> None:
     hold = HeldReference()
-    assert not hold.look(at(0), 0)
-    hold.sent(0)
-    assert hold.look(at(0.5), SETTLE_NS // 2), "it still settles"
-    assert hold.look(at(0.1), SETTLE_NS)
-    assert hold.look(at(0.1 + 0.9 * MOVED_M), 2 * SETTLE_NS)
-    assert not hold.look(at(0.1 + 1.1 * MOVED_M), 3 * SETTLE_NS)
+    assert not hold.update(at(0), 0)
+    hold.on_sent(0)
+    assert hold.update(at(0.5), SETTLE_NS // 2), "it still settles"
+    assert hold.update(at(0.1), SETTLE_NS)
+    assert hold.update(at(0.1 + 0.9 * MOVED_M), 2 * SETTLE_NS)
+    assert not hold.update(at(0.1 + 1.1 * MOVED_M), 3 * SETTLE_NS)
     assert not hold.held
-    hold.sent(4 * SETTLE_NS)
+    hold.on_sent(4 * SETTLE_NS)
     assert hold.held
 
 
 def test_an_elbow_that_somebody_moved_while_the_tcp_stayed_is_not_held_any_more() -> None:
     hold = HeldReference()
-    hold.sent(0)
-    assert hold.look(at(0.1), SETTLE_NS)
-    assert hold.look(at(0.1, 0.9 * MOVED_RAD), 2 * SETTLE_NS)
-    assert not hold.look(at(0.1, 1.1 * MOVED_RAD), 3 * SETTLE_NS)
+    hold.on_sent(0)
+    assert hold.update(at(0.1), SETTLE_NS)
+    assert hold.update(at(0.1, 0.9 * MOVED_RAD), 2 * SETTLE_NS)
+    assert not hold.update(at(0.1, 1.1 * MOVED_RAD), 3 * SETTLE_NS)

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from vla_zenoh.kinematics.so3 import (
     Pose,
     angle_between,
-    between,
     body_rates,
     exp3,
+    interpolate,
     log3,
     norm3,
     orthonormal,
@@ -112,7 +112,7 @@ def test_between_goes_straight_from_start_to_end(
     turn *= 0.5
     start = Pose(np.array([0.4, 0.1, 0.3]), exp3(np.array([1.0, 0.5, -0.3])))
     end = Pose(start.position_m + way, exp3(turn) @ start.rotation)
-    pose = between(start, end, share)
+    pose = interpolate(start, end, share)
     np.testing.assert_allclose(pose.position_m, start.position_m + share * way, atol=1e-12)
     assert angle_between(start.rotation, pose.rotation) == pytest.approx(
         share * norm3(turn), abs=LOG_ATOL_RAD

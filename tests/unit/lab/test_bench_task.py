@@ -67,14 +67,14 @@ def test_without_trials_nothing_is_known() -> None:
 
 
 def test_families_take_turns_and_every_episode_has_a_layout_of_its_own() -> None:
-    asked = list(TaskPlan("m", 7, SEED).asked())
+    asked = list(TaskPlan("m", 7, SEED).requests())
     assert [each.seed for each in asked] == list(range(SEED, SEED + 7))
     assert [each.family for each in asked[:3]] == list(FAMILIES)
     assert all(each.target is None for each in asked)
 
 
 def test_pairs_ask_for_another_brick_in_the_same_layout() -> None:
-    asked = list(TaskPlan("m", 6, SEED, family="put", pairs=True).asked())
+    asked = list(TaskPlan("m", 6, SEED, family="put", pairs=True).requests())
     for first, other in zip(asked[0::2], asked[1::2], strict=True):
         assert first.seed == other.seed
         assert {first.target, other.target} <= set(COLOURS)
@@ -136,7 +136,9 @@ def ended(family: str, failure: str = "", time_s: float = 8.0) -> TaskOutcome:
         "push": Order("push", "red", direction="left"),
     }[family]
     verdict = Verdict(not failure, failure, time_s)
-    return TaskOutcome.by(verdict, TaskEpisode(SEED, order, "do it"), "do it", (PICTURE, PICTURE))
+    task = TaskEpisode(SEED, order, "do it")
+    how = (verdict.success, verdict.failure, verdict.time_s)
+    return TaskOutcome(task, "do it", *how, pictures=(PICTURE, PICTURE))
 
 
 def score(*outcomes: TaskOutcome, **plan: Any) -> dict[str, Any]:

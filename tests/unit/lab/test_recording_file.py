@@ -36,6 +36,7 @@ from vla_zenoh.types import (
     GripperState,
     Header,
     Image,
+    InferenceDebug,
     JointCommand,
     JointState,
     NodeStatus,
@@ -43,7 +44,6 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
     SceneState,
-    Seen,
     Task,
 )
 
@@ -64,7 +64,7 @@ KEY_OF: dict[type, str] = {
     Event: KEYS.event("command"),
     SceneState: KEYS.sim_scene,
     ObjectPoses: KEYS.sim_objects,
-    Seen: KEYS.seen_record("scripted"),
+    InferenceDebug: KEYS.seen_record("scripted"),
 }
 EXAMPLES = settings(
     max_examples=15,

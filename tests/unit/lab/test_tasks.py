@@ -49,7 +49,7 @@ def objects(**moved: tuple[float, float, float]) -> ObjectPoses:
 def watch(judge: TaskJudge, scenes: list[tuple[ObjectPoses, float]], linger: int = 8):
     """Show scenes one after the other, the last for a while; gives the verdict."""
     for index, (scene, width_m) in enumerate(scenes + [scenes[-1]] * linger):
-        verdict = judge.see(scene, width_m, index * PERIOD_S)
+        verdict = judge.update(scene, width_m, index * PERIOD_S)
         if verdict is not None:
             return verdict
     return judge.end()
@@ -118,10 +118,10 @@ def test_every_failure_has_its_name(order: Order, scenes: list, failure: str) ->
 def test_who_is_to_stay_succeeds_by_standing_still_until_the_end() -> None:
     home_m = np.array([0.43, 0.0, 0.16])
     judge = TaskJudge(Order("stay"), objects(), home_m)
-    assert judge.see(objects(), OPEN_M, 0.0, home_m) is None
+    assert judge.update(objects(), OPEN_M, 0.0, home_m) is None
     assert judge.end().success
-    judge.see(objects(), OPEN_M, 1.0, home_m + [0.0, 0.0, 0.05])
-    judge.see(objects(), OPEN_M, 2.0, home_m)
+    judge.update(objects(), OPEN_M, 1.0, home_m + [0.0, 0.0, 0.05])
+    judge.update(objects(), OPEN_M, 2.0, home_m)
     assert judge.end().failure == "moved"
 
 

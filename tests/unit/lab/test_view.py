@@ -38,13 +38,13 @@ from vla_zenoh.types import (
     GripperState,
     Header,
     Image,
+    InferenceDebug,
     JointCommand,
     JointState,
     NodeStatus,
     ObjectPoses,
     PoseCommand,
     PoseState,
-    Seen,
     Task,
 )
 
@@ -115,7 +115,7 @@ def run() -> Iterable[Sample]:
     joints = PROFILE.robot.arm_joints
     angles = np.array(PROFILE.robot.home_rad)
     for setting, text in (("prompt", "HARD: go *up*"), ("active", "true")):
-        yield Sample(KEYS.whole(setting), text.encode(), TEXT, None, ZERO_NS)
+        yield Sample(KEYS.full(setting), text.encode(), TEXT, None, ZERO_NS)
     yield put(KEYS.task, Task(1, True, "HARD: go *up*", "scripted", 5.0), 0)
     yield put(KEYS.spec("scripted"), SPEC, 0)
     for index in range(200):
@@ -141,7 +141,9 @@ def run() -> Iterable[Sample]:
     yield picture(KEYS.camera_jpeg("front"), SECOND)
     yield picture(KEYS.camera_jpeg("extra"), SECOND)
     yield picture(KEYS.seen("scripted", "front"), SECOND)
-    seen = Seen("scripted", 1, SPEC.hash, 1, ZERO_NS, "go up", np.zeros((3, 6)), 30.0, {"a": 1.5})
+    seen = InferenceDebug(
+        "scripted", 1, SPEC.hash, 1, ZERO_NS, "go up", np.zeros((3, 6)), 30.0, {"a": 1.5}
+    )
     yield put(KEYS.seen_record("scripted"), seen, SECOND)
     bound = Event("warning", "limit", "singularity", "panda_joint4", 0.02, 0.05, 4)
     yield put(KEYS.event("command"), bound, SECOND)
@@ -355,9 +357,9 @@ def test_broken_samples_are_counted_by_key_and_reason_and_shown(tmp_path: Path) 
         Sample(KEYS.state_pose, b"\xff\xff", MSGPACK, header, ZERO_NS),
         Sample(KEYS.state_pose, b"", MSGPACK, None, ZERO_NS),
         Sample(KEYS.camera_jpeg("front"), b"no picture", JPEG, header, ZERO_NS),
-        Sample(KEYS.whole("camera/front"), b"", JPEG, header, ZERO_NS),
+        Sample(KEYS.full("camera/front"), b"", JPEG, header, ZERO_NS),
         Sample(KEYS.prompt, b"\xff\xfe", TEXT, None, ZERO_NS),
-        Sample(KEYS.whole("some/thing"), b"", TEXT, None, ZERO_NS),
+        Sample(KEYS.full("some/thing"), b"", TEXT, None, ZERO_NS),
         put(KEYS.spec("scripted"), SPEC, 0),
         chunk(0, 1, spec_hash="ffff"),
         chunk(0, 2, steps=np.zeros((1, 9), np.float32)),

@@ -12,8 +12,8 @@ from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.nodes.worker.inference_debug import MAX_WAITING, PendingImages
 from vla_zenoh.policy import MAX_CAMERAS
-from vla_zenoh.types import Seen
-from vla_zenoh.types.seen import plain_raw
+from vla_zenoh.types import InferenceDebug
+from vla_zenoh.types.seen import plain_values
 
 
 class Tensor:
@@ -26,7 +26,7 @@ class Tensor:
         return "tensor(cuda)"
 
 
-def seen(**fields: Any) -> Seen:
+def seen(**fields: Any) -> InferenceDebug:
     given: dict[str, Any] = {
         "worker": "openvla",
         "chunk_seq": 7,
@@ -38,7 +38,7 @@ def seen(**fields: Any) -> Seen:
         "inference_ms": 83.5,
         **fields,
     }
-    return Seen(**given)
+    return InferenceDebug(**given)
 
 
 @pytest.mark.parametrize(
@@ -60,15 +60,15 @@ def seen(**fields: Any) -> Seen:
     ],
 )
 def test_whatever_a_model_tells_is_text_numbers_and_lists(given: Any, said: Any) -> None:
-    raw = plain_raw({"it": given})
+    raw = plain_values({"it": given})
     assert said is None or raw["it"] == said
-    again = records.decode(Seen, records.encode(seen(raw=raw)))
+    again = records.decode(InferenceDebug, records.encode(seen(raw=raw)))
     assert again.raw == raw
 
 
 def test_it_travels_and_comes_back() -> None:
     sent = seen(raw={"tokens": [1, 2]}, done=True)
-    came = records.decode(Seen, records.encode(sent))
+    came = records.decode(InferenceDebug, records.encode(sent))
     np.testing.assert_array_equal(came.steps, sent.steps)
     for name in ("worker", "chunk_seq", "prompt", "raw", "done", "inference_ms"):
         assert getattr(came, name) == getattr(sent, name)
@@ -84,7 +84,7 @@ def test_what_is_no_such_record_is_refused(fields: dict[str, Any]) -> None:
 
 def test_foreign_bytes_are_refused() -> None:
     with pytest.raises(CodecError):
-        records.decode(Seen, b"\x81\xa1a\x01")
+        records.decode(InferenceDebug, b"\x81\xa1a\x01")
 
 
 def test_a_worker_that_names_more_cameras_than_a_model_can_have_is_refused() -> None:

@@ -17,8 +17,8 @@ from vla_zenoh.runtime import launch
 from vla_zenoh.runtime.certificate_expiry import (
     LOOK_PERIOD_S,
     TELL_PERIOD_S,
-    Expiry,
-    Outlook,
+    CertificateExpiry,
+    ExpiryOutlook,
     outlook,
 )
 from vla_zenoh.security.identity import Identity, Role
@@ -58,7 +58,7 @@ def days(count: float) -> float:
 
 
 def test_what_ends_soon_is_told_beside_what_has_ended(security: SecurityProfile) -> None:
-    assert outlook(security, NOW) == Outlook(40)
+    assert outlook(security, NOW) == ExpiryOutlook(40)
     soon = outlook(security, NOW + dt.timedelta(days=20))
     assert [said.partition("viewer.pem ")[2] for said in soon.wrong] == [
         "ends in 20 days; renew it"
@@ -74,7 +74,7 @@ def test_what_ends_soon_is_told_beside_what_has_ended(security: SecurityProfile)
 
 def test_it_is_told_when_it_begins_and_once_a_day_from_then_on(security: SecurityProfile) -> None:
     time = Time()
-    expiry = Expiry(security, time.monotonic, time.now)
+    expiry = CertificateExpiry(security, time.monotonic, time.now)
     told: dict[int, int] = {}
     for third in range(8 * 3, 16 * 3):
         time.s = days(third / 3)
@@ -86,7 +86,7 @@ def test_it_is_told_when_it_begins_and_once_a_day_from_then_on(security: Securit
 
 def test_a_certificate_that_is_renewed_is_told_of_no_more(security: SecurityProfile) -> None:
     time = Time()
-    expiry = Expiry(security, time.monotonic, time.now)
+    expiry = CertificateExpiry(security, time.monotonic, time.now)
     time.s = days(45)
     assert len(expiry.due()) == 2
     renewed = [Identity(Role.VIEWER, "viewer", HOST)]
@@ -101,7 +101,7 @@ def test_a_certificate_that_is_renewed_is_told_of_no_more(security: SecurityProf
 def test_a_computer_that_cannot_say_which_it_is_says_so_once(security: SecurityProfile) -> None:
     Store(security.folder).add([Identity(Role.VIEWER, "viewer", "wall")], NOW)
     time = Time()
-    expiry = Expiry(security.model_copy(update={"host": None}), time.monotonic, time.now)
+    expiry = CertificateExpiry(security.model_copy(update={"host": None}), time.monotonic, time.now)
     (said,) = expiry.due()
     assert "gpu, wall" in said
     time.s = days(3)
@@ -109,8 +109,8 @@ def test_a_computer_that_cannot_say_which_it_is_says_so_once(security: SecurityP
 
 
 def test_without_certificates_there_is_nothing_to_tell() -> None:
-    assert Expiry(None).due() == ()
-    assert Expiry(None).outlook == Outlook()
+    assert CertificateExpiry(None).due() == ()
+    assert CertificateExpiry(None).outlook == ExpiryOutlook()
 
 
 def secured(folder: str) -> Profile:

@@ -32,7 +32,7 @@ def test_it_stands_until_it_is_taken_away_and_the_last_word_counts(file: Path) -
     for words, stands in (([WHY], WHY), ([WHY, None], None), ([None, "one", WHY], WHY)):
         latch = EstopLatch(file)
         for why in words:
-            latch.keep(why)
+            latch.set(why)
         latch.close()
         assert EstopLatch(file).read() == stands
         assert latch.failure() is None
@@ -41,7 +41,7 @@ def test_it_stands_until_it_is_taken_away_and_the_last_word_counts(file: Path) -
 def test_a_folder_that_was_tidied_away_is_made_again(file: Path) -> None:
     assert not file.parent.exists()
     latch = EstopLatch(file)
-    latch.keep(WHY)
+    latch.set(WHY)
     latch.close()
     assert file.read_text() == WHY
 
@@ -49,10 +49,10 @@ def test_a_folder_that_was_tidied_away_is_made_again(file: Path) -> None:
 def test_what_cannot_be_written_is_told_and_hinders_nobody(file: Path) -> None:
     file.mkdir(parents=True)
     latch = EstopLatch(file)
-    latch.keep(WHY)
+    latch.set(WHY)
     assert "stopped cannot be written" in failure_of(latch)
     assert latch.failure() is None
-    latch.keep(None)
+    latch.set(None)
     assert "stopped cannot be removed" in failure_of(latch)
 
 

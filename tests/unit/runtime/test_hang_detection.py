@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vla_zenoh.runtime.hang_detection import HANG_S, LastStatus, hanging
+from vla_zenoh.runtime.hang_detection import HANG_S, LastStatus, hung_nodes
 
 RUNNING = {
     "router": ("router", 1),
@@ -21,35 +21,35 @@ def said(**ages_s: float) -> dict[str, LastStatus]:
 
 
 def test_nobody_hangs_while_all_speak() -> None:
-    assert hanging(RUNNING, said()) == []
+    assert hung_nodes(RUNNING, said()) == []
 
 
 def test_a_node_that_is_silent_while_others_speak_hangs() -> None:
-    assert hanging(RUNNING, said(sim=LONG_S)) == ["sim"]
-    assert hanging(RUNNING, said(sim=HANG_S - 1.0)) == []
+    assert hung_nodes(RUNNING, said(sim=LONG_S)) == ["sim"]
+    assert hung_nodes(RUNNING, said(sim=HANG_S - 1.0)) == []
 
 
 def test_a_worker_may_think_as_long_as_it_likes() -> None:
-    assert hanging(RUNNING, said(worker_big=600.0)) == []
+    assert hung_nodes(RUNNING, said(worker_big=600.0)) == []
 
 
 def test_a_node_that_was_started_anew_is_not_blamed_for_what_ran_before() -> None:
     before = {**said(), "sim": LastStatus(17, LONG_S)}
-    assert hanging(RUNNING, before) == []
+    assert hung_nodes(RUNNING, before) == []
 
 
 def test_a_node_that_has_said_nothing_yet_is_starting() -> None:
     heard = said()
     del heard["command"]
-    assert hanging(RUNNING, heard) == []
+    assert hung_nodes(RUNNING, heard) == []
 
 
 def test_when_nobody_is_heard_the_router_is_ended_alone() -> None:
     silence = said(router=LONG_S, sim=LONG_S, command=LONG_S, worker_big=LONG_S)
-    assert hanging(RUNNING, silence) == ["router"]
+    assert hung_nodes(RUNNING, silence) == ["router"]
 
 
 def test_when_nobody_is_heard_and_the_router_is_elsewhere_nothing_is_ended() -> None:
     silence = said(router=LONG_S, sim=LONG_S, command=LONG_S, worker_big=LONG_S)
     here = {name: RUNNING[name] for name in ("sim", "command")}
-    assert hanging(here, silence) == []
+    assert hung_nodes(here, silence) == []

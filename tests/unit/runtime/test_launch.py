@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.host_id import own_boot
+from vla_zenoh.bus.host_id import own_boot_id
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.schema import NODE_KINDS
@@ -103,7 +103,7 @@ def brakes(process: subprocess.Popen[Any], host: str, *said: NodeStatus) -> bool
 
 
 def worker_at(pid: int, boot: str | None = None) -> NodeStatus:
-    here = own_boot() if boot is None else boot
+    here = own_boot_id() if boot is None else boot
     return NodeStatus(WORKER, "inferring", "gpu", pid, 1, boot=here)
 
 

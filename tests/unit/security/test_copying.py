@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from vla_zenoh.cli.free_endpoint import is_own
 from vla_zenoh.cli.secure import secure_app
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.security.operator_identity import people_hosts
+from vla_zenoh.security.operator_identity import operator_hosts
 from vla_zenoh.security.store import THIS_HOST, Store
 
 PATIENCE_S = 30.0
@@ -181,7 +181,7 @@ def test_a_computer_that_is_added_gets_the_whole_profile_and_so_does_the_router(
     world.at("desk", monkeypatch)
     after = load_profile("./mine_secure.yaml")
     assert after.about == "mine, with certificates"
-    assert people_hosts(after) == ["desk"]
+    assert operator_hosts(after) == ["desk"]
 
 
 def test_the_computer_of_init_notes_which_host_it_is_where_that_can_be_known(
@@ -207,9 +207,9 @@ def test_where_it_is_not_known_people_drive_all_the_same_until_it_is_said(world:
     assert "ssh robot" in said
     assert "`vla-zenoh secure here HOST` notes it" in said
     profile = load_profile("panda_sim_two_hosts_secure.yaml")
-    assert people_hosts(profile) == ["robot", "gpu"]
+    assert operator_hosts(profile) == ["robot", "gpu"]
     world.secure("here", "gpu", "-p", "panda_sim_two_hosts_secure.yaml")
-    assert people_hosts(profile) == ["gpu", "robot"]
+    assert operator_hosts(profile) == ["gpu", "robot"]
     assert "this computer is gpu" in world.secure("show", "-p", "panda_sim_two_hosts_secure.yaml")
 
 

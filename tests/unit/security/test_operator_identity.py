@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.security.identity import Identity, Role, identities_of, people_at
-from vla_zenoh.security.operator_identity import people_hosts, role_here
+from vla_zenoh.security.identity import Identity, Role, identities_of, operator_identities
+from vla_zenoh.security.operator_identity import local_role, operator_hosts
 from vla_zenoh.security.store import Store
 
 NOW = dt.datetime(2026, 3, 1, 12, tzinfo=dt.UTC)
@@ -24,7 +24,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Store:
     store.make_authority("test lab", NOW)
     lab = profile(store, PEOPLE)
     store.add([one for host in (*lab.hosts, *PEOPLE) for one in identities_of(lab, host)], NOW)
-    store.add(people_at("attic", Role.OPERATOR), NOW)
+    store.add(operator_identities("attic", Role.OPERATOR), NOW)
     return store
 
 
@@ -46,15 +46,15 @@ def only(store: Store, folder: Path, *hosts: str) -> Store:
 def test_where_nobody_said_which_host_it_is_an_operator_goes_before_a_viewer(
     made: Store,
 ) -> None:
-    assert people_hosts(profile(made, {})) == ["robot", "gpu"]
-    assert people_hosts(profile(made, {"wall": "viewer"})) == ["robot", "gpu", "wall"]
-    assert people_hosts(profile(made, {"desk": "operator"})) == ["robot", "desk", "gpu"]
+    assert operator_hosts(profile(made, {})) == ["robot", "gpu"]
+    assert operator_hosts(profile(made, {"wall": "viewer"})) == ["robot", "gpu", "wall"]
+    assert operator_hosts(profile(made, {"desk": "operator"})) == ["robot", "desk", "gpu"]
 
 
 def test_whom_the_profile_does_not_name_and_who_plays_recordings_are_never_chosen(
     made: Store,
 ) -> None:
-    found = people_hosts(profile(made, PEOPLE))
+    found = operator_hosts(profile(made, PEOPLE))
     assert "attic" not in found
     assert "stage" not in found
 
@@ -63,30 +63,30 @@ def test_the_host_that_was_noted_goes_before_all_others_but_a_viewer_not_for_a_s
     made: Store, tmp_path: Path
 ) -> None:
     here = only(made, tmp_path / "here", "robot", "gpu", "desk")
-    here.note_this_host("gpu")
+    here.remember_host("gpu")
     lab = profile(here, {"desk": "operator"})
-    assert people_hosts(lab) == ["gpu", "robot", "desk"]
-    assert people_hosts(lab, stop=True) == ["robot", "desk", "gpu"]
-    here.note_this_host("desk")
-    assert people_hosts(lab, stop=True) == ["desk", "robot", "gpu"]
+    assert operator_hosts(lab) == ["gpu", "robot", "desk"]
+    assert operator_hosts(lab, stop=True) == ["robot", "desk", "gpu"]
+    here.remember_host("desk")
+    assert operator_hosts(lab, stop=True) == ["desk", "robot", "gpu"]
 
 
 def test_who_says_which_host_it_is_is_obeyed_and_can_stop_as_anybody_here(made: Store) -> None:
     lab = profile(made, PEOPLE, host="wall")
-    assert people_hosts(lab) == ["wall"]
-    assert people_hosts(lab, stop=True) == ["robot", "desk", "wall", "gpu"]
+    assert operator_hosts(lab) == ["wall"]
+    assert operator_hosts(lab, stop=True) == ["robot", "desk", "wall", "gpu"]
 
 
 def test_a_computer_with_one_folder_uses_that_also_when_its_profile_is_an_old_one(
     made: Store, tmp_path: Path
 ) -> None:
     attic = only(made, tmp_path / "attic", "attic")
-    assert people_hosts(profile(attic, {})) == ["attic"]
+    assert operator_hosts(profile(attic, {})) == ["attic"]
 
 
 def test_without_certificates_there_is_nobody_to_choose(tmp_path: Path) -> None:
-    assert people_hosts(profile(Store(tmp_path), {})) == []
-    assert people_hosts(load_profile("panda_sim")) == []
+    assert operator_hosts(profile(Store(tmp_path), {})) == []
+    assert operator_hosts(load_profile("panda_sim")) == []
 
 
 @pytest.mark.parametrize(
@@ -95,12 +95,12 @@ def test_without_certificates_there_is_nobody_to_choose(tmp_path: Path) -> None:
 def test_what_people_here_may_do_is_told_by_their_certificate(
     made: Store, host: str, role: Role
 ) -> None:
-    assert role_here(profile(made, PEOPLE, host=host)) is role
+    assert local_role(profile(made, PEOPLE, host=host)) is role
 
 
 def test_where_nobody_knows_what_people_may_do_nothing_is_said(made: Store) -> None:
-    assert role_here(profile(made, PEOPLE)) is None
-    assert role_here(load_profile("panda_sim")) is None
+    assert local_role(profile(made, PEOPLE)) is None
+    assert local_role(load_profile("panda_sim")) is None
 
 
 def test_a_half_of_a_pair_is_none(made: Store, tmp_path: Path) -> None:
@@ -110,4 +110,4 @@ def test_a_half_of_a_pair_is_none(made: Store, tmp_path: Path) -> None:
     store.add([Identity(Role.OPERATOR, "operator", "robot")], NOW)
     store.add([Identity(Role.VIEWER, "viewer", "gpu")], NOW)
     store.files("robot", "operator").key.unlink()
-    assert people_hosts(profile(store, {})) == ["gpu"]
+    assert operator_hosts(profile(store, {})) == ["gpu"]

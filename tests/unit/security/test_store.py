@@ -16,10 +16,10 @@ from vla_zenoh.cli.secure import secure_app
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.security import authority as ca
-from vla_zenoh.security.identity import Identity, Role, people_at
-from vla_zenoh.security.secure_profile import moved, profile_text, with_person
+from vla_zenoh.security.identity import Identity, Role, operator_identities
+from vla_zenoh.security.secure_profile import moved_hosts, profile_text, with_operator
 from vla_zenoh.security.store import Store
-from vla_zenoh.security.unused_certificates import stale
+from vla_zenoh.security.unused_certificates import unused_certificates
 
 NOW = dt.datetime(2026, 3, 1, 12, tzinfo=dt.UTC)
 ROUTER = Identity(Role.ROUTER, "router", "robot")
@@ -184,14 +184,14 @@ def test_a_computer_knows_which_host_it_is_when_it_has_one_folder(store: Store) 
 
 def test_a_computer_with_certificates_of_several_hosts_notes_which_it_is(store: Store) -> None:
     store.add([WORKER, ROUTER], NOW)
-    note = store.note_this_host("robot")
+    note = store.remember_host("robot")
     assert store.this_host(None) == "robot"
     assert store.this_host("gpu") == "gpu"
     assert store.identity_files(None, "router").certificate.parent.name == "robot"
     # Folders of hosts are copied, and none of them holds it.
     assert note.parent == store.folder
     assert store.hosts() == ["gpu", "robot"]
-    store.note_this_host("attic")
+    store.remember_host("attic")
     assert store.known_host() is None
 
 
@@ -207,14 +207,17 @@ def test_people_are_the_operator_where_there_is_one_else_the_viewer(store: Store
 def test_people_who_were_given_less_show_that_and_are_told_what_else_lies_there(
     store: Store,
 ) -> None:
-    store.add([*people_at("desk", Role.OPERATOR), *people_at("desk", Role.VIEWER)], NOW)
+    store.add(
+        [*operator_identities("desk", Role.OPERATOR), *operator_identities("desk", Role.VIEWER)],
+        NOW,
+    )
     security = {"folder": str(store.folder), "people": {"desk": "viewer"}}
     tls = ["tls/10.0.0.2:7447"]
     session = {"listen": tls, "connect": tls, "security": security}
     lab = override(load_profile("panda_sim"), {"session": session})
     found = store.identity_files("desk", None, {"desk": "viewer"})
     assert found.certificate.name == "viewer.pem"
-    told = stale(lab, store.entries(NOW))
+    told = unused_certificates(lab, store.entries(NOW))
     assert sorted(path.name for path in told) == ["operator.pem", "worker-teleop.pem"]
     assert "where people at desk are viewer: delete it" in told[store.folder / "desk/operator.pem"]
     found.certificate.unlink()
@@ -238,7 +241,7 @@ def test_what_is_wrong_with_each_file_is_told(store: Store) -> None:
 # -- the profile ------------------------------------------------------------------------------
 def test_a_secured_profile_says_tls_everywhere_and_where_the_routers_are(tmp_path: Path) -> None:
     plain = load_profile("panda_sim_two_sites")
-    places = moved(plain, {"robot": "10.0.0.2", "spare": "fd00::3", "gpu": "gpu.lab"})
+    places = moved_hosts(plain, {"robot": "10.0.0.2", "spare": "fd00::3", "gpu": "gpu.lab"})
     file = tmp_path / "lab.yaml"
     file.write_text(profile_text(plain, "panda_sim_two_sites", tmp_path / "keys", places))
     found = load_profile(str(file))
@@ -250,7 +253,7 @@ def test_a_secured_profile_says_tls_everywhere_and_where_the_routers_are(tmp_pat
         name: host.nodes for name, host in plain.hosts.items()
     }
     with pytest.raises(SecurityError, match="no router runs on 'desk'; it does on: robot, spare"):
-        moved(plain, {"desk": "10.0.0.9"})
+        moved_hosts(plain, {"desk": "10.0.0.9"})
 
 
 @pytest.mark.parametrize("name", ["panda_sim", "panda_sim_two_hosts", "panda_sim_lab"])
@@ -259,7 +262,7 @@ def test_people_are_added_one_by_one_and_can_change(name: str, tmp_path: Path) -
     text = profile_text(plain, name, tmp_path / "keys")
     text += "# a remark that stays\n"
     for host, role in (("desk", Role.VIEWER), ("wall", Role.VIEWER), ("desk", Role.OPERATOR)):
-        text = with_person(text, host, role)
+        text = with_operator(text, host, role)
     file.write_text(text)
     security = load_profile(str(file)).session.security
     assert security is not None
@@ -269,7 +272,7 @@ def test_people_are_added_one_by_one_and_can_change(name: str, tmp_path: Path) -
 
 def test_a_profile_without_the_list_is_left_alone() -> None:
     with pytest.raises(SecurityError, match="Write it by hand:\nsession:\n  security:\n    people"):
-        with_person("session: {security: {}}\n", "desk", Role.VIEWER)
+        with_operator("session: {security: {}}\n", "desk", Role.VIEWER)
 
 
 # -- the command ------------------------------------------------------------------------------

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import DEFAULT_ROOT, MAX_CHUNK, Keys, chunk, last
+from vla_zenoh.keys import DEFAULT_ROOT, MAX_CHUNK, Keys, key_chunk, last_chunk
 
 MAX_SENTENCE = 1000  # characters of an error message
 
 KEYS = Keys("panda")
 SELECTORS = (
-    "everything",
+    "all_keys",
     "all_deltas",
     "all_specs",
     "all_seen",
@@ -27,10 +27,10 @@ SELECTORS = (
     "all_alive",
     "all_holding",
     "all_robots",
-    "without_pictures",
-    "without_raw_pictures",
+    "without_images",
+    "without_raw_images",
 )
-NO_KEYS = ("short", "of", "on", "all_seen_of", "group", "whole")
+NO_KEYS = ("short", "of", "on", "all_seen_of", "group", "full")
 """Methods that give something else than one key."""
 GOOD_CHUNKS = st.from_regex(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,20}", fullmatch=True)
 
@@ -87,11 +87,11 @@ def test_selectors_find_their_own_keys_and_no_others() -> None:
     for selector, key in own.items():
         expression = zenoh.KeyExpr(getattr(KEYS, selector))
         assert [k for k in every if expression.intersects(zenoh.KeyExpr(k))] == [key]
-    assert all(zenoh.KeyExpr(KEYS.everything).includes(zenoh.KeyExpr(k)) for k in every)
+    assert all(zenoh.KeyExpr(KEYS.all_keys).includes(zenoh.KeyExpr(k)) for k in every)
 
 
 def test_two_robots_never_meet() -> None:
-    one, other = zenoh.KeyExpr(KEYS.everything), zenoh.KeyExpr(Keys("panda2").everything)
+    one, other = zenoh.KeyExpr(KEYS.all_keys), zenoh.KeyExpr(Keys("panda2").all_keys)
     assert not one.intersects(other)
 
 
@@ -128,10 +128,10 @@ def test_what_would_mean_something_to_zenoh_is_refused(name: str) -> None:
 @given(st.text(max_size=80))
 def test_a_name_is_taken_whole_or_not_at_all(name: str) -> None:
     if 0 < len(name) <= MAX_CHUNK and name.isascii() and re.fullmatch(r"\w[\w.-]*", name):
-        assert chunk(name, "name") == name
+        assert key_chunk(name, "name") == name
         return
     with pytest.raises(ProfileError) as caught:
-        chunk(name, "name")
+        key_chunk(name, "name")
     assert len(str(caught.value)) < MAX_SENTENCE
 
 
@@ -139,7 +139,7 @@ def test_a_key_is_shortened_as_people_say_it() -> None:
     assert KEYS.delta("scripted") == f"{DEFAULT_ROOT}/panda/delta/scripted"
     assert KEYS.short(KEYS.delta("scripted")) == "delta/scripted"
     assert KEYS.short("vla/panda2/active") == "vla/panda2/active"
-    assert last(KEYS.delta("scripted")) == "scripted"
+    assert last_chunk(KEYS.delta("scripted")) == "scripted"
 
 
 def test_a_key_is_told_from_those_of_other_robots() -> None:
@@ -157,14 +157,14 @@ def test_a_key_is_told_from_those_of_other_robots() -> None:
 
 def test_a_short_key_is_made_whole_and_a_whole_one_left() -> None:
     ours = Keys("panda")
-    assert ours.whole("state/*") == "vla/panda/state/*"
-    assert ours.whole(ours.short(ours.state_pose)) == ours.state_pose
-    assert ours.whole("vla/ur5/**") == "vla/ur5/**"
+    assert ours.full("state/*") == "vla/panda/state/*"
+    assert ours.full(ours.short(ours.state_pose)) == ours.state_pose
+    assert ours.full("vla/ur5/**") == "vla/ur5/**"
 
 
 def test_a_recorder_hears_everything_but_raw_pictures() -> None:
     ours = Keys("panda")
-    expressions = [zenoh.KeyExpr(each) for each in ours.without_raw_pictures]
+    expressions = [zenoh.KeyExpr(each) for each in ours.without_raw_images]
 
     def heard(key: str) -> int:
         return sum(each.includes(zenoh.KeyExpr(key)) for each in expressions)

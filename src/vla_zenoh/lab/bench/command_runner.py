@@ -53,13 +53,13 @@ def measure_command(
         client = host.client
 
         def watch() -> None:
-            if not host.supervisor.watch():
+            if not host.supervisor.poll():
                 raise NodeError("a node dies again and again")
 
         listener = StreamListener(host.session, profile.keys, profile.task.worker)
         run = DemoRunner(client, listener, stop, watch, lambda *_: None)
         run.wait_until_ready()
-        run.activate(RATE_HZ)
+        run.start("hold", RATE_HZ)
         listener.close()  # what it hears costs time that is not the command node's
         client.set_prompt(PROMPT)
         if stop.wait(STATUS_S):

@@ -30,7 +30,7 @@ from vla_zenoh.lab.bench.motion import (
     make_row,
     path_length,
 )
-from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, judge, make_segment
+from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, judge_segment, make_segment
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import Profile
@@ -127,7 +127,7 @@ def _row(profile: Profile, trial: MotionCase, conditions: Conditions) -> Row:
     loop.run(1.0 / PREPARATION_HZ)
     before, since = _standing(loop), len(loop.trace.time_ns)
     steps_done = _carry_out(loop, trial.segment, conditions.rate_hz)
-    outcome = judge(
+    outcome = judge_segment(
         trial.segment,
         before,
         _standing(loop),

@@ -28,8 +28,7 @@ from vla_zenoh.lab.recording.run import first_commands
 from vla_zenoh.lab.recording.stream_listener import StreamListener, Streams
 from vla_zenoh.runtime.launch import Host
 
-RESET_PATIENCE_S = 3.0
-HOME_TOLERANCE_M = 0.002
+RESET_SETTLE_S = 0.3
 
 
 def run_in_real_time(
@@ -61,12 +60,14 @@ def run_in_real_time(
                 host.client,
                 listener,
                 stop,
-                host.watch,
+                host.poll,
                 lambda _, done, trial=trial, each=each: progress(trial, each, done),
             )
             run.wait_until_ready()
-            _go_home(host, listener)
-            run.activate(PREPARATION_HZ)
+            host.client.deactivate()
+            run.reset_simulator()
+            run.pause(RESET_SETTLE_S)
+            run.start("hold", PREPARATION_HZ)
             try:
                 if trial.preparation:
                     prepared = run.run_segment(
@@ -91,18 +92,6 @@ def run_in_real_time(
             yield make_row(trial, each, profile, outcome, stream, refused), recording
 
 
-def _go_home(host: Host, listener: StreamListener) -> None:
-    """Put the simulated arm back; the command node is inactive."""
-    assert host.client is not None
-    client = host.client
-    client.deactivate()
-    resets = _resets(host)
-    client.put(client.keys.sim_reset, "")
-    if not client.wait_for(lambda: _resets(host) > resets, RESET_PATIENCE_S):
-        raise NodeError("the simulator did not reset; it says: " + str(client.status("sim")))
-    time.sleep(0.3)
-
-
 def _refusals(host: Host) -> Counter[str]:
     """What every node has refused so far, by ``node.reason``."""
     assert host.client is not None
@@ -114,11 +103,6 @@ def _refusals(host: Host) -> Counter[str]:
             if name.startswith("refused.")
         }
     )
-
-
-def _resets(host: Host) -> int:
-    status = host.client.status("sim") if host.client else None
-    return int(status.counters.get("sim.resets", 0)) if status else 0
 
 
 def stream_of(

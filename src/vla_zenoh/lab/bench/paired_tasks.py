@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from vla_zenoh.errors import RecordError
 from vla_zenoh.lab.statistics import Paired, paired
-from vla_zenoh.pydantic_errors import in_words
+from vla_zenoh.pydantic_errors import describe_fault
 
 ALPHA = 0.05
 """A p below this counts as a difference, as in the intervals at 95 %."""
@@ -100,7 +100,7 @@ def read_run(content: bytes, where: str) -> TaskResultFile:
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         place = ".".join(map(str, fault["loc"]))
-        why = f"{place} {in_words(fault)}" if place else in_words(fault)
+        why = f"{place} {describe_fault(fault)}" if place else describe_fault(fault)
         raise RecordError(f"{where} is no result of `vla-zenoh bench task`: {why}") from error
 
 

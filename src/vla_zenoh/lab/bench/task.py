@@ -17,7 +17,6 @@ from vla_zenoh.lab.tasks import (
     LIMIT_S,
     Order,
     TaskEpisode,
-    Verdict,
     draw_episode,
     draw_stay,
 )
@@ -42,8 +41,6 @@ BASELINES: Mapping[str, tuple[str, str]] = {
 }
 """Names that stand for a worker and a prompt of its own. Neither knows any task: what they reach is
 what the measure gives away."""
-SAY_IT_IS_OVER_S = 1.5
-"""A policy that says it is done, and an arm that has stood so long: the episode ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +76,7 @@ class TaskPlan:
         """The worker that runs."""
         return BASELINES.get(self.model, (self.model, ""))[0]
 
-    def asked(self) -> Iterator[TaskRequest]:
+    def requests(self) -> Iterator[TaskRequest]:
         """Every episode, before its layout is known."""
         families = (self.family,) if self.family else FAMILIES
         for index in range(self.episodes):
@@ -149,20 +146,6 @@ class TaskOutcome:
     time_s: float
     why: str = ""
     pictures: tuple[bytes, bytes] | None = None
-
-    @staticmethod
-    def by(
-        verdict: Verdict, episode: TaskEpisode, prompt: str, pictures: tuple[bytes, bytes] | None
-    ) -> TaskOutcome:
-        """As the judge says."""
-        return TaskOutcome(
-            episode,
-            prompt,
-            verdict.success,
-            verdict.failure,
-            verdict.time_s,
-            pictures=pictures,
-        )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain types, without pictures."""
@@ -284,7 +267,7 @@ class DemoPlan(TaskPlan):
 
     prompts: tuple[str, ...] = ()
 
-    def asked(self) -> Iterator[TaskRequest]:
+    def requests(self) -> Iterator[TaskRequest]:
         """Every episode."""
         for prompt in self.prompts:
             yield PromptedTask(self.seed, STAY, None, prompt)

@@ -1,15 +1,11 @@
-"""Runs tasks through the real chain in real time: processes, pictures, keys.
-
-An episode ends with the judge's verdict and the next one begins at once; nothing else is done to
-make it shorter.
-"""
+"""Runs the task benchmark through the real chain in real time."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from typing import TypeVar
+from collections.abc import Iterator
+from typing import Any, TypeVar
 
 import zenoh
 
@@ -19,28 +15,17 @@ from vla_zenoh.codec import records
 from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.lab.bench.task import (
-    ARM_LOST,
-    NO_STATE,
-    NOT_OBEYED,
-    SAY_IT_IS_OVER_S,
-    TaskOutcome,
-    TaskPlan,
-    TaskRequest,
-)
-from vla_zenoh.lab.episode import Interrupted
-from vla_zenoh.lab.tasks import TaskEpisode, TaskJudge
+from vla_zenoh.lab.bench.task import ARM_LOST, NO_STATE, TaskOutcome, TaskPlan
+from vla_zenoh.lab.bench.task_episode import Scene, run_task
+from vla_zenoh.lab.episode import COMMAND, EpisodeRunner
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.types import GripperState, Header, ObjectPoses, PoseState
 
-SIM, COMMAND = "sim", "command"
 READY_PATIENCE_S = 60.0
 LOAD_PATIENCE_S = 600.0
-"""With a worker that says it is loading; it may be making its environment."""
-RESET_PATIENCE_S, RESET_PERIOD_S = 8.0, 1.0
-ACTIVATE_PATIENCE_S = 15.0
-HEARD_PATIENCE_S = 3.0
-LOOK_S = 0.02
+"""While the worker reports that it loads; it may be building its environment."""
+STATE_PATIENCE_S = 3.0
+STEP_S = 0.02
 FRESH_PICTURES_S = 0.2
 """From a reset until cameras and worker have seen the new layout."""
 
@@ -48,55 +33,54 @@ Record = TypeVar("Record")
 
 
 class TaskRunner:
-    """See the module.
+    """Runs the episodes of a plan; a `TaskStage` of running nodes.
 
     Args:
-        host: up, with a simulator whose scene has what tasks are about.
+        host: up, with a simulator whose scene has the bricks.
         plan: what to run.
         stop: set by Ctrl-C.
-        camera: whose pictures go into the sheet of failures, None: none.
+        camera: for the pictures of an outcome, None: none.
     """
 
     def __init__(
         self, host: Host, plan: TaskPlan, stop: threading.Event, camera: str | None
     ) -> None:
-        assert host.session is not None
-        assert host.client is not None
-        self._host, self._plan, self._stop = host, plan, stop
-        self._client, session = host.client, host.session
+        assert host.session is not None and host.client is not None
+        self._plan, self._client, session = plan, host.client, host.session
+        self._runner = EpisodeRunner(host.client, stop, host.poll)
         keys = host.profile.keys
-        streams = {
-            ObjectPoses: keys.sim_objects,
-            GripperState: keys.state_gripper,
-            PoseState: keys.state_pose,
+        self._slots: dict[type[Any], TaskSlot] = {
+            kind: TaskSlot() for kind in (ObjectPoses, GripperState, PoseState)
         }
-        self._heard = {kind: TaskSlot() for kind in streams}
         self._picture = TaskSlot()
-        listening = [(key, self._heard[kind]) for kind, key in streams.items()]
+        slots = {
+            keys.sim_objects: self._slots[ObjectPoses],
+            keys.state_gripper: self._slots[GripperState],
+            keys.state_pose: self._slots[PoseState],
+        }
         if camera is not None:
-            listening.append((keys.camera_jpeg(camera), self._picture))
+            slots[keys.camera_jpeg(camera)] = self._picture
         self._subscribers = [
             session.declare_subscriber(key, zenoh.handlers.Callback(slot, indirect=False))
-            for key, slot in listening
+            for key, slot in slots.items()
         ]
 
     def run(self) -> Iterator[TaskOutcome]:
         """One outcome after the other.
 
         Raises:
-            NodeError: the chain does not come up.
+            NodeError: the chain does not come up, or another client ended an episode.
             Interrupted: Ctrl-C.
         """
         self._wait_until_ready()
-        client, plan = self._client, self._plan
-        if plan.rate_hz is not None:
-            client.set_rate(plan.rate_hz)
-        for asked in plan.asked():
-            yield self._episode(asked)
-            client.deactivate()
+        if self._plan.rate_hz is not None:
+            self._client.set_rate(self._plan.rate_hz)
+        for request in self._plan.requests():
+            yield run_task(self, self._plan, request)
+            self._client.deactivate()
 
     def latency_ms(self) -> dict[str, tuple[float, float]]:
-        """What worker and command node say of their stages now."""
+        """Latencies that worker and command node report now: ``node.stage`` -> (p50, p95)."""
         out: dict[str, tuple[float, float]] = {}
         for node in (worker_node(self._plan.worker), COMMAND):
             status = self._client.status(node)
@@ -104,167 +88,119 @@ class TaskRunner:
                 out |= {f"{node}.{stage}": pair for stage, pair in status.latency_ms.items()}
         return out
 
-    # -- one episode --------------------------------------------------------------------------
-    def _episode(self, asked: TaskRequest) -> TaskOutcome:
-        objects = self._lay_out(asked.seed)
-        episode = asked.draw(objects, held_out=self._plan.held_out)
-        prompt = self._plan.prompt_for(episode)
-        refused = self._give_the_arm(prompt)
-        if refused:
-            self._end_if_somebody_did()
-            return TaskOutcome(episode, prompt, False, NOT_OBEYED, 0.0, refused, self._pictures())
-        return self._watch_it(episode, prompt)
-
-    def _lay_out(self, seed: int) -> ObjectPoses:
-        """Arm home, objects placed anew; what is true then."""
-        client = self._client
-        resets, give_up_s = self._resets(), time.monotonic() + RESET_PATIENCE_S
-        while self._resets() == resets:
-            # Refused while the last of the command stream is still followed.
-            client.put(client.keys.sim_reset, str(seed))
-            client.wait_for(lambda: self._resets() > resets, RESET_PERIOD_S)
-            if time.monotonic() > give_up_s:
-                raise NodeError(f"sim/reset is not obeyed in {RESET_PATIENCE_S:g} s")
-            self._pause(0.0)
-        # What is heard of the simulator from here on was written after the reset.
+    # -- stage of an episode ------------------------------------------------------------------
+    def reset(self, seed: int) -> ObjectPoses:
+        """Reset the simulator; the objects' true poses, published after it."""
+        self._runner.reset_simulator(seed)
         since_s = time.monotonic()
-        self._pause(FRESH_PICTURES_S)
-        for kind in self._heard:
-            self._until(
-                lambda kind=kind: self._heard[kind].mono_s > since_s,
-                HEARD_PATIENCE_S,
-                f"no {kind.__name__} is heard",
+        self._runner.pause(FRESH_PICTURES_S)
+        for kind, slot in self._slots.items():
+            self._runner.wait(
+                lambda slot=slot: slot.mono_s > since_s,
+                STATE_PATIENCE_S,
+                f"no {kind.__name__} received",
             )
         return self._newest(ObjectPoses)[1]
 
-    def _resets(self) -> int:
-        status = self._client.status(SIM)
-        return int(status.counters.get("sim.resets", 0)) if status else 0
+    def start(self, prompt: str) -> str:
+        """Activate; the last rejection, where it is rejected to the end."""
+        try:
+            self._runner.start(prompt)
+        except SessionError as error:
+            self._check_not_ended_by_others()
+            return str(error)
+        return ""
 
-    def _give_the_arm(self, prompt: str) -> str:
-        """Put the prompt and activate; why not, where it is refused to the end."""
-        give_up = time.monotonic() + ACTIVATE_PATIENCE_S
-        while True:
-            try:
-                self._client.set_prompt(prompt)
-                self._client.activate()
-                return ""
-            except SessionError as error:
-                if time.monotonic() > give_up or self._client.latched():
-                    return str(error)
-                self._pause(0.2)
+    def step(self) -> None:
+        """Wait for the next state."""
+        self._runner.pause(STEP_S)
 
-    def _end_if_somebody_did(self) -> None:
-        """No episode is lost, and no arm moved, against the will of a person.
+    def time_s(self) -> float:
+        """Monotonic clock."""
+        return time.monotonic()
+
+    def scene(self) -> Scene:
+        """The newest states."""
+        header, objects = self._newest(ObjectPoses)
+        width_m = self._newest(GripperState)[1].width_m
+        return Scene(header.stamp_wall_ns, objects, width_m, self._newest(PoseState)[1].position_m)
+
+    def failure(self) -> tuple[str, str] | None:
+        """The arm is inactive, or the simulator's objects are silent."""
+        why = self._why_inactive()
+        if why:
+            self._check_not_ended_by_others()
+            return ARM_LOST, why
+        silent_s = time.monotonic() - self._slots[ObjectPoses].mono_s
+        if silent_s > STATE_PATIENCE_S:
+            return NO_STATE, f"sim/objects is silent for {silent_s:.1f} s"
+        return None
+
+    def done(self) -> bool:
+        """As the command node reports."""
+        return self._runner.view().done
+
+    def picture(self) -> bytes | None:
+        """The newest picture, empty before the first."""
+        return self._picture.payload()
+
+    # -- the chain ----------------------------------------------------------------------------
+    def _check_not_ended_by_others(self) -> None:
+        """Do not activate again after a person's emergency stop or deactivation.
 
         Raises:
-            NodeError: it was stopped, or somebody deactivated it.
+            NodeError: there was one.
         """
-        why = self._client.latched() or self._why_lost()
-        if self._client.latched() or why == DEACTIVATED:
-            raise NodeError(f"ended by somebody else: {why}")
+        latched, why = self._client.latch_reason(), self._why_inactive()
+        if latched or why == DEACTIVATED:
+            raise NodeError(f"another client ended the episode: {latched or why}")
 
-    def _watch_it(self, episode: TaskEpisode, prompt: str) -> TaskOutcome:
-        first, objects = self._newest(ObjectPoses)
-        judge = TaskJudge(episode.order, objects, self._newest(PoseState)[1].position_m)
-        beginning = self._picture.payload()
-        began_s = time.monotonic()
-        seen_ns, over_since_s = first.stamp_wall_ns, 0.0
-        while True:
-            self._pause(LOOK_S)
-            time_s = time.monotonic() - began_s
-            header, objects = self._newest(ObjectPoses)
-            width_m = self._newest(GripperState)[1].width_m
-            tcp_m = self._newest(PoseState)[1].position_m
-            verdict = None
-            if header.stamp_wall_ns > seen_ns:
-                seen_ns = header.stamp_wall_ns
-                verdict = judge.see(objects, width_m, time_s, tcp_m)
-            ended = (episode, prompt, (beginning, self._picture.payload()))
-            lost = self._why_lost()
-            over_since_s = (over_since_s or time_s) if self._says_it_is_over() else 0.0
-            if verdict is None and lost:
-                self._end_if_somebody_did()
-                return TaskOutcome(episode, prompt, False, ARM_LOST, time_s, lost, ended[2])
-            silent_s = time.monotonic() - self._heard[ObjectPoses].mono_s
-            if verdict is None and silent_s > HEARD_PATIENCE_S:
-                why = f"sim/objects is silent for {silent_s:.1f} s"
-                return TaskOutcome(episode, prompt, False, NO_STATE, time_s, why, ended[2])
-            over = over_since_s and time_s - over_since_s > SAY_IT_IS_OVER_S
-            if verdict is None and (over or time_s > self._plan.limit_s):
-                verdict = judge.end()
-            if verdict is not None:
-                return TaskOutcome.by(verdict, *ended)
-
-    def _pictures(self) -> tuple[bytes, bytes]:
-        return self._picture.payload(), self._picture.payload()
-
-    def _why_lost(self) -> str:
-        task = self._client.task
+    def _why_inactive(self) -> str:
+        task, status = self._client.task, self._client.status(COMMAND)
         if task is not None and task.active:
             return ""
-        status = self._client.status(COMMAND)
-        why = status.detail.get("why", "") if status else "no command node is heard"
+        why = status.detail.get("why", "") if status else "no status of the command node received"
         return str(why) or "inactive"
 
-    def _says_it_is_over(self) -> bool:
-        status = self._client.status(COMMAND)
-        if status is None:
-            return False
-        return bool(status.detail.get("policy_done")) and bool(status.detail.get("at_rest"))
-
-    # -- waiting ------------------------------------------------------------------------------
     def _wait_until_ready(self) -> None:
         worker = worker_node(self._plan.worker)
         began_s = time.monotonic()
         while True:
-            said = self._client.status(worker)
-            loading = said is None or said.detail.get("complaint") == "loading"
-            ready = all(slot.mono_s for slot in self._heard.values())
+            status = self._client.status(worker)
+            loading = status is None or status.detail.get("complaint") == "loading"
+            ready = all(slot.mono_s for slot in self._slots.values())
             if ready and not loading and self._client.status(COMMAND) is not None:
                 return
             waited_s = time.monotonic() - began_s
             if waited_s > (LOAD_PATIENCE_S if loading and ready else READY_PATIENCE_S):
                 nodes = {name: found[0].state for name, found in self._client.snapshot().items()}
                 raise NodeError(f"the chain did not come up in {waited_s:.0f} s: {nodes}")
-            self._pause(0.1)
-
-    def _until(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
-        give_up = time.monotonic() + timeout_s
-        while not condition():
-            if time.monotonic() > give_up:
-                raise NodeError(otherwise)
-            self._pause(LOOK_S)
-
-    def _pause(self, seconds: float) -> None:
-        self._host.watch()
-        if self._stop.wait(seconds):
-            raise Interrupted
+            self._runner.pause(0.1)
 
     def _newest(self, kind: type[Record]) -> tuple[Header, Record]:
-        return self._heard[kind].read(kind)
+        return self._slots[kind].read(kind)
 
 
 class TaskSlot(LatestSample):
-    """The newest sample of a stream, to be read as often as one likes."""
+    """The newest sample of a stream; reading does not consume it."""
 
     @property
     def mono_s(self) -> float:
-        """When it arrived, 0 before the first."""
+        """When it was received, 0 before the first."""
         return self._arrival.mono_ns / 1e9 if self._arrival else 0.0
 
     def payload(self) -> bytes:
-        """Its bytes, none before the first."""
+        """Its bytes, empty before the first."""
         return self._arrival.sample.payload.to_bytes() if self._arrival else b""
 
     def read(self, kind: type[Record]) -> tuple[Header, Record]:
-        """What it says.
+        """Its header and record.
 
         Raises:
-            NodeError: nothing was heard, or it is no such record.
+            NodeError: nothing was received, or no such record.
         """
         if self._arrival is None:
-            raise NodeError(f"no {kind.__name__} was heard")
+            raise NodeError(f"no {kind.__name__} received")
         try:
             return header_of(self._arrival.sample), records.decode(kind, self.payload())
         except CodecError as error:

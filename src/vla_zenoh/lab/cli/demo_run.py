@@ -60,7 +60,7 @@ def _run(
             bars.update(tasks[index], completed=done)
 
         def watch() -> None:
-            if not running.supervisor.watch():
+            if not running.supervisor.poll():
                 stop.set()
 
         listener = StreamListener(running.session, profile.keys, profile.task.worker, keep=KEPT)

@@ -91,7 +91,7 @@ class Stage:
                         profile,
                         running.session,
                         self.recording,
-                        expressions=(*profile.keys.without_pictures, *pictures_of),
+                        expressions=(*profile.keys.without_images, *pictures_of),
                     ).start()
                     try:
                         yield running, bars

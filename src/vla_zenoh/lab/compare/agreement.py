@@ -16,7 +16,7 @@ import numpy as np
 
 from vla_zenoh.control.actions import step_pose, step_width
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.so3 import Pose, between, log3, pose_of
+from vla_zenoh.kinematics.so3 import Pose, interpolate, log3, pose_of
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import ActionChunk, FloatArray, GripperState, PoseState
 
@@ -92,7 +92,7 @@ class RequestedPath(NamedTuple):
         """Pose and width asked for `time_s` after the observation."""
         index = min(int(time_s / self.dt_s + 1e-9), len(self.poses) - 2)
         share = min(time_s / self.dt_s - index, 1.0)
-        pose = between(self.poses[index], self.poses[index + 1], share)
+        pose = interpolate(self.poses[index], self.poses[index + 1], share)
         last = round(time_s / self.dt_s + 1e-9)
         width_m = None if self.widths_m is None else self.widths_m[min(last, len(self.poses) - 1)]
         return pose, width_m

@@ -54,10 +54,10 @@ class CompareListener:
     def poll(self) -> None:
         """Take in what came since the last call."""
         for kind, inbox in ((PoseState, self._poses), (GripperState, self._grippers)):
-            for header, state in _read(kind, inbox.take_all()):
+            for header, state in _read(kind, inbox.drain()):
                 self.standing.add(header.stamp_wall_ns, state)
         for worker, inbox in self._deltas.items():
-            for _, chunk in _read(ActionChunk, inbox.take_all()):
+            for _, chunk in _read(ActionChunk, inbox.drain()):
                 # A worker that was started anew may have another spec; what it said before and
                 # now cannot be read together.
                 if chunk.spec_hash == self.specs[worker].hash:

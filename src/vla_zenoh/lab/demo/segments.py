@@ -1,4 +1,4 @@
-"""Which prompts a demo puts, one after the other, and what the arm has to do for each."""
+"""Motion segments: what a scripted prompt asks for, and how the measured motion compares. Pure."""
 
 from __future__ import annotations
 
@@ -25,17 +25,20 @@ TOUR: tuple[tuple[str, int], ...] = (
     ("HARD: open gripper", 2),
     ("HARD: go down", 15),
 )
-"""Every axis there and back, and the gripper, within reach of the home pose."""
+"""Prompt and steps: every axis there and back, and the gripper, within reach of the home pose."""
+TOLERANCE_M, TOLERANCE_RAD = 0.002, 0.005
+DRIFT_MM = 1.0
+TOLERANCE_WIDTH_M = 0.002
 
 
 @dataclass(frozen=True, slots=True)
 class DemoSegment:
-    """One prompt carried out for a number of steps.
+    """One scripted prompt for a number of steps.
 
     Args:
-        prompt: as put, without the count.
-        steps: how many.
-        motion: what one step is; None: to stand still.
+        prompt: without the count.
+        steps: number of steps.
+        motion: of one step; None: hold.
         within: turn back before this distance (m or rad) from the start; None: never.
     """
 
@@ -47,56 +50,54 @@ class DemoSegment:
     @property
     def prompt_with_count(self) -> str:
         """The prompt that ends by itself after the steps."""
-        return f"{self.prompt} x{self.steps}{self._turning}"
+        return f"{self.prompt} x{self.steps}{self._within}"
 
     @property
     def prompt_without_end(self) -> str:
-        """The prompt that goes on until another one is put."""
-        return f"{self.prompt}{self._turning}"
+        """The prompt that continues until the next one."""
+        return f"{self.prompt}{self._within}"
 
     @property
-    def _turning(self) -> str:
+    def _within(self) -> str:
         return "" if self.within is None else f" within {self.within:g}"
 
     @property
     def translation_m(self) -> FloatArray:
-        """(3,) asked for in the base frame."""
+        """(3,) translation that the prompt asks for, base frame."""
         return self._asked()[:3]
 
     @property
     def rotation_rad(self) -> FloatArray:
-        """(3,) rotation vector asked for in the base frame."""
+        """(3,) rotation vector that the prompt asks for, base frame."""
         return self._asked()[3:6]
 
     def width_after_m(self, before_m: float, max_width_m: float) -> float:
-        """Gripper width asked for, after `before_m`."""
+        """Gripper width that the prompt asks for, from `before_m`."""
         width_m = before_m
         if self.motion is not None and self.motion.axis == 6:
-            asked = ScriptedPrompt(self.motion, self.steps, self.within)
+            prompt = ScriptedPrompt(self.motion, self.steps, self.within)
             for index in range(self.steps):
-                width_m = min(max(width_m + asked.step(index), 0.0), max_width_m)
+                width_m = min(max(width_m + prompt.step(index), 0.0), max_width_m)
         return width_m
 
     def _asked(self) -> FloatArray:
         asked = np.zeros(7)
         if self.motion is not None:
-            asked[self.motion.axis] = ScriptedPrompt(self.motion, self.steps, self.within).offset(
-                self.steps
-            )
+            prompt = ScriptedPrompt(self.motion, self.steps, self.within)
+            asked[self.motion.axis] = prompt.offset(self.steps)
         return asked
 
 
 def make_segment(prompt: str, steps: int) -> DemoSegment:
-    """A segment of a HARD prompt; a count in the prompt wins over `steps`.
+    """The segment of a HARD prompt; a count in the prompt overrides `steps`.
 
     Raises:
-        SpecError: not a prompt the scripted model knows.
+        SpecError: the scripted model does not know the prompt.
     """
-    asked = parse_scripted(prompt)
-    name = f"HARD: {asked.motion.name}" if asked.motion else "hold"
-    return DemoSegment(
-        name, steps if asked.steps is None else asked.steps, asked.motion, asked.within
-    )
+    parsed = parse_scripted(prompt)
+    name = f"HARD: {parsed.motion.name}" if parsed.motion else "hold"
+    steps = steps if parsed.steps is None else parsed.steps
+    return DemoSegment(name, steps, parsed.motion, parsed.within)
 
 
 def tour() -> list[DemoSegment]:
@@ -104,15 +105,9 @@ def tour() -> list[DemoSegment]:
     return [make_segment(prompt, steps) for prompt, steps in TOUR]
 
 
-TOLERANCE_M = 0.002
-TOLERANCE_RAD = 0.005
-DRIFT_MM = 1.0
-TOLERANCE_WIDTH_M = 0.002
-
-
 @dataclass(frozen=True, slots=True)
 class RestPose:
-    """Where the arm stood, at rest."""
+    """Measured pose and gripper width at rest."""
 
     pose: Pose
     width_m: float
@@ -120,18 +115,18 @@ class RestPose:
 
 @dataclass(frozen=True, slots=True)
 class SegmentOutcome:
-    """What became of one segment. Drift is what the arm did that nobody asked for, at rest.
+    """Measured motion of a segment, from rest to rest. Drift is motion that was not asked for.
 
     Args:
-        segment: what was asked.
-        reached_m: translation along the asked direction (its whole length where none was asked).
-        reached_rad: rotation about the asked axis (its whole angle where none was asked).
+        segment: prompt and steps.
+        reached_m: translation along the asked direction; 0 where none was asked.
+        reached_rad: rotation about the asked axis; 0 where none was asked.
         drift_mm: translation off the asked direction.
         drift_rad: rotation off the asked axis.
-        asked_width_m: gripper width after the segment.
-        reached_width_m: likewise, measured.
-        steps_done: steps the command node carried out.
-        duration_s: from the prompt until the arm stood.
+        asked_width_m: gripper width that the prompt asks for.
+        reached_width_m: measured gripper width.
+        steps_done: steps the command node accepted.
+        duration_s: from the prompt until rest.
     """
 
     segment: DemoSegment
@@ -153,18 +148,15 @@ class SegmentOutcome:
         return float(np.linalg.norm(self.segment.rotation_rad))
 
     def faults(self) -> list[str]:
-        """In which way the arm did not do what was asked; empty when it did."""
+        """Deviations beyond the tolerances; empty: the arm did what was asked."""
+        translation_mm = abs(self.reached_m - self.asked_m) * 1e3
+        width_mm = abs(self.reached_width_m - self.asked_width_m) * 1e3
         checks = (
-            ("translation", abs(self.reached_m - self.asked_m) * 1e3, TOLERANCE_M * 1e3, "mm"),
+            ("translation", translation_mm, TOLERANCE_M * 1e3, "mm"),
             ("rotation", abs(self.reached_rad - self.asked_rad), TOLERANCE_RAD, "rad"),
             ("drift", self.drift_mm, DRIFT_MM, "mm"),
             ("rotation drift", self.drift_rad, TOLERANCE_RAD, "rad"),
-            (
-                "gripper",
-                abs(self.reached_width_m - self.asked_width_m) * 1e3,
-                TOLERANCE_WIDTH_M * 1e3,
-                "mm",
-            ),
+            ("gripper", width_mm, TOLERANCE_WIDTH_M * 1e3, "mm"),
         )
         out = [
             f"{name} off by {value:.4g} {unit} (allowed {limit:g})"
@@ -177,6 +169,7 @@ class SegmentOutcome:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for JSON."""
+        faults = self.faults()
         return {
             "prompt": self.segment.prompt,
             "steps": self.segment.steps,
@@ -194,12 +187,12 @@ class SegmentOutcome:
             "drift_mm": self.drift_mm,
             "rotation_drift_rad": self.drift_rad,
             "duration_s": self.duration_s,
-            "ok": not self.faults(),
-            "faults": self.faults(),
+            "ok": not faults,
+            "faults": faults,
         }
 
 
-def judge(
+def judge_segment(
     segment: DemoSegment,
     before: RestPose,
     after: RestPose,
@@ -208,17 +201,15 @@ def judge(
     steps_done: int,
     duration_s: float,
 ) -> SegmentOutcome:
-    """Compare where the arm stands now with where it should."""
-    moved = after.pose.position_m - before.pose.position_m
-    turned = log3(after.pose.rotation @ before.pose.rotation.T)
-    along_m, off_m = _split(moved, segment.translation_m)
-    about_rad, off_rad = _split(turned, segment.rotation_rad)
-    asked_m = float(np.linalg.norm(segment.translation_m))
-    asked_rad = float(np.linalg.norm(segment.rotation_rad))
+    """Split the motion between two rest poses into what `segment` asks for and drift."""
+    translation = after.pose.position_m - before.pose.position_m
+    rotation = log3(after.pose.rotation @ before.pose.rotation.T)
+    along_m, off_m = _split(translation, segment.translation_m)
+    about_rad, off_rad = _split(rotation, segment.rotation_rad)
     return SegmentOutcome(
         segment,
-        along_m if asked_m else 0.0,
-        about_rad if asked_rad else 0.0,
+        along_m,
+        about_rad,
         off_m * 1e3,
         off_rad,
         segment.width_after_m(before.width_m, max_width_m),
@@ -238,7 +229,7 @@ def _split(vector: FloatArray, asked: FloatArray) -> tuple[float, float]:
 
 
 def latencies(first_commands: Sequence[tuple[Cause, int]]) -> dict[str, Any]:
-    """Latency from the camera's stamp to the pose command that first carries a chunk out, in ms.
+    """Latency from the camera's stamp to the first pose command of a chunk, and its stages, ms.
 
     Args:
         first_commands: for each chunk, its cause and that command's stamp (wall ns).

@@ -15,7 +15,7 @@ from vla_zenoh.profile.session import is_loopback
 from vla_zenoh.security.bridge import NODE as BRIDGE
 from vla_zenoh.security.identity import Identity
 from vla_zenoh.security.store import Entry, Store
-from vla_zenoh.security.unused_certificates import stale
+from vla_zenoh.security.unused_certificates import unused_certificates
 
 SHOWN_FAULTS = 6
 SERVERS = ("router", BRIDGE)
@@ -62,7 +62,7 @@ def access(
         yield HostFinding("certificates", "fail", str(error))
         return
     yield certificates(host, entries)
-    for path, why in stale(profile, entries).items():
+    for path, why in unused_certificates(profile, entries).items():
         yield HostFinding(f"certificate {path.name}", "warn", why)
     try:
         yield from map(rules, check_access())

@@ -202,7 +202,7 @@ def _judge(
 
 def _must(played: Sequence[Part], granted: Sequence[Right], act: Act, key: str) -> bool:
     if act is Act.SUBSCRIBE and any(
-        Role.OPERATOR in one.roles and covers(keys.everything, key) for keys, one in played
+        Role.OPERATOR in one.roles and covers(keys.all_keys, key) for keys, one in played
     ):
         return True
     return any(right.act is act and covers(right.key, key) for right in granted)

@@ -304,8 +304,11 @@ class Lockstep:
 
     def _take_gripper_command(self, command: Stamped[GripperCommand]) -> None:
         try:
-            order = self._gripper_guard.take(
-                command, self.guard.writer, self.wall_ns(SIM), leads=self.guard.leads
+            order = self._gripper_guard.accept(
+                command,
+                self.guard.writer,
+                self.wall_ns(SIM),
+                writer_active=self.guard.writer_active,
             )
         except CodecError as error:
             self.guard_refused[error.reason] += 1

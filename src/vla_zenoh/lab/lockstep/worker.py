@@ -51,7 +51,7 @@ class LockstepWorker:
     def take_task(self, task: Stamped[Task]) -> None:
         """The task, as the command node published it."""
         known, self.task = self.task, task.record
-        if known is not None and known.asked_hz != self.task.asked_hz:
+        if known is not None and known.requested_hz != self.task.requested_hz:
             self._due_ns = min(self._due_ns, self._asked_ns)
         if known is None or known.episode != self.task.episode:
             self._not_before_ns = task.header.stamp_wall_ns
@@ -79,7 +79,7 @@ class LockstepWorker:
         self._asked_ns = now_ns
         if self.task is None or now_ns < self._due_ns or wall_ns < self._not_before_ns:
             return None
-        if self.task.asked_hz <= 0.0:
+        if self.task.requested_hz <= 0.0:
             return None
         observation = assemble(
             self.spec,
@@ -96,7 +96,7 @@ class LockstepWorker:
         share = 1.0 + self._delays.jitter * self._jitter.uniform(-1.0, 1.0)
         duration_ns = round(self._delays.inference_s * share * 1e9)
         # One inference at a time, and a period that was missed is not made up for.
-        period_ns = round(1e9 / self.task.asked_hz)
+        period_ns = round(1e9 / self.task.requested_hz)
         self._due_ns = max(self._due_ns + period_ns, now_ns + duration_ns)
         self._not_before_ns = wall_ns + duration_ns
         obeyed = self.task.active and self.task.worker == self.name

@@ -31,13 +31,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vla_zenoh.policy import ModelSpec
-from vla_zenoh.types import ActionChunk, Cause, ObjectPoses, Seen
+from vla_zenoh.types import ActionChunk, Cause, InferenceDebug, ObjectPoses
 
 PACKAGE = "vla_zenoh_msgs"
 HEADER = "std_msgs/Header header"
 _SHAPED = {
     (ActionChunk, "steps"),
-    (Seen, "steps"),
+    (InferenceDebug, "steps"),
     (ObjectPoses, "position_m"),
     (ObjectPoses, "quat_xyzw"),
 }

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import Keys, last
+from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import (
     ActionChunk,
     Event,
     GripperCommand,
     GripperState,
+    InferenceDebug,
     JointCommand,
     JointState,
     NodeStatus,
@@ -17,7 +18,6 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
     SceneState,
-    Seen,
     Task,
 )
 
@@ -35,7 +35,7 @@ RECORDS: tuple[type, ...] = (
     Event,
     SceneState,
     ObjectPoses,
-    Seen,
+    InferenceDebug,
 )
 """Every record that has a key."""
 
@@ -69,9 +69,9 @@ class RecordTypes:
             (self._keys.spec, ModelSpec),
             (self._keys.status, NodeStatus),
             (self._keys.event, Event),
-            (self._keys.seen_record, Seen),
+            (self._keys.seen_record, InferenceDebug),
         )
-        name = last(key)
+        name = last_chunk(key)
         try:
             return next((kind for make, kind in families if make(name) == key), None)
         except ProfileError:

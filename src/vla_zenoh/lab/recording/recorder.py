@@ -18,7 +18,7 @@ from typing import Any
 import zenoh
 
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.payload_limits import bytes_of, whole
+from vla_zenoh.bus.payload_limits import bytes_of, payload_and_attachment
 from vla_zenoh.errors import CodecError, RecordingError
 from vla_zenoh.keys import Keys, covers
 from vla_zenoh.lab.recording.sample import TEXT, heard
@@ -70,9 +70,9 @@ def recorded_keys(keys: Keys, given: Sequence[str] = (), *, raw: bool = False) -
             but raw pictures, which are 1 MB each.
         raw: raw pictures too.
     """
-    found = dict.fromkeys(map(keys.whole, given)) or dict.fromkeys(keys.without_raw_pictures)
+    found = dict.fromkeys(map(keys.full, given)) or dict.fromkeys(keys.without_raw_images)
     if raw:
-        found[keys.all_raw_pictures] = None
+        found[keys.all_raw_images] = None
     # What two expressions mean would be heard, and recorded, twice.
     return tuple(
         each for each in found if not any(covers(other, each) for other in found if other != each)
@@ -192,7 +192,7 @@ class Recorder:
     def _take(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         try:
-            payload, attachment = whole(sample, self._queue_limit)
+            payload, attachment = payload_and_attachment(sample, self._queue_limit)
         except CodecError as error:  # copying what is too large costs as much as keeping it
             with self._change:
                 if error.reason == "oversize":
@@ -256,7 +256,7 @@ class Recorder:
             self._queue_limit = -1  # nothing is queued any more
             self._queue.clear()
         self._writer.abandon()
-        self.node.tell(Event("error", "fault", "recording_failed", why[:1000]))
+        self.node.emit(Event("error", "fault", "recording_failed", why[:1000]))
 
     def _measure(self) -> None:
         self.recorded.seconds = time.monotonic() - self._began_s
@@ -268,7 +268,7 @@ class Recorder:
         recorded = self.recorded
         dropped = recorded.dropped.total()
         if dropped > self.node.counters["dropped"]:
-            self.node.tell(
+            self.node.emit(
                 Event(
                     "error",
                     "fault",
@@ -279,7 +279,7 @@ class Recorder:
             )
         self.node.counters["samples"] = recorded.samples.total()
         self.node.counters["dropped"] = dropped
-        self.node.report(
+        self.node.publish_status(
             state,
             detail={
                 "file": str(recorded.path),

@@ -164,7 +164,7 @@ class Replay:
         self.replayed.damage = self._file.damage
         self.replayed.late_ms = percentiles(np.array(self._late_ns) / 1e6)
         self.replayed.interval_error_ms = percentiles(np.array(self._errors_ns) / 1e6)
-        self.node.report("stopped", now=True)
+        self.node.publish_status("stopped", now=True)
         self.node.close()
         return self.replayed
 
@@ -280,10 +280,10 @@ class Replay:
             NodeError: it does.
         """
         self._refuse_a_live_robot()
-        if self.node.report_due("replaying"):
+        if self.node.status_due("replaying"):
             self.node.counters["samples"] = self.replayed.samples.total()
             detail = {"file": str(self._file.path), "pass": self.replayed.passes + 1}
-            self.node.report("replaying", detail=detail)
+            self.node.publish_status("replaying", detail=detail)
 
 
 def parse_groups(names: Collection[str]) -> frozenset[str]:

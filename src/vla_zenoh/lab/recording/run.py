@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from vla_zenoh.errors import CodecError
-from vla_zenoh.keys import Keys, last
+from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.lab.recording.reader import Recording, open_recording
 from vla_zenoh.lab.recording.sample import JPEG
 from vla_zenoh.policy import ModelSpec
@@ -20,13 +20,13 @@ from vla_zenoh.types import (
     GripperCommand,
     GripperState,
     Header,
+    InferenceDebug,
     JointCommand,
     JointState,
     NodeStatus,
     ObjectPoses,
     PoseCommand,
     PoseState,
-    Seen,
     Task,
 )
 
@@ -153,7 +153,7 @@ def load_run(path: Path) -> Run:
         Task: run.tasks,
         Event: run.events,
         ObjectPoses: run.objects,
-        Seen: run.seen,
+        InferenceDebug: run.seen,
     }
     for entry in file.entries(_of_interest(keys)):
         run.began_ns = run.began_ns or entry.received_ns
@@ -190,7 +190,7 @@ def _of_interest(keys: Keys) -> Callable[[str], bool]:
         if group == "camera":
             return key == keys.camera_jpeg(_camera(keys, key))
         if group == "seen":
-            return key == keys.seen_record(last(key))
+            return key == keys.seen_record(last_chunk(key))
         return bool(group)
 
     return wanted
@@ -207,7 +207,7 @@ def _keep(run: Run, lists: dict[type, list[RecordedSample]], heard: RecordedSamp
     elif isinstance(heard.record, ModelSpec):
         run.specs[heard.record.hash] = heard.record
     elif isinstance(heard.record, NodeStatus):
-        node = last(heard.key)
+        node = last_chunk(heard.key)
         run.first_statuses.setdefault(node, heard.record)
         run.statuses[node] = heard.record
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.payload_limits import whole
+from vla_zenoh.bus.payload_limits import payload_and_attachment
 from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.codec.records import MAX_RECORD_BYTES
@@ -96,7 +96,7 @@ class StreamListener:
     def _into(self, name: str) -> Callable[[zenoh.Sample], None]:
         def take(sample: zenoh.Sample) -> None:
             try:
-                payload, head = whole(sample, MAX_RECORD_BYTES)
+                payload, head = payload_and_attachment(sample, MAX_RECORD_BYTES)
             except CodecError:
                 return
             entry = (name, str(sample.key_expr), payload, head, time.time_ns())

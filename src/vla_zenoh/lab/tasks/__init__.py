@@ -5,7 +5,7 @@ prompt, and let a `TaskJudge` look on::
 
     episode = draw_episode(seed, objects)
     judge = Judge(episode.order, objects)
-    while (verdict := judge.see(objects, width_m, time_s)) is None and time_s < LIMIT_S:
+    while (verdict := judge.update(objects, width_m, time_s)) is None and time_s < LIMIT_S:
         ...
     verdict = verdict or judge.end()
 """

@@ -99,7 +99,7 @@ class TaskJudge:
         self._was_shut = self._tcp_moved = False
         self._width_m = 1.0
 
-    def see(
+    def update(
         self,
         objects: ObjectPoses,
         width_m: float,

@@ -72,7 +72,7 @@ class Teleop:
             profile, name, self._wish, lambda: self._keyboard.level, frame=frame
         )
         self.worker = WorkerNode(profile, session, self.policy, name)
-        self._client = Client(profile, people).follow() if people is not None else None
+        self._client = Client(profile, people).subscribe() if people is not None else None
         self._others = profile.task.worker
         self._news: deque[str] = deque(maxlen=16)
 
@@ -116,20 +116,20 @@ class Teleop:
         elif client is None:
             self._news.append("these keys need the certificate of an operator on this computer")
         elif order == STOP:
-            client.put(client.keys.stop, "stop")
+            client.publish(client.keys.stop, "stop")
         elif order == ACTIVATE:
             active = client.task is not None and client.task.active
-            client.put(client.keys.active, "false" if active else "true")
+            client.publish(client.keys.active, "false" if active else "true")
         elif order == TAKE_OVER:
             obeyed = client.task.worker if client.task is not None else ""
             if obeyed != self._name:
                 self._others = obeyed or self._others
-            client.put(client.keys.worker, self._others if obeyed == self._name else self._name)
+            client.publish(client.keys.worker, self._others if obeyed == self._name else self._name)
 
     # -- out ----------------------------------------------------------------------------------
     def _show(self, terminal: Terminal) -> None:
         while not self._stop.wait(SHOW_PERIOD_S):
-            for node, _, event in self._client.take_events() if self._client else ():
+            for node, _, event in self._client.pop_events() if self._client else ():
                 if event.level != "info" or event.kind == "transition":
                     self._news.append(f"{node}: {event.what} {event.why}".rstrip())
             while self._news:

@@ -162,10 +162,10 @@ class TrialRunner:
         try:
             client.set_worker(worker)
             client.set_prompt(self._plan.prompt)
-            client.take_events()
+            client.pop_events()
             self._holds, self._deactivated = 0, False
             began_ns, start_m = time.time_ns(), self._tcp_m()
-            self._task = client.activate_while_here("trial")
+            self._task = client.activate_with_deadman("trial")
         except SessionError as error:
             self._brake()  # a late answer may still have given the arm
             self._discard()
@@ -180,7 +180,7 @@ class TrialRunner:
         end_s = time.monotonic() + self._plan.seconds + GRACE_S
         while not over.wait(LOOK_S):
             if self._stop.is_set() or time.monotonic() > end_s:
-                self._client.put(self._client.keys.active, "false")
+                self._client.publish(self._client.keys.active, "false")
                 return
 
     def _watch(self, conduct: EpisodeFsm) -> None:
@@ -197,7 +197,7 @@ class TrialRunner:
     def _look(self) -> EpisodeView:
         given = self._task
         assert given is not None
-        for node, _, event in self._client.take_events():
+        for node, _, event in self._client.pop_events():
             if node != COMMAND or event.kind != "transition":
                 continue
             if event.what == "active->holding":
@@ -285,7 +285,7 @@ class TrialRunner:
 
     # -- where it begins ----------------------------------------------------------------------
     def _tcp_m(self) -> tuple[float, float, float] | None:
-        arrival = self._pose.take()
+        arrival = self._pose.pop()
         if arrival is not None:
             with suppress(CodecError):
                 pose = records.decode(PoseState, bytes_of(arrival.sample.payload))

@@ -9,7 +9,7 @@ from typing import Any
 import zenoh
 
 from vla_zenoh.bus.clock import Clock
-from vla_zenoh.bus.payload_limits import whole
+from vla_zenoh.bus.payload_limits import payload_and_attachment
 from vla_zenoh.errors import CodecError
 from vla_zenoh.lab.recording.sample import Sample, heard
 from vla_zenoh.profile import Profile
@@ -43,7 +43,7 @@ class ViewListener:
         self._queued_bytes, self._queue_limit = 0, queue_bytes
         handler = zenoh.handlers.Callback(self._take, indirect=False)
         self._subscribers: list[Any] = [
-            session.declare_subscriber(key, handler) for key in self.keys.without_raw_pictures
+            session.declare_subscriber(key, handler) for key in self.keys.without_raw_images
         ]
         # Specs come once a second, and chunks cannot be read without.
         for reply in session.get(self.keys.all_specs, timeout=ANSWER_S):
@@ -53,7 +53,7 @@ class ViewListener:
     def _take(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         try:
-            payload, header = whole(sample, self._queue_limit)
+            payload, header = payload_and_attachment(sample, self._queue_limit)
         except CodecError:
             with self._lock:
                 self.dropped[key] += 1

@@ -11,7 +11,7 @@ import rerun as rr
 
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError, RecordError
-from vla_zenoh.keys import Keys, last
+from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.lab.recording.record_types import RecordTypes
 from vla_zenoh.lab.recording.sample import JPEG, Sample
 from vla_zenoh.lab.view import paths
@@ -28,6 +28,7 @@ from vla_zenoh.types import (
     Event,
     GripperCommand,
     GripperState,
+    InferenceDebug,
     JointCommand,
     JointState,
     NodeStatus,
@@ -35,7 +36,6 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
     SceneState,
-    Seen,
     Task,
 )
 
@@ -106,7 +106,7 @@ class RerunLogger:
             Task: self._on_task,
             NodeStatus: self._status,
             Event: self._event,
-            Seen: self._on_seen,
+            InferenceDebug: self._on_seen,
         }
         self._often = (PoseState, JointState, GripperState, ObjectPoses)
 
@@ -246,7 +246,7 @@ class RerunLogger:
         if not obeyed:
             self._charts.shadow(chunk)
 
-    def _on_seen(self, _: ShownSample, stamp_ns: int, seen: Seen) -> None:
+    def _on_seen(self, _: ShownSample, stamp_ns: int, seen: InferenceDebug) -> None:
         if seen.worker not in self._seen:
             self._seen[seen.worker] = set()
             self._layout()
@@ -265,4 +265,4 @@ class RerunLogger:
         self._words.now(stamp_ns, self.refused, self.dropped)
 
     def _event(self, said: ShownSample, stamp_ns: int, event: Event) -> None:
-        self._words.event(last(said.key), stamp_ns, event)
+        self._words.event(last_chunk(said.key), stamp_ns, event)

@@ -10,7 +10,7 @@ from typing import Any
 import rerun as rr
 
 from vla_zenoh.lab.view import paths
-from vla_zenoh.types import Event, NodeStatus, Seen, Task
+from vla_zenoh.types import Event, InferenceDebug, NodeStatus, Task
 
 LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 BOUND_NS = 1_000_000_000
@@ -120,7 +120,7 @@ class TextPanels:
         said = f"{name}: {text}" if text else name
         self._stream.log(f"{paths.EVENTS}/settings", rr.TextLog(said, level="INFO"))
 
-    def answer(self, seen: Seen) -> None:
+    def answer(self, seen: InferenceDebug) -> None:
         """What a model was asked, and what it answered."""
         first = " ".join(f"{value:+.4f}" for value in seen.steps[0]) if len(seen.steps) else ""
         lines = [

@@ -57,8 +57,8 @@ class CameraPublisher:
         self.counts: Counter[str] = Counter()
         self.pace = RateLimiter(profile.rate_hz)
         self._shown, self._clock, self._tell = shown[:_SOURCE_LIMIT], node.clock, tell
-        self._raw = node.stream(node.keys.camera_raw(name), Kind.FRAME)
-        self._jpeg = node.stream(node.keys.camera_jpeg(name), Kind.FRAME)
+        self._raw = node.declare_publisher(node.keys.camera_raw(name), Kind.FRAME)
+        self._jpeg = node.declare_publisher(node.keys.camera_jpeg(name), Kind.FRAME)
         self.forms = FittedStreams(name, profile, node, tell)
         self._jpeg_pace = RateLimiter(profile.jpeg_rate_hz)
         self._seq = 0
@@ -138,7 +138,7 @@ class CameraPublisher:
     @property
     def wanted(self) -> bool:
         """Somebody listens."""
-        return self._raw.wanted or self._jpeg.wanted or self.forms.wanted
+        return self._raw.has_subscribers or self._jpeg.has_subscribers or self.forms.wanted
 
     def put(self, picture: Pixels, mono_ns: int) -> None:
         """Write what OpenCV gave, captured at `mono_ns`, in the profile's size.
@@ -154,7 +154,7 @@ class CameraPublisher:
 
     def put_rgb(self, rgb: NDArray[np.uint8], mono_ns: int, stamp_wall_ns: int) -> None:
         """Write a finished picture, in each form that somebody listens to."""
-        raw, jpeg = self._raw.wanted, self._jpeg.wanted
+        raw, jpeg = self._raw.has_subscribers, self._jpeg.has_subscribers
         fitted = self.forms.due(mono_ns)
         thinned = self.profile.jpeg_rate_hz is not None
         jpeg = jpeg and self._jpeg_pace.due(mono_ns)
@@ -163,12 +163,12 @@ class CameraPublisher:
         image = Image(rgb)
         if raw:
             schema = zenoh.Encoding.ZENOH_BYTES.with_schema(raw_schema(image))
-            self._raw.put(
+            self._raw.publish(
                 encode_raw(image), stamp_wall_ns=stamp_wall_ns, seq=self._seq, encoding=schema
             )
         if jpeg:
             # Where not all of them go out, those that do have numbers of their own.
-            self._jpeg.put(
+            self._jpeg.publish(
                 encode_jpeg(shrink(image, self.profile.jpeg_width), self.profile.jpeg_quality),
                 stamp_wall_ns=stamp_wall_ns,
                 seq=None if thinned else self._seq,

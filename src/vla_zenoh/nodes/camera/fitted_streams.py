@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from vla_zenoh.bus.node import Node, Stream
+from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Kind
 from vla_zenoh.policy import CameraSpec, ModelSpec
@@ -104,7 +104,7 @@ class FittedStream:
         width: without a `spec`, wider images are scaled down to this.
     """
 
-    stream: Stream
+    stream: Publisher
     quality: int
     limiter: RateLimiter
     spec: CameraSpec | None = None
@@ -168,19 +168,23 @@ class FittedStreams:
     def wanted(self) -> bool:
         """Whether any of the streams has a subscriber."""
         with self._lock:
-            return any(one.stream.wanted for one in self._all())
+            return any(one.stream.has_subscribers for one in self._all())
 
     def due(self, mono_ns: int) -> list[FittedStream]:
         """Streams that have a subscriber and are due for the image of this time."""
         with self._lock:
-            return [one for one in self._all() if one.stream.wanted and one.limiter.due(mono_ns)]
+            return [
+                one
+                for one in self._all()
+                if one.stream.has_subscribers and one.limiter.due(mono_ns)
+            ]
 
     def publish(self, fitted: FittedStream, image: Image, stamp_wall_ns: int) -> None:
         """Publish an image on one of the streams, unless it was removed in the meantime."""
         jpeg, encoding = fitted.encode(image), zenoh.Encoding.IMAGE_JPEG
         with self._lock:
             if any(fitted is one for one in self._all()):
-                fitted.stream.put(jpeg, stamp_wall_ns=stamp_wall_ns, encoding=encoding)
+                fitted.stream.publish(jpeg, stamp_wall_ns=stamp_wall_ns, encoding=encoding)
 
     def _all(self) -> list[FittedStream]:
         return [*self._of_hosts, *(one for some in self._of_sizes.values() for one in some)]
@@ -198,7 +202,7 @@ class FittedStreams:
         missing = [name for name in requested if name not in self._of_sizes]
         with self._lock:
             unrequested = {
-                name: any(one.stream.wanted for one in streams)
+                name: any(one.stream.has_subscribers for one in streams)
                 for name, streams in self._of_sizes.items()
                 if name not in requested
             }
@@ -225,7 +229,7 @@ class FittedStreams:
     def _remove(self, name: str) -> None:
         with self._lock:
             for one in self._of_sizes.pop(name):
-                self._node.end(one.stream)
+                self._node.undeclare(one.stream)
         why = f"images are no longer published as {name}: no live model requests this size"
         self._emit(Event("info", "notice", f"{self._camera}:size_given_back", why))
 
@@ -238,5 +242,7 @@ class FittedStreams:
             )
             self._emit(Event("warning", "notice", f"{self._camera}:too_many_sizes", why[:1000]))
 
-    def _stream(self, variant: str) -> Stream:
-        return self._node.stream(self._node.keys.camera_fitted(self._camera, variant), Kind.FRAME)
+    def _stream(self, variant: str) -> Publisher:
+        return self._node.declare_publisher(
+            self._node.keys.camera_fitted(self._camera, variant), Kind.FRAME
+        )

@@ -12,7 +12,7 @@ import zenoh
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, ZenohRing
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.writer_filter import SingleWriterFilter
-from vla_zenoh.keys import last
+from vla_zenoh.keys import last_chunk
 from vla_zenoh.nodes.camera.camera_publisher import ENDED, OK, CameraPublisher
 from vla_zenoh.nodes.camera.fitted_streams import MAX_MODELS, RequestedSizes
 from vla_zenoh.nodes.camera.grabber import SIM, Grabber, choose_cameras, make_source
@@ -72,7 +72,7 @@ class CameraNode:
         self._sized_s = -1e9
         self._specs: ZenohRing | None = None
         if any(settings.fit_for_workers for settings in chosen.values()):
-            self._specs = self.node.listen(self.node.keys.all_specs, ZenohRing(SPECS_A_TICK))
+            self._specs = self.node.subscribe(self.node.keys.all_specs, ZenohRing(SPECS_A_TICK))
         views = [
             (settings.source.removeprefix(SIM), self._outlets[camera])
             for camera, settings in chosen.items()
@@ -81,7 +81,7 @@ class CameraNode:
         if views:
             from vla_zenoh.nodes.camera.sim_cameras import SimCameras
 
-            slot = self.node.listen(self.node.keys.sim_scene, LatestSample())
+            slot = self.node.subscribe(self.node.keys.sim_scene, LatestSample())
             self._sim = SimCameras(profile, views, slot, self._read_scene, self._refuse)
             self._threads.append(self._thread("sim", self._sim.run))
 
@@ -99,7 +99,7 @@ class CameraNode:
             for thread in self._threads:
                 thread.join(max(0.0, give_up - time.monotonic()))
             with self._voice:
-                self.node.report("stopped", now=True)
+                self.node.publish_status("stopped", now=True)
                 self.node.close()
 
     def _thread(self, name: str, body: Callable[[threading.Event], None]) -> threading.Thread:
@@ -110,28 +110,28 @@ class CameraNode:
     def _tell(self, event: Event) -> None:
         with self._voice:
             if not self._halt.is_set():
-                self.node.tell(event)
+                self.node.emit(event)
 
     def _refuse(self, reason: str, why: str) -> None:
         with self._voice:
-            self.node.refuse(reason, why)
+            self.node.reject(reason, why)
 
     def _read_scene(self, arrival: ReceivedSample) -> Stamped[SceneState] | None:
         with self._voice:
-            return self.node.read(SceneState, arrival, self._scene_speaker)
+            return self.node.decode(SceneState, arrival, self._scene_speaker)
 
     def _hear_models(self) -> None:
         """Serve the sizes that models want, where the profile says so."""
         if self._specs is None:
             return
         now_s = time.monotonic()
-        for arrival in self._specs.take_all():
-            worker = last(str(arrival.sample.key_expr))
+        for arrival in self._specs.drain():
+            worker = last_chunk(str(arrival.sample.key_expr))
             with self._voice:
-                stamped = self.node.read(ModelSpec, arrival)
+                stamped = self.node.decode(ModelSpec, arrival)
                 if stamped is not None and not self._asked.add(worker, stamped.record, now_s):
                     why = f"specs of {MAX_MODELS} workers are known; that of {worker!r} is not read"
-                    self.node.refuse("too_many_models", why)
+                    self.node.reject("too_many_models", why)
         if now_s - self._sized_s < SIZES_PERIOD_S:
             return
         self._sized_s = now_s
@@ -146,15 +146,15 @@ class CameraNode:
         state = "degraded" if any(bad) else _summary(states)
         with self._voice:
             changed = (states, bad) != self._told
-            if not changed and not self.node.report_due(state):
+            if not changed and not self.node.status_due(state):
                 return
-            self.node.follow_clock()
+            self.node.adopt_system_time()
             self._told = (states, bad)
             figures = {name: outlet.figures() for name, outlet in self._outlets.items()}
             for outlet in self._outlets.values():
                 for what, count in outlet.counters().items():
                     self.node.counters[what] = count
-            self.node.report(
+            self.node.publish_status(
                 state,
                 detail={
                     "cameras": {name: outlet.detail() for name, outlet in self._outlets.items()},

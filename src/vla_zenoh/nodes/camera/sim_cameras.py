@@ -158,7 +158,7 @@ class SimCameras:
                     for _, outlet in views:
                         outlet.lose(f"no scene on {key} for {STALL_S:g} s; does the sim node run?")
                 continue
-            arrival = self._slot.take()
+            arrival = self._slot.pop()
             stamped = None if arrival is None else self._read(arrival)
             if arrival is not None and stamped is not None and self._show(renderer, stamped.record):
                 self._heard_ns = arrival.mono_ns

@@ -40,19 +40,23 @@ class CommandInputs:
         self._node = node
         keys = node.keys
         self._neighbours = PeerMonitor(node)
-        self._chunks = node.listen(keys.all_deltas, CallbackRing(CHUNKS))
-        self._pose_slot = node.listen(keys.state_pose, CallbackRing(STATES, SMALL_BYTES))
-        self._gripper_slot = node.listen(keys.state_gripper, CallbackRing(STATES, SMALL_BYTES))
-        self._joint_slot = node.listen(keys.state_joint, CallbackRing(STATES, SMALL_BYTES))
+        self._chunks = node.subscribe(keys.all_deltas, CallbackRing(CHUNKS))
+        self._pose_slot = node.subscribe(keys.state_pose, CallbackRing(STATES, SMALL_BYTES))
+        self._gripper_slot = node.subscribe(keys.state_gripper, CallbackRing(STATES, SMALL_BYTES))
+        self._joint_slot = node.subscribe(keys.state_joint, CallbackRing(STATES, SMALL_BYTES))
         self._settings: list[tuple[str, ZenohRing, Callable[[bytes], Any]]] = [
-            ("stop", node.listen(keys.stop, ZenohRing(8, ANYTHING)), lambda _: None),
-            ("reset", node.listen(keys.reset, ZenohRing(8, ANYTHING)), lambda _: None),
-            ("prompt", node.listen(keys.prompt, ZenohRing(16, WORDS)), settings.decode_text),
-            ("worker", node.listen(keys.worker, ZenohRing(16, WORDS)), settings.decode_name),
-            ("rate", node.listen(keys.rate, ZenohRing(16, WORDS)), settings.decode_rate),
-            ("speed", node.listen(keys.speed, ZenohRing(16, WORDS)), settings.decode_percent),
-            ("slower", node.listen(keys.slower, ZenohRing(16, WORDS)), settings.decode_percent),
-            ("active", node.listen(keys.active, ZenohRing(16, WORDS)), settings.decode_activation),
+            ("stop", node.subscribe(keys.stop, ZenohRing(8, ANYTHING)), lambda _: None),
+            ("reset", node.subscribe(keys.reset, ZenohRing(8, ANYTHING)), lambda _: None),
+            ("prompt", node.subscribe(keys.prompt, ZenohRing(16, WORDS)), settings.decode_text),
+            ("worker", node.subscribe(keys.worker, ZenohRing(16, WORDS)), settings.decode_name),
+            ("rate", node.subscribe(keys.rate, ZenohRing(16, WORDS)), settings.decode_rate),
+            ("speed", node.subscribe(keys.speed, ZenohRing(16, WORDS)), settings.decode_percent),
+            ("slower", node.subscribe(keys.slower, ZenohRing(16, WORDS)), settings.decode_percent),
+            (
+                "active",
+                node.subscribe(keys.active, ZenohRing(16, WORDS)),
+                settings.decode_activation,
+            ),
         ]
         self._speakers = {
             kind: SingleWriterFilter(node.profile.timing.state_timeout_s)
@@ -73,7 +77,7 @@ class CommandInputs:
         """
         put = self._settings_put()
         peers = self._neighbours.look(now_ns)
-        chunks = [self._chunk(arrival) for arrival in self._chunks.take_all()]
+        chunks = [self._chunk(arrival) for arrival in self._chunks.drain()]
         clock = self._check_clock()
         return Inputs(
             settings=[*put, *clock],
@@ -93,7 +97,7 @@ class CommandInputs:
         arrivals = [
             (name, decode, arrival)
             for name, inbox, decode in self._settings
-            for arrival in inbox.take_all()
+            for arrival in inbox.drain()
         ]
         stamps = [
             stamp.get_time() for *_, arrival in arrivals if (stamp := arrival.sample.timestamp)
@@ -106,36 +110,36 @@ class CommandInputs:
             if name in ("stop", "reset"):
                 put.append(Setting(name))
                 continue
-            value = self._node.read_text(decode, arrival)
+            value = self._node.decode_text(decode, arrival)
             if value is not None:
                 put.append(Setting(name, value))
         return put
 
     def _chunk(self, arrival: ReceivedSample) -> Stamped[ActionChunk] | None:
         """A chunk by the worker whose key it came on, None for any other."""
-        worker = key_names.last(str(arrival.sample.key_expr))
+        worker = key_names.last_chunk(str(arrival.sample.key_expr))
         owner = self._neighbours.owner(worker)
         try:
             source = self._node.header(arrival).source
         except CodecError as error:
-            self._node.refuse(error.reason, f"delta/{worker}: {error}")
+            self._node.reject(error.reason, f"delta/{worker}: {error}")
             return None
         if owner is not None and source != owner:  # before its payload is looked at: it may be many
-            self._node.refuse(
+            self._node.reject(
                 "foreign", f"delta/{worker} by {source[:60]!r}, the worker is {owner[:60]!r}"
             )
             return None
-        chunk = self._node.read(ActionChunk, arrival)
+        chunk = self._node.decode(ActionChunk, arrival)
         if chunk is not None and chunk.record.worker != worker:
-            self._node.refuse("foreign", "a chunk on another worker's delta key")
+            self._node.reject("foreign", "a chunk on another worker's delta key")
             return None
         return chunk
 
     def _state(self, kind: type[Any], slot: CallbackRing) -> Stamped[Any] | None:
         """The newest state by the writer that speaks for the robot, whoever else writes."""
         newest: Stamped[Any] | None = None
-        for arrival in slot.take_all():
-            newest = self._node.read(kind, arrival, self._speakers[kind]) or newest
+        for arrival in slot.drain():
+            newest = self._node.decode(kind, arrival, self._speakers[kind]) or newest
         return newest
 
     def _joints(self, put: list[Setting]) -> Stamped[JointState] | None:
@@ -143,8 +147,8 @@ class CommandInputs:
         given = any(setting.name in ("active", "worker") for setting in put)
         if not given and time.monotonic() - self._last_joint < JOINT_PERIOD_S:
             return None
-        for arrival in reversed(self._joint_slot.take_all()):
-            found = self._node.read(JointState, arrival, self._speakers[JointState])
+        for arrival in reversed(self._joint_slot.drain()):
+            found = self._node.decode(JointState, arrival, self._speakers[JointState])
             if found is not None:
                 self._last_joint = time.monotonic()
                 return found
@@ -154,8 +158,8 @@ class CommandInputs:
         if time.monotonic() - self._last_clock < CLOCK_PERIOD_S:
             return []
         self._last_clock = time.monotonic()
-        step_s = self._node.clock.follow()
+        step_s = self._node.clock.adopt_system_time()
         if abs(step_s) <= self._node.profile.timing.max_clock_step_s:
             return []
-        self._node.refuse("clock_step", f"the wall clock was set by {step_s:+.3f} s")
+        self._node.reject("clock_step", f"the wall clock was set by {step_s:+.3f} s")
         return [Setting("lose", f"the wall clock was set by {step_s:+.3f} s")]

@@ -60,10 +60,10 @@ class CommandNode:
         keys = node.keys
         self._inputs = CommandInputs(node)
         self._status = CommandStatus(node, self.commander)
-        self._pose_out = node.stream(keys.command_pose, Kind.CONTROL)
-        self._joint_out = node.stream(keys.command_joint, Kind.CONTROL)
-        self._gripper_out = node.stream(keys.command_gripper, Kind.ORDER)
-        self._task_out = node.stream(keys.task, Kind.CONTROL)
+        self._pose_out = node.declare_publisher(keys.command_pose, Kind.CONTROL)
+        self._joint_out = node.declare_publisher(keys.command_joint, Kind.CONTROL)
+        self._gripper_out = node.declare_publisher(keys.command_gripper, Kind.ORDER)
+        self._task_out = node.declare_publisher(keys.task, Kind.CONTROL)
         self._last_task = 0.0
         self._answer_settings()
 
@@ -77,8 +77,8 @@ class CommandNode:
             (keys.speed, lambda: f"{task.task.speed_percent:g}"),
             (keys.active, lambda: "true" if task.task.active else "false"),
         ):
-            self.node.answer(key, self._text_reply(key, value))
-        self.node.answer(keys.task, lambda query: query.reply(keys.task, records.encode(task.task)))
+            self.node.serve(key, self._text_reply(key, value))
+        self.node.serve(keys.task, lambda query: query.reply(keys.task, records.encode(task.task)))
 
     @staticmethod
     def _text_reply(key: str, value: Callable[[], str]) -> Callable[[zenoh.Query], None]:
@@ -94,7 +94,7 @@ class CommandNode:
             self._loop(stop)
         if self._latch is not None:
             self._latch.close()
-        self.node.report("stopped", now=True)
+        self.node.publish_status("stopped", now=True)
         self.node.close()
 
     def _loop(self, stop: threading.Event) -> None:
@@ -136,13 +136,13 @@ class CommandNode:
         if self._latch is None:
             return
         latched = self.commander.state in (State.STOPPED, State.FAULT)
-        self._latch.keep(self.commander.why if latched else None)
+        self._latch.set(self.commander.why if latched else None)
 
     def _tell_of_the_latch(self) -> None:
         why = None if self._latch is None else self._latch.failure()
         if why is not None:
             self.node.counters["command.latch_failed"] += 1
-            self.node.tell(Event("error", "fault", "latch", why))
+            self.node.emit(Event("error", "fault", "latch", why))
 
     @property
     def _hz(self) -> float:
@@ -150,19 +150,19 @@ class CommandNode:
 
     def _publish(self, out: Outputs, now_ns: int) -> None:
         if out.pose is not None:
-            self._pose_out.put(out.pose, stamp_wall_ns=now_ns)
+            self._pose_out.publish(out.pose, stamp_wall_ns=now_ns)
         if out.joint is not None:
-            self._joint_out.put(out.joint, stamp_wall_ns=now_ns)
+            self._joint_out.publish(out.joint, stamp_wall_ns=now_ns)
         if out.gripper is not None:
-            self._gripper_out.put(out.gripper)
+            self._gripper_out.publish(out.gripper)
         for refusal in out.rejections:
             kind = "skipped" if refusal.quiet else "refused"
             self.node.counters[f"{kind}.{refusal.reason}"] += 1
         for event in out.events:
-            self.node.tell(event)
+            self.node.emit(event)
         if out.accepted is not None:
             self._status.measure(out.accepted)
         due = time.monotonic() - self._last_task >= TASK_PERIOD_S
         if out.task_changed or due:
             self._last_task = time.monotonic()
-            self._task_out.put(self.commander.task)
+            self._task_out.publish(self.commander.task)

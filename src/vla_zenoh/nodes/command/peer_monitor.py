@@ -42,8 +42,8 @@ class PeerMonitor:
         self._camera_faults: dict[str, str] = {}
         self._places: dict[str, HostId] = {}
         self._next_clocks_s = 0.0
-        self._statuses = node.listen(node.keys.all_status, ZenohRing(STATUSES_A_TICK))
-        self._new_specs = node.listen(node.keys.all_specs, ZenohRing(SPECS_A_TICK))
+        self._statuses = node.subscribe(node.keys.all_status, ZenohRing(STATUSES_A_TICK))
+        self._new_specs = node.subscribe(node.keys.all_specs, ZenohRing(SPECS_A_TICK))
         node.on_alive(self._on_alive)
         node.on_tokens(node.keys.all_holding, self._on_holding)
         self._robot_node = node.profile.robot.driver
@@ -73,9 +73,9 @@ class PeerMonitor:
 
     def look(self, now_ns: int) -> PeerSnapshot | None:
         """The surroundings now, or None when nothing changed."""
-        for arrival in self._statuses.take_all():
+        for arrival in self._statuses.drain():
             self._hear_status(arrival, now_ns)
-        for arrival in self._new_specs.take_all():
+        for arrival in self._new_specs.drain():
             self._hear_spec(arrival)
         self._follow_clocks()
         with self._lock:
@@ -97,9 +97,9 @@ class PeerMonitor:
                 frozenset(
                     name
                     for name, place in self._places.items()
-                    if place.shares_clock(self._node.place)
+                    if place.shares_clock(self._node.host_id)
                 ),
-                self._node.clocks.known(),
+                self._node.clocks.offsets(),
                 frozenset(self._holders),
                 dict(self._camera_faults),
             )
@@ -111,7 +111,7 @@ class PeerMonitor:
         self._next_clocks_s = time.monotonic() + CLOCKS_PERIOD_S
         with self._lock:
             for name in self._alive:
-                self._node.clocks.follow(name)
+                self._node.clocks.track(name)
             self._changed = True
 
     def owner(self, worker: str) -> str | None:
@@ -128,7 +128,7 @@ class PeerMonitor:
             return
         with self._lock:
             ours = name in self._alive and self._voices.get(name, source) == source
-        stamped = self._node.read(NodeStatus, arrival) if ours else None
+        stamped = self._node.decode(NodeStatus, arrival) if ours else None
         if ours and stamped is None:
             return  # refused for what it is
         status = stamped.record if stamped is not None and stamped.record.node == name else None
@@ -157,7 +157,7 @@ class PeerMonitor:
             if ours and known is None and len(self._specs) >= MAX_WORKERS:
                 self._node.counters["refused.more_workers"] += 1
                 return
-        stamped = self._node.read(ModelSpec, arrival) if ours else None
+        stamped = self._node.decode(ModelSpec, arrival) if ours else None
         if ours and stamped is None:
             return
         with self._lock:
@@ -173,11 +173,11 @@ class PeerMonitor:
         """Whom it is about, by its key, and its source where it has one."""
         key = str(arrival.sample.key_expr)
         try:
-            return key_names.last(key), self._node.header(arrival).source
+            return key_names.last_chunk(key), self._node.header(arrival).source
         except CodecError as error:
             short = self._node.keys.short(key)
-            self._node.refuse(error.reason, f"{short}: {error}", short)
-            return key_names.last(key), None
+            self._node.reject(error.reason, f"{short}: {error}", short)
+            return key_names.last_chunk(key), None
 
     def _take_status(self, status: NodeStatus) -> None:
         self._places[status.node] = HostId(status.host, status.boot)
@@ -198,7 +198,7 @@ class PeerMonitor:
         """How a camera is, as the node says that serves it by the profile."""
         server = self._servers[camera]
         if node != server:
-            self._node.refuse(
+            self._node.reject(
                 "foreign_camera",
                 f"node {node!r} speaks for camera {camera!r}, which node {server!r} serves by the "
                 "profile (hosts.HOST.cameras; --name of `vla-zenoh camera`)",

@@ -58,7 +58,7 @@ class CommandStatus:
         now = any(event.kind == "transition" for event in out.events) or out.task_changed
         now = now or mind.at_rest != self._was_at_rest
         self._was_at_rest = mind.at_rest
-        if not now and not self._node.report_due(mind.state.value):
+        if not now and not self._node.status_due(mind.state.value):
             return
         task = mind.task
         wall_ns = self._node.clock.wall_ns()
@@ -71,7 +71,7 @@ class CommandStatus:
         self._node.counters["command.smoothing_failures"] = mind.smoothing_failures
         self._node.counters["command.gripper_timeouts"] = mind.gripper.timeouts
         self._node.counters["command.chunks_dropped"] = chunks_dropped
-        self._node.report(
+        self._node.publish_status(
             mind.state.value,
             detail={
                 "why": mind.why[:MAX_WHY],

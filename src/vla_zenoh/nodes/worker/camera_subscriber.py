@@ -9,7 +9,7 @@ from typing import NamedTuple
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.writer_filter import SingleWriterFilter
-from vla_zenoh.codec.image import MAX_PICTURE_BYTES
+from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.keys import Kind
 from vla_zenoh.policy import CameraSpec
 from vla_zenoh.policy.observation import host_variant, size_variant
@@ -69,11 +69,11 @@ class CameraSubscriber:
     @property
     def full(self) -> bool:
         """Whether a picture is there that was not taken."""
-        return self._asked.slot.full or (self._plain is not None and self._plain.slot.full)
+        return self._asked.slot.has_new or (self._plain is not None and self._plain.slot.has_new)
 
     def take(self) -> ReceivedImage | None:
         """The newest picture, once."""
-        arrival = self._asked.slot.take()
+        arrival = self._asked.slot.pop()
         if arrival is not None:
             self._heard_s = time.monotonic()
             self._ask_no_more()
@@ -81,7 +81,7 @@ class CameraSubscriber:
         if self._plain is None:
             self._fall_back()
             return None
-        arrival = self._plain.slot.take()
+        arrival = self._plain.slot.pop()
         return None if arrival is None else ReceivedImage(arrival, self._plain.speaker)
 
     def _fall_back(self) -> None:
@@ -90,18 +90,18 @@ class CameraSubscriber:
         self._plain = self._listen(self._plain_key)
         asked, plain = (self._node.keys.short(one.key) for one in (self._asked, self._plain))
         why = f"no picture on {asked} for {self._patience_s:g} s; {plain} is listened to as well"
-        self._node.tell(Event("warning", "notice", f"{self._camera}:plain_pictures", why))
+        self._node.emit(Event("warning", "notice", f"{self._camera}:plain_pictures", why))
 
     def _ask_no_more(self) -> None:
         if self._plain is None:
             return
-        self._node.unlisten(self._plain.slot)
+        self._node.unsubscribe(self._plain.slot)
         self._plain = None
         why = f"there are pictures on {self._node.keys.short(self._asked.key)} again"
-        self._node.tell(Event("info", "notice", f"{self._camera}:own_pictures", why))
+        self._node.emit(Event("info", "notice", f"{self._camera}:own_pictures", why))
 
     def _listen(self, key: str) -> _Ear:
-        slot = self._node.listen(key, LatestSample(MAX_PICTURE_BYTES, self._changed), Kind.FRAME)
+        slot = self._node.subscribe(key, LatestSample(MAX_IMAGE_BYTES, self._changed), Kind.FRAME)
         return _Ear(key, slot, SingleWriterFilter(STREAM_PATIENCE_S))
 
 

@@ -12,14 +12,14 @@ import zenoh
 from numpy.typing import NDArray
 
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.payload_limits import bytes_of, check, header_of
+from vla_zenoh.bus.payload_limits import bytes_of, check_size, header_of
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES, encode_jpeg
 from vla_zenoh.errors import CodecError, ProfileError, RecordError
-from vla_zenoh.keys import Keys, Kind, chunk
+from vla_zenoh.keys import Keys, Kind, key_chunk
 from vla_zenoh.policy import MAX_CAMERAS, ActionSteps, ModelSpec, Observation
-from vla_zenoh.types import Header, Image, Seen
-from vla_zenoh.types.seen import plain_raw
+from vla_zenoh.types import Header, Image, InferenceDebug
+from vla_zenoh.types.seen import plain_values
 
 JPEG_QUALITY = 95
 MAX_WAITING, MAX_SAMPLES = 64, 256
@@ -43,9 +43,9 @@ class InferenceDebugPublisher:
         self._node, self._worker, self._spec = node, worker, spec
         keys = node.keys
         # All with one priority: who has the record has its pictures before.
-        self._record = node.stream(keys.seen_record(worker), Kind.FRAME)
+        self._record = node.declare_publisher(keys.seen_record(worker), Kind.FRAME)
         self._pictures = {
-            camera.camera: node.stream(keys.seen(worker, camera.camera), Kind.FRAME)
+            camera.camera: node.declare_publisher(keys.seen(worker, camera.camera), Kind.FRAME)
             for camera in spec.observation.cameras
         }
 
@@ -70,16 +70,16 @@ class InferenceDebugPublisher:
         try:
             for camera in self._spec.observation.cameras:
                 stream = self._pictures[camera.camera]
-                if stream.wanted:
+                if stream.has_subscribers:
                     rgb = self._rgb(camera.camera, camera.colour, observation, answer)
-                    stream.put(
+                    stream.publish(
                         encode_jpeg(Image(rgb), JPEG_QUALITY),
                         stamp_wall_ns=stamp_ns,
                         seq=seq,
                         encoding=zenoh.Encoding.IMAGE_JPEG,
                     )
-            if self._record.wanted:
-                seen = Seen(
+            if self._record.has_subscribers:
+                seen = InferenceDebug(
                     self._worker,
                     seq,
                     self._spec.hash,
@@ -88,12 +88,12 @@ class InferenceDebugPublisher:
                     observation.prompt,
                     steps,
                     inference_ms,
-                    plain_raw(answer.raw),
+                    plain_values(answer.raw),
                     bool(answer.done),
                 )
-                self._record.put(seen, stamp_wall_ns=stamp_ns, seq=seq)
+                self._record.publish(seen, stamp_wall_ns=stamp_ns, seq=seq)
         except (RecordError, CodecError) as error:
-            self._node.refuse("seen", f"what the model saw cannot be shown: {error}")
+            self._node.reject("seen", f"what the model saw cannot be shown: {error}")
 
     @staticmethod
     def _rgb(
@@ -111,11 +111,11 @@ class InferenceView:
     """One inference with its pictures.
 
     Args:
-        record: see `Seen`.
+        record: see `InferenceDebug`.
         jpegs: camera -> JPEG file of what the model was given.
     """
 
-    record: Seen
+    record: InferenceDebug
     jpegs: Mapping[str, bytes]
 
 
@@ -181,7 +181,7 @@ class InferenceDebugSubscriber:
     def _hear(self, sample: zenoh.Sample) -> None:
         with self._lock:
             try:
-                check(sample, MAX_JPEG_BYTES)
+                check_size(sample, MAX_JPEG_BYTES)
             except CodecError as error:
                 self.left_out[error.reason] += 1
                 return
@@ -211,13 +211,13 @@ class InferenceDebugSubscriber:
         _, worker, *camera = self._keys.short(str(sample.key_expr)).split("/")
         try:  # folders and files are named by them
             for name in (worker, *camera):
-                chunk(name, "name")
+                key_chunk(name, "name")
         except ProfileError as error:
             raise CodecError("malformed", str(error)) from error
         if camera:
             self._pictures.add(worker, header.seq, camera[0], payload)
             return None
-        record = records.decode(Seen, payload)
+        record = records.decode(InferenceDebug, payload)
         if record.worker != worker:
             raise CodecError("foreign", f"{worker} shows what {record.worker[:60]!r} saw")
         return InferenceView(record, self._pictures.take(worker, header.seq))

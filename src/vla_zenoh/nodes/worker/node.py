@@ -114,7 +114,7 @@ class WorkerNode:
         took_s = time.monotonic() - began
         for seat in self.sessions:
             if callable(getattr(self.policy, "load", None)):
-                seat.node.tell(Event("info", "notice", "loaded", f"in {took_s:.1f} s"))
+                seat.node.emit(Event("info", "notice", "loaded", f"in {took_s:.1f} s"))
             seat.complaint, seat.due_s = "", time.monotonic()
         while not stop.is_set():
             self._turn(stop)
@@ -182,7 +182,7 @@ class WorkerNode:
         if self._delay_s:
             time.sleep(self._delay_s)
         for (seat, observation, observed_ns), answer in zip(ready, answers, strict=True):
-            seat.due_s = max(seat.due_s + 1.0 / observation.task.asked_hz, began_s)
+            seat.due_s = max(seat.due_s + 1.0 / observation.task.requested_hz, began_s)
             if isinstance(answer, Exception):
                 seat.failed(answer)
                 continue

@@ -20,7 +20,7 @@ from vla_zenoh.bus.payload_limits import bytes_of
 from vla_zenoh.bus.writer_filter import SingleWriterFilter
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
-from vla_zenoh.codec.image import MAX_PICTURE_BYTES
+from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError
 from vla_zenoh.keys import Kind, worker_node
@@ -86,21 +86,21 @@ class RobotSession:
         self.policy, self.name, self.spec = policy, name, policy.spec
         self.continuation = ChunkPrefix(policy)
         keys = node.keys
-        self._chunk_out = node.stream(keys.delta(name), Kind.ORDER)
-        self._spec_out = node.stream(keys.spec(name), Kind.NEWS)
+        self._chunk_out = node.declare_publisher(keys.delta(name), Kind.ORDER)
+        self._spec_out = node.declare_publisher(keys.spec(name), Kind.TELEMETRY)
         self._seen = InferenceDebugPublisher(node, name, self.spec)
-        node.answer(
+        node.serve(
             keys.spec(name),
             lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
         )
-        self._task_slot = node.listen(keys.task, LatestSample(SMALL_BYTES))
+        self._task_slot = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
         self._jpeg = images == "jpeg"
         self._cameras = {
             one.camera: subscribe_to_camera(one, node, jpeg=self._jpeg, host=host, changed=changed)
             for one in self.spec.observation.cameras
         }
         self._state_slots = {
-            part: node.listen(self._state_key(part), CallbackRing(256, SMALL_BYTES))
+            part: node.subscribe(self._state_key(part), CallbackRing(256, SMALL_BYTES))
             for part in self.spec.observation.state
         }
         self._task_speaker = SingleWriterFilter(TASK_PATIENCE_S)
@@ -140,9 +140,9 @@ class RobotSession:
 
     def listen(self) -> None:
         """Take in what came."""
-        arrival = self._task_slot.take()
+        arrival = self._task_slot.pop()
         if arrival is not None:
-            task = self.node.read(Task, arrival, self._task_speaker)
+            task = self.node.decode(Task, arrival, self._task_speaker)
             if task is not None:
                 self._take_task(task)
         for name, camera in self._cameras.items():
@@ -156,14 +156,14 @@ class RobotSession:
     def listen_to_states(self) -> None:
         """Take in states; while nothing else is to do it costs no time afterwards."""
         for part, inbox in self._state_slots.items():
-            for arrival in inbox.take_all():
-                state = self.node.read(STATE_KINDS[part], arrival, self._speakers[part])
+            for arrival in inbox.drain():
+                state = self.node.decode(STATE_KINDS[part], arrival, self._speakers[part])
                 if state is not None:
                     self._states[part].add(state)
 
     def _take_task(self, task: Stamped[Task]) -> None:
         before, self.task, self._task_heard_s = self.task, task.record, time.monotonic()
-        if before is not None and before.asked_hz != self.task.asked_hz:
+        if before is not None and before.requested_hz != self.task.requested_hz:
             self.due_s = min(self.due_s, self._task_heard_s)
         if task.record.episode == self._episode:
             return
@@ -183,19 +183,19 @@ class RobotSession:
         try:
             header = self.node.header(arrival)
             speaker.check(header, arrival.mono_ns)
-            payload = bytes_of(sample.payload, MAX_PICTURE_BYTES)
+            payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
             if self._jpeg:
                 image = image_codec.decode_jpeg(payload)
             else:
                 _, _, schema = str(sample.encoding).partition(";")
                 image = image_codec.decode_raw(payload, schema)
         except CodecError as error:
-            self.node.refuse(error.reason, f"camera {camera}: {error}")
+            self.node.reject(error.reason, f"camera {camera}: {error}")
             return None
         speaker.heard(header, arrival.mono_ns)
-        self.node.traffic.heard(str(sample.key_expr), header, arrival.nth)
-        header, image = self.node.clocks.here(header, image)
-        return Stamped(header, image, self.node.wall_of(arrival))
+        self.node.traffic.received(str(sample.key_expr), header, arrival.nth)
+        header, image = self.node.clocks.to_local_clock(header, image)
+        return Stamped(header, image, self.node.arrival_wall_ns(arrival))
 
     def observe(self) -> Observation | None:
         """An observation, None when there is none yet.
@@ -204,8 +204,8 @@ class RobotSession:
         is already half a camera period old on average, and all that time would be latency.
         """
         self.listen()
-        self.node.clock.follow()
-        if self.task is not None and self.task.asked_hz <= 0.0:
+        self.node.clock.adopt_system_time()
+        if self.task is not None and self.task.requested_hz <= 0.0:
             return None
         if self.task is None or time.monotonic() - self._task_heard_s > TASK_PATIENCE_S:
             self.complaint = "no command node is heard"
@@ -262,7 +262,7 @@ class RobotSession:
         self._inference_ms.add((end_ns - start_ns) / 1e6)
         horizon_ns = int(len(steps) * self.spec.action.dt_s * 1e9)
         patience_ns = int(self.node.profile.timing.max_observation_age_s * 1e9)
-        header = self._chunk_out.put(
+        header = self._chunk_out.publish(
             ActionChunk(
                 worker=self.name,
                 spec_hash=self.spec.hash,
@@ -294,7 +294,7 @@ class RobotSession:
         expected = isinstance(error, (SpecError, PeerError))
         why = str(error) if expected else f"{type(error).__name__}: {error}"
         self.complaint = f"{reason}: {why}"
-        self.node.refuse(reason, why)
+        self.node.reject(reason, why)
         self.due_s = time.monotonic() + AFTER_A_FAILURE_S
         return False
 
@@ -302,9 +302,9 @@ class RobotSession:
         """Tell spec and status when it is time, or `now`."""
         if now or time.monotonic() - self._last_spec_s > SPEC_PERIOD_S:
             self._last_spec_s = time.monotonic()
-            self._spec_out.put(self.spec)
+            self._spec_out.publish(self.spec)
         state = "waiting" if self.complaint else "inferring"
-        if not now and not self.node.report_due(state):
+        if not now and not self.node.status_due(state):
             return
         task = self.task
         inference = self._inference_ms.summary()
@@ -316,7 +316,7 @@ class RobotSession:
             "obeyed": bool(task and task.active and task.worker == self.name),
             "batch": self._batch,
         }
-        self.node.report(
+        self.node.publish_status(
             state,
             detail=detail,
             rates_hz={"chunks": self._rate.rate_hz},
@@ -326,5 +326,5 @@ class RobotSession:
 
     def close(self) -> None:
         """Say goodbye to the robot."""
-        self.node.report("stopped", now=True)
+        self.node.publish_status("stopped", now=True)
         self.node.close()

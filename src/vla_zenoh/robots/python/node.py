@@ -67,7 +67,7 @@ class ArmNode:
         self._heard, self._states = ArmHearing(node, self._file, kinematics), ArmStates(node)
         self._lead = CommandFollower(node, kinematics, self._move)
         self._last_brake = ShutdownBrake(node, self._lead)
-        self._orders = node.listen(node.keys.command_gripper, CallbackRing(16, SMALL_BYTES))
+        self._orders = node.subscribe(node.keys.command_gripper, CallbackRing(16, SMALL_BYTES))
         self._gripper_guard = GripperGuard(robot.gripper)
         self._width_m = robot.gripper.max_width_m
         self._was = ""
@@ -85,8 +85,8 @@ class ArmNode:
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         try:
             # A node that says nothing for long is taken for one that hangs.
-            self.node.report("connecting", now=True)
-            self._file.connect(lambda: self.node.report("connecting"))
+            self.node.publish_status("connecting", now=True)
+            self._file.connect(lambda: self.node.publish_status("connecting"))
             gc.collect()
             gc.freeze()
             with realtime_thread() as self._realtime:
@@ -98,9 +98,9 @@ class ArmNode:
         try:
             self._file.close()
         except NodeError as error:  # what went wrong before it is what matters
-            self.node.refuse("robot_failed", str(error))
+            self.node.reject("robot_failed", str(error))
         finally:
-            self.node.report("stopped", now=True)
+            self.node.publish_status("stopped", now=True)
             self.node.close()
 
     def _loop(self, pace: FixedRate, stop: threading.Event) -> None:
@@ -110,9 +110,9 @@ class ArmNode:
         except Exception as error:
             self._last_brake.wind_down(pace, self._brake_on)
             if isinstance(error, NodeError):
-                self.node.refuse("robot_failed", str(error))
+                self.node.reject("robot_failed", str(error))
             else:
-                self.node.tell(Event("error", "fault", "broken", one_line(repr(error), MAX_WORDS)))
+                self.node.emit(Event("error", "fault", "broken", one_line(repr(error), MAX_WORDS)))
             raise
 
     def _drive(self, pace: FixedRate, stop: threading.Event) -> None:
@@ -159,20 +159,20 @@ class ArmNode:
     def _take_widths(self, now_ns: int) -> None:
         if self._lead.deaf:
             return
-        for arrival in self._orders.take_all():
-            order = self.node.read(GripperCommand, arrival)
+        for arrival in self._orders.drain():
+            order = self.node.decode(GripperCommand, arrival)
             if order is None:
                 continue
             if not self._file.grips:
                 why = f"command/gripper: {self._file.name} has no method grip"
-                self.node.refuse("no_gripper", why)
+                self.node.reject("no_gripper", why)
                 continue
             try:
-                command = self._gripper_guard.take(
-                    order, self._lead.writer, now_ns, leads=self._lead.leads
+                command = self._gripper_guard.accept(
+                    order, self._lead.writer, now_ns, writer_active=self._lead.leads
                 )
             except CodecError as error:
-                self.node.refuse(error.reason, f"command/gripper {error}")
+                self.node.reject(error.reason, f"command/gripper {error}")
                 continue
             self.node.counters["gripper_bounded"] = self._gripper_guard.bounded
             self._width_m = command.width_m
@@ -209,20 +209,20 @@ class ArmNode:
     def _watch(self) -> None:
         if time.monotonic() - self._clock_s >= CLOCK_PERIOD_S:
             self._clock_s = time.monotonic()
-            self.node.follow_clock()
+            self.node.adopt_system_time()
         state = self.state
         if state != self._was:
             level = "info" if state == "running" else "warning"
             if self._was:
                 change = f"{self._was}->{state}"
-                self.node.tell(Event(level, "transition", change, self._why(state)))
+                self.node.emit(Event(level, "transition", change, self._why(state)))
             self._was = state
-        if not self.node.report_due(state):
+        if not self.node.status_due(state):
             return
         newest = self._heard.newest
         self.node.counters["arm.stream_silences"] = self._lead.silences
         self.node.counters["arm.stalls"] = self._lead.stalls
-        self.node.report(
+        self.node.publish_status(
             state,
             detail={
                 "file": self._file.name,

@@ -23,9 +23,9 @@ class ArmStates:
 
     def __init__(self, node: Node) -> None:
         self._clock = node.clock
-        self._joint_out = node.stream(node.keys.state_joint, Kind.STATE)
-        self._pose_out = node.stream(node.keys.state_pose, Kind.STATE)
-        self._gripper_out = node.stream(node.keys.state_gripper, Kind.STATE)
+        self._joint_out = node.declare_publisher(node.keys.state_joint, Kind.STATE)
+        self._pose_out = node.declare_publisher(node.keys.state_pose, Kind.STATE)
+        self._gripper_out = node.declare_publisher(node.keys.state_gripper, Kind.STATE)
         # A little less than the period: who asks comes at multiples of another one.
         self._period_ns = 0.9e9 / node.profile.timing.state_hz
         self._seq = self._put_ns = 0
@@ -60,8 +60,8 @@ class ArmStates:
             )
         if angles_rad is not None:
             joints = replace(joints, reference_rad=angles_rad)
-        self._joint_out.put(joints, stamp_wall_ns=taken.stamp_ns, seq=self._seq)
-        self._pose_out.put(pose, stamp_wall_ns=taken.stamp_ns, seq=self._seq)
+        self._joint_out.publish(joints, stamp_wall_ns=taken.stamp_ns, seq=self._seq)
+        self._pose_out.publish(pose, stamp_wall_ns=taken.stamp_ns, seq=self._seq)
         self._tell_gripper(taken.gripper, taken.stamp_ns, mode, fault, mono_ns)
 
     def tell_fault(self, gripper: GripperState, mode: str, fault: str, mono_ns: int) -> None:
@@ -77,6 +77,6 @@ class ArmStates:
         self, gripper: GripperState, stamp_ns: int, mode: str, fault: str, mono_ns: int
     ) -> None:
         record = replace(gripper, mode=mode, faults=(fault,) if fault else ())
-        self._gripper_out.put(record, stamp_wall_ns=stamp_ns, seq=self._seq)
+        self._gripper_out.publish(record, stamp_wall_ns=stamp_ns, seq=self._seq)
         self._seq += 1
         self._put_ns, self._fault = mono_ns, fault

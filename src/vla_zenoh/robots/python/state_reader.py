@@ -64,7 +64,7 @@ class ArmHearing:
             return None
         # A robot in a fault often says nothing else that is new, or that holds.
         if self._fault.say(reading.fault, mono_ns) and self.fault:
-            self._node.tell(Event("error", "fault", "robot_fault", self.fault))
+            self._node.emit(Event("error", "fault", "robot_fault", self.fault))
         try:
             measured_ns = _measured_ns(reading)
             if measured_ns == self._measured_ns:
@@ -72,7 +72,7 @@ class ArmHearing:
             taken = self._reading.take(reading, self._node.clock.wall_at(measured_ns), asked_m)
         except (TypeError, ValueError) as error:
             reason = getattr(error, "reason", "invalid")
-            self._node.refuse(reason, f"{self._file.name}: read: {one_line(error, MAX_WORDS)}")
+            self._node.reject(reason, f"{self._file.name}: read: {one_line(error, MAX_WORDS)}")
             return None
         self.newest, self._measured_ns = taken, measured_ns
         self.rate.tick()

@@ -65,9 +65,9 @@ class Arm:
         self._clock_told = False
         self._fingers_lost = False
         keys = node.keys
-        self._joint_out = node.stream(keys.state_joint, Kind.STATE)
-        self._pose_out = node.stream(keys.state_pose, Kind.STATE)
-        self._gripper_out = node.stream(keys.state_gripper, Kind.STATE)
+        self._joint_out = node.declare_publisher(keys.state_joint, Kind.STATE)
+        self._pose_out = node.declare_publisher(keys.state_pose, Kind.STATE)
+        self._gripper_out = node.declare_publisher(keys.state_gripper, Kind.STATE)
         output = self._output()
         self._frame = output.frame or profile.robot.base_frame
         self._kind, self._write = output.type, self._writing(output)
@@ -146,12 +146,12 @@ class Arm:
                 joints = replace(joints, reference_rad=held_rad)
         except RecordError as error:  # finite, and no arm's: what comes of it is not
             topic = self._ros2.joint_states
-            self._node.refuse("invalid", f"{topic}: {error}", topic)
+            self._node.reject("invalid", f"{topic}: {error}", topic)
             return
         self.lead.measured(Measured(tcp, joints.position_rad, joints.velocity_rad_s))
         seq = self._joint_out.seq
-        self._joint_out.put(joints, stamp_wall_ns=stamp_ns, seq=seq)
-        self._pose_out.put(record, stamp_wall_ns=stamp_ns, seq=seq)
+        self._joint_out.publish(joints, stamp_wall_ns=stamp_ns, seq=seq)
+        self._pose_out.publish(record, stamp_wall_ns=stamp_ns, seq=seq)
         self._publish_gripper(stamp_ns, seq)
 
     @property
@@ -168,7 +168,7 @@ class Arm:
         lost = bool(self._profile.robot.finger_joints) and silent_ns > FINGER_PATIENCE_NS
         if lost and not self._fingers_lost:
             why = f"no joint state of {', '.join(self._profile.robot.finger_joints)}"
-            self._node.tell(Event("warning", "fault", "fingers_lost", why))
+            self._node.emit(Event("warning", "fault", "fingers_lost", why))
         self._fingers_lost = lost
         if lost:
             return
@@ -176,7 +176,7 @@ class Arm:
             record = replace(record, mode=self.state)
         elif not self._writer.heard:
             record = replace(record, mode=f"not listening at {self._topic[:100]}")
-        self._gripper_out.put(record, stamp_wall_ns=stamp_ns, seq=seq)
+        self._gripper_out.publish(record, stamp_wall_ns=stamp_ns, seq=seq)
 
     def _send(self, command: PoseCommand | JointCommand, now_ns: int) -> None:
         message = self._write(self._messages, self._kind, command, Stamp(now_ns, self._frame))
@@ -205,7 +205,7 @@ class Arm:
                 bad = state in ("silent", "braking", "stalled", "unheeded")
                 level = "warning" if bad else "info"
                 change = f"{self._was}->{state}"
-                self._node.tell(Event(level, "transition", change, self._why(state)))
+                self._node.emit(Event(level, "transition", change, self._why(state)))
             self._was = state
         if self._clock.differs != self._clock_told and self._clock.offset_s is not None:
             self._clock_told = self._clock.differs
@@ -214,7 +214,7 @@ class Arm:
                     f"the robot's stamps are {self._clock.offset_s:+.3f} s behind this clock; "
                     "synchronise both (chrony or ptp)"
                 )
-                self._node.tell(Event("warning", "notice", "robot_clock", why))
+                self._node.emit(Event("warning", "notice", "robot_clock", why))
 
     def _why(self, state: str) -> str:
         if state == "silent":

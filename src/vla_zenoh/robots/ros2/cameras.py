@@ -65,7 +65,7 @@ class Camera:
         last_s = time.monotonic()
         while not stop.is_set():
             if self._slot.wait(WAIT_S):
-                arrival = self._slot.take()
+                arrival = self._slot.pop()
                 if arrival is not None and self._take(arrival):
                     last_s = time.monotonic()
             silent_s = time.monotonic() - last_s

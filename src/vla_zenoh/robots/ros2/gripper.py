@@ -50,7 +50,7 @@ class Gripper:
     ) -> None:
         self._node, self._messages, self._profile = node, messages, profile
         self._measured_m, self._sent_m = width, node.profile.robot.gripper.max_width_m
-        self._orders = node.listen(node.keys.command_gripper, CallbackRing(16, SMALL_BYTES))
+        self._orders = node.subscribe(node.keys.command_gripper, CallbackRing(16, SMALL_BYTES))
         self._guard = GripperGuard(node.profile.robot.gripper)
         self._keeper = GoalSequencer(GIVE_UP_S, node.profile.robot.gripper.max_width_m)
         self._news: deque[Callable[[], None]] = deque()
@@ -106,8 +106,8 @@ class Gripper:
         self._led_by = writer if leads else ""
         while self._news:
             self._news.popleft()()
-        for arrival in self._orders.take_all():
-            order = self._node.read(GripperCommand, arrival)
+        for arrival in self._orders.drain():
+            order = self._node.decode(GripperCommand, arrival)
             if order is not None:
                 self._offer(order, now_ns, writer, leads=leads)
         step = self._keeper.step(self._mono_ns)
@@ -124,22 +124,22 @@ class Gripper:
         if wish is not None:
             self.wanted_m = self._sent_m
             why = f"to {wish.width_m:.3f} m waited when {self._led_by[:60]!r} stopped"
-            self._node.refuse("outlived", f"command/gripper {why}")
+            self._node.reject("outlived", f"command/gripper {why}")
 
     def _offer(
         self, order: Stamped[GripperCommand], now_ns: int, writer: str, *, leads: bool
     ) -> None:
         try:
-            command = self._guard.take(order, writer, now_ns, leads=leads)
+            command = self._guard.accept(order, writer, now_ns, writer_active=leads)
         except CodecError as error:
-            self._node.refuse(error.reason, f"command/gripper {error}")
+            self._node.reject(error.reason, f"command/gripper {error}")
             return
         self._node.counters["gripper_bounded"] = self._guard.bounded
         self._take(command, now_ns)
 
     def _take(self, command: GripperCommand, now_ns: int) -> None:
         if self._profile is None:
-            self._node.refuse("no_gripper", "command/gripper: the profile has no ros2.gripper")
+            self._node.reject("no_gripper", "command/gripper: the profile has no ros2.gripper")
             return
         self.wanted_m = command.width_m
         if self._topic is None:
@@ -233,14 +233,14 @@ class Gripper:
         try:
             return self._messages.decode(kind, answer)
         except CodecError as error:
-            self._node.refuse(error.reason, f"answer of {self._action}: {error}", self._action)
+            self._node.reject(error.reason, f"answer of {self._action}: {error}", self._action)
             return None
 
     def _complain(self, what: str) -> None:
         assert self._profile is not None
         where = self._profile.topic if self._action != GRASP else self._profile.grasp
         why = f"the gripper at {where or self._profile.topic} {what}"
-        self._node.tell(Event("warning", "fault", "gripper", why[:1000]))
+        self._node.emit(Event("warning", "fault", "gripper", why[:1000]))
 
 
 _NUMBERS: dict[str, table.Write] = {row.type: row.write for row in table.GRIPPER_WRITINGS}

@@ -119,7 +119,7 @@ class Ros2Node:
                 profile, session, self.link, read_messages(ros2), ros2.services, self._refuse
             )
         for slot in self.link.slots:
-            node.watch(slot)
+            node.watch_buffer(slot)
         self._rate = RateMeter()
         self._bad: tuple[bool, ...] = ()
         self._realtime = False
@@ -130,10 +130,10 @@ class Ros2Node:
 
     # -- for the threads ----------------------------------------------------------------------
     def _tell(self, event: Event) -> None:
-        self._news.append(lambda: self.node.tell(event))
+        self._news.append(lambda: self.node.emit(event))
 
     def _refuse(self, reason: str, why: str, about: str) -> None:
-        self._news.append(lambda: self.node.refuse(reason, why, about))
+        self._news.append(lambda: self.node.reject(reason, why, about))
 
     # -- running ------------------------------------------------------------------------------
     def run(self, stop: threading.Event) -> None:
@@ -158,7 +158,7 @@ class Ros2Node:
             give_up = time.monotonic() + GOODBYE_S
             for thread in threads:
                 thread.join(max(0.0, give_up - time.monotonic()))
-            self.node.report("stopped", now=True)
+            self.node.publish_status("stopped", now=True)
             self.node.close()
             self.link.close()
             if self._own_session is not None:
@@ -174,7 +174,7 @@ class Ros2Node:
                 braked = self._last_brake.wind_down(pace, self._brake_on)
                 how = "braked, and ends" if braked else "not braked, and ends"
             why = f"{one_line(repr(error), MAX_WORDS)}: {how}"
-            self.node.tell(Event("error", "fault", "broken", why))
+            self.node.emit(Event("error", "fault", "broken", why))
             raise
 
     def _brake_on(self, tick: Tick) -> None:
@@ -205,11 +205,11 @@ class Ros2Node:
     def _watch(self) -> None:
         if time.monotonic() - self._clock_s >= CLOCK_PERIOD_S:
             self._clock_s = time.monotonic()
-            self.node.follow_clock()
+            self.node.adopt_system_time()
             self._watch_bridges()
         state = "running" if self._arm is None else self._arm.state
         bad = tuple(camera.outlet.bad is not None for camera in self._cameras)
-        if bad == self._bad and not self.node.report_due(state):
+        if bad == self._bad and not self.node.status_due(state):
             return
         now, self._bad = bad != self._bad, bad
         figures = {camera.outlet.name: camera.outlet.figures() for camera in self._cameras}
@@ -220,7 +220,7 @@ class Ros2Node:
         rates_hz = {"loop": self._rate.rate_hz}
         if self._arm is not None:
             rates_hz["joint_states"] = self._arm.heard.rate.rate_hz
-        self.node.report(
+        self.node.publish_status(
             state,
             detail={
                 **({} if self._arm is None else self._arm.detail()),
@@ -254,7 +254,7 @@ class Ros2Node:
                 "warning", "transition", "bridge:there->gone", f"no {what} is there any more"
             )
         )
-        self.node.tell(event)
+        self.node.emit(event)
 
 
 def _way(profile: Profile, places: tuple[str, ...]) -> SessionProfile:

@@ -65,7 +65,7 @@ class RosServices:
         refuse: Refuse,
     ) -> None:
         self._robot, self._messages, self._refuse = profile.robot.name, messages, refuse
-        self._client = Client(profile, session).follow()
+        self._client = Client(profile, session).subscribe()
         self._stops = EstopOrder(session, profile.keys.stop)
         self._calls: queue.Queue[tuple[Service, Request, int]] = queue.Queue(MAX_WAITING)
         self._asked_ns = 0
@@ -86,7 +86,7 @@ class RosServices:
     def _taker(self, service: Service) -> Callable[[Request], None]:
         def take(request: Request) -> None:
             if service is STOP:  # before all that wait
-                self._stops.stop(lambda: self._client.put(self._client.keys.stop, ""))
+                self._stops.stop(lambda: self._client.publish(self._client.keys.stop, ""))
             try:
                 self._calls.put_nowait((service, request, time.monotonic_ns()))
             except queue.Full:
@@ -149,7 +149,7 @@ class RosServices:
 
     def _reset(self, asked: Any) -> str:
         self._stops.unless_stopped(
-            self._asked_ns, lambda: self._client.put(self._client.keys.reset, "")
+            self._asked_ns, lambda: self._client.publish(self._client.keys.reset, "")
         )
         self._await_state("inactive")
         return "inactive"

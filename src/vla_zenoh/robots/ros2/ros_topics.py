@@ -71,7 +71,7 @@ class RosTopics:
         came = [
             (arrival.mono_ns, obey, arrival)
             for slot, obey in ((self._prompts, self._wish), (self._switches, self._turn))
-            for arrival in slot.take_all()
+            for arrival in slot.drain()
         ]
         for _, obey, arrival in sorted(came, key=lambda each: each[0]):
             obey(arrival)
@@ -88,7 +88,7 @@ class RosTopics:
         self._prompt = prompt
         task = self._client.task
         if changed or task is None or task.prompt != prompt:
-            self._client.put(self._client.keys.prompt, prompt)
+            self._client.publish(self._client.keys.prompt, prompt)
 
     def _turn(self, arrival: ReceivedSample) -> None:
         topic = f"{self._prefix}/{ACTIVE_TOPIC}"
@@ -103,7 +103,7 @@ class RosTopics:
                 self._refuse("stopped", f"{topic}: true, and then an emergency stop", ACTIVE_TOPIC)
                 return
             self._put_ns, self._told = arrival.mono_ns, False
-            self._client.put(self._client.keys.active, settings.encode_bool(wanted).decode())
+            self._client.publish(self._client.keys.active, settings.encode_bool(wanted).decode())
             return
         task = self._client.task
         if task is not None and task.active:

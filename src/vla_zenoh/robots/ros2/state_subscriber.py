@@ -103,7 +103,7 @@ class StateSubscriber:
 
     # -- topics -------------------------------------------------------------------------------
     def _refuse(self, topic: str, error: CodecError) -> None:
-        self._node.refuse(error.reason, f"{topic}: {error}", topic)
+        self._node.reject(error.reason, f"{topic}: {error}", topic)
 
     def _read(self, kind: str, arrival: ReceivedSample) -> Any:
         return table.read(self._messages, kind, arrival.sample.payload.to_bytes())
@@ -111,11 +111,11 @@ class StateSubscriber:
     def _take_joints(self) -> bool:
         fresh = False
         for slot in self._joint_slots:
-            for arrival in slot.take_all():
+            for arrival in slot.drain():
                 topic = str(arrival.sample.key_expr)
                 try:
                     joints = self._read(joint_state.TYPE, arrival)
-                    arrived_ns = self._node.wall_of(arrival)
+                    arrived_ns = self._node.arrival_wall_ns(arrival)
                     if self.state.take(joints, joints.stamp_ns or arrived_ns) is None:
                         continue  # of the fingers alone, or another robot's
                 except CodecError as error:
@@ -129,7 +129,7 @@ class StateSubscriber:
 
     def _take_transforms(self) -> None:
         for slot, static in self._tf_slots:
-            for arrival in slot.take_all():
+            for arrival in slot.drain():
                 assert self._frames is not None
                 try:
                     self._frames.take(self._read(transforms.TYPE, arrival), static=static)
@@ -140,7 +140,7 @@ class StateSubscriber:
         if self._wrench_slot is None or self._ros2.wrench is None:
             return
         frame = self._ros2.wrench.frame or self._node.profile.robot.base_frame
-        for arrival in self._wrench_slot.take_all():
+        for arrival in self._wrench_slot.drain():
             try:
                 found: Wrench = self._read(wrench.TYPE, arrival)
                 if found.frame != frame:
@@ -150,7 +150,7 @@ class StateSubscriber:
             except CodecError as error:
                 self._refuse(self._ros2.wrench.topic, error)
             else:
-                stamp_ns = found.stamp_ns or self._node.wall_of(arrival)
+                stamp_ns = found.stamp_ns or self._node.arrival_wall_ns(arrival)
                 self._wrench = found._replace(stamp_ns=stamp_ns)
 
     def _tcp_of(self, frames: TransformBuffer, stamp_ns: int) -> Pose | None:

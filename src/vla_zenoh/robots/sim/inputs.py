@@ -45,28 +45,28 @@ class SimInputs:
         self._node, self._world, self._guard = node, world, guard
         self._reset, self._lockstep = reset, lockstep
         keys = node.keys
-        self._poses = node.listen(keys.command_pose, CallbackRing(64, SMALL_BYTES))
-        self._joints = node.listen(keys.command_joint, CallbackRing(64, SMALL_BYTES))
-        self._widths = node.listen(keys.command_gripper, CallbackRing(16, SMALL_BYTES))
-        self._resets = node.listen(keys.sim_reset, CallbackRing(4, settings.MAX_SETTING_BYTES))
+        self._poses = node.subscribe(keys.command_pose, CallbackRing(64, SMALL_BYTES))
+        self._joints = node.subscribe(keys.command_joint, CallbackRing(64, SMALL_BYTES))
+        self._widths = node.subscribe(keys.command_gripper, CallbackRing(16, SMALL_BYTES))
+        self._resets = node.subscribe(keys.sim_reset, CallbackRing(4, settings.MAX_SETTING_BYTES))
         self._gripper_guard = GripperGuard(node.profile.robot.gripper)
 
     def take(self, now_ns: int) -> None:
         """Obey or refuse what came since the last call."""
-        for arrival in self._poses.take_all():
-            pose = self._node.read(PoseCommand, arrival)
+        for arrival in self._poses.drain():
+            pose = self._node.decode(PoseCommand, arrival)
             if pose is not None:
                 self._offer(pose, self._guard.offer_pose, "pose", now_ns)
-        for arrival in self._joints.take_all():
-            joints = self._node.read(JointCommand, arrival)
+        for arrival in self._joints.drain():
+            joints = self._node.decode(JointCommand, arrival)
             if joints is not None:
                 self._offer(joints, self._guard.offer_joint, "joint", now_ns)
-        for arrival in self._widths.take_all():
-            width = self._node.read(GripperCommand, arrival)
+        for arrival in self._widths.drain():
+            width = self._node.decode(GripperCommand, arrival)
             if width is not None:
                 self._take_width(width, now_ns)
-        for arrival in self._resets.take_all():
-            seed = self._node.read_text(_seed_or_default, arrival)
+        for arrival in self._resets.drain():
+            seed = self._node.decode_text(_seed_or_default, arrival)
             if seed is not None:
                 self._reset(seed.value)
 
@@ -81,7 +81,7 @@ class SimInputs:
             command = replace(command, received_ns=now_ns)
         reason = take(command, now_ns)
         if reason is not None:
-            self._node.refuse(
+            self._node.reject(
                 f"{mode}_{reason}", f"command/{mode} by {command.header.source[:60]!r}: {reason}"
             )
 
@@ -89,11 +89,11 @@ class SimInputs:
         if self._lockstep:  # its clock is nobody else's: nothing has an age
             now_ns = width.header.stamp_wall_ns
         try:
-            order = self._gripper_guard.take(
-                width, self._guard.writer, now_ns, leads=self._guard.leads
+            order = self._gripper_guard.accept(
+                width, self._guard.writer, now_ns, writer_active=self._guard.writer_active
             )
         except CodecError as error:
-            self._node.refuse(error.reason, f"command/gripper {error}")
+            self._node.reject(error.reason, f"command/gripper {error}")
             return
         self._node.counters["gripper_bounded"] = self._gripper_guard.bounded
         self._world.set_gripper(order.width_m, order.speed_m_s, max(order.force_n, LEAST_FORCE_N))

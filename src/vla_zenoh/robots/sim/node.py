@@ -62,11 +62,11 @@ class SimNode:
         keys = node.keys
         self._inputs = SimInputs(node, self.world, self.guard, self._reset, lockstep=lockstep)
         self._braking = False
-        self._joint = node.stream(keys.state_joint, Kind.STATE)
-        self._pose = node.stream(keys.state_pose, Kind.STATE)
-        self._gripper = node.stream(keys.state_gripper, Kind.STATE)
-        self._scene = node.stream(keys.sim_scene, Kind.STATE)
-        self._objects = node.stream(keys.sim_objects, Kind.NEWS)
+        self._joint = node.declare_publisher(keys.state_joint, Kind.STATE)
+        self._pose = node.declare_publisher(keys.state_pose, Kind.STATE)
+        self._gripper = node.declare_publisher(keys.state_gripper, Kind.STATE)
+        self._scene = node.declare_publisher(keys.sim_scene, Kind.STATE)
+        self._objects = node.declare_publisher(keys.sim_objects, Kind.TELEMETRY)
         self._reference = self.guard.reference
         self._base_ns = 0
         self._ticks = 0
@@ -98,7 +98,7 @@ class SimNode:
             gc.freeze()
             with realtime_thread() as self._realtime:
                 self._run_in_real_time(stop)
-        self.node.report("stopped", now=True)
+        self.node.publish_status("stopped", now=True)
         self.node.close()
 
     def _run_in_real_time(self, stop: threading.Event) -> None:
@@ -119,7 +119,7 @@ class SimNode:
     def _run_lockstep(self, stop: threading.Event) -> None:
         self._base_ns = 0
         self._publish_state(0)
-        self.node.answer(self.node.keys.sim_step, self._answer_step)
+        self.node.serve(self.node.keys.sim_step, self._answer_step)
         while not stop.wait(0.2):
             with self._step_lock:
                 self._watch()
@@ -135,7 +135,7 @@ class SimNode:
             if not 0 < duration_ns <= MAX_LOCKSTEP_NS or duration_ns % STEP_NS:
                 raise CodecError("invalid", f"ns: wanted a multiple of {STEP_NS}, at most 60 s")
         except CodecError as error:
-            self.node.refuse(error.reason, f"sim/step: {error}")
+            self.node.reject(error.reason, f"sim/step: {error}")
             query.reply_err(str(error).encode())
             return
         with self._step_lock:
@@ -164,12 +164,12 @@ class SimNode:
                     self.world.tick(self._reference)
             except NodeError as error:
                 self._blown_up = str(error)
-                self.node.refuse("simulation_fault", str(error))
+                self.node.reject("simulation_fault", str(error))
         self._rate.tick()
         if self._ticks % self._every["state"] == 0:
             self._publish_state(now_ns)
         if self._ticks % self._every["scene"] == 0 and self._scene_wanted:
-            self._scene.put(
+            self._scene.publish(
                 SceneState(self.node.profile.sim.scene, self.world.qpos(), self.world.seed),
                 stamp_wall_ns=now_ns,
             )
@@ -191,19 +191,21 @@ class SimNode:
             if self._braking
             else Event("info", "transition", "braking->standing", "nobody is followed")
         )
-        self.node.tell(event)
-        self.node.report("braking" if self._braking else "running", detail=self._detail(), now=True)
+        self.node.emit(event)
+        self.node.publish_status(
+            "braking" if self._braking else "running", detail=self._detail(), now=True
+        )
 
     def _reset(self, seed: int | None) -> None:
         if self.guard.following and not self._blown_up:
             why = "sim/reset: the arm is being commanded; deactivate first"
-            self.node.refuse("reset_refused", why)
+            self.node.reject("reset_refused", why)
             return
         self.world.reset(self.node.profile.sim.seed if seed is None else seed)
-        self.guard.restart()
+        self.guard.reset()
         self._blown_up = ""
         self.node.counters["sim.resets"] += 1
-        self.node.report("running", detail=self._detail(), now=True)
+        self.node.publish_status("running", detail=self._detail(), now=True)
 
     # -- what is published --------------------------------------------------------------------
     def _publish_state(self, now_ns: int) -> None:
@@ -216,13 +218,13 @@ class SimNode:
                 mode=state if state in ("braking", "unheeded") else gripper.mode,
                 faults=(self._blown_up,) if self._blown_up else (),
             )
-        self._joint.put(self.world.joint_state(), stamp_wall_ns=now_ns, seq=seq)
-        self._pose.put(self.world.pose_state(self._reference), stamp_wall_ns=now_ns, seq=seq)
-        self._gripper.put(gripper, stamp_wall_ns=now_ns, seq=seq)
+        self._joint.publish(self.world.joint_state(), stamp_wall_ns=now_ns, seq=seq)
+        self._pose.publish(self.world.pose_state(self._reference), stamp_wall_ns=now_ns, seq=seq)
+        self._gripper.publish(gripper, stamp_wall_ns=now_ns, seq=seq)
 
     def _publish_objects(self, now_ns: int) -> None:
         objects = self.world.objects()
-        self._objects.put(
+        self._objects.publish(
             ObjectPoses(
                 tuple(objects),
                 np.array([place[0] for place in objects.values()]).reshape(-1, 3),
@@ -232,9 +234,12 @@ class SimNode:
         )
 
     def _watch(self) -> None:
-        self._scene_wanted, self._objects_wanted = self._scene.wanted, self._objects.wanted
-        self.node.follow_clock()
-        self.node.report(
+        self._scene_wanted, self._objects_wanted = (
+            self._scene.has_subscribers,
+            self._objects.has_subscribers,
+        )
+        self.node.adopt_system_time()
+        self.node.publish_status(
             self._state,
             detail=self._detail(),
             rates_hz={"control": self._rate.rate_hz},
