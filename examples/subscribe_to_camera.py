@@ -1,6 +1,6 @@
 """Receives camera images, prints rate and age, and saves the last one.
 
-    python examples/subscribe_to_camera.py [PROFILE] [CAMERA]
+python examples/subscribe_to_camera.py [PROFILE] [CAMERA]
 """
 
 import sys

@@ -4,9 +4,9 @@
 # ///
 """A model: lifts the arm while the prompt contains "lift".
 
-    vla-zenoh check examples/ten_line_model.py
-    vla-zenoh worker examples/ten_line_model.py      # beside `vla-zenoh up panda_sim`
-    vla-zenoh use lift && vla-zenoh prompt "lift" && vla-zenoh activate
+vla-zenoh check examples/ten_line_model.py
+vla-zenoh worker examples/ten_line_model.py      # beside `vla-zenoh up panda_sim`
+vla-zenoh use lift && vla-zenoh prompt "lift" && vla-zenoh activate
 """
 
 from vla_zenoh.policy import ActionSpec, ActionSteps, CameraSpec, ModelSpec, ObservationSpec

@@ -7,13 +7,13 @@ import re
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import cv2
 import pytest
 from chain import Chain, command_line
 
+import vla_zenoh
 from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
@@ -38,7 +38,7 @@ def run(name: str, *arguments: str, folder: Path, timeout_s: float = 60) -> str:
 
 
 def profile_file(chain: Chain) -> str:
-    return str(chain.host.profile_file)
+    return str(chain.profile_file)
 
 
 def test_the_arm_is_driven_from_python(chain: Chain, tmp_path: Path) -> None:
@@ -47,6 +47,26 @@ def test_the_arm_is_driven_from_python(chain: Chain, tmp_path: Path) -> None:
     assert heights_m[-1] - heights_m[0] > MOVED_M
     assert "the arm stands" in text
     assert chain.state() == "inactive"
+
+
+def test_a_program_stops_the_arm_and_resets_it(chain: Chain) -> None:
+    chain.move()
+    with vla_zenoh.connect(chain.profile) as robot:
+        robot.stop()
+        assert chain.state() == "stopped"
+        with pytest.raises(vla_zenoh.SessionError, match="emergency stop"):
+            robot.activate()
+        robot.reset()
+        assert chain.state() == "inactive"
+        assert robot.chunk("scripted").record.worker == "scripted"
+
+
+def test_a_stream_without_publisher_is_an_error_with_its_key(chain: Chain) -> None:
+    with (
+        vla_zenoh.connect(chain.profile) as robot,
+        pytest.raises(vla_zenoh.SessionError, match="camera/nowhere/raw"),
+    ):
+        robot.image("nowhere", timeout_s=0.2)
 
 
 def test_images_are_received_and_the_last_one_is_saved(chain: Chain, tmp_path: Path) -> None:
@@ -68,10 +88,10 @@ def test_the_arm_is_driven_by_the_zenoh_package_alone(chain: Chain, tmp_path: Pa
 
 def test_a_recording_is_evaluated_and_plotted(chain: Chain, tmp_path: Path) -> None:
     file = tmp_path / "run.mcap"
-    words = ("record", "--profile", profile_file(chain), "--out", str(file), "--seconds", "6")
+    words = ("record", "--profile", profile_file(chain), "--out", str(file), "--seconds", "10")
     recording = threading.Thread(target=command_line, args=words)
     recording.start()
-    time.sleep(2)
+    chain.until("the recorder is alive", lambda: "recorder" in chain.client.alive)
     chain.activate_when_ready()
     chain.go("up", 10)
     recording.join()

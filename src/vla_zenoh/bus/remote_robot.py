@@ -94,6 +94,33 @@ class RemoteRobot(Client):
         image = decode_jpeg(payload) if jpeg else decode_raw(payload, schema)
         return Stamped(header_of(sample.sample), image, sample.mono_ns)
 
+    def stop(self, timeout_s: float = TIMEOUT_S) -> None:
+        """Emergency stop: the arm brakes and stays stopped until `reset`.
+
+        Raises:
+            SessionError: the command node did not confirm it within `timeout_s`.
+        """
+        self.publish(self.keys.stop, "stop")
+        self._confirm("stop", lambda state: state == "stopped", timeout_s)
+
+    def reset(self, timeout_s: float = TIMEOUT_S) -> None:
+        """Clear an emergency stop or a fault. The arm stays inactive.
+
+        Raises:
+            SessionError: it was not cleared within `timeout_s`; says why.
+        """
+        self.publish(self.keys.reset, "reset")
+        self._confirm("reset", lambda state: state not in ("", "stopped", "fault"), timeout_s)
+
+    def _confirm(self, what: str, done: Callable[[str], bool], timeout_s: float) -> None:
+        def state() -> str:
+            status = self.status("command")
+            return status.state if status is not None else ""
+
+        if not self.wait_for(lambda: done(state()), timeout_s):
+            why = f": {self.latch_reason()}" if self.latch_reason() else ""
+            raise SessionError(f"{what}: the command node did not confirm it{why}")
+
     def _record(self, kind: type[Record], key: str, timeout_s: float) -> Stamped[Record]:
         buffer = self._buffer(key, MAX_RECORD_BYTES)
         sample = buffer.pop() if key in self._newest else self._next(key, 0, timeout_s)
