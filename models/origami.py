@@ -80,7 +80,7 @@ class Origami(Adapter):
     def _query(self, operation: origami.Operation, fields: dict[str, Any] | None = None) -> Any:
         import zenoh
 
-        from vla_zenoh.bus.payload_limits import bytes_of
+        from vla_zenoh.bus.buffers import bytes_of
 
         request_id = uuid.uuid4().hex
         try:

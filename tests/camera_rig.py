@@ -16,7 +16,6 @@ import numpy as np
 import zenoh
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
 from vla_zenoh.nodes.camera.node import CameraNode
@@ -92,7 +91,7 @@ class Rig:
             assert attachment is not None
             frames.append(
                 Frame(
-                    header_codec.decode(attachment.to_bytes()),
+                    records.decode_header(attachment.to_bytes()),
                     sample.payload.to_bytes(),
                     str(sample.encoding),
                     time.time_ns(),

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import Keys
@@ -192,7 +191,7 @@ class Recorder:
             if arrived_ns < since_ns:
                 continue
             try:
-                header = header_codec.decode(attachment)
+                header = records.decode_header(attachment)
                 if header.source.startswith(ours):
                     out.append((header, records.decode(kind, payload)))
             except ValueError:
@@ -236,7 +235,7 @@ class Recorder:
         """The newest measured pose by the simulator."""
         for payload, attachment, _ in reversed(self._states):
             try:
-                if header_codec.decode(attachment).source.startswith(self.only["state"]):
+                if records.decode_header(attachment).source.startswith(self.only["state"]):
                     return records.decode(PoseState, payload)
             except ValueError:
                 continue

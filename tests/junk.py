@@ -12,7 +12,6 @@ import numpy as np
 import zenoh
 from chain import Chain
 
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import message, records
 from vla_zenoh.keys import SCHEMA, Keys
 from vla_zenoh.security.roles import key_members
@@ -101,7 +100,7 @@ def samples_of(chain: Chain, seconds: float = 1.2) -> dict[str, tuple[bytes, byt
     subscriber.undeclare()
     keys = all_keys(chain.profile.keys)
     for name, record in SELDOM.items():
-        header = header_codec.encode(Header(time.time_ns(), 0, STRANGER))
+        header = records.encode_header(Header(time.time_ns(), 0, STRANGER))
         found.setdefault(keys[name], (records.encode(record), header))
     return found
 
@@ -129,10 +128,10 @@ def wrong_shape(value: Any) -> Any:
 
 
 def junk_for_stream(key: str, payload: bytes, attachment: bytes, seq: int) -> Iterator[Junk]:
-    true = header_codec.decode(attachment)
-    stranger = header_codec.encode(Header(time.time_ns(), seq, STRANGER))
-    old = header_codec.encode(Header(time.time_ns() - 3_600_000_000_000, seq, STRANGER))
-    forged = header_codec.encode(true)
+    true = records.decode_header(attachment)
+    stranger = records.encode_header(Header(time.time_ns(), seq, STRANGER))
+    old = records.encode_header(Header(time.time_ns() - 3_600_000_000_000, seq, STRANGER))
+    forged = records.encode_header(true)
     fields = message.unpack(payload)
     yield Junk("noise", key, random.randbytes(200), forged)
     yield Junk("truncated", key, payload[: len(payload) // 2], forged)
@@ -168,7 +167,7 @@ def junk_for_setting(name: str, key: str) -> Iterator[Junk]:
 
 
 def junk_for_other(key: str, sample: tuple[bytes, bytes | None] | None) -> Iterator[Junk]:
-    header = header_codec.encode(Header(time.time_ns(), 1, STRANGER))
+    header = records.encode_header(Header(time.time_ns(), 1, STRANGER))
     yield Junk("noise", key, random.randbytes(200), header)
     yield Junk("huge", key, HUGE, header)
     yield Junk("empty", key, b"", header)

@@ -16,7 +16,6 @@ from ros2_peer import KinematicPanda, Ros2Peer
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.node import Publisher
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import Profile, load_profile
@@ -142,7 +141,7 @@ def _keep(
 ) -> zenoh.Subscriber[Any]:
     def keep(sample: zenoh.Sample) -> None:
         assert sample.attachment is not None
-        header = header_codec.decode(sample.attachment.to_bytes())
+        header = records.decode_header(sample.attachment.to_bytes())
         heard.append((header, records.decode(kind, sample.payload.to_bytes())))
 
     return session.declare_subscriber(key, zenoh.handlers.Callback(keep, indirect=False))

@@ -18,7 +18,6 @@ from ros2_rig import write_profile
 
 from vla_zenoh.bus import buffers as slots
 from vla_zenoh.bus.node import Node
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.kinematics.so3 import quat_from_rotation
@@ -90,7 +89,7 @@ class Turns:
         self.seq += 1
         keys = self.node.keys
         key = keys.command_joint if isinstance(record, JointCommand) else keys.command_pose
-        header = header_codec.encode(Header(self.wall_ns, self.seq, source))
+        header = records.encode_header(Header(self.wall_ns, self.seq, source))
         self.session.put(key, records.encode(record), attachment=header)
 
     def up(self, *, moves: bool = True) -> None:

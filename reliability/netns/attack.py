@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.keys import Keys
 from vla_zenoh.types import Header, PoseCommand
@@ -101,7 +100,7 @@ def _speak(session: zenoh.Session, keys: Keys, worker: str, number: int) -> None
     put(keys.worker, MARK)
     put(keys.rate, "100")
     put(keys.active, "true")
-    header = header_codec.encode(Header(time.time_ns(), number, f"command#{MARK}"))
+    header = records.encode_header(Header(time.time_ns(), number, f"command#{MARK}"))
     aside, down, still = np.array([0.5, 0.3, 0.4]), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(6)
     pose = PoseCommand(aside, down, still, still, aside, down, MARK)
     put(keys.command_pose, records.encode(pose), attachment=header)

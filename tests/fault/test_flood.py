@@ -15,7 +15,7 @@ import pytest
 from chain import Chain
 from test_strangers import STRANGER, samples_of
 
-from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
 from vla_zenoh.nodes.command.status import SPREAD_S
 from vla_zenoh.types import Header
 
@@ -85,7 +85,7 @@ def test_a_flood_does_not_delay_the_command_loop_beyond_its_watchdog(
     else:
         key = keys.delta("scripted")
         payload, _ = samples_of(chain, 0.6)[key]
-        head = header_codec.encode(Header(time.time_ns(), 1, STRANGER))
+        head = records.encode_header(Header(time.time_ns(), 1, STRANGER))
     chain.client.set_prompt("HARD: go up within 0.1")
     chain.until("it moves", chain.moves)
     time.sleep(SPREAD_S)

@@ -13,7 +13,6 @@ import zenoh
 from chain import Chain, Recorder
 from junk import OBEYED, OTHERS, SETTINGS, STRANGER, STREAMS, all_junk, all_keys, samples_of
 
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import message, records
 from vla_zenoh.types import GripperState, Header
 
@@ -156,11 +155,11 @@ def forged(chain: Chain, **changes: Any) -> tuple[bytes, bytes]:
     """A chunk in the name of the true worker, newer than its newest, with some fields changed."""
     payload, attachment = samples_of(chain, 0.5)[chain.profile.keys.delta("scripted")]
     assert attachment is not None
-    true, fields = header_codec.decode(attachment), message.unpack(payload)
+    true, fields = records.decode_header(attachment), message.unpack(payload)
     now_ns = time.time_ns()
     fresh = {"observation_stamp_ns": now_ns, "valid_until_ns": now_ns + 10**9}
     header = Header(now_ns, true.seq + 3, true.source)
-    return message.pack(fields | fresh | changes), header_codec.encode(header)
+    return message.pack(fields | fresh | changes), records.encode_header(header)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +202,7 @@ def test_a_flood_does_not_slow_the_command_loop(chain: Chain) -> None:
     chain.go("up", 10)
     keys = chain.profile.keys
     payload, attachment = samples_of(chain, 0.6)[keys.delta("scripted")]
-    stranger = header_codec.encode(Header(time.time_ns(), 1, STRANGER))
+    stranger = records.encode_header(Header(time.time_ns(), 1, STRANGER))
     assert attachment is not None
     pid = chain.pid("command")
     missed = chain.counter("command.missed_ticks")

@@ -28,7 +28,7 @@ from vla_zenoh.cli import seen as cli_seen
 from vla_zenoh.cli import status as cli_status
 from vla_zenoh.cli.options import model_options, number_list
 from vla_zenoh.cli.output import Screen, plain_types
-from vla_zenoh.codec import header, image, message, records, settings
+from vla_zenoh.codec import image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
 from vla_zenoh.interop import groot, npy, openpi, openvla_rest, origami
 from vla_zenoh.interop.ros2 import attachment, table
@@ -323,7 +323,7 @@ def _targets() -> Iterator[Target]:
         lambda: [message.pack({"a": [1, 2.5, None, "x", b"y"], "b": np.arange(3.0)})],
     )
     head = _header_bytes
-    yield Target("header", header.decode, codec, lambda: [head()])
+    yield Target("header", records.decode_header, codec, lambda: [head()])
     for kind in RECORDS:
         yield Target(
             f"record-{kind.__name__}",
@@ -464,7 +464,7 @@ def _targets() -> Iterator[Target]:
 def _header_bytes() -> bytes:
     from vla_zenoh.types import Header
 
-    return header.encode(Header(1, 2, "sim#1"))
+    return records.encode_header(Header(1, 2, "sim#1"))
 
 
 TARGETS = {target.name: target for target in _targets()}

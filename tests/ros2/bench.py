@@ -40,7 +40,6 @@ from ros_messages import CartesianImpedanceGoal, Header, Image, Pose, PoseStampe
 from ros_node import Listener, RosNode, free_domain
 
 from benchmarks.picture import noisy_picture
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.lab.bench.cpu_time import cpu_s
 from vla_zenoh.types import PoseCommand
@@ -287,9 +286,9 @@ def measure_chain(requests: int) -> tuple[dict[str, list[float]], dict[str, floa
     return found, {name: (after_s[name] - s) / took_s for name, s in before_s.items()}, lost
 
 
-def _header(sample: zenoh.Sample) -> header_codec.Header:
+def _header(sample: zenoh.Sample) -> records.Header:
     attachment = sample.attachment
-    return header_codec.decode(attachment.to_bytes() if attachment else None)
+    return records.decode_header(attachment.to_bytes() if attachment else None)
 
 
 def _ros_stamp_ns(sample: zenoh.Sample) -> int:

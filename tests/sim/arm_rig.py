@@ -15,7 +15,7 @@ import numpy as np
 
 from vla_zenoh.codec import message
 from vla_zenoh.control.reachability import ReachabilityFilter, make_reachability_filter
-from vla_zenoh.guard.command_stream import BRAKE_MARGIN
+from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.lab.lockstep import Lockstep, Message, Tamper
 from vla_zenoh.policy import (
     ActionSpec,

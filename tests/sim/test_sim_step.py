@@ -17,7 +17,6 @@ from camera_rig import until
 from chain import READY_PATIENCE_S, write_profile
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import message, records
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import Header, PoseCommand, PoseState
@@ -80,7 +79,7 @@ def rise(session: zenoh.Session, profile: Profile) -> list[dict[str, Any]]:
         session.put(
             profile.keys.command_pose,
             records.encode(command),
-            attachment=header_codec.encode(header),
+            attachment=records.encode_header(header),
         )
         states.append(step(session, profile))
     return states

@@ -17,11 +17,10 @@ from guard_rig import JointWriter
 
 from vla_zenoh.bus import buffers as slots
 from vla_zenoh.bus.clock import Tick
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.errors import NodeError
-from vla_zenoh.guard.command_stream import BRAKE_MARGIN
 from vla_zenoh.guard.joint_guard import joint_motion_limits
+from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.python import state_reader as arm_hearing
 from vla_zenoh.robots.python.node import ArmNode
@@ -133,7 +132,7 @@ class Turns:
         self.session.put(
             self.node.node.keys.command_joint,
             records.encode(JointCommand(names, columns[0], columns[1], columns[2], self.state)),
-            attachment=header_codec.encode(header),
+            attachment=records.encode_header(header),
         )
 
     def ask(self, width_m: float, age_s: float = 0.0) -> None:
@@ -143,7 +142,7 @@ class Turns:
         self.session.put(
             self.node.node.keys.command_gripper,
             records.encode(GripperCommand(width_m, 0.1, 10.0)),
-            attachment=header_codec.encode(header),
+            attachment=records.encode_header(header),
         )
 
     def run(self) -> None:
@@ -255,7 +254,7 @@ def test_over_an_ill_link_what_move_is_given_keeps_the_limits(turns: Turns, seed
             turns.session.put(
                 turns.node.node.keys.command_joint,
                 records.encode(each[2]),
-                attachment=header_codec.encode(each[1]),
+                attachment=records.encode_header(each[1]),
             )
 
     turns.lead = lead  # type: ignore[method-assign]

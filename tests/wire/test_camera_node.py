@@ -12,7 +12,6 @@ import pytest
 import zenoh
 from camera_rig import Rig, await_match, camera_rig, grey, until, write_video
 
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import message, records
 from vla_zenoh.codec.image import decode_raw
 from vla_zenoh.errors import NodeError
@@ -192,7 +191,7 @@ def test_a_slow_reader_never_gets_old_frames(tmp_path: Path) -> None:
         for _ in range(20):
             sample = reader.recv()
             assert sample.attachment is not None
-            stamp_ns = header_codec.decode(sample.attachment.to_bytes()).stamp_wall_ns
+            stamp_ns = records.decode_header(sample.attachment.to_bytes()).stamp_wall_ns
             ages_s.append((time.time_ns() - stamp_ns) / 1e9)
             decode_raw(sample.payload.to_bytes(), "rgb8;480x640")
             time.sleep(SLOW_READER_S)
@@ -243,7 +242,7 @@ class Stage:
         self.put(records.encode(scene), stamp_ns)
 
     def put(self, payload: bytes, stamp_ns: int = 1) -> None:
-        header = header_codec.encode(Header(stamp_ns, self._seq, "sim#test"))
+        header = records.encode_header(Header(stamp_ns, self._seq, "sim#test"))
         self._publisher.put(payload, attachment=header)
         self._seq += 1
 

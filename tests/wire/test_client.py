@@ -13,7 +13,6 @@ from vla_zenoh.bus.client import MAX_WHY, Client
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.node_registry import MAX_OTHERS
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES
 from vla_zenoh.nodes.worker.inference_debug import MAX_SAMPLES, InferenceDebugSubscriber
@@ -40,7 +39,7 @@ def profile() -> Iterator[Profile]:
 @pytest.mark.slow
 def test_names_of_strangers_neither_fill_a_client_nor_hide_a_node(profile: Profile) -> None:
     keys, ghost = profile.keys, records.encode(NodeStatus("sim", "ok", "h", 1, 2))
-    who = header_codec.encode(Header(1, 2, "stranger#1"))
+    who = records.encode_header(Header(1, 2, "stranger#1"))
     with open_session(profile.session) as here, open_session(profile.session) as there:
         client = Client(profile, here).subscribe()
         tokens = [
@@ -87,7 +86,7 @@ def test_a_flood_of_long_events_is_kept_short(profile: Profile) -> None:
 def test_nobody_shows_what_another_worker_saw_nor_names_a_folder_elsewhere(
     profile: Profile,
 ) -> None:
-    who = header_codec.encode(Header(1, 2, "stranger#1"))
+    who = records.encode_header(Header(1, 2, "stranger#1"))
     key = profile.keys.seen_record("scripted")
     with open_session(profile.session) as here, open_session(profile.session) as there:
         listener = InferenceDebugSubscriber(here, profile.keys)
@@ -109,7 +108,7 @@ def test_nobody_shows_what_another_worker_saw_nor_names_a_folder_elsewhere(
 
 
 def test_what_is_no_picture_does_not_wait_for_who_looks(profile: Profile) -> None:
-    who = header_codec.encode(Header(1, 2, "stranger#1"))
+    who = records.encode_header(Header(1, 2, "stranger#1"))
     key = profile.keys.seen("scripted", "front")
     with open_session(profile.session) as here, open_session(profile.session) as there:
         listener = InferenceDebugSubscriber(here, profile.keys)

@@ -18,7 +18,6 @@ import zenoh
 from camera_rig import await_match, free_endpoint, until
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import message, records
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import (
@@ -67,7 +66,7 @@ class Robot:
     ) -> None:
         self.seq += 1
         header = Header(time.time_ns() if stamp_ns is None else stamp_ns, self.seq, source)
-        self.session.put(key, payload, attachment=header_codec.encode(header))
+        self.session.put(key, payload, attachment=records.encode_header(header))
 
     def put_joints(
         self, position: FloatArray, velocity: FloatArray | None = None, **how: Any

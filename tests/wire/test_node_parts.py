@@ -17,11 +17,11 @@ from vla_zenoh.bus.buffers import CallbackRing, LatestSample, ReceivedSample, Ze
 from vla_zenoh.bus.clock import ADOPT_S, Clock
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES, open_session
-from vla_zenoh.bus.writer_filter import SingleWriterFilter
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile import SessionProfile, load_profile, override
 from vla_zenoh.runtime.parent_watch import is_running
 from vla_zenoh.types import Header
+from vla_zenoh.types.stream import SingleWriterFilter
 
 SILENCE_NS = 500_000_000
 STEP_TOLERANCE_S = 0.002

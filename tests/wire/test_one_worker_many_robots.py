@@ -18,11 +18,10 @@ import pytest
 import zenoh
 from camera_rig import await_match, free_endpoint, until
 
+from vla_zenoh.bus.buffers import bytes_of, header_of
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.payload_limits import bytes_of, header_of
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.worker import robot_names
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, WorkerError
 from vla_zenoh.nodes.worker.node import WorkerNode
@@ -80,7 +79,7 @@ class Robot:
             (self.keys.state_pose, "sim#1", PoseState(np.array([0.4, 0, z_m]), DOWN, np.zeros(6))),
             (self.keys.state_gripper, "sim#1", GripperState(0.08, False, False)),
         ):
-            header = header_codec.encode(Header(time.time_ns(), self._seq, source))
+            header = records.encode_header(Header(time.time_ns(), self._seq, source))
             self._session.put(key, records.encode(record), attachment=header)
 
     def asked(self, **changes: Any) -> None:

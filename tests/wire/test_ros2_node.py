@@ -179,10 +179,10 @@ def test_pictures_come_with_their_stamp_and_depth_is_refused(rig: Ros2Rig) -> No
     heard: list[tuple[int, np.ndarray[Any, Any]]] = []
 
     def keep(sample: zenoh.Sample) -> None:
-        from vla_zenoh.codec import header as header_codec
+        from vla_zenoh.codec import records
 
         assert sample.attachment is not None
-        header = header_codec.decode(sample.attachment.to_bytes())
+        header = records.decode_header(sample.attachment.to_bytes())
         schema = str(sample.encoding).partition(";")[2]
         heard.append((header.stamp_wall_ns, decode_raw(sample.payload.to_bytes(), schema).rgb))
 

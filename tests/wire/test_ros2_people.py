@@ -18,7 +18,6 @@ from ros2_rig import write_profile
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Keys
@@ -130,7 +129,7 @@ def test_what_comes_last_in_a_request_is_not_done_after_a_stop_in_between(rig: R
     call = rig.ask("set_request", "vla_msgs/srv/SetRequest", prompt="", rate_hz=5.0, active=True)
     rig.expect(("rate", "5"))
     task = records.encode(Task(1, False, "", "scripted", 5.0))
-    header = header_codec.encode(Header(time.time_ns(), 1, "command#1"))
+    header = records.encode_header(Header(time.time_ns(), 1, "command#1"))
     rig.operator.put(rig.keys.task, task, attachment=header)
     until("the rate is agreed to", lambda: rig.people._client.task)
     stop = rig.ask("stop")

@@ -14,7 +14,6 @@ from vla_zenoh.bus import clock_sync as offsets
 from vla_zenoh.bus.clock_sync import MAX_HEARD, MAX_PEERS
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.nodes.command.peer_monitor import MAX_WORKERS, PeerMonitor
@@ -172,7 +171,7 @@ def test_made_up_names_do_not_keep_out_a_clock_that_is_there(scene: Scene) -> No
     scene.thief.publish_status("running", now=True)
     until("its own voice", lambda: scene.look().hosts.get("worker-scripted"))
     for number in range(2 * MAX_PEERS):
-        header = header_codec.encode(Header(time.time_ns(), number, f"ghost{number}#1"))
+        header = records.encode_header(Header(time.time_ns(), number, f"ghost{number}#1"))
         scene.thief.session.put(key, status, attachment=header)
         if number % AT_ONCE == AT_ONCE - 1:  # more do not find room in a mailbox
             until(

@@ -19,7 +19,7 @@ RECORDED = {"sim": "state/pose", "command": "command/pose"}
 
 def _note_commands(heard_s: list[float]) -> None:
     """Of the simulator: whenever its guard takes a command."""
-    from vla_zenoh.guard.command_stream import CommandStream
+    from vla_zenoh.guard.stream_guard import CommandStream
 
     take = CommandStream.take
 

@@ -1,8 +1,8 @@
-"""Where Zenoh's callbacks leave samples. A callback does this and nothing else.
+"""Buffers between Zenoh's callbacks and the loops of a node, with limits on payload sizes.
 
-An unbounded queue or a slow callback on a stream makes everything behind it late, control keys
-included, so streams keep the newest sample only and orders a bounded number. A sample that was not
-put, or has more bytes than its slot takes, is dropped before any of them is copied, and told.
+An unbounded queue or a slow callback delays every sample behind it, control keys included. So a
+stream keeps only its newest sample, and settings a bounded number. A sample that is a deletion or
+too large is dropped before its bytes are copied, and counted.
 """
 
 from __future__ import annotations
@@ -15,9 +15,61 @@ from typing import NamedTuple
 
 import zenoh
 
-from vla_zenoh.bus.payload_limits import check_size
+from vla_zenoh.codec import records
 from vla_zenoh.codec.records import MAX_RECORD_BYTES
 from vla_zenoh.errors import CodecError
+from vla_zenoh.types import Header
+
+
+def bytes_of(payload: zenoh.ZBytes | None, limit: int = MAX_RECORD_BYTES) -> bytes:
+    """The bytes; none are empty.
+
+    Raises:
+        CodecError: ``oversize``, more than `limit`.
+    """
+    if payload is None:
+        return b""
+    if len(payload) > limit:
+        raise CodecError("oversize", f"{len(payload)} bytes, at most {limit} are taken")
+    return payload.to_bytes()
+
+
+def check_size(sample: zenoh.Sample, limit: int) -> None:
+    """Whether a sample may be taken. A deletion comes without bytes, and would pass for a setting.
+
+    Raises:
+        CodecError: ``deleted``, it was not put; ``oversize``, payload and attachment together are
+            more than `limit`.
+    """
+    if sample.kind != zenoh.SampleKind.PUT:
+        raise CodecError("deleted", "nothing is deleted here; what is put is taken")
+    attachment = sample.attachment
+    size = len(sample.payload) + (len(attachment) if attachment is not None else 0)
+    if size > limit:
+        raise CodecError("oversize", f"{size} bytes, at most {limit} are taken")
+
+
+def payload_and_attachment(sample: zenoh.Sample, limit: int) -> tuple[bytes, bytes | None]:
+    """Payload and attachment.
+
+    Raises:
+        CodecError: as `check` says.
+    """
+    check_size(sample, limit)
+    attachment = sample.attachment
+    return sample.payload.to_bytes(), attachment.to_bytes() if attachment is not None else None
+
+
+def header_of(sample: zenoh.Sample) -> Header:
+    """What the sample's writer says of it.
+
+    Raises:
+        CodecError: it has no header that can be read.
+    """
+    attachment = sample.attachment
+    if attachment is None:
+        return records.decode_header(None)
+    return records.decode_header(bytes_of(attachment, records.MAX_HEADER_BYTES))
 
 
 class ReceivedSample(NamedTuple):

@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 
 import zenoh
 
+from vla_zenoh.bus.buffers import bytes_of, header_of
 from vla_zenoh.bus.node_registry import MAX_STATUS_BYTES, NodeRegistry
-from vla_zenoh.bus.payload_limits import bytes_of, header_of
 from vla_zenoh.bus.session import QOS
 from vla_zenoh.codec import records
 from vla_zenoh.codec.settings import encode_deadman_activation

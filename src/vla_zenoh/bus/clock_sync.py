@@ -13,8 +13,8 @@ from typing import TypeVar
 
 import zenoh
 
+from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.clock import Clock
-from vla_zenoh.bus.payload_limits import bytes_of
 from vla_zenoh.bus.session import QOS
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, ProfileError

@@ -1,9 +1,16 @@
-"""Rates and latencies of the last seconds, for status."""
+"""Rates, latencies and traffic of a node, for its status."""
 
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import zenoh
+
+from vla_zenoh.types import Header
 
 
 class RateMeter:
@@ -60,3 +67,113 @@ class Percentiles:
         last = len(ordered) - 1
         shares = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
         return {name: round(ordered[round(share * last)], 1) for name, share in shares.items()}
+
+
+LINKS_PERIOD_S = 5.0
+MAX_SENDERS = 256
+"""So many are compared with themselves; where more come, who was silent longest is forgotten."""
+OTHERS = "others"
+"""Where losses are counted of more keys than `MAX_SENDERS`."""
+MAX_LINKS = 8
+
+
+class Sender(Protocol):
+    """Counts what it has written."""
+
+    @property
+    def key(self) -> str: ...
+    @property
+    def seq(self) -> int: ...
+    @property
+    def sent_bytes(self) -> int: ...
+
+
+@dataclass(slots=True)
+class _Heard:
+    """A writer of a key: where its numbers and our arrivals began, and what is missing since."""
+
+    seq: int
+    arrivals: int
+    lost: int = 0
+
+
+class Traffic:
+    """Rates of what is sent, from one report to the next, and records that never arrived.
+
+    Args:
+        session: whose links are shown.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._sessions = [session]
+        self._reported_s = time.monotonic()
+        self._sent: dict[str, tuple[int, int]] = {}
+        self._heard: dict[tuple[str, str], _Heard] = {}  # in the order of when they spoke last
+        self._lost_before: Counter[str] = Counter()
+        self._links: list[str] = []
+        self._links_s = -1e9
+
+    def add(self, session: zenoh.Session) -> None:
+        """Show the links of this one as well."""
+        self._sessions.append(session)
+
+    def received(self, key: str, header: Header, arrivals: int) -> None:
+        """A record was read.
+
+        What a slot dropped by itself is not lost: it arrived. Where several writers share a slot
+        this counts too few, never too many.
+
+        Args:
+            key: it came on.
+            header: its writer's word.
+            arrivals: samples that had arrived in its slot by then; 0: nobody counts there.
+        """
+        if arrivals == 0:
+            return
+        who = (key, header.source)
+        known = self._heard.pop(who, None) or _Heard(header.seq, arrivals)
+        missing = (header.seq - known.seq) - (arrivals - known.arrivals)
+        known.lost = max(missing, known.lost)
+        self._heard[who] = known
+        if len(self._heard) > MAX_SENDERS:
+            self._forget(next(iter(self._heard)))
+
+    def _forget(self, who: tuple[str, str]) -> None:
+        key, lost = who[0], self._heard.pop(who).lost
+        if lost:
+            full = key not in self._lost_before and len(self._lost_before) >= MAX_SENDERS
+            self._lost_before[OTHERS if full else key] += lost
+
+    def sent(self, streams: Iterable[Sender]) -> dict[str, list[float]]:
+        """Key -> records and bytes a second since the last call, of those that carried any."""
+        now_s = time.monotonic()
+        took_s = max(now_s - self._reported_s, 1e-3)
+        out: dict[str, list[float]] = {}
+        before, self._sent = self._sent, {}
+        for stream in streams:
+            count, size = before.get(stream.key, (0, 0))
+            self._sent[stream.key] = (stream.seq, stream.sent_bytes)
+            if stream.seq > count:
+                rates = ((stream.seq - count) / took_s, (stream.sent_bytes - size) / took_s)
+                out[stream.key] = [round(rate, 2) for rate in rates]
+        self._reported_s = now_s
+        return out
+
+    def lost(self) -> dict[str, int]:
+        """Key -> records that were written and never arrived here."""
+        out = Counter(self._lost_before)
+        for (key, _), heard in list(self._heard.items()):  # readers may have threads of their own
+            out[key] += heard.lost
+        return {key: count for key, count in out.items() if count}
+
+    def links(self) -> list[str]:
+        """Where this node is connected to, as Zenoh writes it."""
+        if time.monotonic() - self._links_s > LINKS_PERIOD_S:
+            self._links_s = time.monotonic()
+            found = {str(link.dst) for one in self._sessions for link in one.info.links()}
+            self._links = sorted(found)[:MAX_LINKS]
+        return self._links
+
+    def detail(self, streams: Iterable[Sender]) -> Mapping[str, Any]:
+        """For status."""
+        return {"sent": self.sent(streams), "lost": self.lost(), "links": self.links()}

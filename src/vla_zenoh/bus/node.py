@@ -18,22 +18,22 @@ from vla_zenoh.bus.buffers import (
     ReceivedSample,
     SampleBuffer,
     ZenohRing,
+    bytes_of,
+    header_of,
 )
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.clock_sync import ClockSync
 from vla_zenoh.bus.event_throttle import EventThrottle
 from vla_zenoh.bus.host_id import own_host_id
 from vla_zenoh.bus.liveliness import alive_nodes
-from vla_zenoh.bus.payload_limits import bytes_of, header_of
+from vla_zenoh.bus.metrics import Traffic
 from vla_zenoh.bus.session import QOS, open_session
-from vla_zenoh.bus.traffic import Traffic
-from vla_zenoh.bus.writer_filter import SingleWriterFilter
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Event, Header, NodeStatus, Stamped
+from vla_zenoh.types.stream import SingleWriterFilter
 
 MSGPACK = zenoh.Encoding("application/msgpack")
 STATUS_PERIOD_S = 0.5
@@ -75,7 +75,7 @@ class Publisher:
             self._source,
         )
         payload = record if isinstance(record, bytes) else records.encode(record)
-        self._publisher.put(payload, attachment=header_codec.encode(header), encoding=encoding)
+        self._publisher.put(payload, attachment=records.encode_header(header), encoding=encoding)
         self.seq += 1
         self.sent_bytes += len(payload)
         return header

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from vla_zenoh.bus.payload_limits import bytes_of, header_of
+from vla_zenoh.bus.buffers import bytes_of, header_of
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError
 

@@ -128,7 +128,7 @@ def _brake(profile: Profile) -> list[str]:
     if profile.robot.driver == "sim":
         return []
     try:
-        from vla_zenoh.guard.braking_time import max_braking_time_s
+        from vla_zenoh.guard.arm_guard import max_braking_time_s
     except ImportError:
         return []  # the arm was not looked at either, which is told
     brake_s = max_braking_time_s(profile)

@@ -1,4 +1,4 @@
-"""One arm, two streams: poses of the TCP or joint positions. Whoever is followed owns the arm."""
+"""Guard of one arm that is commanded by TCP poses or by joint positions, one stream at a time."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from vla_zenoh.control.smoothing import ROTATION_BOX
 from vla_zenoh.control.states import OBEYING
-from vla_zenoh.guard.joint_guard import JointGuard, joint_guard_limits
+from vla_zenoh.guard.joint_guard import JointGuard, joint_guard_limits, joint_motion_limits
 from vla_zenoh.guard.pose_guard import PoseGuard, guard_limits
-from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
+from vla_zenoh.guard.stream_guard import ACCELERATE_S
+from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, JointCommand, PoseCommand, Stamped
-from vla_zenoh.types.references import JointReference, PoseReference
+from vla_zenoh.types.commands import JointReference, PoseReference
 
 STANDING_RAD_S = 0.02
 """An arm of which no joint is faster stands: its law may be exchanged."""
@@ -230,3 +233,77 @@ def make_arm_guard(
 
 def _moves(measured: Measured) -> bool:
     return float(np.abs(measured.velocity_rad_s).max()) > STANDING_RAD_S
+
+
+SETTLE_NS = 500_000_000
+"""After the last command the arm comes to rest within this time."""
+MOVED_M, MOVED_RAD = 0.005, 0.02
+"""An arm at rest that is moved by more than this, TCP or any joint, is moved by somebody else: its
+elbow may be, while the TCP stays."""
+
+
+class HeldReference:
+    """Remembers whether the last command sent still counts.
+
+    A controller goes on holding what it was sent last, some way from where the arm is measured; the
+    next stream has to begin there. When somebody else moves the arm that is no longer so. Times are
+    of the monotonic clock.
+    """
+
+    def __init__(self) -> None:
+        self._sent_ns: int | None = None
+        self._settled: Measured | None = None
+
+    @property
+    def held(self) -> bool:
+        """What was sent last is what the controller holds."""
+        return self._sent_ns is not None
+
+    def on_sent(self, now_ns: int) -> None:
+        """A command was sent."""
+        self._sent_ns, self._settled = now_ns, None
+
+    def invalidate(self) -> None:
+        """Nobody knows what became of the last commands: the robot is not heard."""
+        self._sent_ns = self._settled = None
+
+    def update(self, measured: Measured, now_ns: int) -> bool:
+        """Whether `held` still; call it while nothing is sent."""
+        if self._sent_ns is None or now_ns - self._sent_ns < SETTLE_NS:
+            return self.held
+        if self._settled is None:
+            self._settled = measured
+        apart_m, apart_rad = pose_distance(self._settled.pose, measured.pose)
+        turned_rad = float(np.abs(measured.position_rad - self._settled.position_rad).max())
+        if apart_m > MOVED_M or max(apart_rad, turned_rad) > MOVED_RAD:
+            self.invalidate()
+        return self.held
+
+
+def max_braking_time_s(profile: Profile) -> float:
+    """From the last command until the arm stands, whatever motion the robot's side followed.
+
+    That may be faster than the profile's limits, by `BRAKE_MARGIN`, and still be gaining speed.
+    """
+    if profile.robot.command == "joint":
+        limits = joint_motion_limits(profile, BRAKE_MARGIN)
+        stops_s = [_stop_s(*map(float, axis), share=1.0) for axis in zip(*limits, strict=True)]
+    else:
+        brake = guard_limits(profile).brake
+        stops_s = [
+            _stop_s(*brake.translation, share=1.0),
+            _stop_s(*brake.rotation, share=ROTATION_BOX),
+        ]
+    return profile.timing.command_timeout_s + max(stops_s)
+
+
+def _stop_s(velocity: float, acceleration: float, jerk: float, share: float) -> float:
+    """Of one axis that moves at both limits, by this share of acceleration and jerk.
+
+    The acceleration fades first, and is believed for a while before; then the axis slows down: by a
+    trapezoid of acceleration, than which the triangle of a short stop is shorter.
+    """
+    most, change = share * acceleration, share * jerk
+    fades_s = acceleration / change
+    reached = velocity + acceleration * (ACCELERATE_S + 0.5 * fades_s)
+    return fades_s + reached / most + most / change

@@ -19,12 +19,11 @@ from ruckig import (
 )
 
 from vla_zenoh.control.limits import JointMotionLimits
-from vla_zenoh.guard.command_stream import BRAKE_MARGIN
-from vla_zenoh.guard.reference_governor import GovernedPath, GovernorLimits
+from vla_zenoh.guard.reference_governor import BRAKE_MARGIN, GovernedPath, GovernorLimits
 from vla_zenoh.guard.stream_guard import StreamGuard
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, JointCommand, Stamped
-from vla_zenoh.types.references import JointReference
+from vla_zenoh.types.commands import JointReference
 
 
 class JointGuardLimits(NamedTuple):

@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.smoothing import Motion, MotionLimits, motion_limits
-from vla_zenoh.guard.command_stream import BRAKE_MARGIN
-from vla_zenoh.guard.reference_governor import GovernedPath, GovernorLimits
+from vla_zenoh.guard.reference_governor import BRAKE_MARGIN, GovernedPath, GovernorLimits
 from vla_zenoh.guard.stream_guard import StreamGuard
 from vla_zenoh.kinematics.so3 import (
     Pose,

@@ -32,9 +32,10 @@ from ruckig import (
     Trajectory,
 )
 
-from vla_zenoh.guard.command_stream import BRAKE_MARGIN
 from vla_zenoh.types import FloatArray
 
+BRAKE_MARGIN = 2.0
+"""The robot's own stop may use this multiple of the stream's limits."""
 ORDINARY = 1.15
 """Part of the stream's limits of jerk within which what is told is taken as it is. The difference
 has what is left of `BRAKE_MARGIN`."""

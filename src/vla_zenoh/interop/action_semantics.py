@@ -29,11 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from vla_zenoh.errors import SpecError
+from vla_zenoh.errors import SpecError, describe_fault
 from vla_zenoh.interop.joints import Forward, poses_of
 from vla_zenoh.policy import ActionSpec, Frame, GripperSemantics, Rotation
 from vla_zenoh.policy.model_options import number, one_of, whole_number
-from vla_zenoh.pydantic_errors import describe_fault
 from vla_zenoh.types import JointState
 
 Action = Literal["delta", "absolute", "joint_delta", "joint_position"]

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import SpecError
-from vla_zenoh.policy import CameraSpec, ModelSpec, Observation
-from vla_zenoh.types import Image, Stamped, Task
+from vla_zenoh.policy import ActionSteps, CameraSpec, ModelSpec, Observation
+from vla_zenoh.types import ActionChunk, Image, Stamped, Task
 
 CLOCK_TOLERANCE_S = 0.05
 """A picture may seem to come from the future by this much before clocks are said to differ."""
@@ -180,3 +180,43 @@ def _scale(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]
     smaller = width < rgb.shape[1] or height < rgb.shape[0]
     method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(rgb, (width, height), interpolation=method), np.uint8)
+
+
+def make_chunk(
+    worker: str,
+    spec: ModelSpec,
+    observation: Observation,
+    answer: ActionSteps,
+    *,
+    patience_s: float,
+    observed_ns: int,
+    start_ns: int,
+    end_ns: int,
+) -> ActionChunk:
+    """The action chunk of a worker's answer to `observation`.
+
+    Args:
+        worker: its name.
+        spec: of its model.
+        observation: that was answered.
+        answer: with checked steps.
+        patience_s: how long the chunk is valid after its last step.
+        observed_ns: observation complete, wall clock.
+        start_ns: start of inference, wall clock.
+        end_ns: end of inference, wall clock.
+    """
+    steps = np.asarray(answer.steps)
+    valid_ns = int(len(steps) * spec.action.dt_s * 1e9) + int(patience_s * 1e9)
+    return ActionChunk(
+        worker=worker,
+        spec_hash=spec.hash,
+        episode=observation.task.episode,
+        observation_stamp_ns=observation.stamp_wall_ns,
+        observation_seq=observation.seq,
+        valid_until_ns=observation.stamp_wall_ns + valid_ns,
+        steps=steps,
+        observed_ns=observed_ns,
+        inference_start_ns=start_ns,
+        inference_end_ns=end_ns,
+        done=answer.done,
+    )

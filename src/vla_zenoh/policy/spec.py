@@ -26,8 +26,7 @@ from pydantic import (
     model_validator,
 )
 
-from vla_zenoh.errors import SpecError
-from vla_zenoh.pydantic_errors import describe_fault
+from vla_zenoh.errors import SpecError, describe_fault
 from vla_zenoh.types import GripperState, JointState, PoseState, Task
 
 StatePart = Literal["joint", "pose", "gripper"]

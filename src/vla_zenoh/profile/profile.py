@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from vla_zenoh import keys
-from vla_zenoh.errors import ProfileError
+from vla_zenoh.errors import ProfileError, nearest
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import ArmProfile, Options, RobotProfile
@@ -31,7 +31,6 @@ from vla_zenoh.profile.session import (
     endpoint_faults,
     is_loopback,
 )
-from vla_zenoh.pydantic_errors import nearest
 from vla_zenoh.resources import is_path
 
 ONLY_ONE = {

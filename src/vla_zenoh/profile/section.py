@@ -10,8 +10,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from vla_zenoh import keys
-from vla_zenoh.errors import ProfileError
-from vla_zenoh.pydantic_errors import describe_fault, nearest
+from vla_zenoh.errors import ProfileError, describe_fault, nearest
 from vla_zenoh.types import MAX_TEXT, shown
 
 Place = tuple[str, ...]

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from vla_zenoh.errors import nearest
 from vla_zenoh.profile.section import Distinct, Name, Section, Word, reject
-from vla_zenoh.pydantic_errors import nearest
 
 IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
 FILE_PROTOCOLS = ("unixsock-stream",)

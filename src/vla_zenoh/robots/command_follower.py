@@ -12,12 +12,11 @@ from dataclasses import replace
 from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec.records import SMALL_BYTES
-from vla_zenoh.guard.arm_guard import ArmGuard, Measured, make_arm_guard
-from vla_zenoh.guard.held_reference import SETTLE_NS, HeldReference
+from vla_zenoh.guard.arm_guard import SETTLE_NS, ArmGuard, HeldReference, Measured, make_arm_guard
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
 from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
-from vla_zenoh.types.references import JointReference, PoseReference
+from vla_zenoh.types.commands import JointReference, PoseReference
 
 INBOX = 64
 STREAMING = "streaming"

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from vla_zenoh.bus.clock import FixedRate, Tick
 from vla_zenoh.bus.node import Node
-from vla_zenoh.guard.braking_time import max_braking_time_s
+from vla_zenoh.guard.arm_guard import max_braking_time_s
 from vla_zenoh.robots.command_follower import CommandFollower
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event

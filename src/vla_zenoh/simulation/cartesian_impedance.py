@@ -31,7 +31,7 @@ import numpy as np
 import pinocchio as pin
 
 from vla_zenoh.types import FloatArray
-from vla_zenoh.types.references import PoseReference
+from vla_zenoh.types.commands import PoseReference
 
 # Task-space mobility (1/kg or 1/(kg m^2)) below which a direction counts as singular: its apparent
 # inertia grows without bound, and so would damping and feed-forward.

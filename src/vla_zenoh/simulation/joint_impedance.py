@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.simulation.cartesian_impedance import ArmState
 from vla_zenoh.types import FloatArray
-from vla_zenoh.types.references import JointReference
+from vla_zenoh.types.commands import JointReference
 
 
 class JointImpedanceOutput(NamedTuple):

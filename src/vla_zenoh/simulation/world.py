@@ -28,7 +28,7 @@ from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import STEP_S, build_model, read_pose_vector, write_pose_vector
 from vla_zenoh.simulation.simulated_robot import SimulatedArm, SimulatedGripper
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState, vector
-from vla_zenoh.types.references import JointReference, PoseReference
+from vla_zenoh.types.commands import JointReference, PoseReference
 
 STEP_NS = round(STEP_S * 1e9)
 WRENCH_FILTER_S = 0.01

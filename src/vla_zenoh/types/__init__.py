@@ -18,7 +18,7 @@ from vla_zenoh.types.checks import (
     unit_quaternion,
     vector,
 )
-from vla_zenoh.types.chunk import ActionChunk
+from vla_zenoh.types.chunk import ActionChunk, InferenceDebug
 from vla_zenoh.types.commands import (
     LATENCY_STAGES,
     Cause,
@@ -26,13 +26,16 @@ from vla_zenoh.types.commands import (
     JointCommand,
     PoseCommand,
 )
-from vla_zenoh.types.image import Image
-from vla_zenoh.types.reports import Event, NodeStatus
-from vla_zenoh.types.scene import ObjectPoses, SceneState
-from vla_zenoh.types.seen import InferenceDebug
-from vla_zenoh.types.stamped import Header, Stamped
-from vla_zenoh.types.states import GripperState, JointState, PoseState
-from vla_zenoh.types.task import Task
+from vla_zenoh.types.reports import Event, NodeStatus, Task
+from vla_zenoh.types.states import (
+    GripperState,
+    Image,
+    JointState,
+    ObjectPoses,
+    PoseState,
+    SceneState,
+)
+from vla_zenoh.types.stream import Header, Stamped
 
 __all__ = [
     "LATENCY_STAGES",

@@ -1,8 +1,11 @@
-"""What a model answers."""
+"""What a model worker publishes: action chunks, and a record of each inference for debugging."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +13,16 @@ from numpy.typing import NDArray
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types.checks import (
     MAX_CHUNK_NUMBERS,
+    MAX_ENTRIES,
+    MAX_TEXT,
     boolean,
+    details,
+    entries,
     integer,
+    number,
     numbers,
     set_field,
+    shown,
     text,
 )
 
@@ -73,3 +82,79 @@ class ActionChunk:
             raise RecordError("steps holds NaN or infinity")
         steps.setflags(write=False)
         set_field(self, "steps", steps)
+
+
+MAX_RAW_NUMBERS = 4096
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InferenceDebug:
+    """One inference, looked at from outside. Its pictures travel beside it, one key a camera.
+
+    Args:
+        worker: name of the worker.
+        chunk_seq: number of the chunk it led to; the pictures have the same.
+        spec_hash: what the steps are to be read with.
+        episode: as in the chunk.
+        observation_stamp_ns: capture time, wall clock; the pictures have the same.
+        prompt: the model was given.
+        steps: (H, D) float32, the final action.
+        inference_ms: time the model took.
+        raw: what stood before the steps: tokens, normalised action, whatever the model tells.
+        done: the policy says its task is finished with these steps.
+    """
+
+    worker: str
+    chunk_seq: int
+    spec_hash: str
+    episode: int
+    observation_stamp_ns: int
+    prompt: str
+    steps: NDArray[np.float32]
+    inference_ms: float
+    raw: Mapping[str, Any] = field(default_factory=dict)
+    done: bool = False
+
+    def __post_init__(self) -> None:
+        for name, limit in (("worker", 128), ("spec_hash", 128), ("prompt", MAX_TEXT)):
+            text(name, getattr(self, name), limit)
+        for name in ("chunk_seq", "episode", "observation_stamp_ns"):
+            set_field(self, name, integer(name, getattr(self, name)))
+        set_field(self, "inference_ms", number("inference_ms", self.inference_ms, 0.0))
+        steps = np.array(self.steps)
+        if steps.dtype.kind not in "iuf" or steps.ndim != 2:
+            raise RecordError(f"steps are {steps.dtype} of shape {steps.shape}, wanted (H, D)")
+        steps = np.ascontiguousarray(steps, np.float32)
+        steps.setflags(write=False)
+        set_field(self, "steps", steps)
+        set_field(self, "raw", details("raw", entries("raw", self.raw)))
+
+
+def plain_values(raw: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What a model tells of itself as text, numbers and lists, whatever it gave.
+
+    Arrays of any library become lists; what is too large or has no such form is described.
+    """
+    return {str(name)[:256]: _plain(value, 2) for name, value in list((raw or {}).items())[:64]}
+
+
+def _plain(value: Any, depth: int) -> Any:
+    if value is None or isinstance(value, (bool, np.bool_, int, np.integer)):
+        return bool(value) if isinstance(value, np.bool_) else value
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else str(float(value))
+    if isinstance(value, str):
+        return value[:MAX_TEXT].encode("utf-8", "replace").decode()
+    if isinstance(value, Mapping) and depth:
+        return {str(key)[:256]: _plain(item, depth - 1) for key, item in list(value.items())[:64]}
+    try:
+        array = np.asarray(value)
+    except Exception:  # tensors of other devices raise what they like
+        return shown(value)
+    if array.dtype.kind not in "biuf" or array.ndim > 2:
+        return shown(value)
+    if array.size > MAX_RAW_NUMBERS or max(array.shape, default=0) > MAX_ENTRIES:
+        return f"{array.dtype} of shape {array.shape}"
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        return shown(array.tolist())
+    return array.tolist()

@@ -1,9 +1,11 @@
-"""What the robot is told."""
+"""Commands to an arm and a gripper, and the set-points a controller holds."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types.checks import (
@@ -140,3 +142,39 @@ class GripperCommand:
         set_field(self, "width_m", number("width_m", self.width_m, 0.0, 1.0))
         set_field(self, "speed_m_s", number("speed_m_s", self.speed_m_s, 1e-4, 10.0))
         set_field(self, "force_n", number("force_n", self.force_n, 0.0, 1000.0))
+
+
+class PoseReference(NamedTuple):
+    """Where the TCP has to be now, in the base frame, and how it moves there.
+
+    Args:
+        position_m: (3,).
+        rotation: (3, 3), columns are the TCP's axes.
+        twist: (6,) m/s and rad/s.
+        acceleration: (6,) m/s^2 and rad/s^2.
+    """
+
+    position_m: FloatArray
+    rotation: FloatArray
+    twist: FloatArray
+    acceleration: FloatArray
+
+
+class JointReference(NamedTuple):
+    """Where the joints have to be now, in the order along the arm.
+
+    Args:
+        position_rad: (n,).
+        velocity_rad_s: (n,).
+        acceleration_rad_s2: (n,).
+    """
+
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+    acceleration_rad_s2: FloatArray
+
+    @classmethod
+    def at_rest(cls, position_rad: FloatArray) -> JointReference:
+        """Standing at `position_rad`, of which it keeps a copy."""
+        zeros = np.zeros(len(position_rad))
+        return cls(np.array(position_rad, float), zeros, zeros)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from random_records import RECORDS, headers, refusal, same
 
 from vla_zenoh import types
-from vla_zenoh.codec import header, message, records
+from vla_zenoh.codec import message, records
 from vla_zenoh.errors import CodecError
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import (
@@ -270,27 +270,27 @@ def test_what_a_stranger_says_of_himself_can_be_printed_as_json() -> None:
 # -- headers ----------------------------------------------------------------------------------
 @given(headers)
 def test_a_header_comes_back_as_it_was(written: Any) -> None:
-    assert header.decode(header.encode(written)) == written
+    assert records.decode_header(records.encode_header(written)) == written
 
 
 @given(st.binary(max_size=200))
 def test_arbitrary_attachments_are_refused_or_read(attachment: bytes) -> None:
-    error = refusal(header.decode, attachment)
+    error = refusal(records.decode_header, attachment)
     assert error is None or error.reason in HEADER_REASONS
 
 
 @given(headers, st.data())
 def test_flipped_bits_in_a_header_are_refused_or_read(written: Any, data: st.DataObject) -> None:
-    payload = bytearray(header.encode(written))
+    payload = bytearray(records.encode_header(written))
     payload[data.draw(st.integers(0, len(payload) - 1))] ^= 1 << data.draw(st.integers(0, 7))
-    error = refusal(header.decode, bytes(payload))
+    error = refusal(records.decode_header, bytes(payload))
     assert error is None or error.reason in HEADER_REASONS
 
 
 @given(st.sampled_from(["schema", "stamp_wall_ns", "seq", "source"]), ANY_VALUE)
 def test_a_header_field_may_hold_anything(name: str, value: Any) -> None:
     fields = {"schema": 1, "stamp_wall_ns": 1, "seq": 1, "source": "a"} | {name: value}
-    error = refusal(header.decode, message.pack(fields))
+    error = refusal(records.decode_header, message.pack(fields))
     assert error is None or error.reason in HEADER_REASONS
 
 
@@ -315,5 +315,5 @@ GOOD = {"schema": 1, "stamp_wall_ns": 5, "seq": 6, "source": "sim#1"}
 )
 def test_a_wrong_header_is_refused_with_its_reason(attachment: bytes | None, reason: str) -> None:
     with pytest.raises(CodecError) as caught:
-        header.decode(attachment)
+        records.decode_header(attachment)
     assert caught.value.reason == reason

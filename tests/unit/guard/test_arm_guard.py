@@ -13,7 +13,7 @@ from vla_zenoh.guard.pose_guard import PoseGuard, guard_limits
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Header, JointCommand, PoseCommand, Stamped
-from vla_zenoh.types.references import JointReference, PoseReference
+from vla_zenoh.types.commands import JointReference, PoseReference
 
 PROFILE = load_profile("panda_sim")
 NAMES = PROFILE.robot.arm_joints

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.smoothing import Motion, Smoother
-from vla_zenoh.guard.braking_time import max_braking_time_s
-from vla_zenoh.guard.command_stream import BRAKE_MARGIN
+from vla_zenoh.guard.arm_guard import max_braking_time_s
 from vla_zenoh.guard.joint_guard import joint_motion_limits, stop_from
 from vla_zenoh.guard.pose_guard import guard_limits
+from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.types.references import JointReference
+from vla_zenoh.types.commands import JointReference
 
 SIM = load_profile("panda_sim")
 TICK_S = 0.01

@@ -22,8 +22,7 @@ from guard_rig import (
     ratios,
 )
 
-from vla_zenoh.guard.command_stream import BRAKE_MARGIN
-from vla_zenoh.guard.reference_governor import ORDINARY
+from vla_zenoh.guard.reference_governor import BRAKE_MARGIN, ORDINARY
 
 TICKS_S = [STREAM_S, 0.001]
 """An arm of one's own and a ROS 2 controller, and the simulator's law."""

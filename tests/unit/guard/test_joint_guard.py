@@ -18,7 +18,7 @@ from vla_zenoh.guard.joint_guard import (
 )
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import FloatArray, Header, JointCommand, Stamped
-from vla_zenoh.types.references import JointReference
+from vla_zenoh.types.commands import JointReference
 
 PROFILE = load_profile("panda_sim")
 NAMES = PROFILE.robot.arm_joints

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 
 from vla_zenoh.errors import CodecError
-from vla_zenoh.guard.arm_guard import Measured
-from vla_zenoh.guard.held_reference import MOVED_M, MOVED_RAD, SETTLE_NS, HeldReference
+from vla_zenoh.guard.arm_guard import MOVED_M, MOVED_RAD, SETTLE_NS, HeldReference, Measured
 from vla_zenoh.interop.joint_reading import (
     BEYOND,
     RESTARTED_NS,

@@ -20,7 +20,6 @@ from random_records import RECORDS
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_jpeg, encode_raw, raw_schema
 from vla_zenoh.errors import RecordingError
@@ -413,6 +412,6 @@ def test_a_foreign_mcap_is_said_with_its_topics(tmp_path: Path) -> None:
 
 def test_a_header_is_told_from_other_attachments() -> None:
     header = Header(5, 6, "camera#1")
-    assert heard("k", b"", "x", header_codec.encode(header), 7).header == header
+    assert heard("k", b"", "x", records.encode_header(header), 7).header == header
     assert heard("k", b"", "x", b"\xff", 7).attached == b"\xff"
     assert heard("k", b"", "x", None, 7).attached is None

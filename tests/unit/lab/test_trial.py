@@ -14,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import RecordError, RecordingError
+from vla_zenoh.lab.episode import EpisodeView
 from vla_zenoh.lab.statistics import Paired
-from vla_zenoh.lab.trial.episode_fsm import DONE_S, EpisodeFsm, EpisodeView, Phase
+from vla_zenoh.lab.trial.episode_fsm import DONE_S, EpisodeFsm, Phase
 from vla_zenoh.lab.trial.folder import PLAN, TRIALS, TrialFolder
 from vla_zenoh.lab.trial.plan import HIDDEN, DueEpisode, TrialPlan
 from vla_zenoh.lab.trial.score import score
@@ -97,7 +98,7 @@ def test_names_of_workers_are_hidden_unless_the_trial_is_open() -> None:
         ({"workers": ()}, "name one or more"),
         ({"workers": ("a", "")}, "name one or more"),
         ({"workers": ("a", "a")}, "names one of them twice"),
-        ({"prompt": " "}, "say what the workers are to do"),
+        ({"prompt": " "}, "prompt: empty"),
         ({"setups": ()}, "allowed: 1 to"),
         ({"seconds": 0.0}, "allowed: more than 0"),
         ({"seconds": float("nan")}, "allowed: more than 0"),
@@ -110,57 +111,57 @@ def test_a_plan_that_cannot_be_done_is_refused(change: dict[str, Any], why: str)
 
 # -- one episode ----------------------------------------------------------------------------------
 def running() -> EpisodeFsm:
-    conduct = EpisodeFsm(DUE, SECONDS)
-    assert conduct.typed("")
-    conduct.given(100.0, 5, (0.4, 0.0, 0.3))
-    return conduct
+    episode = EpisodeFsm(DUE, SECONDS)
+    assert episode.enter("")
+    episode.started(100.0, 5, (0.4, 0.0, 0.3))
+    return episode
 
 
 def test_an_episode_from_setup_to_verdict() -> None:
-    conduct = EpisodeFsm(DUE, SECONDS)
-    assert not conduct.typed("y"), "nothing to be judged yet"
-    assert conduct.typed("")
-    assert conduct.phase is Phase.GIVE
-    conduct.given(100.0, 5, (0.4, 0.0, 0.3))
-    conduct.look(EpisodeView(chunks=3), 100.5)
-    conduct.look(EpisodeView(chunks=90, holds=1, state="holding"), 109.0)
-    assert conduct.phase is Phase.RUN
-    assert conduct.typed("")
-    assert conduct.phase is Phase.BRAKE, "first the arm stands"
-    conduct.braked(EpisodeView(False, chunks=91, holds=1))
-    assert conduct.phase is Phase.JUDGE
-    assert not conduct.typed("")
-    assert not conduct.typed("perhaps")
-    assert conduct.typed("Y pushed it in")
-    assert conduct.phase is Phase.OVER
-    assert conduct.judged(4, "episode-0004.mcap", 2) == EpisodeVerdict(
+    episode = EpisodeFsm(DUE, SECONDS)
+    assert not episode.enter("y"), "nothing to be judged yet"
+    assert episode.enter("")
+    assert episode.phase is Phase.START
+    episode.started(100.0, 5, (0.4, 0.0, 0.3))
+    episode.update(EpisodeView(chunks=3), 100.5)
+    episode.update(EpisodeView(chunks=90, holds=1, state="holding"), 109.0)
+    assert episode.phase is Phase.RUN
+    assert episode.enter("")
+    assert episode.phase is Phase.BRAKE, "first the arm stands"
+    episode.stopped(EpisodeView(False, chunks=91, holds=1))
+    assert episode.phase is Phase.JUDGE
+    assert not episode.enter("")
+    assert not episode.enter("perhaps")
+    assert episode.enter("Y pushed it in")
+    assert episode.phase is Phase.OVER
+    assert episode.verdict(4, "episode-0004.mcap", 2) == EpisodeVerdict(
         *(4, 1, 1, "a", "success", "pushed it in", "person", "", 9.0, 91, 1, 5),
         *((0.4, 0.0, 0.3), "episode-0004.mcap", 2),
     )
 
 
 def test_a_refused_arm_is_repaired_or_the_episode_is_void() -> None:
-    conduct = EpisodeFsm(DUE, SECONDS)
-    conduct.typed("")
-    conduct.refused("camera 'front' is silent")
-    assert (conduct.phase, conduct.reasons) == (Phase.REPAIR, "camera 'front' is silent")
-    assert not conduct.typed("y"), "it was not even tried"
-    assert conduct.typed("")
-    assert conduct.phase is Phase.GIVE
-    conduct.refused("camera 'front' is silent")
-    assert conduct.typed("x cable")
-    found = conduct.judged(1, "", 0)
+    episode = EpisodeFsm(DUE, SECONDS)
+    episode.enter("")
+    episode.rejected("camera 'front' is silent")
+    assert (episode.phase, episode.reasons) == (Phase.BLOCKED, "camera 'front' is silent")
+    assert not episode.enter("y"), "it was not even tried"
+    assert episode.enter("")
+    assert episode.phase is Phase.START
+    episode.rejected("camera 'front' is silent")
+    assert episode.enter("x cable")
+    found = episode.verdict(1, "", 0)
     assert (found.verdict, found.end, found.note) == ("void", "refused", "cable")
     assert (found.why, found.time_s, found.began_ns) == ("camera 'front' is silent", 0.0, 0)
 
 
 def test_whatever_is_typed_while_the_arm_moves_makes_it_stand() -> None:
     for line, phase in (("", Phase.JUDGE), ("halt!", Phase.JUDGE), ("n fell", Phase.OVER)):
-        conduct = running()
-        assert conduct.typed(line)
-        assert conduct.phase is Phase.BRAKE
-        conduct.braked(EpisodeView(False))
-        assert conduct.phase is phase
+        episode = running()
+        assert episode.enter(line)
+        assert episode.phase is Phase.BRAKE
+        episode.stopped(EpisodeView(False))
+        assert episode.phase is phase
 
 
 @pytest.mark.parametrize(
@@ -192,29 +193,29 @@ def test_whatever_is_typed_while_the_arm_moves_makes_it_stand() -> None:
 def test_what_ended_it_is_told(
     look: EpisodeView, later: EpisodeView, end: str, brakes: int
 ) -> None:
-    conduct = running()
-    conduct.look(look, 101.0)
-    assert conduct.phase is Phase.BRAKE
-    conduct.braked(later)
-    conduct.typed("n")
-    found = conduct.judged(1, "", 0)
+    episode = running()
+    episode.update(look, 101.0)
+    assert episode.phase is Phase.BRAKE
+    episode.stopped(later)
+    episode.enter("n")
+    found = episode.verdict(1, "", 0)
     assert (found.end, found.why, found.brakes) == (end, later.why or later.recording, brakes)
 
 
 def test_it_ends_when_the_policy_says_so_for_a_while_and_when_the_time_is_over() -> None:
-    conduct = running()
-    conduct.look(EpisodeView(done=True), 101.0)
-    conduct.look(EpisodeView(done=False), 101.0 + DONE_S / 2)
-    conduct.look(EpisodeView(done=True), 101.0 + DONE_S)
-    conduct.look(EpisodeView(done=True), 101.0 + 1.9 * DONE_S)
-    assert conduct.phase is Phase.RUN, "it went on meanwhile"
-    conduct.look(EpisodeView(done=True), 101.0 + 2 * DONE_S)
-    assert (conduct.phase, conduct.end) == (Phase.BRAKE, "policy")
-    conduct = running()
-    conduct.look(EpisodeView(), 100.0 + SECONDS - 0.01)
-    assert conduct.phase is Phase.RUN
-    conduct.look(EpisodeView(), 100.0 + SECONDS)
-    assert (conduct.phase, conduct.end) == (Phase.BRAKE, "time")
+    episode = running()
+    episode.update(EpisodeView(done=True), 101.0)
+    episode.update(EpisodeView(done=False), 101.0 + DONE_S / 2)
+    episode.update(EpisodeView(done=True), 101.0 + DONE_S)
+    episode.update(EpisodeView(done=True), 101.0 + 1.9 * DONE_S)
+    assert episode.phase is Phase.RUN, "it went on meanwhile"
+    episode.update(EpisodeView(done=True), 101.0 + 2 * DONE_S)
+    assert (episode.phase, episode.end) == (Phase.BRAKE, "policy")
+    episode = running()
+    episode.update(EpisodeView(), 100.0 + SECONDS - 0.01)
+    assert episode.phase is Phase.RUN
+    episode.update(EpisodeView(), 100.0 + SECONDS)
+    assert (episode.phase, episode.end) == (Phase.BRAKE, "time")
 
 
 LOOKS = st.builds(
@@ -232,29 +233,29 @@ LOOKS = st.builds(
 def test_the_arm_is_braked_before_an_episode_that_moved_it_is_over(
     inputs: list[str | EpisodeView], data: st.DataObject
 ) -> None:
-    conduct, now_s, moved, braked = EpisodeFsm(DUE, SECONDS), 0.0, False, False
+    episode, now_s, moved, braked = EpisodeFsm(DUE, SECONDS), 0.0, False, False
     for given_input in inputs:
         now_s += 1.0
-        if conduct.phase is Phase.GIVE:
+        if episode.phase is Phase.START:
             if data.draw(st.booleans()):
-                conduct.refused("no")
+                episode.rejected("no")
             else:
-                conduct.given(now_s, 1, None)
+                episode.started(now_s, 1, None)
                 moved = True
-        elif conduct.phase is Phase.BRAKE:
-            conduct.braked(EpisodeView(False))
+        elif episode.phase is Phase.BRAKE:
+            episode.stopped(EpisodeView(False))
             braked = True
         elif isinstance(given_input, str):
-            conduct.typed(given_input)
-        elif conduct.phase is Phase.RUN:
-            conduct.look(given_input, now_s)
-        if conduct.phase is Phase.OVER:
+            episode.enter(given_input)
+        elif episode.phase is Phase.RUN:
+            episode.update(given_input, now_s)
+        if episode.phase is Phase.OVER:
             break
-    assert conduct.phase not in (Phase.JUDGE, Phase.OVER) or braked or not moved
-    if conduct.phase is not Phase.OVER:
-        conduct.break_off()
-        assert conduct.judged(1, "", 0).verdict == "void"
-    assert (conduct.judged(1, "", 0).end == "refused") <= (not moved)
+    assert episode.phase not in (Phase.JUDGE, Phase.OVER) or braked or not moved
+    if episode.phase is not Phase.OVER:
+        episode.abort()
+        assert episode.verdict(1, "", 0).verdict == "void"
+    assert (episode.verdict(1, "", 0).end == "refused") <= (not moved)
 
 
 @pytest.mark.parametrize(
@@ -276,7 +277,7 @@ def test_verdicts_are_read_as_people_type_them(line: str, read: tuple[str, str] 
 # -- on the disk ----------------------------------------------------------------------------------
 def begun(folder: Path) -> TrialFolder:
     trial = TrialFolder(folder)
-    with trial.alone():
+    with trial.lock():
         trial.begin(PLAN_AB)
     return trial
 
@@ -293,7 +294,7 @@ def test_a_trial_is_gone_on_with_where_it_was_broken_off(tmp_path: Path) -> None
     again = TrialFolder(tmp_path / "new")
     assert again.plan() == PLAN_AB
     assert again.episodes() == done
-    assert not again.torn
+    assert not again.truncated
     due = PLAN_AB.next_due(again.episodes())
     assert due is not None
     assert (due.setup, due.worker) == (1, "a")
@@ -315,21 +316,21 @@ def test_a_line_that_was_cut_off_is_as_if_it_had_never_been_written(cut: int) ->
         line = path.read_bytes()[len(whole) :]
         path.write_bytes(whole + line[: min(cut, len(line) - 1)])
         assert trial.episodes() == [first]
-        assert trial.torn
+        assert trial.truncated
         trial.append(second)
         assert trial.episodes() == [first, second]
-        assert not trial.torn
+        assert not trial.truncated
 
 
 def test_only_one_at_a_time_goes_on_with_a_trial(tmp_path: Path) -> None:
     begun(tmp_path)
     with (
-        TrialFolder(tmp_path).alone(),
+        TrialFolder(tmp_path).lock(),
         pytest.raises(RecordingError, match="another `vla-zenoh trial` is at work"),
-        TrialFolder(tmp_path).alone(),
+        TrialFolder(tmp_path).lock(),
     ):
         pass
-    with TrialFolder(tmp_path).alone():
+    with TrialFolder(tmp_path).lock():
         pass
 
 
@@ -348,7 +349,7 @@ def test_files_that_are_not_as_they_were_written_are_refused_by_line(tmp_path: P
         with pytest.raises(RecordingError, match=why):
             trial.episodes()
     (tmp_path / PLAN).unlink()
-    with pytest.raises(RecordingError, match=r"plan.json, which says what it is about, is not"):
+    with pytest.raises(RecordingError, match=r"exists without its plan.json"):
         trial.plan()
     (tmp_path / PLAN).write_text(json.dumps({**asdict(PLAN_AB), "seconds": -1}))
     with pytest.raises(RecordingError, match="allowed: more than 0"):
@@ -356,8 +357,8 @@ def test_files_that_are_not_as_they_were_written_are_refused_by_line(tmp_path: P
 
 
 def test_other_arguments_than_those_it_was_begun_with_are_named() -> None:
-    assert PLAN_AB.other_than({"workers": ("a", "b"), "seed": None, "blind": None}) == []
-    assert PLAN_AB.other_than(
+    assert PLAN_AB.differences({"workers": ("a", "b"), "seed": None, "blind": None}) == []
+    assert PLAN_AB.differences(
         {"workers": ("b", "a"), "prompt": "wave", "seconds": 3.0, "setups": ("", ""), "seed": 8}
     ) == [
         "workers a, b, not b, a",

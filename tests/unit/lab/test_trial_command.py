@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.cli.trial import trial
 from vla_zenoh.lab.cli.trial_person import Lines, TrialPerson
-from vla_zenoh.lab.episode import Interrupted
-from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, EpisodeView
+from vla_zenoh.lab.episode import EpisodeView, Interrupted
+from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.plan import DueEpisode, TrialPlan
 from vla_zenoh.lab.trial.verdict import End, EpisodeVerdict
@@ -43,10 +43,10 @@ def laid() -> EpisodeFsm:
 
 
 def running() -> EpisodeFsm:
-    conduct = laid()
-    conduct.typed("")
-    conduct.given(0.0, 1, None)
-    return conduct
+    episode = laid()
+    episode.enter("")
+    episode.started(0.0, 1, None)
+    return episode
 
 
 # -- lines ----------------------------------------------------------------------------------------
@@ -70,30 +70,30 @@ def test_while_an_episode_runs_a_script_ends_it_by_an_empty_line_alone(
     someone = person(read)
     os.write(write, b"\ny well done\n")
     assert someone.ask(laid()) == ""
-    assert someone.typed() is None, "the verdict stays until it is asked for"
+    assert someone.poll_line() is None, "the verdict stays until it is asked for"
     os.write(write, b"\n")
-    assert someone.typed() is None
-    conduct = running()
-    conduct.look(EpisodeView(), 30.0)
-    conduct.braked(EpisodeView())
-    assert someone.ask(conduct) == "y well done"
-    assert someone.typed() == ""
-    assert someone.typed() is None
+    assert someone.poll_line() is None
+    episode = running()
+    episode.update(EpisodeView(), 30.0)
+    episode.stopped(EpisodeView())
+    assert someone.ask(episode) == "y well done"
+    assert someone.poll_line() == ""
+    assert someone.poll_line() is None
     os.close(write)
     with pytest.raises(NodeError, match="has ended while an episode runs"):
-        someone.typed()
+        someone.poll_line()
     with pytest.raises(NodeError, match="the same command goes on"):
         someone.ask(laid())
 
 
 def test_a_script_whose_lines_are_not_where_they_belong_is_stopped(pipe: tuple[int, int]) -> None:
     read, write = pipe
-    conduct, someone = laid(), person(read)
+    episode, someone = laid(), person(read)
     os.write(write, b"y\n")
-    line = someone.ask(conduct)
-    assert not conduct.typed(line)
+    line = someone.ask(episode)
+    assert not episode.enter(line)
     with pytest.raises(NodeError, match="'y' means nothing here: an empty line when it is laid"):
-        someone.misunderstood(line, conduct.phase)
+        someone.reject_line(line, episode.phase)
     os.close(write)
 
 
@@ -158,14 +158,14 @@ def test_who_is_at_work_is_told_in_an_open_trial_alone(
     pipe: tuple[int, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     read, write = pipe
-    conduct = running()
-    conduct.look(EpisodeView(False), 1.0)
-    conduct.braked(EpisodeView(False, why="node 'worker-ann' is gone"))
+    episode = running()
+    episode.update(EpisodeView(False), 1.0)
+    episode.stopped(EpisodeView(False, why="node 'worker-ann' is gone"))
     for is_blind in (True, False):
         plan = TrialPlan("panda", ("ann", "bob"), "wave", ("left",), 20.0, 7, is_blind)
         someone = person(read, plan=plan, lays=True)
         someone.ask(laid())
-        someone.ended(conduct)
+        someone.show_end(episode)
         said = capsys.readouterr().err
         assert said.count("ann") == (0 if is_blind else 2)
         assert "the command node braked and ended it: node" in said
@@ -189,7 +189,7 @@ def judged(setup: int, worker: str, success: bool) -> EpisodeVerdict:
 @pytest.fixture
 def begun(tmp_path: Path) -> Path:
     folder = TrialFolder(tmp_path / "ab")
-    with folder.alone():
+    with folder.lock():
         folder.begin(PLAN)
     for setup, worker, success in ((1, "ann", True), (1, "bob", False), (2, "ann", True)):
         folder.append(judged(setup, worker, success))

@@ -10,7 +10,7 @@ from vla_zenoh import resources
 from vla_zenoh.simulation.cartesian_impedance import ArmState, CartesianImpedance, ImpedanceGains
 from vla_zenoh.simulation.joint_impedance import JointGains, JointImpedance
 from vla_zenoh.types import FloatArray
-from vla_zenoh.types.references import JointReference, PoseReference
+from vla_zenoh.types.commands import JointReference, PoseReference
 
 URDF = "example-robot-data:panda_description/urdf/panda.urdf"
 JOINTS = 7

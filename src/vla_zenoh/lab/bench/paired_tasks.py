@@ -14,9 +14,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from vla_zenoh.errors import RecordError
+from vla_zenoh.errors import RecordError, describe_fault
 from vla_zenoh.lab.statistics import Paired, paired
-from vla_zenoh.pydantic_errors import describe_fault
 
 ALPHA = 0.05
 """A p below this counts as a difference, as in the intervals at 95 %."""

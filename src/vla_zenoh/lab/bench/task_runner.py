@@ -9,8 +9,7 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.buffers import LatestSample
-from vla_zenoh.bus.payload_limits import header_of
+from vla_zenoh.bus.buffers import LatestSample, header_of
 from vla_zenoh.codec import records
 from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.errors import CodecError, NodeError, SessionError

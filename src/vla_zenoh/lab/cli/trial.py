@@ -87,10 +87,10 @@ def trial(
             "seed": seed,
             "blind": False if is_open else None,
         }
-        with folder.alone():
+        with folder.lock():
             plan = _begun(folder, asked)
             found = folder.episodes()
-            if folder.torn:
+            if folder.truncated:
                 said = "the last line of trials.jsonl was cut off; its episode is done again"
                 errors().print(said, style="yellow", markup=False)
             if plan.next_due(found) is not None:
@@ -122,7 +122,7 @@ def _begun(folder: TrialFolder, asked: dict[str, Any]) -> TrialPlan:
     """The plan of the folder, or one of what was asked for."""
     plan = folder.plan()
     if plan is not None:
-        others = plan.other_than(asked)
+        others = plan.differences(asked)
         if others:
             fail(
                 f"{folder.path} was begun otherwise: {'; '.join(others)}. Leave that out to go on "

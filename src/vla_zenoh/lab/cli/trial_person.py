@@ -29,8 +29,8 @@ REFRESH_S = 0.2
 MAX_LINE_BYTES = 64 * 1024
 VERDICTS = "y / n / x (void, done again), and a note"
 EXPECTED = {
-    Phase.LAY: "an empty line when it is laid",
-    Phase.REPAIR: "an empty line to try again, or x and a note",
+    Phase.SETUP: "an empty line when it is laid",
+    Phase.BLOCKED: "an empty line to try again, or x and a note",
     Phase.JUDGE: VERDICTS,
 }
 
@@ -99,20 +99,20 @@ class TrialPerson:
         self._refreshed_s = 0.0
 
     # -- questions ----------------------------------------------------------------------------
-    def ask(self, conduct: EpisodeFsm) -> str:
-        """See `vla_zenoh.lab.trial.runner`."""
-        phase = conduct.phase
-        if phase is Phase.LAY:
-            self._say(self._setup(conduct), style="bold")
-            if self._lays and not conduct.needs_confirmation:
+    def ask(self, episode: EpisodeFsm) -> str:
+        """See `Operator`."""
+        phase = episode.phase
+        if phase is Phase.SETUP:
+            self._say(self._setup(episode), style="bold")
+            if self._lays and not episode.needs_confirmation:
                 return ""
             question = "lay it, then press Enter:"
-            if conduct.needs_confirmation:
+            if episode.needs_confirmation:
                 question = (
                     "the arm was taken away before: lay it, see that it may move, then Enter:"
                 )
-        elif phase is Phase.REPAIR:
-            self._say(self._plan.hide(conduct.reasons), style="yellow")
+        elif phase is Phase.BLOCKED:
+            self._say(self._plan.hide(episode.reasons), style="yellow")
             question = "repair it, then press Enter; or x (void, done again), and a note:"
         else:
             question = f"did it succeed? {VERDICTS}:"
@@ -121,8 +121,8 @@ class TrialPerson:
         self._say(question, end=" " if self._terminal else "\n")
         return self._wait()
 
-    def _setup(self, conduct: EpisodeFsm) -> str:
-        plan, due = self._plan, conduct.due
+    def _setup(self, episode: EpisodeFsm) -> str:
+        plan, due = self._plan, episode.due
         at = (due.setup - 1) * len(plan.workers) + due.turn
         said = f"episode {at} of {plan.episodes}: setup {due.setup}"
         words = plan.words(due.setup)
@@ -139,8 +139,8 @@ class TrialPerson:
                 )
         return line
 
-    def misunderstood(self, line: str, phase: Phase) -> None:
-        """See `vla_zenoh.lab.trial.runner`.
+    def reject_line(self, line: str, phase: Phase) -> None:
+        """See `Operator`.
 
         Raises:
             NodeError: it is a line of a script.
@@ -151,8 +151,8 @@ class TrialPerson:
         self._say(said, style="yellow")
 
     # -- while the arm moves ------------------------------------------------------------------
-    def typed(self) -> str | None:
-        """See `vla_zenoh.lab.trial.runner`.
+    def poll_line(self) -> str | None:
+        """See `Operator`.
 
         Raises:
             NodeError: a script has ended, so nobody would judge.
@@ -169,8 +169,8 @@ class TrialPerson:
             )
         return None
 
-    def watch(self, conduct: EpisodeFsm) -> None:
-        """See `vla_zenoh.lab.trial.runner`."""
+    def show(self, episode: EpisodeFsm) -> None:
+        """See `Operator`."""
         if not (self._terminal and self._screen.is_terminal):
             return
         if self._live is None:
@@ -179,23 +179,23 @@ class TrialPerson:
         now_s = time.monotonic()
         if now_s - self._refreshed_s >= REFRESH_S:
             self._refreshed_s = now_s
-            seen = conduct.seen
-            said = f"{conduct.time_s:5.1f} of {conduct.seconds:g} s  {seen.state}  "
+            seen = episode.view
+            said = f"{episode.time_s:5.1f} of {episode.seconds:g} s  {seen.state}  "
             said += f"{seen.chunks} chunks  {self._plan.hide(seen.why)}  (Enter ends it)"
             self._live.update(
                 Text(printable(said), no_wrap=True, overflow="ellipsis"), refresh=True
             )
 
-    def ended(self, conduct: EpisodeFsm) -> None:
-        """See `vla_zenoh.lab.trial.runner`."""
+    def show_end(self, episode: EpisodeFsm) -> None:
+        """See `Operator`."""
         self._calm()
-        assert conduct.end is not None
-        why = self._plan.hide(conduct.why)
-        said = f"{END_WORDS[conduct.end]}{f': {why}' if why else ''}"
-        self._say(f"{said}; {conduct.time_s:.1f} s, {conduct.seen.chunks} chunks")
+        assert episode.end is not None
+        why = self._plan.hide(episode.why)
+        said = f"{END_WORDS[episode.end]}{f': {why}' if why else ''}"
+        self._say(f"{said}; {episode.time_s:.1f} s, {episode.view.chunks} chunks")
 
-    def tell(self, text: str) -> None:
-        """See `vla_zenoh.lab.trial.runner`."""
+    def notify(self, text: str) -> None:
+        """See `Operator`."""
         self._calm()
         self._say(text, style="yellow")
 

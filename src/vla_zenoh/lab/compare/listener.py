@@ -8,8 +8,7 @@ from typing import TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample
-from vla_zenoh.bus.payload_limits import bytes_of, header_of
+from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample, bytes_of, header_of
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Keys

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.preflight import PeerSnapshot
@@ -39,7 +38,7 @@ from vla_zenoh.types import (
     Stamped,
     Task,
 )
-from vla_zenoh.types.references import JointReference
+from vla_zenoh.types.commands import JointReference
 
 if TYPE_CHECKING:
     from vla_zenoh.simulation.world import World
@@ -250,7 +249,7 @@ class Lockstep:
 
     def _arrive(self, message: Message, take: Callable[[Stamped[Any]], None]) -> None:
         try:
-            header = header_codec.decode(header_codec.encode(message.header))
+            header = records.decode_header(records.encode_header(message.header))
             record = records.decode(message.kind, message.payload)
         except CodecError as error:
             self.refused[error.reason] += 1

@@ -7,9 +7,9 @@ from typing import Any
 
 from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.lockstep.records import Delays
-from vla_zenoh.policy import Policy, check_steps, reset_of
+from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
-from vla_zenoh.policy.observation import History, NotReady, assemble
+from vla_zenoh.policy.observation import History, NotReady, assemble, make_chunk
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
@@ -39,7 +39,7 @@ class LockstepWorker:
         self.policy, self.spec = policy, policy.spec
         self._continuation = ChunkPrefix(policy)
         self.task: Task | None = None
-        self._patience_ns = int(profile.timing.max_observation_age_s * 1e9)
+        self._patience_s = profile.timing.max_observation_age_s
         self._delays, self._jitter = delays, jitter
         self._images: dict[str, Stamped[Image]] = {}
         self._states = {part: History() for part in self.spec.observation.state}
@@ -101,18 +101,13 @@ class LockstepWorker:
         self._not_before_ns = wall_ns + duration_ns
         obeyed = self.task.active and self.task.worker == self.name
         self._continuation.published(observation, steps, self._not_before_ns, obeyed=obeyed)
-        return ActionChunk(
-            worker=self.name,
-            spec_hash=self.spec.hash,
-            episode=observation.task.episode,
-            observation_stamp_ns=observation.stamp_wall_ns,
-            observation_seq=observation.seq,
-            valid_until_ns=observation.stamp_wall_ns
-            + int(len(steps) * self.spec.action.dt_s * 1e9)
-            + self._patience_ns,
-            steps=steps,
+        return make_chunk(
+            self.name,
+            self.spec,
+            observation,
+            ActionSteps(steps, answer.done),
+            patience_s=self._patience_s,
             observed_ns=wall_ns,
-            inference_start_ns=wall_ns,
-            inference_end_ns=wall_ns + duration_ns,
-            done=answer.done,
+            start_ns=wall_ns,
+            end_ns=wall_ns + duration_ns,
         )

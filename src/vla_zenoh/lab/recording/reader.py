@@ -21,7 +21,6 @@ from mcap.records import Header as McapHeader
 from mcap.stream_reader import CRCValidationError, StreamReader
 from zstandard import ZstdError
 
-from vla_zenoh.codec import header as header_codec
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, RecordError, RecordingError
 from vla_zenoh.keys import Keys
@@ -191,7 +190,7 @@ class _Source:
         header = None
         if attachment is not None:
             with suppress(CodecError):
-                header, attachment = header_codec.decode(attachment), None
+                header, attachment = records.decode_header(attachment), None
         payload = found.payload.tobytes()
         return RecordedEntry(
             self.key, header, received_ns, self.encoding, data=payload, attachment=attachment

@@ -17,8 +17,8 @@ from typing import Any
 
 import zenoh
 
+from vla_zenoh.bus.buffers import bytes_of, payload_and_attachment
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.payload_limits import bytes_of, payload_and_attachment
 from vla_zenoh.errors import CodecError, RecordingError
 from vla_zenoh.keys import Keys, covers
 from vla_zenoh.lab.recording.sample import TEXT, heard

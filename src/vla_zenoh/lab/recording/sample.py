@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vla_zenoh.codec import header as header_codec
+from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError
 from vla_zenoh.types import Header
 
@@ -42,7 +42,7 @@ class Sample:
     @property
     def attached(self) -> bytes | None:
         """The attachment to put it with."""
-        return self.attachment if self.header is None else header_codec.encode(self.header)
+        return self.attachment if self.header is None else records.encode_header(self.header)
 
 
 def heard(
@@ -52,7 +52,7 @@ def heard(
     header = None
     if attachment is not None:
         try:
-            header = header_codec.decode(attachment)
+            header = records.decode_header(attachment)
         except CodecError:
             return Sample(key, payload, encoding, None, received_ns, attachment)
     return Sample(key, payload, encoding, header, received_ns)

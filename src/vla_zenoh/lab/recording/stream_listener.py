@@ -10,8 +10,7 @@ from typing import TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.payload_limits import payload_and_attachment
-from vla_zenoh.codec import header as header_codec
+from vla_zenoh.bus.buffers import payload_and_attachment
 from vla_zenoh.codec import records
 from vla_zenoh.codec.records import MAX_RECORD_BYTES
 from vla_zenoh.errors import CodecError
@@ -121,7 +120,7 @@ class StreamListener:
             for name, key, payload, attachment, received_ns in queue:
                 try:
                     heard = RecordedSample(
-                        header_codec.decode(attachment),
+                        records.decode_header(attachment),
                         records.decode(kinds[name], payload),
                         received_ns,
                         key,

@@ -1,7 +1,7 @@
-"""A trial on the disk: ``plan.json``, ``trials.jsonl`` with a line an episode, and recordings.
+"""Folder of a trial: ``plan.json``, ``trials.jsonl`` with a line per episode, and recordings.
 
-A line is on the disk when `TrialFolder.append` returns. One that was cut off by a crash never was:
-its episode is done again.
+A line is on the disk when `TrialFolder.append` returns. The episode of a line that a crash
+truncated is repeated.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ def _adapter(kind: type) -> TypeAdapter[Any]:
 
 
 class TrialFolder:
-    """See the module.
+    """Folder of a trial.
 
     Args:
-        path: of the folder; made by `begin`.
+        path: of the folder; `lock` creates it.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.torn = False
-        """`episodes` found a last line that was cut off."""
+        self.truncated = False
+        """The last line that `episodes` read was truncated."""
 
     # -- reading ------------------------------------------------------------------------------
     def plan(self) -> TrialPlan | None:
-        """What the trial was begun with; None: there is no trial here.
+        """The plan of the trial; None: the folder has no trial.
 
         Raises:
             RecordingError: it cannot be read.
@@ -56,28 +56,28 @@ class TrialFolder:
         except FileNotFoundError:
             if (self.path / TRIALS).exists():
                 raise RecordingError(
-                    f"{self.path / TRIALS} is there, and {PLAN}, which says what it is about, is "
-                    "not; put it back, or give another --out"
+                    f"{self.path / TRIALS} exists without its {PLAN}; restore that file, or give "
+                    "another --out"
                 ) from None
             return None
         except OSError as error:
             raise RecordingError(f"{self.path / PLAN} cannot be read: {error.strerror}") from error
 
     def episodes(self) -> list[EpisodeVerdict]:
-        """Every episode that has a verdict, in the order in which they were done.
+        """Verdicts in the order of the episodes.
 
         Raises:
             RecordingError: a line cannot be read.
         """
         try:
-            whole, _, torn = (self.path / TRIALS).read_bytes().rpartition(b"\n")
+            whole, _, rest = (self.path / TRIALS).read_bytes().rpartition(b"\n")
         except FileNotFoundError:
             return []
         except OSError as error:
             raise RecordingError(
                 f"{self.path / TRIALS} cannot be read: {error.strerror}"
             ) from error
-        self.torn = bool(torn)
+        self.truncated = bool(rest)
         lines = whole.split(b"\n") if whole else []
         return [
             self._parse(EpisodeVerdict, line, f"{TRIALS}, line {number}")
@@ -85,13 +85,13 @@ class TrialFolder:
         ]
 
     def next_number(self, episodes: Sequence[EpisodeVerdict]) -> int:
-        """Of the next attempt: recordings without a verdict keep theirs."""
+        """Number of the next attempt; recordings without a verdict keep theirs."""
         found = [_RECORDING.fullmatch(path.name) for path in self.path.glob("episode-*.mcap")]
         numbers = [int(match[1]) for match in found if match]
         return max([*numbers, *(each.number for each in episodes)], default=0) + 1
 
     def recording(self, number: int) -> Path:
-        """Where that of an attempt is; nothing in its name tells the worker."""
+        """Path of the recording of an attempt; the name does not reveal the worker."""
         return self.path / f"episode-{number:04d}.mcap"
 
     def _parse(self, kind: type, data: bytes, where: str) -> Any:
@@ -101,17 +101,17 @@ class TrialFolder:
             fault = error.errors()[0]
             at = ".".join(map(str, fault["loc"]))
             raise RecordingError(
-                f"{self.path / where}: {at}{': ' if at else ''}{fault['msg']}; it is as "
-                "`vla-zenoh trial` writes it, or another --out is to be given"
+                f"{self.path / where}: {at}{': ' if at else ''}{fault['msg']}; restore it as "
+                "`vla-zenoh trial` wrote it, or give another --out"
             ) from error
 
     # -- writing ------------------------------------------------------------------------------
     @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Nobody else goes on with this trial while the block lasts.
+    def lock(self) -> Iterator[None]:
+        """Keep other processes from this trial inside the block.
 
         Raises:
-            RecordingError: somebody does already, or the folder cannot be made.
+            RecordingError: another process holds it, or the folder cannot be created.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -130,7 +130,7 @@ class TrialFolder:
             os.close(folder)
 
     def begin(self, plan: TrialPlan) -> None:
-        """Write what the trial is begun with.
+        """Write the plan.
 
         Raises:
             RecordingError: it cannot be written.
@@ -146,18 +146,18 @@ class TrialFolder:
         except OSError as error:
             raise self._cannot(path, error) from error
 
-    def append(self, judged: EpisodeVerdict) -> None:
-        """Write an episode, onto the disk itself.
+    def append(self, verdict: EpisodeVerdict) -> None:
+        """Append a verdict and sync it to the disk.
 
         Raises:
             RecordingError: it cannot be written.
         """
         path = self.path / TRIALS
-        line = (json.dumps(asdict(judged)) + "\n").encode()
+        line = (json.dumps(asdict(verdict)) + "\n").encode()
         try:
             with path.open("ab+") as file:
                 file.seek(0)
-                file.truncate(file.read().rfind(b"\n") + 1)  # a line that was cut off
+                file.truncate(file.read().rfind(b"\n") + 1)  # a truncated line
                 file.seek(0, os.SEEK_END)
                 file.write(line)
                 file.flush()

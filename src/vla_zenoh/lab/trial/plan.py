@@ -1,4 +1,4 @@
-"""What a trial asks: which workers, for what, from which setups, in which order."""
+"""Plan of a trial: workers, prompt, setups, and the random order of episodes. Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 
 MAX_SETUPS = 10_000
 HIDDEN = "[worker]"
-"""Stands for every worker's name while nobody is to know which one is at work."""
+"""Replaces the names of workers in a blind trial."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +23,8 @@ class DueEpisode:
 
     Args:
         setup: number of its setup, from 1.
-        turn: which of that setup's episodes it is, from 1.
-        worker: that is to be obeyed.
+        turn: which of that setup's episodes, from 1.
+        worker: to activate.
     """
 
     setup: int
@@ -34,19 +34,19 @@ class DueEpisode:
 
 @dataclass(frozen=True, slots=True)
 class TrialPlan:
-    """What is to be done: every worker does every setup once.
+    """Every worker does every setup once.
 
     Args:
         robot: its name.
         workers: each once.
-        prompt: put before every episode.
-        setups: words for each, empty where a number is all there is.
-        seconds: an episode lasts at most so long.
+        prompt: of every episode.
+        setups: a description of each; empty: its number is enough.
+        seconds: time limit of an episode.
         seed: of the order.
-        blind: the person is not told who is at work.
+        blind: hide from the operator which worker is active.
 
     Raises:
-        RecordError: one of them is not allowed.
+        RecordError: a value is not allowed.
     """
 
     robot: str
@@ -63,7 +63,7 @@ class TrialPlan:
         if len(set(self.workers)) != len(self.workers):
             raise RecordError(f"workers: {', '.join(self.workers)} names one of them twice")
         if not self.prompt.strip():
-            raise RecordError("prompt: say what the workers are to do")
+            raise RecordError("prompt: empty; it is the task of the workers")
         if not 1 <= len(self.setups) <= MAX_SETUPS:
             raise RecordError(f"setups: {len(self.setups)}, allowed: 1 to {MAX_SETUPS}")
         if not (math.isfinite(self.seconds) and self.seconds > 0):
@@ -71,21 +71,21 @@ class TrialPlan:
 
     @property
     def episodes(self) -> int:
-        """How many there are in all."""
+        """Number of episodes."""
         return len(self.setups) * len(self.workers)
 
     def words(self, setup: int) -> str:
-        """Of the setup with this number, from 1."""
+        """Description of a setup, by its number from 1."""
         return self.setups[setup - 1]
 
     def order(self, setup: int) -> tuple[str, ...]:
-        """Who does this setup first, who next: drawn for each setup anew."""
+        """The workers in the order in which they do this setup, drawn from the seed."""
         workers = list(self.workers)
         random.Random(f"{self.seed} {setup}").shuffle(workers)
         return tuple(workers)
 
     def next_due(self, done: Iterable[EpisodeVerdict]) -> DueEpisode | None:
-        """What comes after `done`; None: nothing. Void episodes do not count as done."""
+        """The first episode without a verdict other than void in `done`; None: all have one."""
         judged = {(each.setup, each.worker) for each in done if each.verdict != "void"}
         for setup in range(1, len(self.setups) + 1):
             for turn, worker in enumerate(self.order(setup), 1):
@@ -93,24 +93,24 @@ class TrialPlan:
                     return DueEpisode(setup, turn, worker)
         return None
 
-    def other_than(self, asked: Mapping[str, Any]) -> list[str]:
-        """What was asked for that this plan has not, in words; fields that are None were not."""
+    def differences(self, asked: Mapping[str, Any]) -> list[str]:
+        """Fields of `asked` that differ from this plan, as text; fields that are None do not."""
         out = []
         for field in fields(self):
             wanted, mine = asked.get(field.name), getattr(self, field.name)
             if wanted is not None and wanted != mine:
-                out.append(f"{field.name} {_said(mine)}, not {_said(wanted)}")
+                out.append(f"{field.name} {_shown(mine)}, not {_shown(wanted)}")
         return out
 
     def hide(self, text: str) -> str:
-        """`text` without the workers' names, where nobody is to know them."""
+        """`text` without the names of workers, in a blind trial."""
         if not self.blind:
             return text
         names = "|".join(sorted(map(re.escape, self.workers), key=len, reverse=True))
         return re.sub(rf"(?<!\w)({names})(?!\w)", HIDDEN, text)
 
 
-def _said(value: Any) -> str:
+def _shown(value: Any) -> str:
     if isinstance(value, tuple):
         return ", ".join(value) if len(value) <= 5 and any(value) else f"({len(value)} of them)"
     return repr(value) if isinstance(value, str) else f"{value}"

@@ -1,4 +1,4 @@
-"""What a trial's verdicts add up to."""
+"""Score of a trial: success rates of its workers, and their paired difference."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from vla_zenoh.lab.trial.verdict import INTERVENTIONS, EpisodeVerdict
 
 @dataclass(frozen=True, slots=True)
 class WorkerScore:
-    """Of one worker; void episodes count in `void` alone.
+    """Score of one worker; void episodes count in `void` alone.
 
     Args:
         worker: its name.
-        successes: of its episodes.
-        episodes: that were judged.
+        successes: number of them.
+        episodes: judged.
         wilson_95: interval of the success rate.
-        time_to_success_s: median; None: there was none.
-        brakes: times the command node braked by itself.
-        interventions: episodes that an emergency stop or somebody else ended.
-        void: episodes that tell nothing.
+        time_to_success_s: median; None: no success.
+        brakes: times the command node braked.
+        interventions: episodes ended by an emergency stop or another client.
+        void: number of void episodes.
     """
 
     worker: str
@@ -37,19 +37,19 @@ class WorkerScore:
 
     @property
     def rate(self) -> float | None:
-        """Share of successes; None: there was no episode."""
+        """Share of successes; None: no episode."""
         return self.successes / self.episodes if self.episodes else None
 
 
 @dataclass(frozen=True, slots=True)
 class TrialScore:
-    """Of a trial.
+    """Score of a trial.
 
     Args:
         workers: in the plan's order.
-        paired: of two workers: setups that both did; None: there are not two.
-        done: episodes that were judged.
-        of: all that are to be.
+        paired: setups that both of two workers did; None: not two workers.
+        done: judged episodes.
+        of: all episodes of the plan.
     """
 
     workers: tuple[WorkerScore, ...]
@@ -59,7 +59,7 @@ class TrialScore:
 
 
 def score(plan: TrialPlan, episodes: Sequence[EpisodeVerdict]) -> TrialScore:
-    """All that was judged so far."""
+    """Score of the verdicts so far."""
     is_judged = [each for each in episodes if each.verdict != "void"]
     workers = tuple(_of(worker, episodes) for worker in plan.workers)
     both = _both(plan, is_judged) if len(plan.workers) == 2 else None

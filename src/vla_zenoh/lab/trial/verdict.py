@@ -1,4 +1,4 @@
-"""What became of an episode, and what a person says of it."""
+"""Verdict on one trial episode: what the operator said of it, and how it ended."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 Verdict = Literal["success", "failure", "void"]
-"""A void episode tells nothing of its worker and is done again."""
+"""A void episode does not count, and is repeated."""
 End = Literal[
     "person", "policy", "time", "lost", "stopped", "taken", "recording", "refused", "broken_off"
 ]
 FACT = "trial"
-"""Name under which the record of an episode stands at the end of its recording."""
+"""Name of the verdict in the metadata at the end of a recording."""
 END_WORDS: dict[End, str] = {
     "person": "ended by you",
-    "policy": "the policy says that it is done",
-    "time": "the time is over",
+    "policy": "the policy reported that it is done",
+    "time": "the time limit was reached",
     "lost": "the command node braked and ended it",
-    "stopped": "stopped by an emergency stop",
-    "taken": "somebody else took the arm, or changed what it is to do",
+    "stopped": "emergency stop",
+    "taken": "another client took the arm, or changed its task",
     "recording": "the recording failed",
-    "refused": "the arm was not given",
-    "broken_off": "broken off",
+    "refused": "activation was rejected",
+    "broken_off": "aborted",
 }
 INTERVENTIONS: frozenset[End] = frozenset({"stopped", "taken"})
 _VERDICTS: dict[str, Verdict] = {
@@ -36,24 +36,24 @@ _VERDICTS: dict[str, Verdict] = {
 
 @dataclass(frozen=True, slots=True)
 class EpisodeVerdict:
-    """One episode that was done, well or not.
+    """Record of one attempt at an episode.
 
     Args:
         number: of the attempt, from 1; it names the recording.
         setup: number of its setup, from 1.
         turn: which of that setup's episodes, from 1.
-        worker: that was obeyed.
-        verdict: the person's.
-        note: likewise.
+        worker: that was active.
+        verdict: the operator's.
+        note: the operator's.
         end: what ended it.
-        why: in words.
+        why: the reason, as a sentence.
         time_s: from activation to the end.
-        chunks: carried out.
-        brakes: times the command node braked by itself: for want of a chunk, or to end it.
-        began_ns: when the arm was given, wall clock of the person's computer; 0: it was not.
-        start_m: (3,) where the TCP stood then, base frame; None: it was not heard.
-        recording: file name in the folder, empty: there is none.
-        dropped: samples that are missing in it.
+        chunks: accepted.
+        brakes: times the command node braked: for want of a chunk, or to end it.
+        began_ns: activation, wall clock of the operator's computer; 0: none.
+        start_m: (3,) TCP at activation, base frame; None: no pose was received.
+        recording: file name in the folder, empty: none.
+        dropped: samples missing from it.
     """
 
     number: int
@@ -74,20 +74,20 @@ class EpisodeVerdict:
 
 
 def read_verdict(line: str) -> tuple[Verdict, str] | None:
-    """``y``, ``n`` or ``x`` and a note, as a person types it; None: it is neither."""
+    """Parse ``y``, ``n`` or ``x`` with an optional note; None: neither of them."""
     word, _, note = line.strip().partition(" ")
     verdict = _VERDICTS.get(word.lower())
     return None if verdict is None else (verdict, note.strip())
 
 
-def verdict_in(ended: Mapping[str, Any] | None, worker: str) -> Verdict | None:
-    """What a person said of `worker` at the end of a recording; None: nobody said anything.
+def verdict_in(metadata: Mapping[str, Any] | None, worker: str) -> Verdict | None:
+    """The verdict on `worker` in the metadata at the end of a recording; None: there is none.
 
     Args:
-        ended: what stands at the end of the recording; None: it was cut off.
-        worker: whose episode it is.
+        metadata: None: the recording was cut off.
+        worker: name of a worker.
     """
-    fact = (ended or {}).get(FACT)
+    fact = (metadata or {}).get(FACT)
     if not isinstance(fact, Mapping) or fact.get("worker") != worker:
         return None
     verdict = fact.get("verdict")

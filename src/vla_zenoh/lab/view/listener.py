@@ -8,8 +8,8 @@ from typing import Any
 
 import zenoh
 
+from vla_zenoh.bus.buffers import payload_and_attachment
 from vla_zenoh.bus.clock import Clock
-from vla_zenoh.bus.payload_limits import payload_and_attachment
 from vla_zenoh.errors import CodecError
 from vla_zenoh.lab.recording.sample import Sample, heard
 from vla_zenoh.profile import Profile

@@ -11,7 +11,6 @@ import zenoh
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, ZenohRing
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.writer_filter import SingleWriterFilter
 from vla_zenoh.keys import last_chunk
 from vla_zenoh.nodes.camera.camera_publisher import ENDED, OK, CameraPublisher
 from vla_zenoh.nodes.camera.fitted_streams import MAX_MODELS, RequestedSizes
@@ -20,6 +19,7 @@ from vla_zenoh.nodes.camera.source import STALL_S, without_password
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Event, SceneState, Stamped
+from vla_zenoh.types.stream import SingleWriterFilter
 
 TICK_S = 0.05
 SPECS_A_TICK = 8

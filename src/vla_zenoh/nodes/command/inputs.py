@@ -10,13 +10,13 @@ from vla_zenoh import keys as key_names
 from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample, ZenohRing
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES
-from vla_zenoh.bus.writer_filter import SingleWriterFilter
 from vla_zenoh.codec import settings
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.control.commander_io import Inputs, Setting
 from vla_zenoh.errors import CodecError
 from vla_zenoh.nodes.command.peer_monitor import PeerMonitor
 from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped
+from vla_zenoh.types.stream import SingleWriterFilter
 
 STATES = 16
 """States kept between two looks; room for the robot's own beside a stranger's."""

@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.writer_filter import SingleWriterFilter
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.keys import Kind
 from vla_zenoh.policy import CameraSpec
 from vla_zenoh.policy.observation import host_variant, size_variant
 from vla_zenoh.types import Event
+from vla_zenoh.types.stream import SingleWriterFilter
 
 STREAM_PATIENCE_S = 0.5
 """Another camera is believed when the one before it was silent for so long."""

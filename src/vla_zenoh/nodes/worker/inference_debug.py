@@ -11,15 +11,15 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
+from vla_zenoh.bus.buffers import bytes_of, check_size, header_of
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.payload_limits import bytes_of, check_size, header_of
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES, encode_jpeg
 from vla_zenoh.errors import CodecError, ProfileError, RecordError
 from vla_zenoh.keys import Keys, Kind, key_chunk
 from vla_zenoh.policy import MAX_CAMERAS, ActionSteps, ModelSpec, Observation
 from vla_zenoh.types import Header, Image, InferenceDebug
-from vla_zenoh.types.seen import plain_values
+from vla_zenoh.types.chunk import plain_values
 
 JPEG_QUALITY = 95
 MAX_WAITING, MAX_SAMPLES = 64, 256

@@ -13,11 +13,9 @@ from typing import Any, Literal
 
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing, LatestSample
+from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.payload_limits import bytes_of
-from vla_zenoh.bus.writer_filter import SingleWriterFilter
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
@@ -32,10 +30,9 @@ from vla_zenoh.nodes.worker.camera_subscriber import (
 from vla_zenoh.nodes.worker.inference_debug import InferenceDebugPublisher
 from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
-from vla_zenoh.policy.observation import History, NotReady, assemble
+from vla_zenoh.policy.observation import History, NotReady, assemble, make_chunk
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
-    ActionChunk,
     GripperState,
     Image,
     JointState,
@@ -43,6 +40,7 @@ from vla_zenoh.types import (
     Stamped,
     Task,
 )
+from vla_zenoh.types.stream import SingleWriterFilter
 
 SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5
@@ -260,23 +258,17 @@ class RobotSession:
             return self.failed(error)
         self._batch = batch
         self._inference_ms.add((end_ns - start_ns) / 1e6)
-        horizon_ns = int(len(steps) * self.spec.action.dt_s * 1e9)
-        patience_ns = int(self.node.profile.timing.max_observation_age_s * 1e9)
-        header = self._chunk_out.publish(
-            ActionChunk(
-                worker=self.name,
-                spec_hash=self.spec.hash,
-                episode=observation.task.episode,
-                observation_stamp_ns=observation.stamp_wall_ns,
-                observation_seq=observation.seq,
-                valid_until_ns=observation.stamp_wall_ns + horizon_ns + patience_ns,
-                steps=steps,
-                observed_ns=observed_ns,
-                inference_start_ns=start_ns,
-                inference_end_ns=end_ns,
-                done=done,
-            )
+        chunk = make_chunk(
+            self.name,
+            self.spec,
+            observation,
+            ActionSteps(steps, done),
+            patience_s=self.node.profile.timing.max_observation_age_s,
+            observed_ns=observed_ns,
+            start_ns=start_ns,
+            end_ns=end_ns,
         )
+        header = self._chunk_out.publish(chunk)
         self._not_before_ns = header.stamp_wall_ns
         self._rate.tick()
         obeyed = observation.task.active and observation.task.worker == self.name

@@ -11,8 +11,7 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing, LatestSample
-from vla_zenoh.bus.payload_limits import bytes_of
+from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.ros2 import attachment as attachments
 from vla_zenoh.interop.ros2.attachment import Attachment

@@ -19,9 +19,9 @@ from dataclasses import replace
 import numpy as np
 import zenoh
 
+from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.payload_limits import bytes_of
 from vla_zenoh.codec import message, records
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.guard.arm_guard import ArmGuard, Measured, make_arm_guard
@@ -32,7 +32,7 @@ from vla_zenoh.robots.sim.inputs import SimInputs
 from vla_zenoh.runtime.scheduling import realtime_thread
 from vla_zenoh.simulation.world import STEP_NS, World, build_world
 from vla_zenoh.types import Event, ObjectPoses, SceneState
-from vla_zenoh.types.references import JointReference
+from vla_zenoh.types.commands import JointReference
 
 CATCH_UP_NS = 50_000_000
 SCENE_HZ, OBJECTS_HZ, WATCH_HZ = 60.0, 10.0, 4.0

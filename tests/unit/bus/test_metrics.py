@@ -6,7 +6,7 @@ from typing import cast
 
 import zenoh
 
-from vla_zenoh.bus.traffic import MAX_SENDERS, OTHERS, Traffic
+from vla_zenoh.bus.metrics import MAX_SENDERS, OTHERS, Traffic
 from vla_zenoh.types import Header
 
 POSE, DELTA = "vla/panda/state/pose", "vla/panda/delta/scripted"
