@@ -162,7 +162,7 @@ def keys_page() -> str:
     out = ["# Keys", MADE.strip()]
     out.append(
         "All keys of a robot begin with `<root>/<robot>/`; the root is `vla` unless the profile "
-        "says otherwise. Roles are those of certificates ([security](../explanation/security.md)); "
+        "says otherwise. Roles are those of certificates ([security](../how-to/security.md)); "
         "without certificates they are not checked."
     )
     rows = ["| key | payload | published by | read by |", "|---|---|---|---|"]
