@@ -47,7 +47,7 @@ def picture_view(run: Path, at_s: float | None, out: Path) -> None:
         began_ns = ended_ns = 0
         for entry in file.entries(lambda key: not key.endswith("/raw")):
             began_ns, ended_ns = began_ns or entry.received_ns, entry.received_ns
-            show.take(entry)
+            show.log(entry)
         stream.disconnect()
         offset_ns = (ended_ns - began_ns) // 2 if at_s is None else int(at_s * 1e9)
         moment = np.datetime64(began_ns + offset_ns, "ns")

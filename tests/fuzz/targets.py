@@ -37,7 +37,7 @@ from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.evaluation.csv_file import evaluate_csv
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
-from vla_zenoh.lab.recording import cdr
+from vla_zenoh.lab.recording.record_json import record_from_json, record_to_json
 from vla_zenoh.lab.recording.record_types import RECORDS
 from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.nodes.worker.inference_debug import InferenceView
@@ -241,12 +241,9 @@ def _cdr_seed(kind: str) -> list[bytes]:
     return [every.encode(every.new(kind, **fields.get(kind.rsplit("/", 1)[-1], {})))]
 
 
-def _bag_seed(kind: type) -> list[bytes]:
-    try:
-        fields = cdr.fields_in(kind, records.encode(examples()[kind]))
-        return [cdr.write_record(kind, fields, 10**18, "base")]
-    except CodecError:
-        return []
+def _recorded_seed(kind: type) -> list[bytes]:
+    text, _ = record_to_json(kind, records.encode(examples()[kind]))
+    return [text.encode()]
 
 
 def _recording() -> list[bytes]:
@@ -406,10 +403,10 @@ def _targets() -> Iterator[Target]:
     # -- files
     for kind in RECORDS:
         yield Target(
-            f"bag-{kind.__name__}",
-            partial(cdr.read_record, kind),
+            f"recorded-{kind.__name__}",
+            lambda data, kind=kind: record_from_json(kind, _text(data)),
             codec,
-            lambda kind=kind: _bag_seed(kind),
+            lambda kind=kind: _recorded_seed(kind),
         )
     own = (VlaZenohError,)
     yield Target("recording", partial(_in_file, ".mcap", evaluate_run), own, _recording)

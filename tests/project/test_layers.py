@@ -63,6 +63,7 @@ ALLOWED = {
             "lab/episode.py",
             "lab/recording/recorder.py",
             "lab/recording/replay.py",
+            "lab/recording/sample_queue.py",
             "lab/recording/stream_listener.py",
             "lab/teleop/node.py",
             "lab/trial/runner.py",

@@ -262,7 +262,7 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
 def test_a_worker_that_is_not_there_cannot_be_compared(chain: Chain) -> None:
     said = command_line("compare", "scripted", "ghost", profile=chain.profile_file)
     assert said.returncode == 1
-    assert "worker 'ghost' tells no spec; is it alive?" in said.stderr
+    assert "worker 'ghost' publishes no spec; is it alive?" in said.stderr
 
 
 @pytest.mark.slow

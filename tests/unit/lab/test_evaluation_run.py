@@ -219,20 +219,20 @@ def test_a_run_that_moves_to_another_time_and_robot_keeps_its_latencies(recordin
         assert moved.key == entry.key.replace("vla/panda", "lab/ghost")
         assert moved.received_ns == entry.received_ns + later_ns
         if entry.header is None:
-            assert moved.payload == entry.data
+            assert moved.payload == entry.payload
             continue
         assert moved.header is not None
         assert moved.header.stamp_wall_ns == entry.header.stamp_wall_ns + later_ns
         assert moved.header.seq == entry.header.seq
         assert moved.header.source == entry.header.source.split("#")[0] + "#abc"
-        if entry.kind is PoseCommand and entry.fields["cause"]:
+        if entry.kind is PoseCommand and (cause := entry.record().cause):
             found = records.decode(PoseCommand, moved.payload).cause
             for name in Cause.__dataclass_fields__:
                 if name.endswith("_ns"):
-                    assert getattr(found, name) == entry.fields["cause"][name] + later_ns
+                    assert getattr(found, name) == getattr(cause, name) + later_ns
         if entry.kind is ActionChunk:
             found = records.decode(ActionChunk, moved.payload)
-            assert found.valid_until_ns == entry.fields["valid_until_ns"] + later_ns
+            assert found.valid_until_ns == entry.record().valid_until_ns + later_ns
 
 
 def test_at_twice_the_speed_everything_takes_half_the_time(recording: Path) -> None:

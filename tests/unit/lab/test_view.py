@@ -162,7 +162,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
     writer.finish({"dropped": {}})
     show = RerunLogger(PROFILE, stream := stream_to(folder / "run.rrd"))
     for entry in open_recording(folder / "run.mcap").entries():
-        show.take(entry)
+        show.log(entry)
     assert show.refused == {}
     stream.disconnect()
     return Shown(folder / "run.rrd")
@@ -178,7 +178,7 @@ def heard(tmp_path: Path, *samples: Sample, profile: Profile = BARE) -> tuple[Re
     """Samples off the wire, shown."""
     show = RerunLogger(profile, stream := stream_to(tmp_path / "a.rrd"), live=True)
     for sample in samples:
-        show.hear(sample)
+        show.log(sample)
     stream.disconnect()
     return show, Shown(tmp_path / "a.rrd")
 

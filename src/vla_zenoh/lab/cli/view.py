@@ -102,7 +102,7 @@ def _live(
                 if end_s is not None and time.monotonic() >= end_s:
                     break
                 for sample in listener.take():
-                    show.hear(sample)
+                    show.log(sample)
                 show.dropped = listener.dropped.total()
                 stop.wait(POLL_S)
             listener.close()
@@ -129,10 +129,10 @@ def _recorded(
         _refuse_strangers(profile, bind, port)
     with _sink(path.stem, serve, save, bind, port) as (stream, viewer):
         show = RerunLogger(profile, stream, keys=file.keys)
-        for entry in file.entries(lambda key: not key.endswith("/raw")):
+        for sample in file.entries(lambda key: not key.endswith("/raw")):
             if stop.is_set() or (viewer is not None and viewer.closed):
                 break
-            show.take(entry)
+            show.log(sample)
         _tell(show, save)
         if file.damage:
             errors().print(f"{path} is {file.damage}", style="yellow")

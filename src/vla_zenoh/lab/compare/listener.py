@@ -1,32 +1,29 @@
-"""Hears two workers over a live run: their chunks, their specs, and where the arm was."""
+"""Receives chunks and specs of two workers, and the states of the arm, of a live run."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from typing import TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample, bytes_of, header_of
+from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
-from vla_zenoh.keys import Keys
+from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.lab.compare.agreement import ArmStateHistory
+from vla_zenoh.lab.recording.sample_queue import SampleQueue
 from vla_zenoh.policy import ModelSpec
-from vla_zenoh.types import ActionChunk, GripperState, Header, PoseState
+from vla_zenoh.types import ActionChunk, GripperState, PoseState
 
 SPEC_PATIENCE_S, ASK_AGAIN_S = 3.0, 0.1
-MAX_STATES, MAX_CHUNKS = 4096, 1024
-
-Record = TypeVar("Record")
+MAX_BYTES, MAX_SAMPLES = 16 * 1024 * 1024, 8192
 
 
 class CompareListener:
-    """See the module; `poll` often.
+    """Chunks of two workers and the states of the arm; call `poll` often.
 
     Args:
-        session: open session.
+        session: an open session; the caller closes it.
         keys: of the robot.
         workers: the two names.
 
@@ -38,38 +35,33 @@ class CompareListener:
         self.specs = {worker: _spec(session, keys, worker) for worker in workers}
         self.chunks: dict[str, list[ActionChunk]] = {worker: [] for worker in workers}
         self.standing = ArmStateHistory()
-        self._deltas = {worker: CallbackRing(MAX_CHUNKS) for worker in workers}
-        self._poses, self._grippers = CallbackRing(MAX_STATES), CallbackRing(MAX_STATES)
-        listening = [
-            *((keys.delta(worker), self._deltas[worker]) for worker in workers),
-            (keys.state_pose, self._poses),
-            (keys.state_gripper, self._grippers),
-        ]
-        self._subscribers = [
-            session.declare_subscriber(key, zenoh.handlers.Callback(inbox, indirect=False))
-            for key, inbox in listening
-        ]
+        self._kinds: dict[str, type] = {keys.delta(worker): ActionChunk for worker in workers}
+        self._kinds |= {keys.state_pose: PoseState, keys.state_gripper: GripperState}
+        self._queue = SampleQueue(session, max_bytes=MAX_BYTES, max_samples=MAX_SAMPLES)
+        self._queue.subscribe(self._kinds)
 
     def poll(self) -> None:
-        """Take in what came since the last call."""
-        for kind, inbox in ((PoseState, self._poses), (GripperState, self._grippers)):
-            for header, state in _read(kind, inbox.drain()):
-                self.standing.add(header.stamp_wall_ns, state)
-        for worker, inbox in self._deltas.items():
-            for _, chunk in _read(ActionChunk, inbox.drain()):
-                # A worker that was started anew may have another spec; what it said before and
-                # now cannot be read together.
-                if chunk.spec_hash == self.specs[worker].hash:
-                    self.chunks[worker].append(chunk)
+        """Decode the samples received since the last call."""
+        for sample in self._queue.take():
+            try:
+                record = records.decode(self._kinds[sample.key], sample.payload)
+            except CodecError:
+                continue  # the nodes count and report what they reject
+            if sample.header is None:
+                continue
+            if not isinstance(record, ActionChunk):
+                self.standing.add(sample.header.stamp_wall_ns, record)
+            # A worker that restarted may have another spec, which gives its steps another meaning.
+            elif record.spec_hash == self.specs[last_chunk(sample.key)].hash:
+                self.chunks[last_chunk(sample.key)].append(record)
 
     def close(self) -> None:
-        """Stop listening."""
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
+        """Stop receiving."""
+        self._queue.close()
 
 
 def _spec(session: zenoh.Session, keys: Keys, worker: str) -> ModelSpec:
-    """The worker's spec; a session that was opened just now does not know yet whom to ask."""
+    """The worker's spec; a session that was just opened may not know the worker yet."""
     give_up_s = time.monotonic() + SPEC_PATIENCE_S
     while time.monotonic() < give_up_s:
         for reply in session.get(keys.spec(worker), timeout=SPEC_PATIENCE_S):
@@ -77,18 +69,6 @@ def _spec(session: zenoh.Session, keys: Keys, worker: str) -> ModelSpec:
                 try:
                     return records.decode(ModelSpec, bytes_of(reply.ok.payload))
                 except CodecError as error:
-                    raise NodeError(f"worker {worker!r}: its spec is not one: {error}") from error
+                    raise NodeError(f"worker {worker!r}: invalid spec: {error}") from error
         time.sleep(ASK_AGAIN_S)
-    raise NodeError(f"worker {worker!r} tells no spec; is it alive? (`vla-zenoh status`)")
-
-
-def _read(
-    kind: type[Record], arrivals: Sequence[ReceivedSample]
-) -> Iterator[tuple[Header, Record]]:
-    for arrival in arrivals:
-        try:
-            header = header_of(arrival.sample)
-            record = records.decode(kind, bytes_of(arrival.sample.payload))
-        except CodecError:
-            continue  # the nodes count and tell what strangers write
-        yield header, record
+    raise NodeError(f"worker {worker!r} publishes no spec; is it alive? (`vla-zenoh status`)")

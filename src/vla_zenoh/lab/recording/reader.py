@@ -10,8 +10,7 @@ import json
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -21,81 +20,28 @@ from mcap.records import Header as McapHeader
 from mcap.stream_reader import CRCValidationError, StreamReader
 from zstandard import ZstdError
 
-from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, RecordError, RecordingError
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.recording import cdr
-from vla_zenoh.lab.recording.definitions import SAMPLE_NAME, type_name
+from vla_zenoh.lab.recording import ros2_messages
+from vla_zenoh.lab.recording.record_json import bytes_from_json, record_from_json
 from vla_zenoh.lab.recording.record_types import RECORDS
-from vla_zenoh.lab.recording.sample import Sample
-from vla_zenoh.lab.recording.writer import ABOUT, ENDED, PROFILE_FILE
+from vla_zenoh.lab.recording.sample import Sample, received_sample
+from vla_zenoh.lab.recording.writer import ABOUT, BYTES, ENDED, PROFILE_FILE
 from vla_zenoh.types import Header
 
 MAX_RECORD_BYTES = 256 * 1024 * 1024
 SHOWN_TOPICS = 6
-_KINDS = {type_name(kind): kind for kind in RECORDS}
+_KINDS = {kind.__name__: kind for kind in RECORDS}
+_SCHEMAS = (ros2_messages.TEXT, ros2_messages.IMAGE, ros2_messages.JPEG_IMAGE)
 _BROKEN = (McapError, CRCValidationError, ZstdError, struct.error, ValueError, EOFError, KeyError)
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedEntry:
-    """One sample of a file, decoded as far as it was asked for.
-
-    Args:
-        key: the whole key.
-        header: what the writer said of it, None for settings.
-        heard_ns: when it was heard, wall clock of the recorder.
-        encoding: as Zenoh writes it.
-        kind: its record, None where it is none.
-        fields: of the record, as in its payload; not judged yet.
-        data: the payload where it is no record; for `text` decoded.
-        attachment: bytes in a header's place that are none.
-    """
-
-    key: str
-    header: Header | None
-    received_ns: int
-    encoding: str
-    kind: type | None = None
-    fields: dict[str, Any] = field(default_factory=dict)
-    data: bytes = b""
-    attachment: bytes | None = None
-
-    @property
-    def text(self) -> str:
-        """A setting's words."""
-        return self.data.decode("utf-8", "replace")
-
-    @property
-    def payload(self) -> bytes:
-        """As it was on the wire."""
-        return self.data if self.kind is None else cdr.payload_of(self.kind, self.fields)
-
-    @property
-    def sample(self) -> Sample:
-        """As it was heard."""
-        return Sample(
-            self.key, self.payload, self.encoding, self.header, self.received_ns, self.attachment
-        )
-
-    def record(self) -> Any:
-        """The record, checked.
-
-        Raises:
-            CodecError: it is none, or a value is not allowed.
-        """
-        if self.kind is None:
-            raise CodecError("malformed", f"{self.key} carries no record")
-        data = self.fields.get("spec", self.fields)
-        return records.from_map(self.kind, data)
-
-
 class Recording:
-    """A recorded run; see `open_recording`.
+    """A recording on disk; `open_recording` opens one.
 
     Args:
         path: of the file.
-        about: facts written at its beginning.
+        about: metadata from its start: robot, root, version, ...
         profile_yaml: the profile that was in force.
     """
 
@@ -103,15 +49,15 @@ class Recording:
         self.path, self.about, self.profile_yaml = path, about, profile_yaml
         self.keys = Keys(about["robot"], about["root"])
         self.ended: dict[str, Any] | None = None
-        """Facts written at its end, once `entries` has been there; None: it was cut off."""
+        """Metadata from its end, once `entries` has read it; None: the file was cut off."""
         self.damage = ""
-        """Why reading ended early, once it has; empty when it did not."""
+        """Why reading ended early; empty if it did not."""
 
-    def entries(self, wanted: Callable[[str], bool] = lambda key: True) -> Iterator[RecordedEntry]:
-        """Samples in the order heard. Damage ends them, see `damage`.
+    def entries(self, wanted: Callable[[str], bool] = lambda key: True) -> Iterator[Sample]:
+        """Samples in the order of reception, up to the first damage (see `damage`).
 
         Args:
-            wanted: which keys; the others are passed over undecoded.
+            wanted: whether to read a key; other keys are skipped undecoded.
         """
         schemas: dict[int, Schema] = {}
         channels: dict[int, _Source | None] = {}
@@ -140,7 +86,7 @@ class Recording:
 
     @property
     def dropped(self) -> int:
-        """Samples that the recorder heard and could not write, once `entries` has been there."""
+        """Samples that the recorder dropped, once `entries` has read the end."""
         counts = (self.ended or {}).get("dropped")
         counted = counts.values() if isinstance(counts, dict) else ()
         return sum(count for count in counted if type(count) is int)
@@ -148,9 +94,9 @@ class Recording:
     def _note_damage(self, why: str) -> None:
         self.damage = why
 
-    def _read(self, source: _Source, message: Message) -> RecordedEntry | None:
+    def _read(self, source: _Source, message: Message) -> Sample | None:
         try:
-            return source.entry(message)
+            return source.sample(message)
         except CodecError as error:
             self.damage = self.damage or f"{source.key}: {error}"
             return None
@@ -158,57 +104,54 @@ class Recording:
 
 @dataclass(frozen=True, slots=True)
 class _Source:
-    """A channel of ours."""
+    """A channel of one key and writer.
+
+    Args:
+        key: the whole key.
+        writer: source in its headers; empty for settings.
+        encoding: of the payloads.
+        schema: type of the messages.
+        json_of: name of the record whose JSON a message holds, or `BYTES`; empty for the rest.
+    """
 
     key: str
     writer: str
     encoding: str
     schema: str
+    json_of: str
 
-    def entry(self, message: Message) -> RecordedEntry:
-        kind = _KINDS.get(self.schema)
+    def sample(self, message: Message) -> Sample:
+        data = ros2_messages.deserialize(self.schema, message.data).data
+        key, encoding, received_ns = self.key, self.encoding, message.log_time
+        if self.json_of == BYTES:
+            payload, attachment = bytes_from_json(data)
+            return received_sample(key, payload, encoding, attachment, received_ns)
         header = None
         if self.writer:
             try:
                 header = Header(message.publish_time, message.sequence, self.writer)
             except RecordError as error:
                 raise CodecError("invalid", str(error)) from error
+        kind, fields = _KINDS.get(self.json_of), None
         if kind is not None:
-            _, fields = cdr.read_record(kind, message.data)
-            return RecordedEntry(self.key, header, message.log_time, self.encoding, kind, fields)
-        found = cdr.deserialize(self.schema, message.data)
-        if self.schema == cdr.TEXT:
-            data = found.data.encode()
-        elif self.schema == SAMPLE_NAME:
-            return self._stray(found, message.log_time)
+            payload, fields = record_from_json(kind, data)
         else:
-            data = found.data.tobytes()
-        return RecordedEntry(self.key, header, message.log_time, self.encoding, data=data)
-
-    def _stray(self, found: Any, received_ns: int) -> RecordedEntry:
-        attachment = found.attachment.tobytes() if found.has_attachment else None
-        header = None
-        if attachment is not None:
-            with suppress(CodecError):
-                header, attachment = records.decode_header(attachment), None
-        payload = found.payload.tobytes()
-        return RecordedEntry(
-            self.key, header, received_ns, self.encoding, data=payload, attachment=attachment
-        )
+            payload = data.encode() if self.schema == ros2_messages.TEXT else data.tobytes()
+        return Sample(key, payload, encoding, header, received_ns, None, kind, fields)
 
 
 def _source(channel: Channel, schemas: dict[int, Schema]) -> _Source | None:
     facts, schema = channel.metadata, schemas.get(channel.schema_id)
-    if "key" not in facts or schema is None:
+    if "key" not in facts or schema is None or schema.name not in _SCHEMAS:
         return None
-    known = {*_KINDS, cdr.TEXT, cdr.IMAGE, cdr.JPEG_IMAGE, SAMPLE_NAME}
-    if schema.name not in known:
+    source, encoding, json_of = (facts.get(name, "") for name in ("source", "encoding", "json"))
+    if json_of and (schema.name != ros2_messages.TEXT or json_of not in {*_KINDS, BYTES}):
         return None
-    return _Source(facts["key"], facts.get("source", ""), facts.get("encoding", ""), schema.name)
+    return _Source(facts["key"], source, encoding, schema.name, json_of)
 
 
 def _whole(file: IO[bytes], damage: Callable[[str], None]) -> Iterator[Any]:
-    """Records until the end, or until one cannot be read."""
+    """MCAP records up to the end, or to the first that cannot be read."""
     reader = StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True)
     records = iter(reader.records)
     while True:
@@ -229,10 +172,10 @@ def open_recording(path: Path) -> Recording:
     """Open a file that ``vla-zenoh record`` wrote.
 
     Raises:
-        RecordingError: it cannot be read, is no MCAP file, or is one of another program.
+        RecordingError: the file cannot be read, is no MCAP file, or is of another program.
         MissingExtraError: rosbags is not installed.
     """
-    cdr.messages()
+    ros2_messages.messages()
     about: dict[str, str] | None = None
     problems: list[str] = []
     topics: Counter[str] = Counter()

@@ -1,7 +1,7 @@
-"""Writes what is said on keys into a file, and says on its own keys how that goes.
+"""Records the keys of a robot into a file, as a node with its own status and events.
 
-Zenoh's callback only puts a sample into a queue of bounded size; a thread writes. What the queue
-cannot take is counted by key, in status and in the file.
+Zenoh's callback only adds a sample to a bounded queue; a thread writes. Dropped samples are counted
+by key, in the status and in the file.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,11 +17,12 @@ from typing import Any
 
 import zenoh
 
-from vla_zenoh.bus.buffers import bytes_of, payload_and_attachment
+from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.node import Node
-from vla_zenoh.errors import CodecError, RecordingError
+from vla_zenoh.errors import RecordingError
 from vla_zenoh.keys import Keys, covers
-from vla_zenoh.lab.recording.sample import TEXT, heard
+from vla_zenoh.lab.recording.sample import TEXT
+from vla_zenoh.lab.recording.sample_queue import SampleQueue
 from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.types import Event
@@ -32,7 +33,7 @@ QUEUE_SAMPLES = 50_000
 """Some ten seconds of a robot with two cameras."""
 COMMIT_S = 0.5
 """Who kills the recorder with -9 loses at most what was said in this time."""
-POLL_S = 0.1
+POLL_S, WRITE_S = 0.1, 0.025
 ANSWER_S = 1.0
 SWITCH_INTERVAL_S = 5e-4
 RECORDING, FAILED, STOPPED = "recording", "failed", "stopped"
@@ -107,13 +108,12 @@ class Recorder:
     ) -> None:
         self.node = Node(name, profile, session)
         self._expressions = expressions or recorded_keys(self.node.keys)
-        self._queue: deque[tuple[str, bytes, str, bytes | None, int]] = deque()
-        self._queued_bytes, self._queue_limit = 0, queue_bytes
-        self._change = threading.Condition()
-        self._closing = False
+        self._queue = SampleQueue(
+            session, max_bytes=queue_bytes, max_samples=QUEUE_SAMPLES, clock=self.node.clock
+        )
+        self._closing = threading.Event()
         self._ended: Mapping[str, Any] = {}
-        self._subscribers: list[Any] = []
-        self.recorded = RecordingResult(path)
+        self.recorded = RecordingResult(path, dropped=self._queue.dropped)
         self._began_s = time.monotonic()
         self._writer = RecordingWriter(
             path,
@@ -134,13 +134,7 @@ class Recorder:
         """
         # Else Zenoh's thread may wait 5 ms for the writing one at every sample, and hears late.
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        handler = zenoh.handlers.Callback(self._take, indirect=False)
-        for expression in self._expressions:
-            try:
-                subscriber = self.node.session.declare_subscriber(expression, handler)
-            except zenoh.ZError as error:
-                raise RecordingError(f"{expression!r} is not a key expression: {error}") from error
-            self._subscribers.append(subscriber)
+        self._queue.subscribe(self._expressions)
         self._thread.start()
         self._ask_settings()
         return self
@@ -154,7 +148,7 @@ class Recorder:
                 continue
             for reply in self.node.session.get(key, timeout=ANSWER_S):
                 if reply.ok is not None:
-                    self._put(key, bytes_of(reply.ok.payload), TEXT, None)
+                    self._queue.add(key, bytes_of(reply.ok.payload), TEXT, None)
 
     def run(self, stop: threading.Event, seconds: float | None = None) -> RecordingResult:
         """Record until `stop` is set, `seconds` have passed, or the disk is full."""
@@ -169,9 +163,7 @@ class Recorder:
 
     def stop_listening(self) -> None:
         """Take no more samples; the file stays open until `close`."""
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
-        self._subscribers.clear()
+        self._queue.close()
 
     def close(self, ended: Mapping[str, Any] | None = None) -> RecordingResult:
         """Stop listening, write what is queued, and finish the file.
@@ -181,40 +173,10 @@ class Recorder:
         """
         self.stop_listening()
         self._ended = ended or {}
-        with self._change:
-            self._closing = True
-            self._change.notify()
+        self._closing.set()
         self._thread.join()
         self.node.close()
         return self.recorded
-
-    # -- in -----------------------------------------------------------------------------------
-    def _take(self, sample: zenoh.Sample) -> None:
-        key = str(sample.key_expr)
-        try:
-            payload, attachment = payload_and_attachment(sample, self._queue_limit)
-        except CodecError as error:  # copying what is too large costs as much as keeping it
-            with self._change:
-                if error.reason == "oversize":
-                    self.recorded.dropped[key] += 1
-                else:
-                    self.node.counters[f"refused.{error.reason}"] += 1
-            return
-        self._put(key, payload, str(sample.encoding), attachment)
-
-    def _put(self, key: str, payload: bytes, encoding: str, attachment: bytes | None) -> None:
-        size = len(payload) + len(attachment or b"")
-        with self._change:
-            full = self._queued_bytes + size > self._queue_limit
-            if full or len(self._queue) >= QUEUE_SAMPLES:
-                self.recorded.dropped[key] += 1
-                return
-            # The stamp is taken under the lock: the file is in the order of its stamps.
-            now_ns = self.node.clock.wall_ns()
-            self._queue.append((key, payload, encoding, attachment, now_ns))
-            self._queued_bytes += size
-            if len(self._queue) == 1:
-                self._change.notify()
 
     # -- out ----------------------------------------------------------------------------------
     def _write_all(self) -> None:
@@ -231,30 +193,19 @@ class Recorder:
         commit_s = time.monotonic() + COMMIT_S
         closing = False
         while not closing:
-            with self._change:
-                self._change.wait_for(lambda: self._queue or self._closing, POLL_S)
-                closing = self._closing
-                taken, self._queue = self._queue, deque()
-                taken_bytes = self._queued_bytes
-            for each in taken:
-                self._writer.write(heard(*each))
-            taken.clear()
-            with self._change:
-                self._queued_bytes -= taken_bytes
+            # Samples are written in batches: waking up for each costs more than writing it.
+            closing = self._closing.wait(WRITE_S)
+            for sample in self._queue.take():
+                self._writer.write(sample)
             if time.monotonic() >= commit_s:
                 self._writer.commit()
                 commit_s = time.monotonic() + COMMIT_S
                 self._measure()
                 self._report(RECORDING)
-            elif not closing:
-                # Samples are written some at a time: waking up for each costs more than they do.
-                time.sleep(POLL_S / 4)
 
     def _fail(self, why: str) -> None:
-        with self._change:
-            self.recorded.failure = why
-            self._queue_limit = -1  # nothing is queued any more
-            self._queue.clear()
+        self.recorded.failure = why
+        self._queue.reject_all()
         self._writer.abandon()
         self.node.emit(Event("error", "fault", "recording_failed", why[:1000]))
 
@@ -279,6 +230,8 @@ class Recorder:
             )
         self.node.counters["samples"] = recorded.samples.total()
         self.node.counters["dropped"] = dropped
+        for reason, count in self._queue.rejected.items():
+            self.node.counters[f"refused.{reason}"] = count
         self.node.publish_status(
             state,
             detail={

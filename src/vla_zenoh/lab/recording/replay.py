@@ -20,7 +20,7 @@ from vla_zenoh.bus.liveliness import alive_nodes
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import CodecError, NodeError, RecordingError
-from vla_zenoh.lab.recording.reader import RecordedEntry, Recording
+from vla_zenoh.lab.recording.reader import Recording
 from vla_zenoh.lab.recording.restamp import Restamper
 from vla_zenoh.lab.recording.sample import JPEG, Sample
 from vla_zenoh.lab.statistics import percentiles
@@ -219,7 +219,7 @@ class Replay:
                 return
         _hand_over(ready, None, ending)
 
-    def _chosen(self) -> Iterator[RecordedEntry]:
+    def _chosen(self) -> Iterator[Sample]:
         for entry in self._file.entries(lambda key: self._here.group(key) in self._groups):
             writer = "" if entry.header is None else entry.header.source.partition("#")[0]
             if writer in self._alive:

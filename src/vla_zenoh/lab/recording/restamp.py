@@ -11,9 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from vla_zenoh.codec import message
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.recording import cdr
-from vla_zenoh.lab.recording.reader import RecordedEntry
 from vla_zenoh.lab.recording.sample import Sample
 from vla_zenoh.types import Header
 
@@ -47,16 +46,16 @@ class Restamper:
             since_ns = round(since_ns / self._speed)
         return max(0, self._starts_ns + since_ns)
 
-    def move(self, entry: RecordedEntry) -> Sample:
+    def move(self, entry: Sample) -> Sample:
         """The sample to put, `received_ns` being when it is to be put."""
         header = entry.header
         if header is not None:
             node, _, _ = header.source.partition("#")
             source = f"{node}#{self._suffix}"
             header = Header(self.moved_ns(header.stamp_wall_ns), header.seq, source)
-        payload = entry.data
-        if entry.kind is not None:
-            payload = cdr.payload_of(entry.kind, _stamps_moved(entry.fields, self.moved_ns))
+        payload = entry.payload
+        if entry.fields is not None:
+            payload = message.pack(_stamps_moved(entry.fields, self.moved_ns))
         return Sample(
             self._here.on(self._there, entry.key),
             payload,

@@ -226,4 +226,4 @@ def _jpegs(file: Recording, key: str) -> Iterator[RecordedImage]:
     for entry in file.entries(lambda each: each == key):
         if entry.header is not None and entry.encoding == JPEG:
             stamp_ns, seq = entry.header.stamp_wall_ns, entry.header.seq
-            yield RecordedImage(entry.received_ns, stamp_ns, seq, entry.data)
+            yield RecordedImage(entry.received_ns, stamp_ns, seq, entry.payload)

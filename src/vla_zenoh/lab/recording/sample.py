@@ -1,8 +1,11 @@
-"""One sample of one key, as it was heard."""
+"""A sample of one key, as it was received."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
 
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError
@@ -10,21 +13,23 @@ from vla_zenoh.types import Header
 
 MSGPACK, JPEG, TEXT = "application/msgpack", "image/jpeg", "text/plain"
 RAW = "zenoh/bytes;rgb8;"
-"""Beginning of a raw picture's encoding; its height and width follow."""
+"""Prefix of the encoding of raw images; height and width follow."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What a key said once.
+    """Payload, encoding and header of one sample of a key.
 
     Args:
         key: the whole key.
         payload: bytes.
         encoding: as Zenoh writes it, for example ``image/jpeg``.
-        header: what the writer said of it, None for settings.
-        heard_ns: when it arrived, wall clock of whoever heard it.
-        attachment: bytes that came in a header's place and are none; None with a header, or
-            without any attachment.
+        header: its header, None for settings.
+        received_ns: time of reception, wall clock of the receiver.
+        attachment: bytes of an attachment that is no header; None with a header, or without any
+            attachment.
+        kind: type of the record; None for images, settings, unknown bytes, and off the wire.
+        fields: of the record as decoded, not validated; None as `kind`.
     """
 
     key: str
@@ -33,26 +38,41 @@ class Sample:
     header: Header | None
     received_ns: int
     attachment: bytes | None = None
+    kind: type | None = field(default=None, compare=False)
+    fields: Mapping[str, Any] | None = field(default=None, compare=False)
 
     @property
     def stamp_ns(self) -> int:
-        """Its header's stamp, or when it was heard."""
+        """The header's stamp; without a header the time of reception."""
         return self.received_ns if self.header is None else self.header.stamp_wall_ns
 
     @property
     def attached(self) -> bytes | None:
-        """The attachment to put it with."""
+        """The attachment to publish the sample with."""
         return self.attachment if self.header is None else records.encode_header(self.header)
 
+    @property
+    def text(self) -> str:
+        """The text of a setting."""
+        return self.payload.decode("utf-8", "replace")
 
-def heard(
+    def record(self) -> Any:
+        """The validated record of type `kind`.
+
+        Raises:
+            CodecError: the payload is no record, or a value is not allowed.
+        """
+        if self.kind is None:
+            raise CodecError("malformed", f"{self.key} carries no record")
+        return records.from_map(self.kind, self.fields)
+
+
+def received_sample(
     key: str, payload: bytes, encoding: str, attachment: bytes | None, received_ns: int
 ) -> Sample:
-    """A sample of what came from the wire, whatever it is."""
+    """A sample off the wire; an attachment that is no header is kept as bytes."""
     header = None
     if attachment is not None:
-        try:
-            header = records.decode_header(attachment)
-        except CodecError:
-            return Sample(key, payload, encoding, None, received_ns, attachment)
-    return Sample(key, payload, encoding, header, received_ns)
+        with suppress(CodecError):
+            header, attachment = records.decode_header(attachment), None
+    return Sample(key, payload, encoding, header, received_ns, attachment)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from vla_zenoh.codec import settings
+from vla_zenoh.codec import records, settings
 from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.lab.recording.record_types import RecordTypes
@@ -19,7 +19,6 @@ from vla_zenoh.lab.view.charts import Charts
 from vla_zenoh.lab.view.layout import blueprint
 from vla_zenoh.lab.view.robot_model import load_robot_model
 from vla_zenoh.lab.view.scene import Scene, pose_of
-from vla_zenoh.lab.view.shown_sample import Live, ShownSample
 from vla_zenoh.lab.view.texts import TextPanels
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile, to_yaml
@@ -70,7 +69,7 @@ class RerunLogger:
     ) -> None:
         self._stream, self._live = stream, live
         self.keys = keys or profile.keys
-        self._kinds = RecordTypes(self.keys)
+        self._types = RecordTypes(self.keys)
         self._command_status = self.keys.status(COMMAND_NODE)
         shapes, missing = load_robot_model(profile)
         self._kinematics = shapes.kinematics if shapes is not None else None
@@ -93,7 +92,7 @@ class RerunLogger:
         """Samples that cannot be shown, by key and reason."""
         self.dropped = 0
         """Samples that whoever feeds this had to leave out."""
-        self._take: dict[type, Callable[[ShownSample, int, Any], None]] = {
+        self._log_record: dict[type, Callable[[Sample, int, Any], None]] = {
             PoseState: self._pose_state,
             JointState: self._joint_state,
             GripperState: self._gripper_state,
@@ -116,35 +115,31 @@ class RerunLogger:
         )
 
     # -- in -----------------------------------------------------------------------------------
-    def hear(self, sample: Sample) -> None:
-        """Take a sample off the wire."""
-        self.take(Live(sample, self._kinds.of(sample.key)))
-
-    def take(self, said: ShownSample) -> None:
-        """Take a sample; whatever it is, nothing is raised."""
-        group = self.keys.group(said.key)
-        if not group or said.kind is SceneState:
+    def log(self, sample: Sample) -> None:
+        """Log what a sample shows; whatever it holds, nothing is raised."""
+        group, kind = self.keys.group(sample.key), self._types.of(sample.key)
+        if not group or kind is SceneState:
             return
-        stamp_ns = self._stamp_ns(said)
+        stamp_ns = self._stamp_ns(sample)
         if not self.shown:
             self._scene.robot_moved()  # at home, until its joints are known
         try:
-            if said.kind is not None:
-                self._record(said, stamp_ns)
+            if kind is not None:
+                self._record(kind, sample, stamp_ns)
             elif group in (paths.CAMERA, paths.SEEN):
-                self._picture(said, group)
+                self._picture(sample, group)
             else:
-                self._setting(said)
-            self.shown[said.key] += 1
+                self._setting(sample)
+            self.shown[sample.key] += 1
         except CodecError as error:
-            self.refused[f"{self.keys.short(said.key)}: {error.reason}"] += 1
+            self.refused[f"{self.keys.short(sample.key)}: {error.reason}"] += 1
         except RecordError:
-            self.refused[f"{self.keys.short(said.key)}: does not fit its spec"] += 1
+            self.refused[f"{self.keys.short(sample.key)}: does not fit its spec"] += 1
 
-    def _stamp_ns(self, said: ShownSample) -> int:
-        stamp_ns = said.received_ns
-        if said.header is not None and abs(said.header.stamp_wall_ns - stamp_ns) < APART_NS:
-            stamp_ns = said.header.stamp_wall_ns
+    def _stamp_ns(self, sample: Sample) -> int:
+        stamp_ns = sample.received_ns
+        if sample.header is not None and abs(sample.header.stamp_wall_ns - stamp_ns) < APART_NS:
+            stamp_ns = sample.header.stamp_wall_ns
         self._stream.set_time(paths.TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
         return stamp_ns
 
@@ -154,23 +149,20 @@ class RerunLogger:
         self._drawn_ns[key] = stamp_ns
         return True
 
-    def _record(self, said: ShownSample, stamp_ns: int) -> None:
-        if said.header is None and said.kind is not ModelSpec:  # an answer to a question has none
-            raise CodecError("no_header", f"{said.key} has no header")
-        if said.kind in self._often and not self._due(said.key, stamp_ns):
+    def _record(self, kind: type, sample: Sample, stamp_ns: int) -> None:
+        if sample.header is None and kind is not ModelSpec:  # the reply to a query has none
+            raise CodecError("no_header", f"{sample.key} has no header")
+        if kind in self._often and not self._due(sample.key, stamp_ns):
             return
-        record = said.record()
-        take = self._take.get(type(record))
-        if take is not None:
-            take(said, stamp_ns, record)
+        self._log_record[kind](sample, stamp_ns, records.decode(kind, sample.payload))
 
     # -- pictures and settings ----------------------------------------------------------------
-    def _picture(self, said: ShownSample, group: str) -> None:
-        _, first, *rest = self.keys.short(said.key).split("/", 2)
+    def _picture(self, sample: Sample, group: str) -> None:
+        _, first, *rest = self.keys.short(sample.key).split("/", 2)
         second = rest[0] if rest else ""
         if group == paths.CAMERA and second != "jpeg":
             return
-        if not second or said.encoding != JPEG or not said.data.startswith(JPEG_BEGINS):
+        if not second or sample.encoding != JPEG or not sample.payload.startswith(JPEG_BEGINS):
             raise CodecError("malformed", "it is no JPEG")
         if group == paths.CAMERA:
             path, known, name = paths.picture(first), self._cameras, first
@@ -179,15 +171,15 @@ class RerunLogger:
         if name not in known:
             known.add(name)
             self._layout()
-        self._stream.log(path, rr.EncodedImage(contents=said.data, media_type=JPEG))
+        self._stream.log(path, rr.EncodedImage(contents=sample.payload, media_type=JPEG))
 
-    def _setting(self, said: ShownSample) -> None:
-        if said.header is not None or "/" in self.keys.short(said.key):
+    def _setting(self, sample: Sample) -> None:
+        if sample.header is not None or "/" in self.keys.short(sample.key):
             raise CodecError("malformed", "bytes that are no record")
-        self._words.setting(self.keys.short(said.key), settings.decode_text(said.data))
+        self._words.setting(self.keys.short(sample.key), settings.decode_text(sample.payload))
 
     # -- the robot ----------------------------------------------------------------------------
-    def _pose_state(self, _: ShownSample, stamp_ns: int, state: PoseState) -> None:
+    def _pose_state(self, _: Sample, stamp_ns: int, state: PoseState) -> None:
         self._scene.pose(paths.MEASURED, stamp_ns, pose_of(state.position_m, state.quat_xyzw))
         self._charts.speed(paths.MEASURED, state.twist)
         commanded_m = state.reference_position_m
@@ -196,33 +188,33 @@ class RerunLogger:
         if commanded_m is not None:
             self._charts.tracking(float(np.linalg.norm(commanded_m - state.position_m)))
 
-    def _joint_state(self, _: ShownSample, stamp_ns: int, state: JointState) -> None:
+    def _joint_state(self, _: Sample, stamp_ns: int, state: JointState) -> None:
         self._scene.joints(state.names, state.position_rad)
         self._charts.joints(state.names, state.position_rad)
 
-    def _gripper_state(self, _: ShownSample, stamp_ns: int, state: GripperState) -> None:
+    def _gripper_state(self, _: Sample, stamp_ns: int, state: GripperState) -> None:
         self._scene.gripper(max(state.width_m, 0.0))
         self._charts.gripper(paths.MEASURED, state.width_m)
 
-    def _objects(self, _: ShownSample, stamp_ns: int, objects: ObjectPoses) -> None:
+    def _objects(self, _: Sample, stamp_ns: int, objects: ObjectPoses) -> None:
         self._scene.objects(objects)
 
     # -- commands -----------------------------------------------------------------------------
-    def _pose_command(self, said: ShownSample, stamp_ns: int, command: PoseCommand) -> None:
+    def _pose_command(self, sample: Sample, stamp_ns: int, command: PoseCommand) -> None:
         goal = pose_of(command.goal_position_m, command.goal_quat_xyzw)
         self._scene.goal(stamp_ns, goal)
         self._charts.command(stamp_ns, command.cause)
         self._commanded = command
-        if self._due(said.key, stamp_ns):
+        if self._due(sample.key, stamp_ns):
             pose = pose_of(command.position_m, command.quat_xyzw)
             self._scene.pose(paths.COMMANDED, stamp_ns, pose)
             self._scene.pose(paths.GOAL, stamp_ns, goal)
             self._charts.speed(paths.COMMANDED, command.twist)
 
-    def _joint_command(self, said: ShownSample, stamp_ns: int, command: JointCommand) -> None:
+    def _joint_command(self, sample: Sample, stamp_ns: int, command: JointCommand) -> None:
         self._charts.command(stamp_ns, command.cause)
         arm = self._kinematics
-        if arm is None or not self._due(said.key, stamp_ns):
+        if arm is None or not self._due(sample.key, stamp_ns):
             return
         joints_rad = arm.ordered(command.names, command.position_rad)
         velocity = arm.ordered(command.names, command.velocity_rad_s)
@@ -230,14 +222,14 @@ class RerunLogger:
         self._scene.pose(paths.COMMANDED, stamp_ns, pose)
         self._charts.speed(paths.COMMANDED, jacobian @ velocity)
 
-    def _gripper_command(self, _: ShownSample, stamp_ns: int, command: GripperCommand) -> None:
+    def _gripper_command(self, _: Sample, stamp_ns: int, command: GripperCommand) -> None:
         self._charts.gripper(paths.COMMANDED, command.width_m)
 
     # -- models -------------------------------------------------------------------------------
-    def _spec(self, _: ShownSample, stamp_ns: int, spec: ModelSpec) -> None:
+    def _spec(self, _: Sample, stamp_ns: int, spec: ModelSpec) -> None:
         self._specs[spec.hash] = spec
 
-    def _chunk(self, _: ShownSample, stamp_ns: int, chunk: ActionChunk) -> None:
+    def _chunk(self, _: Sample, stamp_ns: int, chunk: ActionChunk) -> None:
         spec = self._specs.get(chunk.spec_hash)
         if spec is None:
             raise CodecError("no_spec", "no spec says what its numbers mean")
@@ -246,23 +238,23 @@ class RerunLogger:
         if not obeyed:
             self._charts.shadow(chunk)
 
-    def _on_seen(self, _: ShownSample, stamp_ns: int, seen: InferenceDebug) -> None:
+    def _on_seen(self, _: Sample, stamp_ns: int, seen: InferenceDebug) -> None:
         if seen.worker not in self._seen:
             self._seen[seen.worker] = set()
             self._layout()
         self._words.answer(seen)
 
     # -- words --------------------------------------------------------------------------------
-    def _on_task(self, _: ShownSample, stamp_ns: int, task: Task) -> None:
+    def _on_task(self, _: Sample, stamp_ns: int, task: Task) -> None:
         self._obeyed = task.worker
         self._words.task(task)
         self._words.now(stamp_ns, self.refused, self.dropped)
 
-    def _status(self, said: ShownSample, stamp_ns: int, status: NodeStatus) -> None:
-        if said.key == self._command_status:
+    def _status(self, sample: Sample, stamp_ns: int, status: NodeStatus) -> None:
+        if sample.key == self._command_status:
             self._charts.status(status)
             self._words.status(status)
         self._words.now(stamp_ns, self.refused, self.dropped)
 
-    def _event(self, said: ShownSample, stamp_ns: int, event: Event) -> None:
-        self._words.event(last_chunk(said.key), stamp_ns, event)
+    def _event(self, sample: Sample, stamp_ns: int, event: Event) -> None:
+        self._words.event(last_chunk(sample.key), stamp_ns, event)
