@@ -8,12 +8,12 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.buffers import MAX_RECORD_BYTES, LatestSample, ReceivedSample
+from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, bytes_of, header_of
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.payload_limits import bytes_of, header_of
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES, decode_jpeg, decode_raw
+from vla_zenoh.codec.records import MAX_RECORD_BYTES
 from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import Profile, as_robot, load_profile, override
 from vla_zenoh.types import (
