@@ -43,7 +43,7 @@ def test_a_session_from_prompt_to_reset(chain: Chain) -> None:
     assert "worker: nobody" in ok(chain, "use", "nobody")
     refused = run(chain, "activate")
     assert refused.returncode == REFUSED
-    assert "activate refused:" in refused.stderr
+    assert "activate rejected:" in refused.stderr
     assert "- worker 'nobody' is not alive; alive are: scripted" in refused.stderr
     ok(chain, "use", "scripted")
 
@@ -57,7 +57,7 @@ def test_a_session_from_prompt_to_reset(chain: Chain) -> None:
     assert f"stopped: {named}; {how}" in ok(chain, "stop")
     refused = run(chain, "activate")
     assert refused.returncode == REFUSED
-    assert "the state is stopped (emergency stop); put anything on reset" in refused.stderr
+    assert "the state is stopped (emergency stop); reset it first" in refused.stderr
     assert "reset; inactive" in ok(chain, "reset")
 
 
@@ -108,7 +108,7 @@ def test_echo_decodes_what_is_written(chain: Chain) -> None:
 def test_echo_of_a_silent_key_fails(chain: Chain) -> None:
     done = run(chain, "echo", "no/such/key", "--seconds", "0.3")
     assert done.returncode == REFUSED
-    assert "nothing was written on vla/panda/no/such/key" in done.stderr
+    assert "nothing was published on vla/panda/no/such/key" in done.stderr
 
 
 def test_without_a_router_a_command_says_where_it_looked_and_what_to_do(chain: Chain) -> None:

@@ -1,4 +1,4 @@
-"""Which goal is in force where chunks overlap: the newest plan's, a blend, or an ensemble.
+"""Aggregation of overlapping plans: the newest plan, a blend, or an ensemble.
 
 ``P_i(t)`` is the waypoint of plan i at time t, i = 0 the oldest::
 
@@ -7,17 +7,17 @@
                w(s) = s^3 (10 - 15 s + 6 s^2), s = (t - a) / T
     ensemble   F(t) = sum_i w_i P_i(t) / sum_i w_i, w_i = exp(-m i), over the plans alive at t
 
-``a`` is when plan n arrived, ``T`` the declared window `blend_s`, or less where the plan before it
-ends sooner: only what overlaps is blended. A plan is alive until its last step's window ends; the
-newest always is. A mix of two poses is linear in position and on the geodesic in rotation; the mean
-of several rotations is the one on SO(3), ``sum_i w_i log(R_i R^T) = 0``. The width is the newest's.
+``a`` is the arrival of plan n, ``T`` the profile's `blend_s`, or less where the plan before it ends
+sooner: only what overlaps is blended. A plan is alive until the end of its last step; the newest
+always is. A mix of two poses is linear in position and on the geodesic in rotation; the mean of
+several rotations is that on SO(3), ``sum_i w_i log(R_i R^T) = 0``. The width is the newest's.
 
-Plans are mixed within an episode only, and none from before a hold: a new prompt counts at once.
+Only plans of one episode since the last hold are mixed: a new prompt counts at once.
 
-What a later chunk stands on is ``G(t)``, the newest plan's alone, in every mode: what was asked
-for, of which the mode only says how to get there. So no step is lost or counted twice, and when the
-last plan stands alone the goal is exactly where its steps end. ``F`` lies between goals that were
-bounded, and inside the workspace, which is convex.
+In every mode a later chunk stands on ``G(t)`` of the newest plan alone: that is what was asked for,
+the mode only says how to get there. So no step is lost or counted twice, and once the last plan is
+alone the goal is exactly where its steps end. ``F`` lies between bounded goals, and inside the
+workspace, which is convex.
 
 Source of the ensemble: Zhao, Kumar, Levine, Finn, "Learning Fine-Grained Bimanual Manipulation with
 Low-Cost Hardware", RSS 2023 (temporal ensembling; m = 0.01 there).
@@ -29,7 +29,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vla_zenoh.control.limits import Slowdown
+from vla_zenoh.control.limits import slowest
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.kinematics.so3 import Pose, exp3, interpolate, log3, norm3, orthonormal
 from vla_zenoh.profile import Composition
@@ -37,36 +37,36 @@ from vla_zenoh.types import FloatArray
 
 MEAN_ITERATIONS = 10
 MEAN_RAD = 1e-10
-"""The mean of rotations is known well enough when it moves by less."""
+"""The mean of rotations has converged when it moves by less."""
 
 
 class PlanAggregator:
-    """See the module.
+    """The goal F(t) of the plans on a timeline, by one of the three modes.
 
     Args:
-        composition: the mode and its numbers.
+        composition: the mode and its parameters.
     """
 
     def __init__(self, composition: Composition) -> None:
         self._mode = composition.mode
         self._blend_ns = round(composition.blend_s * 1e9)
-        self._most = composition.ensemble_plans
-        self._weights = np.exp(-composition.ensemble_decay * np.arange(self._most))
+        self._max_plans = composition.ensemble_plans
+        self._weights = np.exp(-composition.ensemble_decay * np.arange(self._max_plans))
         self._waypoints: list[Goal] = []
         self._mean: Goal | None = None
 
     def plans(self, timeline: GoalTimeline, now_ns: int) -> list[Plan]:
-        """Those that have a say at `now_ns`, the newest last."""
+        """The plans that F(now) depends on, the newest last."""
         if self._mode == "replace":
             return [timeline.plan]
         if self._mode == "blend":
             return self._blended(timeline, now_ns)
         newest, *older = timeline.episode_plans()
         alive = [plan for plan in older if now_ns < plan.end_ns]
-        return [newest, *alive[: self._most - 1]][::-1]
+        return [newest, *alive[: self._max_plans - 1]][::-1]
 
     def goal(self, plans: Sequence[Plan], now_ns: int) -> Goal:
-        """F(t) of `plans`; of a single one, its own waypoint."""
+        """F(t) of `plans`; of a single plan, its own waypoint."""
         waypoints = [plan.goals[plan.index_at(now_ns)] for plan in plans]
         if len(plans) == 1:
             return waypoints[0]
@@ -74,14 +74,22 @@ class PlanAggregator:
             mixed = waypoints[0].pose
             for older, plan, waypoint in zip(plans, plans[1:], waypoints[1:], strict=False):
                 mixed = interpolate(mixed, waypoint.pose, self._weight(older, plan, now_ns))
-            return Goal(mixed, waypoints[-1].width_m, slowdown=_slowest(waypoints))
+            return Goal(
+                mixed,
+                waypoints[-1].width_m,
+                slowdown=slowest(*(goal.slowdown for goal in waypoints)),
+            )
         same = len(waypoints) == len(self._waypoints) and all(
             ours is theirs for ours, theirs in zip(waypoints, self._waypoints, strict=True)
         )
         if self._mean is None or not same:
             self._waypoints = waypoints
             pose = mean_pose([goal.pose for goal in waypoints], self._weights[: len(waypoints)])
-            self._mean = Goal(pose, waypoints[-1].width_m, slowdown=_slowest(waypoints))
+            self._mean = Goal(
+                pose,
+                waypoints[-1].width_m,
+                slowdown=slowest(*(goal.slowdown for goal in waypoints)),
+            )
         return self._mean
 
     def _blended(self, timeline: GoalTimeline, now_ns: int) -> list[Plan]:
@@ -95,27 +103,21 @@ class PlanAggregator:
 
     def _weight(self, older: Plan, plan: Plan, now_ns: int) -> float:
         """Share of `plan` against `older`: 0 when it arrives, 1 at the end of its window."""
-        had_ns = plan.elapsed_ns(now_ns) - plan.elapsed_ns(plan.arrival_ns)
+        elapsed_ns = plan.elapsed_ns(now_ns) - plan.elapsed_ns(plan.arrival_ns)
         left_ns = len(older.goals) * older.dt_ns - older.elapsed_ns(plan.arrival_ns)
         window_ns = min(self._blend_ns, left_ns)
-        if had_ns >= window_ns:
+        if elapsed_ns >= window_ns:
             return 1.0
-        s = max(had_ns, 0) / window_ns
+        s = max(elapsed_ns, 0) / window_ns
         return s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
 
 
-def _slowest(goals: Sequence[Goal]) -> Slowdown | None:
-    """What slows the mix of `goals`: it lies between them."""
-    found = [goal.slowdown for goal in goals if goal.slowdown is not None]
-    return min(found, key=lambda each: each.share, default=None)
-
-
 def mean_pose(poses: Sequence[Pose], weights: FloatArray) -> Pose:
-    """Weighted mean of poses: in R^3, and on SO(3) (Karcher), found from the last one on.
+    """Weighted mean of poses: in R^3, and on SO(3) (Karcher mean, iterated from the last one).
 
     Args:
         poses: rotations less than half a turn apart.
-        weights: one each, not negative, not all zero.
+        weights: (n,) not negative, not all zero.
     """
     shares = weights / weights.sum()
     position_m = shares @ np.array([pose.position_m for pose in poses])

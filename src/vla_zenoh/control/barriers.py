@@ -1,7 +1,4 @@
-"""What must not become negative: singular value and distances of an arm, each minus its stop.
-
-The arm to itself and to the table, the hand and fingers to the table with bounds of their own.
-"""
+"""Barriers and distance constraints of an arm: singularity, self-collision, table, workspace."""
 
 from __future__ import annotations
 
@@ -10,22 +7,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.limits import LimitHit, Slowdown, slowdown
+from vla_zenoh.control.limits import LimitHit, Slowdown, slowdown, workspace_corners
 from vla_zenoh.kinematics.collision import TABLE, CollisionModel
 from vla_zenoh.kinematics.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.profile import Limits, ReachLimits
 from vla_zenoh.types import FloatArray
 
 DECAY = 0.5
-"""Part of the way to a stop that one step may take once it is nearer than `slow`."""
+"""Part of the distance to a stop that one step may take inside its zone."""
 NOISE = 2e-6
-"""m, and singular value: what distance and solver may differ by between two equal poses."""
+"""m, and singular value: difference of distances and solver between two equal poses."""
 NEAR_M = 0.08
-"""What is further from its stop than this is no concern until the next look."""
+"""A pair further from its stop than this is no constraint until the next update."""
 
 
 class Margins(NamedTuple):
-    """How much room an arm has.
+    """Distances of an arm to its bounds.
 
     Args:
         joint_rad: smallest distance of a joint to the end of its range.
@@ -47,17 +44,20 @@ class Margins(NamedTuple):
 
 
 class Barriers:
-    """See the module. Number 0 is the singular value, the others are pairs that may touch.
+    """Values that must not become negative: singular value and distances, each minus its stop.
+
+    Barrier 0 is the singular value, the others are pairs that may touch: the arm and itself, the
+    arm and the table; hand and fingers to the table have a stop of their own.
 
     Args:
         kinematics: of the arm.
         limits: stop and slow of each kind.
-        known_good_rad: configurations known to be free.
+        known_good_rad: configurations known to be free of collisions.
 
     Attributes:
-        names: of each, as in `vla_zenoh.control.limits.LimitHit`.
-        stop: (n,) what each is measured from.
-        slow: (n,) where its zone begins.
+        names: of the barriers, as in `vla_zenoh.control.limits.LimitHit`.
+        stop: (n,) value at which each is zero.
+        slow: (n,) value at which its zone begins.
 
     Raises:
         ResourceError: the URDF's collision shapes cannot be loaded.
@@ -89,14 +89,14 @@ class Barriers:
         self._zone = self.slow - self.stop
 
     def at(self, joints_rad: FloatArray, jacobian: FloatArray) -> FloatArray:
-        """(n,) of an arm in these joints, whose Jacobian is (6, n) m and rad."""
+        """Barriers (n,) at these joints, whose Jacobian is (6, n) m and rad."""
         values = np.empty(len(self.stop))
         values[0] = smallest_singular_value(jacobian)
         values[1:] = self.collisions.distances(joints_rad)
         return values - self.stop
 
     def floor(self, before: FloatArray) -> FloatArray:
-        """(n,) what they may come down to in one step from `before`."""
+        """Least values (n,) after one step from `before`."""
         floor = np.minimum(self._zone, (1 - DECAY) * before)
         past = before <= 0
         if past.any():
@@ -104,18 +104,18 @@ class Barriers:
         return floor
 
     def where(self, index: int) -> str:
-        """What of the arm number `index` is about; empty: the whole of it."""
+        """The part of the arm that barrier `index` is about; empty: the whole arm."""
         if index == 0:
             return ""
         pair = self.collisions.pairs[index - 1]
         return pair.first if pair.second == TABLE else str(pair)
 
     def slowdown(self, before: FloatArray, after: FloatArray) -> Slowdown | None:
-        """Why a step from `before` to `after` is to be taken slower than at full speed."""
+        """The slowdown of a step from barriers `before` to `after`, None for full speed."""
         return slowdown(before, after, self.stop, self.slow, self.names, self.where)
 
     def margins(self, joints_rad: FloatArray, barriers: FloatArray) -> Margins:
-        """Room left in these joints, whose barriers are known."""
+        """Margins at these joints, whose barriers are known."""
         kinematics = self._kinematics
         room = np.minimum(joints_rad - kinematics.lower_rad, kinematics.upper_rad - joints_rad)
         tightest = int(np.argmin(room))
@@ -142,21 +142,19 @@ class DistanceConstraints:
     points along the line between them.
 
     Args:
-            limits: with the box of the TCP.
-            barriers: of the arm; None: only the box.
+        limits: with the box of the TCP.
+        barriers: of the arm; None: only the box.
     """
 
     def __init__(self, limits: Limits, barriers: Barriers | None) -> None:
-        workspace = limits.workspace
-        box = np.array([workspace.x_m, workspace.y_m, workspace.z_m])
-        self._low_m, self._high_m = box[:, 0], box[:, 1]
+        self._low_m, self._high_m = workspace_corners(limits)
         self._barriers = barriers
         self._at_rad: FloatArray | None = None
         self._near = np.zeros(0, dtype=np.intp)
         self._rows, self._left_m = np.zeros((0, 0)), np.zeros(0)
 
-    def look(self, joints_rad: FloatArray) -> None:
-        """Find what the arm is near to in these joints (n,)."""
+    def update(self, joints_rad: FloatArray) -> None:
+        """Compute distances and slopes at these joints (n,)."""
         if self._barriers is None:
             return
         collisions, stop_m = self._barriers.collisions, self._barriers.stop[1:]
@@ -166,18 +164,18 @@ class DistanceConstraints:
         self._rows = -collisions.gradients(joints_rad, near.tolist())
         self._left_m = (distances_m - stop_m)[near]
 
-    def hit(self, wall: int, left_m: float) -> LimitHit:
-        """What the wall of this number is, so far from the arm."""
-        if wall < 6 or self._barriers is None:
+    def hit(self, row: int, left_m: float) -> LimitHit:
+        """The constraint of this row as a limit that acted, `left_m` from the arm."""
+        if row < 6 or self._barriers is None:
             return LimitHit("workspace", -left_m, 0.0)
-        index = int(self._near[wall - 6]) + 1
+        index = int(self._near[row - 6]) + 1
         barriers, stop_m = self._barriers, float(self._barriers.stop[index])
         return LimitHit(barriers.names[index], left_m + stop_m, stop_m, where=barriers.where(index))
 
     def at(
         self, joints_rad: FloatArray, position_m: FloatArray, jacobian: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Rows (m, n) and ways left (m,) of these joints (n,), their TCP and its Jacobian."""
+        """Rows (m, n) and distances left (m,) at these joints (n,), their TCP and its Jacobian."""
         rows, left_m = [jacobian[:3], -jacobian[:3]], [self._high_m - position_m]
         left_m.append(position_m - self._low_m)
         if self._at_rad is not None and len(self._rows):

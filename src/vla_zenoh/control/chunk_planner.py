@@ -1,22 +1,36 @@
-"""A chunk becomes a plan: its steps as goals, each within what is allowed and what the arm can.
+"""The path of an action chunk to the goals the arm follows: validate, plan, bound, enqueue.
 
-What one evaluation of the arm costs is known, and how many a step takes is not: one in free space,
-some ten where a limit cuts. So every tick has a budget of them. A plan is made step by step and
-comes in force when the step that is due is bounded: in the tick in which it came, where nothing is
-in its way. Then a few steps are looked ahead. Where one is due before it is bounded, the one before
-it stays the goal. Whatever the pieces, the plan is the same.
+1. `ChunkPlanner.submit` validates a chunk (`vla_zenoh.control.chunk_validation`) and queues it.
+2. `ChunkPlanner.plan` puts its steps on top of what was asked for when its observation was taken.
+3. `ChunkPlanner.bound` shortens each step to its limits and to what the arm can do.
+4. `ChunkPlanner.advance` does 2 and 3 with the newest chunk of the queue, and adds the plan to the
+   `GoalTimeline`.
+
+The cost of one evaluation of the arm is known, their number per step is not: one in free space,
+about ten where a limit cuts. So every tick has a budget of evaluations. A plan comes into force as
+soon as the step that is due is bounded, in free space in the tick in which its chunk arrived. Then
+a few steps are bounded ahead. A step that is due before it is bounded waits: the one before it
+stays the goal. The plan does not depend on how the work is divided among ticks.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.actions import rotation_of, step_pose, step_width
-from vla_zenoh.control.chunk_validation import Rejection
+from vla_zenoh.control.actions import step_pose, step_width
+from vla_zenoh.control.chunk_validation import (
+    ROUNDING,
+    Lease,
+    Rejection,
+    validate_chunk,
+    validate_steps,
+)
 from vla_zenoh.control.limits import (
     APPROACH,
     LEAST,
@@ -24,138 +38,224 @@ from vla_zenoh.control.limits import (
     Slowdown,
     bound_step,
     full_speed_s,
-    going_on,
+    keep_slowdown,
 )
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
-from vla_zenoh.control.reachability import Bounded, ReachabilityFilter
-from vla_zenoh.errors import RecordError
+from vla_zenoh.control.reachability import BoundedStep, ReachabilityFilter
 from vla_zenoh.kinematics.so3 import Pose, interpolate, pose_distance
-from vla_zenoh.policy import ROTATION_SIZE, ActionSpec
-from vla_zenoh.profile import REJECT_FACTOR, Profile
-from vla_zenoh.types import (
-    QUATERNION_NORM_TOLERANCE,
-    ActionChunk,
-    Cause,
-    FloatArray,
-    Stamped,
-)
+from vla_zenoh.policy import ActionSpec
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import ActionChunk, Cause, FloatArray, Stamped, Task
 
-ROUNDING = 1e-6
+MAX_QUEUED = 4
+"""Of a burst of chunks only the newest few are kept; the newest valid one is executed."""
 EVALUATIONS_1_S = 1500.0
-"""Evaluations of the arm that may be made in a second of ticks."""
+"""Evaluations of the arm per second of ticks."""
 PATIENCE = 24
-"""After so many for one chunk it comes in force with the steps that are bounded."""
+"""After this many evaluations a plan comes into force with the steps bounded so far."""
 LOOK_AHEAD = 8
-"""Steps that are bounded before they are due."""
+"""Steps bounded before they are due."""
 BEHIND_S = 0.3
-"""An arm is behind its goal by up to this where an approach ends."""
+"""At the end of an approach the arm is up to this late."""
 
 
 @dataclass(slots=True)
 class ChunkPlan(Plan):
-    """A plan that is made step by step.
+    """The plan of a chunk, computed and bounded step by step.
 
     Args:
-        action: what the numbers of a step mean.
+        action: the meaning of the numbers of a step.
         steps: (n, D).
-        before: what they stand on, W_0.
-        approaches: a target of it is further away than a step,
-        announced: and that is told already.
-        first_ns: time that its first step has to approach it.
-        spent: evaluations made for it.
-        hits: limits that acted on it, each once by name and place, the first along the path first.
-        told: so many of them are told.
-        under_way: the step that is being bounded.
+        base: W_0, the goal that the first step starts from.
+        approaches: one of its targets is further away than a step.
+        announced: that has been reported.
+        first_step_ns: time that its first step has to approach its target; -1: a whole step.
+        evaluations: evaluations of the arm spent on it.
+        hits: limits that acted on it, each once by name and place, in path order.
+        reported: number of those that have been reported.
+        current: the step being bounded.
     """
 
     action: ActionSpec = field(kw_only=True)
     steps: FloatArray = field(kw_only=True)
-    before: Goal = field(kw_only=True)
+    base: Goal = field(kw_only=True)
     approaches: bool = False
     announced: bool = False
-    first_ns: int = -1
-    spent: int = 0
+    first_step_ns: int = -1
+    evaluations: int = 0
     hits: list[LimitHit] = field(default_factory=list)
-    told: int = 0
-    under_way: _Step | None = None
+    reported: int = 0
+    current: _StepBounding | None = None
 
     @property
-    def start(self) -> Goal:
-        """Where the step begins that is bounded next."""
-        return self.goals[self.bounded - 1] if self.bounded else self.before
+    def step_start(self) -> Goal:
+        """The goal that the next step to be bounded starts from."""
+        return self.goals[self.bounded - 1] if self.bounded else self.base
 
     @property
-    def moved(self) -> Goal | None:
-        """Where it is to end, where the leash has moved it since it was made."""
-        return self.goals[self.bounded] if self.bounded < self.made else None
+    def shifted_goal(self) -> Goal | None:
+        """The end of that step, where the leash has shifted it since it was computed."""
+        return self.goals[self.bounded] if self.bounded < self.computed else None
 
-    def note(self, hits: Iterable[LimitHit]) -> None:
-        """Keep what was not met before."""
+    def add_hits(self, hits: Iterable[LimitHit]) -> None:
+        """Keep the hits that are new by name and place."""
         for hit in hits:
-            if all(hit.name != met.name or hit.where != met.where for met in self.hits):
+            if all(hit.name != known.name or hit.where != known.where for known in self.hits):
                 self.hits.append(hit)
 
-    def news(self) -> list[LimitHit]:
-        """What was kept since the last call."""
-        news, self.told = self.hits[self.told :], len(self.hits)
-        return news
+    def unreported_hits(self) -> list[LimitHit]:
+        """The hits added since the last call."""
+        hits, self.reported = self.hits[self.reported :], len(self.hits)
+        return hits
 
 
 @dataclass(slots=True)
-class _Step:
+class _StepBounding:
     """A step while it is bounded.
 
     Args:
-        start: where it begins.
-        moved: where it is to end, where it was made before.
-        pose: where it is to end by the limits of a step.
+        start: the goal it starts from.
+        shifted: its end, where that was computed before.
+        target: its end within the limits of a step.
         width_m: of the gripper.
-        hits: what acted already.
-        cut: m and rad that this cut off.
+        hits: limits that acted so far.
+        cut: m and rad that they cut off.
         slowdown: of an approach.
-        pieces: the arm's say; None: there are no kinematics.
+        search: bounds it by the arm's kinematics, in pieces; None: there are no kinematics.
     """
 
     start: Goal
-    moved: Goal | None
-    pose: Pose
+    shifted: Goal | None
+    target: Pose
     width_m: float
     hits: list[LimitHit] = field(default_factory=list)
     cut: float = 0.0
     slowdown: Slowdown | None = None
-    pieces: Generator[None, None, Bounded] | None = None
+    search: Generator[None, None, BoundedStep] | None = None
+
+
+class ChunkOutcome(NamedTuple):
+    """The end of a chunk's path: it is rejected, or its plan has come into force.
+
+    Args:
+        chunk: as received.
+        rejection: why it is not executed; None: it is.
+        plan: in force; None: rejected.
+        hits: limits that acted on the steps bounded so far.
+    """
+
+    chunk: Stamped[ActionChunk]
+    rejection: Rejection | None = None
+    plan: ChunkPlan | None = None
+    hits: Sequence[LimitHit] = ()
 
 
 class ChunkPlanner:
-    """See the module.
+    """Turns action chunks into bounded plans on a timeline, within a budget per tick.
 
     Args:
-        profile: limits, and what is done with a step beyond them.
-        reach: the arm's kinematic shadow; None: only steps and workspace are bounded.
+        profile: limits, and what happens to a step beyond them.
+        reach: bounds steps by the arm's kinematics; None: only step limits and workspace do.
     """
 
     def __init__(self, profile: Profile, reach: ReachabilityFilter | None) -> None:
         self._limits = profile.limits
-        self._refusing = profile.limits.out_of_bounds == "refuse"
+        self._rejecting = profile.limits.out_of_bounds == "refuse"
         self._open_loop_s = profile.timing.max_open_loop_s
+        self._max_age_s = profile.timing.max_observation_age_s
         self._max_width_m = profile.robot.gripper.max_width_m
         self._reach = reach
         self._pace = profile.composition.pace
+        self._queue: deque[Stamped[ActionChunk]] = deque()
+        self._pending: tuple[Stamped[ActionChunk], ChunkPlan] | None = None
         self.budget = math.ceil(EVALUATIONS_1_S / profile.timing.command_hz)
-        """Evaluations of the arm that a tick may have."""
+        """Evaluations of the arm per tick."""
         self._left = self.budget
 
-    def tick(self) -> None:
-        """A tick begins, with a budget of its own."""
+    def begin_tick(self) -> None:
+        """Renew the budget of evaluations."""
         self._left = self.budget
 
-    def begin(
+    # -- validate -----------------------------------------------------------------------------
+    def submit(
+        self,
+        chunk: Stamped[ActionChunk],
+        owner: str | None,
+        lease: Lease | None,
+        task: Task,
+        now_ns: int,
+    ) -> ChunkOutcome | None:
+        """Validate a chunk and queue it if its worker has the lease; see `validate_chunk`.
+
+        Returns:
+            a chunk that was rejected: this one, or the oldest of a full queue.
+        """
+        rejection = validate_chunk(chunk, owner, lease, task, self._max_age_s, now_ns)
+        if rejection is not None:
+            return ChunkOutcome(chunk, rejection)
+        if lease is None:
+            return None
+        oldest = self._queue.popleft() if len(self._queue) == MAX_QUEUED else None
+        self._queue.append(chunk)
+        return None if oldest is None else ChunkOutcome(oldest, OVERTAKEN)
+
+    # -- all of the path ----------------------------------------------------------------------
+    def advance(
+        self,
+        timeline: GoalTimeline,
+        action: ActionSpec,
+        episode: int | None,
+        earliest_ns: int,
+        now_ns: int,
+    ) -> list[ChunkOutcome]:
+        """Continue with the pending chunk, then with the newest of the queue.
+
+        A chunk that arrived meanwhile stands on the pending one, so it is planned when that is in
+        force.
+
+        Args:
+            timeline: where plans are added.
+            action: the meaning of the numbers, by the lease.
+            episode: the current one; None: the arm executes no chunks.
+            earliest_ns: no plan comes into force before this time. An arm that holds stands, and so
+                do observations of it: the chunks of a burst after a pause replace each other.
+            now_ns: wall time.
+
+        Returns:
+            chunks rejected, and chunks whose plan came into force, in this order of events.
+        """
+        outcomes: list[ChunkOutcome] = []
+        while self._pending is not None or self._queue:
+            if self._pending is None:
+                chunk = self._queue.pop()
+                plan = _superseded(chunk, episode) or self.plan(chunk, action, timeline)
+                if isinstance(plan, Rejection):
+                    outcomes.append(ChunkOutcome(chunk, plan))
+                    continue
+                outcomes += [ChunkOutcome(older, OVERTAKEN) for older in self._queue]
+                self._queue.clear()
+                self._pending = chunk, plan
+            chunk, plan = self._pending
+            ready = _superseded(chunk, episode) or self.bound(plan, now_ns)
+            if ready is False:
+                break
+            self._pending = None
+            if isinstance(ready, Rejection):
+                outcomes.append(ChunkOutcome(chunk, ready))
+                continue
+            plan.effective_ns = max(plan.effective_ns, earliest_ns)
+            timeline.add(plan, now_ns)
+            outcomes.append(ChunkOutcome(chunk, None, plan, plan.unreported_hits()))
+        return outcomes
+
+    # -- plan ---------------------------------------------------------------------------------
+    def plan(
         self, chunk: Stamped[ActionChunk], action: ActionSpec, timeline: GoalTimeline
     ) -> ChunkPlan | Rejection:
         """A plan of `chunk` on top of what was asked for when its observation was taken.
 
-        None of its steps is made yet, see `go_on`. Steps later than ``timing.max_open_loop_s`` are
-        left out: whoever made them saw nothing of what the arm will have met by then.
+        None of its steps is computed yet, see `bound`. Steps later than ``timing.max_open_loop_s``
+        are left out: the model has seen nothing of what the arm will meet by then.
         """
         record = chunk.record
         count = len(record.steps)
@@ -163,117 +263,128 @@ class ChunkPlanner:
             count = max(1, int((self._open_loop_s + ROUNDING) / action.dt_s))
         done = record.done and count == len(record.steps)
         observed_ns = record.observation_stamp_ns
-        standing_on = timeline.in_force(observed_ns)
-        before = standing_on.goal_at(observed_ns)
+        previous = timeline.in_force(observed_ns)
+        base = previous.goal_at(observed_ns)
         steps = np.asarray(record.steps[:count], np.float64)
-        refusal = self._mistake(action, steps, before)
-        if refusal is not None:
-            return refusal
+        rejection = validate_steps(action, steps, base, self._limits, self._max_width_m)
+        if rejection is not None:
+            return rejection
         # Between two waypoints the joints and the speed are about those of the coming one.
-        near = standing_on.goals[standing_on.index_at(observed_ns)]
+        near = previous.goals[previous.index_at(observed_ns)]
         plan = ChunkPlan(
             max(chunk.header.stamp_wall_ns, observed_ns),
             observed_ns,
             max(int(action.dt_s * 1e9), 1),
-            [before] * count,
+            [base] * count,
             _cause(chunk),
             0,
             record.episode,
             done=done,
-            made=0,
+            computed=0,
             clock=timeline.clock,
             soonest=(action.pace if self._pace == "spec" else self._pace) == "soonest",
             action=action,
             steps=steps,
-            before=Goal(before.pose, before.width_m, _joints(before, near), near.slowdown),
+            base=Goal(base.pose, base.width_m, _joints(base, near), near.slowdown),
         )
         if count < len(record.steps):
-            plan.note([LimitHit("open_loop", len(record.steps) * action.dt_s, self._open_loop_s)])
-        if isinstance(standing_on, ChunkPlan) and standing_on.approaches:
-            # What goes on is not told again, nor faster the more often a model is asked.
+            plan.add_hits(
+                [LimitHit("open_loop", len(record.steps) * action.dt_s, self._open_loop_s)]
+            )
+        if isinstance(previous, ChunkPlan) and previous.approaches:
+            # An approach that continues is not reported again, nor is it faster the more often a
+            # model is asked.
             plan.announced = True
-            plan.first_ns = min(plan.dt_ns, max(standing_on.elapsed_ns(observed_ns), 0))
-        if standing_on.episode == record.episode:
-            plan.begun = standing_on.steps_until(observed_ns)
-            if done and standing_on.done:  # it only says the last of its steps again
-                plan.most = min(standing_on.begun + len(standing_on.goals), standing_on.most)
+            plan.first_step_ns = min(plan.dt_ns, max(previous.elapsed_ns(observed_ns), 0))
+        if previous.episode == record.episode:
+            plan.steps_before = previous.steps_until(observed_ns)
+            if done and previous.done:  # the last of its steps are repeated
+                plan.steps_total = min(
+                    previous.steps_before + len(previous.goals), previous.steps_total
+                )
         return plan
 
-    def go_on(self, plan: ChunkPlan, now_ns: int) -> Rejection | bool:
-        """Make the steps of `plan` up to the one that is due, as far as the budget goes.
+    # -- bound --------------------------------------------------------------------------------
+    def bound(self, plan: ChunkPlan, now_ns: int) -> Rejection | bool:
+        """Bound the steps of `plan` up to the one that is due, as far as the budget goes.
 
         Returns:
-            whether it may come in force; where the profile says that what is out of bounds is to
-            be refused, all of it is made before that is known.
+            whether it may come into force. Where the profile rejects steps that are out of bounds,
+            all of them are bounded first.
         """
-        until = len(plan.goals) if self._refusing else plan.due_index(now_ns) + 1
+        until = len(plan.goals) if self._rejecting else plan.due_index(now_ns) + 1
         while plan.bounded < until:
-            acted = self._make_step(plan)
+            acted = self._bound_step(plan)
             if acted is None:
-                return plan.spent >= PATIENCE and not self._refusing
-            if acted and self._refusing:
+                return plan.evaluations >= PATIENCE and not self._rejecting
+            if acted and self._rejecting:
                 why = "out of bounds, and the profile says refuse"
                 return Rejection(acted[0].name, why, *acted[0][1:3])
         return True
 
-    def bound_until(self, plans: Sequence[Plan], now_ns: int) -> list[LimitHit]:
-        """Bound the steps of `plans` (the newest last) that are due, then those that soon will be.
+    def bound_due(self, plans: Sequence[Plan], now_ns: int) -> list[LimitHit]:
+        """Bound the steps of `plans` (the newest last) that are due, then those due next.
 
-        What is cut off is known to every later goal.
+        Later goals move with what is cut off.
 
         Returns:
-            what acted on them since the last call.
+            limits that acted on them since the last call.
         """
         chunks = [plan for plan in reversed(plans) if isinstance(plan, ChunkPlan)]
         for ahead in (0, LOOK_AHEAD):
             for plan in chunks:
                 due = plan.due_index(now_ns)
                 if plan.action.kind == "absolute" and plan.bounded > due:
-                    plan.made = plan.bounded  # the leash moves no pose that is named
+                    plan.computed = plan.bounded  # the leash does not shift absolute poses
                 until = min(due + 1 + ahead, len(plan.goals))
-                while plan.bounded < until and self._make_step(plan) is not None:
+                while plan.bounded < until and self._bound_step(plan) is not None:
                     pass
-        return [hit for plan in chunks for hit in plan.news()]
+        return [hit for plan in chunks for hit in plan.unreported_hits()]
 
-    # -- one step -----------------------------------------------------------------------------
-    def _make_step(self, plan: ChunkPlan) -> list[LimitHit] | None:
-        """What acted on the next step of `plan`, once it is bounded; None: the budget is spent."""
-        step = plan.under_way
-        if step is None or step.start is not plan.start or step.moved is not plan.moved:
-            step = plan.under_way = self._ask(plan)
-        found: Bounded | None = None
-        while step.pieces is not None and found is None:
+    def _bound_step(self, plan: ChunkPlan) -> list[LimitHit] | None:
+        """Limits that acted on the next step of `plan`; None: not bounded, the budget is spent."""
+        step = plan.current
+        if (
+            step is None
+            or step.start is not plan.step_start
+            or step.shifted is not plan.shifted_goal
+        ):
+            step = plan.current = self._begin_step(plan)
+        found: BoundedStep | None = None
+        while step.search is not None and found is None:
             if self._left <= 0 or self._reach is None:
                 return None
             try:
-                next(step.pieces)
+                next(step.search)
             except StopIteration as end:
                 found = end.value
             self._left -= self._reach.cost
-            plan.spent += self._reach.cost
-        index, pose, hits, slower, joints_rad = plan.bounded, step.pose, step.hits, None, None
+            plan.evaluations += self._reach.cost
+        index, pose, hits, slower, joints_rad = plan.bounded, step.target, step.hits, None, None
         if found is not None:
             pose, joints_rad, slower = found.pose, found.joints_rad, found.slowdown
-            cut = sum(pose_distance(pose, step.pose)) if found.hits else 0.0
-            # What cuts most is told first.
+            cut = sum(pose_distance(pose, step.target)) if found.hits else 0.0
+            # The limit that cuts most comes first.
             hits = [*found.hits, *hits] if cut > step.cut else [*hits, *found.hits]
-            plan.made = index + 1 if found.hits else max(plan.made, index + 1)
+            plan.computed = index + 1 if found.hits else max(plan.computed, index + 1)
         else:
-            plan.made = max(plan.made, index + 1)
+            plan.computed = max(plan.computed, index + 1)
         if step.slowdown is not None and (slower is None or step.slowdown.share < slower.share):
             slower = step.slowdown
         most_s = self._limits.lead_m / self._limits.translation.velocity_m_s
-        slower = going_on(step.start.slowdown, slower, plan.dt_ns / 1e9, most_s)
+        slower = keep_slowdown(step.start.slowdown, slower, plan.dt_ns / 1e9, most_s)
         plan.goals[index] = Goal(pose, step.width_m, joints_rad, slower)
-        plan.bounded, plan.under_way = index + 1, None
-        plan.note(hits)
+        plan.bounded, plan.current = index + 1, None
+        plan.add_hits(hits)
         return hits
 
-    def _ask(self, plan: ChunkPlan) -> _Step:
-        """The next step of `plan` by the limits of a step."""
-        start, moved = plan.start, plan.moved
-        if moved is not None:
-            step = _Step(start, moved, moved.pose, moved.width_m, slowdown=moved.slowdown)
+    def _begin_step(self, plan: ChunkPlan) -> _StepBounding:
+        """The next step of `plan` within the limits of a step."""
+        start, shifted = plan.step_start, plan.shifted_goal
+        if shifted is not None:
+            step = _StepBounding(
+                start, shifted, shifted.pose, shifted.width_m, slowdown=shifted.slowdown
+            )
         else:
             numbers = plan.steps[plan.bounded]
             asked = step_pose(plan.action, numbers, start.pose)
@@ -284,15 +395,17 @@ class ChunkPlanner:
             pose, acted = bound_step(self._limits, start.pose, asked)
             cut = sum(pose_distance(pose, asked)) if acted else 0.0
             width_m = start.width_m if width_m is None else width_m
-            step = _Step(start, None, pose, width_m, acted, cut, slower)
+            step = _StepBounding(start, None, pose, width_m, acted, cut, slower)
         if self._reach is not None:
             dt_s = plan.dt_ns / 1e9
-            step.pieces = self._reach.bounding(start.pose, step.pose, dt_s, start.joints_rad)
-            next(step.pieces)  # up to its first evaluation
+            step.search = self._reach.bound_in_pieces(
+                start.pose, step.target, dt_s, start.joints_rad
+            )
+            next(step.search)  # up to its first evaluation
         return step
 
     def _approach(self, plan: ChunkPlan, start: Pose, target: Pose) -> tuple[Pose, Slowdown | None]:
-        """How far a step goes to `target`, and how fast: straight and slowly while it is far."""
+        """The end of a step to an absolute target, and its slowdown: a far target is approached."""
         limits = self._limits
         far_m, far_rad = pose_distance(start, target)
         steps = max(far_m / limits.step_m, far_rad / limits.step_rad)
@@ -303,70 +416,28 @@ class ChunkPlanner:
         plan.approaches = True
         if not plan.announced:
             plan.announced = True
-            plan.note([LimitHit(APPROACH, far, step, where=unit)])
+            plan.add_hits([LimitHit(APPROACH, far, step, where=unit)])
         needed_s = max(far_m / limits.approach_m_s, far_rad / limits.approach_rad_s)
         full_s = full_speed_s(limits, start, target)
         share = min(max(full_s / needed_s, LEAST), 1.0)
-        has_ns = plan.dt_ns if plan.bounded or plan.first_ns < 0 else plan.first_ns
+        has_ns = plan.dt_ns if plan.bounded or plan.first_step_ns < 0 else plan.first_step_ns
         part = min(has_ns / 1e9 / needed_s, 1 / steps)
         return interpolate(start, target, part), Slowdown(APPROACH, share, far, step, "", BEHIND_S)
 
-    # -- the whole chunk ----------------------------------------------------------------------
-    def _mistake(self, action: ActionSpec, steps: FloatArray, before: Goal) -> Rejection | None:
-        """What no step can mean, looked for before any of them is followed."""
-        turns = steps[:, 3 : 3 + ROTATION_SIZE[action.rotation]]
-        try:
-            for step in steps if action.gripper != "none" else ():
-                step_width(action, step, before.width_m, self._max_width_m)
-            if action.rotation == "quaternion":
-                off = np.abs(np.linalg.norm(turns, axis=1) - 1.0)
-                for index in (off > 0.9 * QUATERNION_NORM_TOLERANCE).nonzero()[0]:
-                    rotation_of(action, turns[index])
-        except RecordError as error:
-            return Rejection("meaning", str(error))
-        limits, ways_m = self._limits, steps[:, :3] * action.position_scale_m
-        if action.kind == "absolute":
-            return self._out_of_the_world(ways_m)
-        if action.rotation == "quaternion":
-            most_rad = 2.0 * np.arccos(np.clip(np.abs(turns[:, 3]) - ROUNDING, 0.0, 1.0))
-        else:  # three turns, or one: together at most as far as this
-            most_rad = np.abs(turns).sum(axis=1)
-        far = np.linalg.norm(ways_m, axis=1) > limits.step_m * REJECT_FACTOR * (1 - ROUNDING)
-        far |= most_rad > limits.step_rad * REJECT_FACTOR * (1 - ROUNDING)
-        for index in far.nonzero()[0]:
-            asked = step_pose(action, steps[index], before.pose)
-            for hit in bound_step(limits, before.pose, asked)[1]:
-                if hit.fatal:
-                    return Rejection(
-                        hit.name,
-                        f"a step of {hit.value:.4g} is over {REJECT_FACTOR:g} times its "
-                        "limit; is its unit right?",
-                        hit.value,
-                        hit.limit,
-                    )
+
+OVERTAKEN = Rejection("overtaken", "a newer chunk came before it was planned", quiet=True)
+
+
+def _superseded(chunk: Stamped[ActionChunk], episode: int | None) -> Rejection | None:
+    """Why a chunk that was valid on arrival is not any more."""
+    if chunk.record.episode == episode:
         return None
-
-    def _out_of_the_world(self, positions_m: FloatArray) -> Rejection | None:
-        """Why absolute targets are no targets of this arm."""
-        box, most_m = self._limits.workspace, REJECT_FACTOR * self._limits.step_m
-        low, high = np.array([box.x_m, box.y_m, box.z_m]).T
-        away_m = np.linalg.norm(positions_m - np.clip(positions_m, low, high), axis=1)
-        for index in (away_m > most_m).nonzero()[0]:
-            at = ", ".join(f"{value:.4g}" for value in positions_m[index])
-            return Rejection(
-                "workspace",
-                f"a target at ({at}) m, {away_m[index]:.4g} m outside the workspace x {box.x_m} "
-                f"y {box.y_m} z {box.z_m}: are its numbers metres (position_scale_m), and is it in "
-                "the base frame?",
-                float(away_m[index]),
-                most_m,
-            )
-        return None
+    return Rejection("superseded", "the arm was stopped or got a new task meanwhile", quiet=True)
 
 
-def _joints(before: Goal, near: Goal) -> FloatArray | None:
-    """Joints of a goal, or where to look for them."""
-    return near.joints_rad if before.joints_rad is None else before.joints_rad
+def _joints(base: Goal, near: Goal) -> FloatArray | None:
+    """Joints of a goal, or those to start the search for them with."""
+    return near.joints_rad if base.joints_rad is None else base.joints_rad
 
 
 def _cause(chunk: Stamped[ActionChunk]) -> Cause:

@@ -1,26 +1,34 @@
-"""Whether a chunk may be carried out. Each refusal has a short stable name and a sentence."""
+"""Validation of action chunks: every reason to reject one has a short name and a sentence."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from vla_zenoh.errors import SpecError
-from vla_zenoh.policy import ModelSpec, check_steps
-from vla_zenoh.types import ActionChunk, Stamped, Task
+import numpy as np
+
+from vla_zenoh.control.actions import rotation_of, step_pose, step_width
+from vla_zenoh.control.limits import bound_step, workspace_corners
+from vla_zenoh.control.plan_timeline import Goal
+from vla_zenoh.errors import RecordError, SpecError
+from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec, check_steps
+from vla_zenoh.profile import REJECT_FACTOR, Limits
+from vla_zenoh.types import QUATERNION_NORM_TOLERANCE, ActionChunk, FloatArray, Stamped, Task
 
 FUTURE_TOLERANCE_NS = 50_000_000
+ROUNDING = 1e-6
+SOURCE_CHARS = 60
 
 
 class Rejection(NamedTuple):
-    """Why a chunk was not carried out.
+    """Why a chunk is not executed, or a setting not applied.
 
     Args:
-        reason: name of the counter.
+        reason: short stable name; its counter.
         why: a sentence.
-        value: what was found, where it is a number.
-        limit: what is allowed.
-        quiet: part of normal running (a chunk under way when the prompt changed): no event.
+        value: the value found, where it is a number.
+        limit: the value allowed.
+        quiet: part of normal operation (a chunk on its way while the prompt changed): no event.
     """
 
     reason: str
@@ -32,14 +40,14 @@ class Rejection(NamedTuple):
 
 @dataclass(slots=True)
 class Lease:
-    """What was agreed with the worker at activation, and what came from it since.
+    """The right of one worker to move the arm, as agreed at activation.
 
     Args:
-        spec: its spec.
-        source: the one source whose chunks count; a second process of the same name is foreign.
-        since_ns: observations older than this were made before the arm was given to the worker.
-        last_seq: of the newest chunk seen.
-        last_observation_ns: of the newest chunk taken to be carried out.
+        spec: the worker's spec.
+        source: the only source whose chunks count, not another process of the same name.
+        since_ns: observations older than this were taken before the arm was given to the worker.
+        last_seq: sequence number of the newest chunk received.
+        last_observation_ns: observation of the newest chunk accepted.
     """
 
     spec: ModelSpec
@@ -49,23 +57,44 @@ class Lease:
     last_observation_ns: int = -1
 
 
-def refuse(
-    chunk: Stamped[ActionChunk], lease: Lease, task: Task, max_age_s: float, now_ns: int
+def validate_chunk(
+    chunk: Stamped[ActionChunk],
+    owner: str | None,
+    lease: Lease | None,
+    task: Task,
+    max_age_s: float,
+    now_ns: int,
 ) -> Rejection | None:
-    """The first reason not to carry `chunk` out, None when there is none.
+    """The first reason to reject `chunk`, None for a valid one.
 
-    Updates the lease's `last_seq`, so that a chunk is looked at once only.
+    Updates `lease`, so that each sequence number and each observation is accepted once.
+
+    Args:
+        chunk: as received.
+        owner: the source that published the spec of the chunk's worker; None: no spec yet.
+        lease: of that worker; None: it does not move the arm, and only the source is checked.
+        task: the task in force.
+        max_age_s: oldest observation allowed.
+        now_ns: wall time.
     """
     record, header = chunk.record, chunk.header
-    if header.source != lease.source:
+    if owner is None:
+        return Rejection("unknown_worker", "its spec is not known yet", quiet=True)
+    expected = owner if lease is None or header.source != owner else lease.source
+    if header.source != expected:
         return Rejection(
             "foreign",
-            f"a chunk for {record.worker!r} by {header.source!r}; the lease is held by "
-            f"{lease.source!r}",
+            f"chunk of worker {record.worker!r} by {header.source[:SOURCE_CHARS]!r}; the source of "
+            f"this worker is {expected[:SOURCE_CHARS]!r}",
         )
+    if lease is None:
+        return None
     if header.seq <= lease.last_seq:
         return Rejection(
-            "replayed", f"chunk {header.seq} came again or late", header.seq, lease.last_seq
+            "replayed",
+            f"chunk {header.seq} came twice or out of order",
+            header.seq,
+            lease.last_seq,
         )
     lease.last_seq = header.seq
     agreed = lease.spec.hash
@@ -77,15 +106,23 @@ def refuse(
     if record.episode != task.episode:
         return Rejection(
             "superseded",
-            f"chunk for episode {record.episode}, now is {task.episode}",
+            f"chunk for episode {record.episode}, the current one is {task.episode}",
             record.episode,
             task.episode,
             quiet=record.episode < task.episode,
         )
-    return _refuse_by_time(record, lease, max_age_s, now_ns) or _refuse_by_shape(record, lease)
+    rejection = _validate_times(record, lease, max_age_s, now_ns)
+    if rejection is not None:
+        return rejection
+    try:
+        check_steps(lease.spec.action, record.steps)
+    except SpecError as error:
+        return Rejection("shape", str(error))
+    lease.last_observation_ns = record.observation_stamp_ns
+    return None
 
 
-def _refuse_by_time(
+def _validate_times(
     record: ActionChunk, lease: Lease, max_age_s: float, now_ns: int
 ) -> Rejection | None:
     age_s = (now_ns - record.observation_stamp_ns) / 1e9
@@ -106,13 +143,69 @@ def _refuse_by_time(
         late_s = (now_ns - record.valid_until_ns) / 1e9
         return Rejection("expired", f"it was valid until {late_s:.3f} s ago", late_s, 0.0)
     if record.observation_stamp_ns <= lease.last_observation_ns:
-        return Rejection("out_of_order", "its observation is not newer than the last one taken")
+        return Rejection("out_of_order", "its observation is not newer than the last one used")
     return None
 
 
-def _refuse_by_shape(record: ActionChunk, lease: Lease) -> Rejection | None:
+def validate_steps(
+    action: ActionSpec, steps: FloatArray, start: Goal, limits: Limits, max_width_m: float
+) -> Rejection | None:
+    """Why no step of this meaning can have such numbers, None where all of them can.
+
+    All steps are checked before the arm follows the first one.
+
+    Args:
+        action: the meaning of the numbers.
+        steps: (n, D).
+        start: the goal that the first step starts from.
+        limits: of the robot.
+        max_width_m: of its gripper.
+    """
+    rotations = steps[:, 3 : 3 + ROTATION_SIZE[action.rotation]]
     try:
-        check_steps(lease.spec.action, record.steps)
-    except SpecError as error:
-        return Rejection("shape", str(error))
+        for step in steps if action.gripper != "none" else ():
+            step_width(action, step, start.width_m, max_width_m)
+        if action.rotation == "quaternion":
+            off = np.abs(np.linalg.norm(rotations, axis=1) - 1.0)
+            for index in (off > 0.9 * QUATERNION_NORM_TOLERANCE).nonzero()[0]:
+                rotation_of(action, rotations[index])
+    except RecordError as error:
+        return Rejection("meaning", str(error))
+    lengths_m = steps[:, :3] * action.position_scale_m
+    if action.kind == "absolute":
+        return _validate_targets(lengths_m, limits)
+    if action.rotation == "quaternion":
+        most_rad = 2.0 * np.arccos(np.clip(np.abs(rotations[:, 3]) - ROUNDING, 0.0, 1.0))
+    else:  # three angles, or one: together at most as large as this
+        most_rad = np.abs(rotations).sum(axis=1)
+    suspect = np.linalg.norm(lengths_m, axis=1) > limits.step_m * REJECT_FACTOR * (1 - ROUNDING)
+    suspect |= most_rad > limits.step_rad * REJECT_FACTOR * (1 - ROUNDING)
+    for index in suspect.nonzero()[0]:
+        asked = step_pose(action, steps[index], start.pose)
+        for hit in bound_step(limits, start.pose, asked)[1]:
+            if hit.fatal:
+                return Rejection(
+                    hit.name,
+                    f"a step of {hit.value:.4g} is over {REJECT_FACTOR:g} times its "
+                    "limit; is its unit right?",
+                    hit.value,
+                    hit.limit,
+                )
+    return None
+
+
+def _validate_targets(positions_m: FloatArray, limits: Limits) -> Rejection | None:
+    """Why absolute targets (n, 3) are too far outside the workspace box to be meant."""
+    box, most_m = limits.workspace, REJECT_FACTOR * limits.step_m
+    away_m = np.linalg.norm(positions_m - np.clip(positions_m, *workspace_corners(limits)), axis=1)
+    for index in (away_m > most_m).nonzero()[0]:
+        at = ", ".join(f"{value:.4g}" for value in positions_m[index])
+        return Rejection(
+            "workspace",
+            f"a target at ({at}) m, {away_m[index]:.4g} m outside the workspace x {box.x_m} "
+            f"y {box.y_m} z {box.z_m}: are its numbers metres (position_scale_m), and is it in "
+            "the base frame?",
+            float(away_m[index]),
+            most_m,
+        )
     return None

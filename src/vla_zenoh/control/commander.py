@@ -1,21 +1,26 @@
-"""The command node's mind: chunks and settings in, a bounded smooth pose stream out.
+"""Core of the command node: turns action chunks and settings into a bounded, smooth pose stream.
 
-`Commander.step` is called once a tick with everything that arrived since the last one. It has no
+`Commander.step` is called once per tick with everything received since the last one. It has no
 clock, no thread and no session; the same inputs give the same outputs, in a test, in lockstep with
 a simulator and on the robot.
 
-Here are states and settings. `planner` makes plans of chunks, `mover` makes commands of plans,
-`watch` sees what is lost.
+This module handles state and settings. `ChunkPlanner` makes plans of chunks, `MotionPipeline`
+makes commands of plans, `Watchdog` and `JointMonitor` find reasons to brake.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 
-from vla_zenoh.control.chunk_planner import ChunkPlan, ChunkPlanner
-from vla_zenoh.control.chunk_validation import Lease, Rejection, refuse
-from vla_zenoh.control.commander_io import Inputs, Outputs, Setting
+from vla_zenoh.control.chunk_planner import ChunkOutcome, ChunkPlanner
+from vla_zenoh.control.chunk_validation import Lease, Rejection
+from vla_zenoh.control.commander_io import (
+    Inputs,
+    Outputs,
+    Setting,
+    limit_events,
+    make_event,
+)
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
 from vla_zenoh.control.joint_monitor import JointMonitor
 from vla_zenoh.control.motion_pipeline import MotionPipeline
@@ -40,16 +45,13 @@ from vla_zenoh.types import (
 
 __all__ = ["Commander", "Inputs", "Outputs", "Setting"]
 
-MOST_WAITING = 4
-"""Of a heap of chunks the newest few; the newest of them that is no mistake is carried out."""
-
 
 class Commander:
-    """See the module.
+    """State machine, settings and one tick of the command node.
 
     Args:
-        profile: limits, timing and first settings.
-        reach: the arm's kinematic shadow; None: only the workspace box bounds a goal, and joints
+        profile: limits, timing and initial settings.
+        reach: bounds goals by the arm's kinematics; None: only the workspace box does, and joints
             cannot be commanded.
         dry_run: compute everything, stream nothing.
 
@@ -74,13 +76,11 @@ class Commander:
         self.progress, self.deadman = EpisodeProgress(), Deadman()
         self._resumed_ns = 0
         self._peers = PeerSnapshot()
-        self._shadow: dict[str, Stamped[ActionChunk]] = {}
+        self._latest: dict[str, Stamped[ActionChunk]] = {}
         self._planner = ChunkPlanner(profile, reach)
-        self._waiting: deque[Stamped[ActionChunk]] = deque()
-        self._coming: tuple[Stamped[ActionChunk], ChunkPlan] | None = None
         self._motion = MotionPipeline(profile, reach, self._planner)
         self.contact, self._retreat = self._motion.contact, self._motion.retreat
-        self._feels = True
+        self._load_known = True
         self._watchdog = Watchdog(profile)
         self._joint_monitor = None if reach is None else JointMonitor(profile, reach)
         self._speed_changed = False
@@ -88,40 +88,42 @@ class Commander:
 
     # -- one tick -----------------------------------------------------------------------------
     def step(self, inputs: Inputs, now_ns: int, ticks: int = 1) -> Outputs:
-        """Take in what arrived and say what to publish.
+        """Process the inputs of one tick.
 
         Args:
-            inputs: since the last call.
+            inputs: everything received since the last call.
             now_ns: nominal time of this tick on the wall clock of this node, which must not jump.
             ticks: periods since the last call. More than one after a late wake-up: the motion is a
-                function of time, so the same trajectory is sampled later, and nothing is hurried.
+                function of time, so the same trajectory is sampled later, no faster.
         """
         self._out = Outputs()
         task_before, state_before = self.task, self.state
-        self._take_state(inputs)
+        self._update_states(inputs)
         stopped = any(setting.name == "stop" for setting in inputs.settings)
         if stopped:
             self._change(Trigger.STOP, "emergency stop")
         for setting in inputs.settings:
-            self._take_setting(setting, now_ns, stopped)
-        self._planner.tick()
+            self._apply_setting(setting, now_ns, stopped)
+        self._planner.begin_tick()
         for chunk in inputs.chunks:
-            self._take_chunk(chunk, now_ns)
-        self._compose(now_ns)
-        self._look_around(now_ns)
-        if not inputs.chunks:  # those cost enough in one tick
-            self._look_at_joints(now_ns)
-        if not self._motion.advance(
-            self.state, self.task, self._watchdog.deadline_ns, now_ns, ticks, self._out
-        ):
+            self._submit_chunk(chunk, now_ns)
+        self._plan_chunks(now_ns)
+        self._supervise(now_ns)
+        if not inputs.chunks:  # planning them is work enough for one tick
+            self._monitor_joints(now_ns)
+        overdue_ns = self._watchdog.deadline_ns
+        planned, events = self._motion.advance(self.state, self.task, overdue_ns, now_ns, ticks)
+        self._out.events += events
+        if not planned:
             self._change(Trigger.FAULT, "no trajectory could be computed; braked")
         if self._speed_changed and self._motion.timeline is not None:
             self._speed_changed = False
             self._expect_next(self._motion.timeline.plan, now_ns)
         if self.state is State.ACTIVE and self._motion.timeline is not None:
-            self.progress.look(self._motion.timeline, self.task.episode, now_ns)
+            self.progress.update(self._motion.timeline, self.task.episode, now_ns)
         if not self.dry_run:
-            self._motion.command(self.state, now_ns, self.gripper_state, self._out)
+            commands = self._motion.commands(self.state, now_ns, self.gripper_state)
+            self._out.pose, self._out.joint, self._out.gripper = commands
         if self.state is not state_before and self.task.active != (self.state in OBEYING):
             self.task = replace(self.task, active=self.state in OBEYING)
         self._out.task_changed = self.task != task_before
@@ -129,17 +131,17 @@ class Commander:
 
     @property
     def goal(self) -> Goal | None:
-        """Where the arm is heading, None before the first activation."""
+        """The goal that the arm follows, None before the first activation."""
         return self._motion.goal
 
     @property
     def gripper(self) -> GripperArbiter:
-        """What decides when the gripper is commanded."""
+        """The gripper's commands."""
         return self._motion.gripper
 
     @property
     def at_rest(self) -> bool:
-        """What is commanded stands still."""
+        """The commanded motion stands still."""
         return self._motion.at_rest
 
     @property
@@ -149,45 +151,45 @@ class Commander:
 
     @property
     def retreating(self) -> bool:
-        """The arm is led back from what blocked it."""
+        """The arm retreats from what blocked it."""
         return self._retreat.busy
 
     @property
     def speed(self) -> float:
-        """Share of the speed limits that the arm has now; less than 1 near a bound."""
+        """Share of the speed limits in use; less than 1 near a bound."""
         return self._motion.speed
 
     @property
     def smoothing_failures(self) -> int:
-        """Times Ruckig found no way and the arm was braked instead."""
+        """Times Ruckig found no trajectory and the arm braked instead."""
         return self._motion.failures
 
     @property
     def tracking_m(self) -> float:
-        """How far the measured TCP is from the commanded one."""
+        """Distance of the measured TCP from the commanded one."""
         return self._watchdog.tracking_m
 
     @property
     def tracking_rad(self) -> float:
-        """Likewise."""
+        """Angle of the measured TCP from the commanded one."""
         return self._watchdog.tracking_rad
 
     @property
     def elbow_rad(self) -> float:
-        """How far the worst measured joint is from where the arm is believed to have it."""
+        """Greatest distance of a measured joint from where it is expected, see `JointMonitor`."""
         return 0.0 if self._joint_monitor is None else self._joint_monitor.elbow_rad
 
     # -- states and settings ------------------------------------------------------------------
-    def _take_state(self, inputs: Inputs) -> None:
+    def _update_states(self, inputs: Inputs) -> None:
         if inputs.peers is not None:
             self._peers = inputs.peers
         if inputs.pose is not None:
             self.pose = inputs.pose
-            self.contact.take_pose(inputs.pose)
-            self._retreat.see(pose_of(inputs.pose.record))
+            self.contact.update_pose(inputs.pose)
+            self._retreat.measure(pose_of(inputs.pose.record))
         if inputs.joint is not None:
             self.joint = inputs.joint
-            self.contact.take_joints(inputs.joint)
+            self.contact.update_joints(inputs.joint)
         if inputs.gripper is not None:
             self.gripper_state = inputs.gripper
             faults, mode = inputs.gripper.record.faults, inputs.gripper.record.mode
@@ -196,16 +198,16 @@ class Commander:
             elif mode != "ready":
                 self._change(Trigger.LOSE, f"the robot is not ready but {mode!r}")
 
-    def _take_setting(self, setting: Setting, now_ns: int, stopped: bool) -> None:
+    def _apply_setting(self, setting: Setting, now_ns: int, stopped: bool) -> None:
         name, value = setting.name, setting.value
         if stopped and (name == "reset" or (name == "active" and value is not False)):
-            # Which of them was put first cannot be told within a tick: the stop wins.
-            self._refuse_setting(name, ["an emergency stop came at the same time"])
+            # Their order within a tick is not known: the stop wins.
+            self._reject_setting(name, ["an emergency stop came at the same time"])
             return
         try:
             self._set(name, value, now_ns)
         except RecordError as error:
-            self._refuse_setting(name, [str(error)])
+            self._reject_setting(name, [str(error)])
 
     def _set(self, name: str, value: str | bool | float | None, now_ns: int) -> None:
         if name == "prompt" and isinstance(value, str):
@@ -219,7 +221,9 @@ class Commander:
         elif name in ("speed", "slower") and isinstance(value, (int, float)):
             if name == "slower" and value > self.task.speed_percent:
                 now = f"the {self.task.speed_percent:g} % in force"
-                raise RecordError(f"{value:g} % is more than {now}; put it on speed to go faster")
+                raise RecordError(
+                    f"{value:g} % is more than {now}; use the setting speed to go faster"
+                )
             self.task = replace(self.task, speed_percent=value)
             self._speed_changed = True
         elif name == "active" and (value is True or isinstance(value, str)):
@@ -231,10 +235,10 @@ class Commander:
         elif name == "lose":
             self._change(Trigger.LOSE, str(value))
         elif name != "stop":
-            raise RecordError(f"{value!r} is nothing that {name!r} can be set to")
+            raise RecordError(f"{name!r} cannot be set to {value!r}")
 
     def _new_episode(self, now_ns: int, **changes: str) -> None:
-        # The wall clock, so that an episode number never comes again after a restart.
+        # From the wall clock, so that a restarted node never reuses an episode number.
         episode = max(self.task.episode + 1, now_ns // 1_000_000)
         self.task = replace(self.task, episode=episode, **changes)  # pyright: ignore
         self.progress.begin()
@@ -245,7 +249,7 @@ class Commander:
         if self.state in OBEYING:
             lease, reasons = self._preflight(worker, now_ns)
             if lease is None:
-                self._refuse_setting("worker", reasons)
+                self._reject_setting("worker", reasons)
                 return
             self.lease = lease
         self._new_episode(now_ns, worker=worker)
@@ -255,15 +259,15 @@ class Commander:
             self._hold_as_well(holder)
             return
         if self.state is not State.INACTIVE:
-            self._refuse_setting(
-                "activate", [f"the state is {self.state.value} ({self.why}); put anything on reset"]
+            self._reject_setting(
+                "activate", [f"the state is {self.state.value} ({self.why}); reset it first"]
             )
             return
         lease, reasons = self._preflight(self.task.worker, now_ns)
-        reasons += self.deadman.refused(holder, self._peers.holders)
+        reasons += self.deadman.reasons_against(holder, self._peers.holders)
         reasons += self._motion.unsettled(now_ns)
         if lease is None or self.pose is None or self.gripper_state is None or reasons:
-            self._refuse_setting("activate", reasons)
+            self._reject_setting("activate", reasons)
             return
         self.lease = lease
         self.deadman.begin(holder)
@@ -277,16 +281,16 @@ class Commander:
         self._new_episode(now_ns)
 
     def _hold_as_well(self, holder: str) -> None:
-        """An arm that obeys already is held by one; nobody takes that away without a brake."""
-        reasons = self.deadman.refused(holder, self._peers.holders, obeying=True)
+        """Add a deadman to an active arm; a present one cannot be replaced without a brake."""
+        reasons = self.deadman.reasons_against(holder, self._peers.holders, obeying=True)
         if reasons:
-            self._refuse_setting("activate", reasons)
+            self._reject_setting("activate", reasons)
         elif holder not in ("", self.deadman.name):
             self.deadman.begin(holder)
-            self._out.tell("info", "notice", "held", f"obeys from now on while {holder!r} holds it")
+            self._emit("info", "notice", "held", f"active from now on while {holder!r} holds it")
 
     def _preflight(self, worker: str, now_ns: int) -> tuple[Lease | None, list[str]]:
-        chunk = self._shadow.get(worker)
+        chunk = self._latest.get(worker)
         reasons = reasons_not_to_activate(
             self.profile,
             worker,
@@ -305,28 +309,28 @@ class Commander:
         if self.joint is not None and self.pose is not None:
             writers = {self.joint.header.source, self.pose.header.source}
             if len(writers) > 1:
-                reasons.append(f"joints and pose are by different writers: {', '.join(writers)}")
+                reasons.append(f"joints and pose have different writers: {', '.join(writers)}")
         if reasons or chunk is None:
             return None, reasons
         spec = self._peers.specs[worker]
         return Lease(spec, chunk.header.source, now_ns, chunk.header.seq), []
 
-    def _refuse_setting(self, what: str, reasons: list[str]) -> None:
-        # Why it stopped is not covered up by what was refused because of it.
+    def _reject_setting(self, what: str, reasons: list[str]) -> None:
+        # Keep the reason for a stop: rejections that follow from it must not replace it.
         if self.state not in (State.STOPPED, State.FAULT):
-            self.why = f"{what} refused: {'; '.join(reasons)}"[:MAX_TEXT]
+            self.why = f"{what} rejected: {'; '.join(reasons)}"[:MAX_TEXT]
         for reason in reasons:
-            self._out.tell("warning", "refusal", f"{what}_refused", reason)
+            self._emit("warning", "refusal", f"{what}_refused", reason)
             self._out.rejections.append(Rejection(f"{what}_refused", reason))
 
     def latch(self, why: str) -> None:
-        """Begin stopped: an emergency stop outlives the process that heard it."""
+        """Start in STOPPED: an emergency stop outlives the process that received it."""
         self.state, self.why = State.STOPPED, why[:MAX_TEXT]
 
     def _reset(self) -> None:
         faults = self.gripper_state.record.faults if self.gripper_state else ()
         if self.state is State.FAULT and faults:
-            self._refuse_setting("reset", [f"the robot still reports: {'; '.join(faults)}"])
+            self._reject_setting("reset", [f"the robot still reports: {'; '.join(faults)}"])
             return
         self._change(Trigger.RESET, "reset")
 
@@ -342,125 +346,91 @@ class Commander:
             if new in OBEYING or trigger in (Trigger.DEACTIVATE, Trigger.RESET)
             else "warning"
         )
-        self._out.tell(level, "transition", f"{old.value}->{new.value}", why)
+        self._emit(level, "transition", f"{old.value}->{new.value}", why)
+
+    def _emit(
+        self,
+        level: str,
+        kind: str,
+        what: str,
+        why: str,
+        value: float | None = None,
+        limit: float | None = None,
+    ) -> None:
+        self._out.events.append(make_event(level, kind, what, why, value, limit))
 
     # -- chunks -------------------------------------------------------------------------------
-    def _take_chunk(self, chunk: Stamped[ActionChunk], now_ns: int) -> None:
+    def _submit_chunk(self, chunk: Stamped[ActionChunk], now_ns: int) -> None:
         worker = chunk.record.worker
+        leased = self.state in OBEYING and worker == self.task.worker
+        lease = self.lease if leased else None
         owner = self._peers.spec_sources.get(worker)
-        if owner is None:
-            unknown = Rejection("unknown_worker", "its spec is not known yet", quiet=True)
-            self._out.refuse(unknown, worker)
-            return
-        if chunk.header.source != owner:
-            why = f"a chunk by {chunk.header.source[:60]!r}, who did not publish this worker's spec"
-            self._out.refuse(Rejection("foreign", why), worker)
-            return
-        if self.state not in OBEYING or worker != self.task.worker or self.lease is None:
-            self._shadow[worker] = chunk
-            return
-        timing = self.profile.timing
-        refusal = refuse(chunk, self.lease, self.task, timing.max_observation_age_s, now_ns)
-        if refusal is not None:
-            self._out.refuse(refusal, worker)
-            return
-        self.lease.last_observation_ns = chunk.record.observation_stamp_ns
-        if len(self._waiting) == MOST_WAITING:
-            self._overtaken(self._waiting.popleft())
-        self._waiting.append(chunk)
+        outcome = self._planner.submit(chunk, owner, lease, self.task, now_ns)
+        if outcome is not None:
+            self._report_outcome(outcome)
+        elif lease is None:
+            self._latest[worker] = chunk
 
-    def _compose(self, now_ns: int) -> None:
-        """Go on with the chunk that becomes a plan, then with the newest that waits.
+    def _plan_chunks(self, now_ns: int) -> None:
+        timeline, lease = self._motion.timeline, self.lease
+        if timeline is None or lease is None:
+            return
+        episode = self.task.episode if self.state in OBEYING else None
+        resumed_ns = now_ns if self.state is State.HOLDING else self._resumed_ns
+        action = lease.spec.action
+        for outcome in self._planner.advance(timeline, action, episode, resumed_ns, now_ns):
+            self._report_outcome(outcome)
+            if outcome.plan is not None:
+                self._resumed_ns = resumed_ns
+                self._latest[outcome.chunk.record.worker] = outcome.chunk
+                self._expect_next(outcome.plan, now_ns)
+                self.progress.chunks += 1
+                self._change(Trigger.FRESH, "fresh chunk")
 
-        One that came meanwhile stands on it, so it is begun when that is in force.
-        """
-        if self._coming is not None:
-            self._go_on(*self._coming, now_ns)
-        while self._coming is None and self._waiting:
-            self._begin(self._waiting.pop(), now_ns)
+    def _report_outcome(self, outcome: ChunkOutcome) -> None:
+        rejection = outcome.rejection
+        if rejection is None:
+            self._out.accepted = outcome.plan.cause if outcome.plan else None
+            self._out.events += limit_events(outcome.hits)
+            return
+        self._out.rejections.append(rejection)
+        if not rejection.quiet:
+            reason, why, value, limit, _ = rejection
+            why = f"{outcome.chunk.record.worker}: {why}"
+            self._emit("warning", "refusal", reason, why, value, limit)
 
     def _expect_next(self, plan: Plan, now_ns: int) -> None:
         rate_hz, speed = self.task.rate_hz, self.task.speed
         self._watchdog.expect_next(max(plan.end_ns, now_ns), rate_hz, now_ns, speed)
 
-    def _begin(self, chunk: Stamped[ActionChunk], now_ns: int) -> None:
-        timeline, lease = self._motion.timeline, self.lease
-        if timeline is None or lease is None or self._superseded(chunk):
-            return
-        plan = self._planner.begin(chunk, lease.spec.action, timeline)
-        if isinstance(plan, Rejection):
-            self._out.refuse(plan, chunk.record.worker)
-            return
-        while self._waiting:
-            self._overtaken(self._waiting.popleft())
-        self._coming = chunk, plan
-        self._go_on(chunk, plan, now_ns)
-
-    def _go_on(self, chunk: Stamped[ActionChunk], plan: ChunkPlan, now_ns: int) -> None:
-        timeline, worker = self._motion.timeline, chunk.record.worker
-        if timeline is None or self._superseded(chunk):
-            self._coming = None
-            return
-        ready = self._planner.go_on(plan, now_ns)
-        if ready is False:
-            return
-        self._coming = None
-        if isinstance(ready, Rejection):
-            self._out.refuse(ready, worker)
-            return
-        if self.state is State.HOLDING:
-            self._resumed_ns = now_ns
-        # Until then the arm stood, and what was seen of it stands on that: chunks that come in a
-        # heap after a pause replace each other.
-        plan.effective_ns = max(plan.effective_ns, self._resumed_ns)
-        timeline.add(plan, now_ns)
-        self._expect_next(plan, now_ns)
-        self._out.accepted = plan.cause
-        self._out.shortened(plan.news())
-        self._shadow[worker] = chunk
-        self.progress.chunks += 1
-        self._change(Trigger.FRESH, "fresh chunk")
-
-    def _superseded(self, chunk: Stamped[ActionChunk]) -> bool:
-        """The arm was stopped, or is told something else, since it came."""
-        if self.state in OBEYING and chunk.record.episode == self.task.episode:
-            return False
-        why = "the arm was stopped or told something else meanwhile"
-        self._out.refuse(Rejection("superseded", why, quiet=True), chunk.record.worker)
-        return True
-
-    def _overtaken(self, chunk: Stamped[ActionChunk]) -> None:
-        why = "a newer one came before it was begun"
-        self._out.refuse(Rejection("overtaken", why, quiet=True), chunk.record.worker)
-
-    # -- watching -----------------------------------------------------------------------------
-    def _look_around(self, now_ns: int) -> None:
+    # -- supervision --------------------------------------------------------------------------
+    def _supervise(self, now_ns: int) -> None:
         if self.pose is not None:
             self._watchdog.measure(self._motion.commanded, pose_of(self.pose.record))
-            self._motion.look_at(self.pose.record, now_ns)
+            self._motion.measure(self.pose.record, now_ns)
         if self._retreat.busy and not self._may_retreat(now_ns):
             self._retreat.end()
         if self.state not in OBEYING:
             return
         assert self.pose is not None and self.gripper_state is not None and self.lease is not None
-        self._motion.pressed = self.contact.slowdown()
-        self._tell_whether_it_feels()
+        self._motion.contact_slowdown = self.contact.slowdown()
+        self._report_load_sensing()
         lost = self._watchdog.lost(
             self.pose, self.gripper_state, self._peers, self.task.worker, self.lease, now_ns
         )
         if not lost and self.streaming and not self.dry_run:
             lost = self._obstructed()
         lost = lost or self._motion.stuck or self._joints_lost(now_ns)
-        if not lost and self._watchdog.forsaken(now_ns):
-            lost = f"held for {self.profile.timing.max_hold_s:g} s, no fresh chunk came"
+        if not lost and self._watchdog.given_up(now_ns):
+            lost = f"held for {self.profile.timing.max_hold_s:g} s without a fresh chunk"
         lost = lost or self.deadman.lost(self._peers.holders)
         if lost:
             self._change(Trigger.LOSE, lost)
-        elif self._watchdog.starved(now_ns):
+        elif self._watchdog.overdue(now_ns):
             self._change(Trigger.STARVE, "no fresh chunk within the watchdog")
 
     def _joints_lost(self, now_ns: int) -> str:
-        """That the measured joints, which are watched, are not heard any more."""
+        """Why the measured joints, which are monitored, count as lost; empty while they arrive."""
         if self._joint_monitor is None or self.joint is None:
             return ""
         silent_s = (now_ns - self.joint.received_ns) / 1e9
@@ -469,65 +439,64 @@ class Commander:
             return ""
         return f"robot state lost: joints {silent_s:.3f} s old, at most {patience_s:g} s"
 
-    def _look_at_joints(self, now_ns: int) -> None:
-        """Hold the arm back, or brake it, where its measured joints come too near to something."""
-        watch, reach, mover = self._joint_monitor, self.reach, self._motion
-        if watch is None or reach is None or self.joint is None:
+    def _monitor_joints(self, now_ns: int) -> None:
+        """Slow the arm down, or brake it, if its measured joints come too near to a bound."""
+        monitor, reach, motion = self._joint_monitor, self.reach, self._motion
+        if monitor is None or reach is None or self.joint is None:
             return
         if self.state not in OBEYING or not self.streaming:
-            watch.forget()
+            monitor.reset()
             return
         try:
             measured_rad = reach.kinematics.joints_of(self.joint.record)
         except RecordError as error:
             self._change(Trigger.LOSE, str(error))
             return
-        commanded_rad = mover.joints_rad
-        hit = watch.look(measured_rad, commanded_rad, now_ns)
-        mover.hold_back(watch.slowdown)
-        reach.reseat(measured_rad if commanded_rad is None else commanded_rad)
+        commanded_rad = motion.joints_rad
+        hit = monitor.update(measured_rad, commanded_rad, now_ns)
+        motion.joint_slowdown = monitor.slowdown
+        reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)
         if hit is not None:
-            at = f" at {hit.where}" if hit.where else ""
-            self._out.tell("warning", "limit", hit.name, f"braked{at}", hit.value, hit.limit)
-            why = f"the measured arm is too near to a bound: {hit.name}{at} is {hit.value:.3g}"
+            self._emit("warning", "limit", hit.name, f"braked{hit.at}", hit.value, hit.limit)
+            why = f"the measured arm is too near to a bound: {hit.name}{hit.at} is {hit.value:.3g}"
             self._change(Trigger.LOSE, f"{why}, the limit is {hit.limit:.3g}")
 
     def _obstructed(self) -> str:
-        """Why the arm cannot go on, empty when it can; then it brakes and is led back."""
-        commanded, pressed = self._motion.commanded, self.contact.pressed()
-        if pressed is None:
+        """Why the arm is blocked or in contact, empty otherwise; it then brakes and retreats."""
+        commanded, overload = self._motion.commanded, self.contact.overload()
+        if overload is None:
             why = self._watchdog.blocked()
-            # Who feels nothing is not blocked: its state is stuck, or it was made slow.
-            leads_back = bool(why) and not (self.contact.told and self.contact.quiet)
+            # An arm without contact is not blocked: its state is stuck, or it was slowed down.
+            retreats = bool(why) and not (self.contact.known and self.contact.quiet)
         else:
-            name, value, limit, unit = pressed
-            self._out.tell("warning", "limit", name, "stopped", value, limit)
+            name, value, limit, unit = overload
+            self._emit("warning", "limit", name, "stopped", value, limit)
             why = (
                 f"something presses against the arm: {name} {value:.1f} {unit}, "
                 f"at most {limit:g} {unit}; it is led back"
             )
-            leads_back = True
-        if leads_back and commanded is not None:
+            retreats = True
+        if retreats and commanded is not None:
             self._retreat.begin(commanded)
         return why
 
     def _may_retreat(self, now_ns: int) -> bool:
-        """The robot is there, well, and says where the arm is."""
+        """The robot is alive and ready, without faults, and publishes its state."""
         pose, gripper = self.pose, self.gripper_state
-        if pose is None or gripper is None or self._watchdog.unheard(pose, gripper, now_ns):
+        if pose is None or gripper is None or self._watchdog.state_lost(pose, gripper, now_ns):
             return False
-        there = self._peers.robot_node in self._peers.alive
-        return there and gripper.record.mode == "ready" and not gripper.record.faults
+        alive = self._peers.robot_node in self._peers.alive
+        return alive and gripper.record.mode == "ready" and not gripper.record.faults
 
-    def _tell_whether_it_feels(self) -> None:
-        if self.contact.told is self._feels:
+    def _report_load_sensing(self) -> None:
+        if self.contact.known is self._load_known:
             return
-        self._feels = self.contact.told
-        if self._feels:
-            self._out.tell("info", "notice", "contact_told", "the robot tells external forces")
+        self._load_known = self.contact.known
+        if self._load_known:
+            self._emit("info", "notice", "contact_told", "the robot measures external loads")
         else:
             why = (
-                "the robot tells no external wrench: limits.contact has nothing to look at, and an "
-                "arm that is blocked is noticed by limits.tracking_m alone"
+                "the robot measures no external wrench: limits.contact has no effect, and a "
+                "blocked arm is detected by limits.tracking_m alone"
             )
-            self._out.tell("warning", "notice", "contact_not_told", why)
+            self._emit("warning", "notice", "contact_not_told", why)

@@ -1,9 +1,9 @@
-"""What goes into a tick of the command node's mind, and what comes out of it."""
+"""Inputs and outputs of one tick of the `Commander`, and the events in them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -26,10 +26,12 @@ from vla_zenoh.types import (
 
 
 class Setting(NamedTuple):
-    """Somebody put a setting. `name`: prompt, active, worker, rate, speed, slower, stop,
-    reset or lose.
+    """A setting received from a client, or a loss found by the command node itself.
 
-    Of ``active`` a text is the name of whoever holds the arm active.
+    Args:
+        name: prompt, active, worker, rate, speed, slower, stop, reset or lose.
+        value: of ``active`` a text is the name of the deadman, the client that holds the arm
+            active.
     """
 
     name: str
@@ -38,15 +40,15 @@ class Setting(NamedTuple):
 
 @dataclass(slots=True)
 class Inputs:
-    """Everything that arrived since the last tick, oldest first.
+    """Everything received since the last tick, oldest first.
 
     Args:
         settings: in the order they were put.
         chunks: of all workers.
-        pose: newest TCP pose, or None when none came since.
-        gripper: likewise.
-        around: the nodes around; None: unchanged.
-        joint: newest joints, or None when none came since, or none were looked at.
+        pose: newest TCP pose, None: none since the last tick.
+        gripper: newest gripper state, None: none since.
+        peers: the other nodes; None: unchanged.
+        joint: newest joints, None: none since, or none were decoded.
     """
 
     settings: Sequence[Setting] = ()
@@ -59,16 +61,16 @@ class Inputs:
 
 @dataclass(slots=True)
 class Outputs:
-    """What to publish.
+    """Everything to publish after a tick.
 
     Args:
         pose: None while nothing is streamed, or where joints are commanded.
         joint: None while nothing is streamed, or where poses are commanded.
-        gripper: None unless a new width is to be sent.
-        task_changed: `Commander.task` differs from the last tick's.
-        events: what happened.
-        refusals: counted by reason by the caller.
-        accepted: the chunk that came in force with this tick, for latencies.
+        gripper: None unless there is a new width to command.
+        task_changed: `Commander.task` differs from that of the last tick.
+        events: in the order they happened.
+        rejections: of chunks and settings; the caller counts them by reason.
+        accepted: the chunk whose plan came into force with this tick, for latencies.
     """
 
     pose: PoseCommand | None = None
@@ -79,33 +81,28 @@ class Outputs:
     rejections: list[Rejection] = field(default_factory=list)
     accepted: Cause | None = None
 
-    def tell(
-        self,
-        level: str,
-        kind: str,
-        what: str,
-        why: str,
-        value: float | None = None,
-        limit: float | None = None,
-    ) -> None:
-        """Add an event; a value that is not finite is left out."""
-        if value is not None and not math.isfinite(value):
-            value = None
-        self.events.append(Event(level, kind, what, why[:MAX_TEXT], value, limit))
 
-    def refuse(self, refusal: Rejection, worker: str) -> None:
-        """Count a chunk of `worker` as refused, and tell it unless that is normal running."""
-        self.rejections.append(refusal)
-        if not refusal.quiet:
-            why = f"{worker}: {refusal.why}"
-            self.tell("warning", "refusal", refusal.reason, why, refusal.value, refusal.limit)
+def make_event(
+    level: str,
+    kind: str,
+    what: str,
+    why: str,
+    value: float | None = None,
+    limit: float | None = None,
+) -> Event:
+    """An event whose text fits into its record; a value that is not finite is left out."""
+    if value is not None and not math.isfinite(value):
+        value = None
+    return Event(level, kind, what, why[:MAX_TEXT], value, limit)
 
-    def shortened(self, hits: Sequence[LimitHit]) -> None:
-        """Tell what acted on the steps of a chunk, see `Composer`."""
-        for hit in hits:
-            if hit.name == APPROACH:
-                why = f"its target is {hit.value:.3g} {hit.where} away, over a step: gone to slowly"
-                self.tell("info", "limit", hit.name, why, hit.value, hit.limit)
-                continue
-            where = f" at {hit.where}" if hit.where else ""
-            self.tell("warning", "limit", hit.name, f"shortened{where}", hit.value, hit.limit)
+
+def limit_events(hits: Iterable[LimitHit]) -> list[Event]:
+    """Events for the limits that acted on the steps of a chunk, see `ChunkPlanner`."""
+    events: list[Event] = []
+    for hit in hits:
+        level, why = "warning", f"shortened{hit.at}"
+        if hit.name == APPROACH:
+            level = "info"
+            why = f"target {hit.value:.3g} {hit.where} away, over a step: approached slowly"
+        events.append(make_event(level, "limit", hit.name, why, hit.value, hit.limit))
+    return events

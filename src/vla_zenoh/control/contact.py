@@ -1,15 +1,15 @@
-"""What presses against the arm, and whether it is too much.
+"""Contact: the external load on the arm, and whether it is too much.
 
-A robot may tell the external wrench at its TCP (`PoseState.wrench`), and efforts of its joints
-(`JointState.effort_nm`), which are of use here where they are external too. Each kind is filtered::
+A robot may measure the external wrench at its TCP (`PoseState.wrench`) and efforts of its joints
+(`JointState.effort_nm`), which count only if they are external too. Each load is filtered, and its
+bias removed::
 
-    f' = (told - f) / FILTER_S                      noise, and blows that are over at once
-    b' = (f - b) / DRIFT_S,  |b - b_0| <= slow      a load that was taken up, a sensor that drifts
+    f' = (measured - f) / FILTER_S                  noise, and impacts that are over at once
+    b' = (f - b) / DRIFT_S,  |b - b_0| <= slow      a load that was picked up, a sensor that drifts
 
-with ``b_0`` what was felt when the arm was activated, ``slow`` of that at most: a load in the
-gripper, a sensor that was not zeroed. What counts is the length of ``f - b``, of joints the
-greatest. Above ``slow`` the arm has a share of its speed, ``(stop - |f - b|) / (stop - slow)``,
-above ``stop`` it must stop.
+with ``b_0`` the load at activation, at most ``slow``: a load in the gripper, a sensor that was not
+zeroed. The value that counts is the norm of ``f - b``, for joints the greatest one. Above ``slow``
+the arm has a share of its speed, ``(stop - |f - b|) / (stop - slow)``, above ``stop`` it must stop.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from vla_zenoh.types import JointState, PoseState, Stamped
 FILTER_S = 0.02
 DRIFT_S = 10.0
 LONGEST_S = 0.1
-"""A state that comes later than that after the one before does not say what was in between."""
+"""Longest time between two states that the filters integrate."""
 QUIET = 0.2
-"""Part of ``slow`` below which nothing presses."""
+"""Part of ``slow`` below which the arm is not in contact."""
 STEPS = 10
-"""The speed has so many shares: each change of it plans the motion anew."""
+"""Number of speed shares; each change of the share replans the motion."""
 
 
 class ExternalLoad(NamedTuple):
-    """More than may press against the arm.
+    """An external load above its limit.
 
     Args:
         name: ``contact_force``, ``contact_torque`` or ``contact_effort``.
-        value: N or Nm.
-        limit: likewise.
-        unit: of both.
+        value: in `unit`.
+        limit: in `unit`.
+        unit: N or Nm.
     """
 
     name: str
@@ -48,8 +48,8 @@ class ExternalLoad(NamedTuple):
     unit: str
 
 
-class _Felt:
-    """One kind of it, filtered."""
+class _LoadFilter:
+    """One kind of load, filtered and without its bias."""
 
     def __init__(
         self,
@@ -64,23 +64,27 @@ class _Felt:
         self.slow = self.stop if slow is None else slow
         self._size = size
         self.known = False
-        self._now: list[float] = []
+        self._filtered: list[float] = []
         self._bias: list[float] = []
-        self._began: list[float] = []
+        self._start_bias: list[float] = []
 
-    def take(self, told: Sequence[float], dt_s: float, *, drifts: bool) -> None:
-        if not self.known or len(told) != len(self._now):
-            self._now, self.known = list(told), True
-            self._bias = self._began = [0.0] * len(told)
+    def update(self, measured: Sequence[float], dt_s: float, *, drifts: bool) -> None:
+        """Add a measurement, `dt_s` after the last one; `drifts`: let the bias follow."""
+        if not self.known or len(measured) != len(self._filtered):
+            self._filtered, self.known = list(measured), True
+            self._bias = self._start_bias = [0.0] * len(measured)
         share = -math.expm1(-dt_s / FILTER_S)
-        self._now = [f + share * (t - f) for f, t in zip(self._now, told, strict=True)]
+        self._filtered = [
+            f + share * (t - f) for f, t in zip(self._filtered, measured, strict=True)
+        ]
         if drifts and dt_s > 0:
             drift = dt_s / DRIFT_S
-            bias = [b + drift * (f - b) for b, f in zip(self._bias, self._now, strict=True)]
-            self._bias = self._near(bias, self._began)
+            bias = [b + drift * (f - b) for b, f in zip(self._bias, self._filtered, strict=True)]
+            self._bias = self._near(bias, self._start_bias)
 
-    def begin(self) -> None:
-        self._bias = self._began = self._near(self._now, [0.0] * len(self._now))
+    def zero(self) -> None:
+        """Take the present load for the bias, as far as `slow`."""
+        self._bias = self._start_bias = self._near(self._filtered, [0.0] * len(self._filtered))
 
     def _near(self, values: Sequence[float], middle: Sequence[float]) -> list[float]:
         apart = [v - m for v, m in zip(values, middle, strict=True)]
@@ -89,7 +93,8 @@ class _Felt:
 
     @property
     def value(self) -> float:
-        return self._size([f - b for f, b in zip(self._now, self._bias, strict=True)])
+        """The size of the load, in N or Nm."""
+        return self._size([f - b for f, b in zip(self._filtered, self._bias, strict=True)])
 
 
 def _length(values: Sequence[float]) -> float:
@@ -101,77 +106,79 @@ def _greatest(values: Sequence[float]) -> float:
 
 
 class Contact:
-    """See the module.
+    """The external load on the arm, as far as the robot measures it.
 
     Args:
-        limits: of what may press.
+        limits: slow and stop of each kind of load.
     """
 
     def __init__(self, limits: ContactLimits) -> None:
-        self._force = _Felt("contact_force", "N", limits.force_slow_n, limits.force_stop_n, _length)
-        self._torque = _Felt(
+        self._force = _LoadFilter(
+            "contact_force", "N", limits.force_slow_n, limits.force_stop_n, _length
+        )
+        self._torque = _LoadFilter(
             "contact_torque", "Nm", limits.torque_slow_nm, limits.torque_stop_nm, _length
         )
-        self._effort = _Felt(
+        self._effort = _LoadFilter(
             "contact_effort", "Nm", limits.effort_slow_nm, limits.effort_stop_nm, _greatest
         )
         self._wants_effort = limits.effort_stop_nm is not None
         self._active = False
         self._pose_ns = self._joint_ns = 0
 
-    # -- what is told -------------------------------------------------------------------------
-    def take_pose(self, state: Stamped[PoseState]) -> None:
-        """The newest pose, with the wrench where the robot tells one."""
+    # -- measurements -------------------------------------------------------------------------
+    def update_pose(self, state: Stamped[PoseState]) -> None:
+        """Add the newest pose, with the wrench if the robot measures one."""
         wrench = state.record.wrench
         if wrench is None:
             self._force.known = self._torque.known = False
             return
-        told = wrench.tolist()
+        load = wrench.tolist()
         dt_s = _passed_s(self._pose_ns, state.header.stamp_wall_ns)
         self._pose_ns = state.header.stamp_wall_ns
-        self._force.take(told[:3], dt_s, drifts=self._active)
-        self._torque.take(told[3:], dt_s, drifts=self._active)
+        self._force.update(load[:3], dt_s, drifts=self._active)
+        self._torque.update(load[3:], dt_s, drifts=self._active)
 
-    def take_joints(self, state: Stamped[JointState]) -> None:
-        """The newest joints; looked at where a limit says that their efforts are external."""
+    def update_joints(self, state: Stamped[JointState]) -> None:
+        """Add the newest joints; used if a limit of the profile says that efforts are external."""
         if self._wants_effort:
             dt_s = _passed_s(self._joint_ns, state.header.stamp_wall_ns)
             self._joint_ns = state.header.stamp_wall_ns
-            self._effort.take(state.record.effort_nm.tolist(), dt_s, drifts=self._active)
+            self._effort.update(state.record.effort_nm.tolist(), dt_s, drifts=self._active)
 
     def begin(self) -> None:
-        """The arm is activated: what presses now is no contact."""
+        """Start an activation: the present load is not a contact."""
         self._active = True
         for kind in self._kinds:
-            kind.begin()
+            kind.zero()
 
     def end(self) -> None:
-        """It is not active any more: what presses from here on is not got used to."""
+        """End the activation: the bias follows the load no longer."""
         self._active = False
 
-    # -- what it means ------------------------------------------------------------------------
+    # -- contact ------------------------------------------------------------------------------
     @property
-    def told(self) -> bool:
-        """The robot says whether something presses."""
+    def known(self) -> bool:
+        """The robot measures external loads."""
         return bool(self._kinds)
 
     @property
     def force_n(self) -> float | None:
-        """External force, None where it is not told."""
+        """External force, None where it is not measured."""
         return self._force.value if self._force.known else None
 
     @property
     def torque_nm(self) -> float | None:
-        """External torque about the TCP, None where it is not told."""
+        """External torque about the TCP, None where it is not measured."""
         return self._torque.value if self._torque.known else None
 
     @property
     def quiet(self) -> bool:
-        """Nothing presses, as far as the robot tells."""
+        """No contact, as far as the robot measures it."""
         return all(kind.value <= QUIET * kind.slow for kind in self._kinds)
 
-    def pressed(self) -> ExternalLoad | None:
-        """What is above its limit, None: nothing."""
+    def overload(self) -> ExternalLoad | None:
+        """The load above its stop limit, None without one."""
         for kind in self._kinds:
             value = kind.value
             if value > kind.stop:
@@ -179,7 +186,7 @@ class Contact:
         return None
 
     def slowdown(self) -> Slowdown | None:
-        """What makes the arm slower, None: nothing."""
+        """The slowdown of the greatest load, None without one."""
         slowest: Slowdown | None = None
         for kind in self._kinds:
             value = kind.value
@@ -192,7 +199,7 @@ class Contact:
         return slowest
 
     @property
-    def _kinds(self) -> list[_Felt]:
+    def _kinds(self) -> list[_LoadFilter]:
         return [kind for kind in (self._force, self._torque, self._effort) if kind.known]
 
 

@@ -1,27 +1,27 @@
-"""Joint positions that follow a stream of TCP poses, for arms that take joints.
+"""Joint positions that follow a stream of TCP poses: differential inverse kinematics.
 
-Each tick takes one damped Newton step to the pose and turns it into joint velocities that the
-joints can have. With ``e`` the error from joints to target, ``v`` the target's twist and J# the
-inverse damped near a singularity::
+Each tick takes one damped Newton step to the pose, as joint velocities within the limits of the
+joints. With ``e`` the error from joints to target, ``v`` the target's twist and J# the inverse
+damped near a singularity::
 
     feed      = J# v
-    back      = J# e / dt - feed      bounded to what can be stopped within J# e - feed dt
+    back      = J# e / dt - feed      bounded: can stop within J# e - feed dt
     qd_wanted = (feed + back) + (1 - J# J) kp (q_posture - q)
 
     J#        = J^T (J J^T + W)^-1,   W = wmax (1 - (s / s0)^2)^2 1 where s < s0, else 0
 
-`feed` makes a smooth stream exact; the bound on `back` makes a far target one that is reached
-without overshoot. All joints are slowed by one factor to the velocity limits and by one to the
-acceleration limits. Each follows what is wanted of it within its jerk limit ``j``: with ``r`` the
-wanted velocity's own rate and ``d`` what is left to it beyond that, the acceleration is
+`feed` makes a smooth stream exact; the bound on `back` lets a far target be reached without
+overshoot. One factor slows all joints to the velocity limits, and one to the acceleration limits.
+Each joint follows its wanted velocity within its jerk limit ``j``: with ``r`` the rate of that
+velocity and ``d`` the difference left beyond it, the acceleration is
 
     r + sign(d) a,   a dt + (a - j dt) dt + (a - 2 j dt) dt + ... = |d|
 
-which comes back to ``r`` as ``d`` comes to nothing. No joint gets faster than it may be, or than it
-can stop before the end of its range, in ticks and within both limits; a joint held back at its end
-is taken out and the others carry on without it.
-Towards a singularity all joints are slowed so that its singular value s falls no faster than
-``ka (s - s_stop)``: an arm that has slipped through one would come back in another branch.
+which returns to ``r`` as ``d`` vanishes. No joint exceeds its velocity limit, or the velocity from
+which it can stop before the end of its range, in whole ticks and within both limits; a joint held
+at its end is removed and the others continue without it. Towards a singularity all joints slow
+down so that the singular value s falls no faster than ``ka (s - s_stop)``: an arm that slips
+through a singularity would come back in another branch.
 
 Damping: Nakamura, Hanafusa, "Inverse kinematic solutions with singularity robustness", J. Dyn.
 Sys. Meas. Control 108, 1986.
@@ -46,39 +46,39 @@ from vla_zenoh.types import FloatArray
 
 _IDENTITY_6 = np.eye(6)
 WATCHED = 4.0
-"""Times `damped_below` under which it is looked where the singular value goes."""
+"""Multiple of `damped_below` under which the rate of the singular value is limited."""
 BACK_SHARE = 0.7
-"""Part of the acceleration planned with on the way to a far target, whose path is curved."""
+"""Part of the acceleration used towards a far target, whose path is curved in joint space."""
 NEAR_END_RAD = 0.1
-"""A joint that is further from the end of its range is not held back by that."""
+"""A joint further from the end of its range is not reported as held by it."""
 HALVINGS = 8
-WALL_SHARE, FAR_SHARE = 0.7, 0.1
-"""Part of the joints' acceleration and jerk that is reckoned with before a wall: they have their
-work besides. And before one that is far."""
+NEAR_SHARE, FAR_SHARE = 0.7, 0.1
+"""Part of the joints' acceleration and jerk available for a distance constraint: they follow the
+pose besides. And for the first test whether a constraint is far away."""
 ELBOW_COST = 1e-2
 """Cost of a joint's motion beside that of the TCP's."""
 BACK_JERK = 0.4
-"""Way is made up for at a rate of so many times jerk over acceleration, at most one tick's."""
+"""Rate of the correction in units of jerk over acceleration, at most one per tick."""
 ROUNDING_RAD_S = 1e-9
 PEEK_RAD = 1e-3
-"""How far the joints are moved to see that."""
+"""Joint displacement for the rate of the singular value."""
 
 
 @dataclass(frozen=True, slots=True)
 class FollowSettings:
-    """How the joints follow.
+    """Parameters of a `JointFollower`.
 
     Args:
         acceleration_rad_s2: of every joint, one number or one per joint.
-        jerk_rad_s3: likewise; the default is none that could be noticed.
+        jerk_rad_s3: of every joint; the default has no noticeable effect.
         velocity_share: part of the URDF's joint velocities that is used.
         joint_margin_rad: kept from both ends of every joint's range.
         posture_1_s: rate at which a redundant arm goes to its posture.
-        posture_rad_s: and its greatest speed.
+        posture_rad_s: greatest speed of that.
         damped_below: singular value s0 below which the inverse is damped.
-        damping: wmax, of a singular arm.
-        singularity_stop: singular value s_stop the arm does not go below by itself.
-        singularity_1_s: ka, how fast it may come near.
+        damping: wmax, at a singularity.
+        singularity_stop: s_stop, below which the arm does not go by itself.
+        singularity_1_s: ka, rate of the approach.
     """
 
     acceleration_rad_s2: float | tuple[float, ...] = 10.0
@@ -94,13 +94,13 @@ class FollowSettings:
 
 
 class JointMotion(NamedTuple):
-    """Where the joints are to be, (n,) each.
+    """Motion of the joints, (n,) each.
 
     Args:
-        position_rad: where.
-        velocity_rad_s: how fast.
-        acceleration_rad_s2: of the tick before; None: they stood.
-        wanted_rad_s: the velocity that was wanted of them; None: the one they have.
+        position_rad: positions.
+        velocity_rad_s: velocities.
+        acceleration_rad_s2: during the tick before; None: they stood.
+        wanted_rad_s: velocities wanted before the limits; None: the present ones.
     """
 
     position_rad: FloatArray
@@ -110,13 +110,13 @@ class JointMotion(NamedTuple):
 
 
 class JointFollower:
-    """See the module.
+    """Joints that follow a TCP pose within joint limits and distance constraints.
 
     Args:
         kinematics: of the arm.
-        posture_rad: (n,) where a redundant arm prefers to be.
+        posture_rad: (n,) preferred joints of a redundant arm.
         settings: see `FollowSettings`.
-        walls: what the arm is held before; None: nothing.
+        constraints: distances to keep; None: none.
 
     Raises:
         RecordError: settings that do not fit the arm.
@@ -127,9 +127,9 @@ class JointFollower:
         kinematics: Kinematics,
         posture_rad: ArrayLike,
         settings: FollowSettings | None = None,
-        walls: DistanceConstraints | None = None,
+        constraints: DistanceConstraints | None = None,
     ) -> None:
-        self.kinematics, self.walls = kinematics, walls
+        self.kinematics, self.constraints = kinematics, constraints
         self.settings = settings = settings or FollowSettings()
         self.posture_rad = np.array(posture_rad, dtype=np.float64)
         self.acceleration_rad_s2, self.jerk_rad_s3 = (
@@ -159,13 +159,14 @@ class JointFollower:
 
         Args:
             now: what the last call returned; at first the measured joints at rest.
-            target: pose the TCP is to have then.
-            twist: (6,) velocity it is to have then, m/s and rad/s in base axes.
+            target: pose of the TCP then.
+            twist: (6,) velocity of the TCP then, m/s and rad/s in base axes.
             dt_s: of the tick.
 
         Returns:
-            joints within their ranges, velocities and accelerations, whatever the target; and
-            what kept them from it: ``joint_velocity``, ``joint_limit``, ``singularity``.
+            joints within their ranges, velocities and accelerations, whatever the target; and the
+            limits that acted: ``joint_velocity``, ``joint_limit``, ``singularity``, and those of
+            the distance constraints.
         """
         joints, velocity = now.position_rad, now.velocity_rad_s
         here, jacobian = self.kinematics.pose_and_jacobian(joints)
@@ -198,14 +199,16 @@ class JointFollower:
             asked, limit = ratio * abs(float(wanted[joint])), float(self.velocity_rad_s[joint])
             name = self.kinematics.arm_joints[joint]
             hits.append(LimitHit("joint_velocity", asked, limit, where=name))
-        reached = self._before_walls(reached, low, high, now, here, jacobian, dt_s, hits)
+        reached, constrained = self._constrained(reached, low, high, now, here, jacobian, dt_s)
         acceleration = (reached - velocity) / dt_s
-        return JointMotion(joints + reached * dt_s, reached, acceleration, wanted), hits
+        motion = JointMotion(joints + reached * dt_s, reached, acceleration, wanted)
+        return motion, hits + constrained
 
     def brake(self, now: JointMotion, dt_s: float) -> JointMotion:
-        """The joints one tick later when they are to stop as soon as they can, all at once.
+        """The joints one tick later if they stop as soon as they can, all together.
 
-        So the TCP keeps its direction. Held before a wall a joint brakes less, and never speeds up.
+        So the TCP keeps its direction. A distance constraint may reduce the braking of a joint, but
+        never lets it speed up.
         """
         joints, velocity = now.position_rad, now.velocity_rad_s
         speed = np.maximum(np.abs(velocity), ROUNDING_RAD_S)
@@ -215,11 +218,11 @@ class JointFollower:
         low, high = self._allowed(now, dt_s)
         least = np.minimum(high, np.maximum(low, np.minimum(velocity, 0.0)))
         most = np.maximum(low, np.minimum(high, np.maximum(velocity, 0.0)))
-        reached = self._before_walls(reached, least, most, now, here, jacobian, dt_s, [])
+        reached, _ = self._constrained(reached, least, most, now, here, jacobian, dt_s)
         acceleration = (reached - velocity) / dt_s
         return JointMotion(joints + reached * dt_s, reached, acceleration, np.zeros(len(joints)))
 
-    def _before_walls(
+    def _constrained(
         self,
         reached: FloatArray,
         low: FloatArray,
@@ -228,28 +231,26 @@ class JointFollower:
         here: Pose,
         jacobian: FloatArray,
         dt_s: float,
-        hits: list[LimitHit],
-    ) -> FloatArray:
-        """`reached`, within `low` and `high`, changed so that the arm can stop before each wall.
+    ) -> tuple[FloatArray, list[LimitHit]]:
+        """`reached`, within `low` and `high`, such that the arm can stop at each constraint.
 
-        With as little change to the motion of the TCP as can be: another elbow costs least. What
-        it is held before is added to `hits`.
+        Changes the motion of the TCP as little as possible: moving the elbow costs least.
         """
-        reached = np.minimum(np.maximum(reached, low), high)
-        if self.walls is None:
-            return reached
-        rows, left_m = self.walls.at(now.position_rad, here.position_m, jacobian)
+        reached, hits = np.minimum(np.maximum(reached, low), high), []
+        if self.constraints is None:
+            return reached, hits
+        rows, left_m = self.constraints.at(now.position_rad, here.position_m, jacobian)
         most, jerk = (
             FAR_SHARE * (np.abs(rows) @ limit)
             for limit in (self.acceleration_rad_s2, self.jerk_rad_s3)
         )
-        # At first what is certainly far enough.
+        # A conservative test first, for all constraints at once.
         fastest = np.maximum(rows @ reached, 0.0) + most * most / jerk
         far = left_m > fastest * (dt_s + 2 * most / jerk + fastest / (2 * most))
         before = rows @ now.velocity_rad_s
         metric = jacobian.T @ jacobian + ELBOW_COST * np.eye(jacobian.shape[1])
-        for wall in np.flatnonzero(~far).tolist():
-            row, nearer = rows[wall], float(rows[wall] @ reached)
+        for index in np.flatnonzero(~far).tolist():
+            row, nearer = rows[index], float(rows[index] @ reached)
             if nearer <= 0:
                 continue
             way = np.linalg.solve(metric, row)
@@ -257,19 +258,19 @@ class JointFollower:
             least = float(np.minimum(row * low, row * high).sum())
             effort = np.maximum(np.abs(way), ROUNDING_RAD_S)
             change = _towards_end(
-                float(left_m[wall]),
-                float(before[wall]),
-                (least - float(before[wall])) / dt_s,
-                (nearer - float(before[wall])) / dt_s,
-                WALL_SHARE * float(np.min(self.acceleration_rad_s2 / effort)),
-                WALL_SHARE * float(np.min(self.jerk_rad_s3 / effort)),
+                float(left_m[index]),
+                float(before[index]),
+                (least - float(before[index])) / dt_s,
+                (nearer - float(before[index])) / dt_s,
+                NEAR_SHARE * float(np.min(self.acceleration_rad_s2 / effort)),
+                NEAR_SHARE * float(np.min(self.jerk_rad_s3 / effort)),
                 dt_s,
             )
-            allowed = float(before[wall]) + change * dt_s
+            allowed = float(before[index]) + change * dt_s
             if nearer > allowed:
-                hits.append(self.walls.hit(wall, float(left_m[wall])))
+                hits.append(self.constraints.hit(index, float(left_m[index])))
                 reached = self._slower_along(row, way, allowed, reached, low, high)
-        return reached
+        return reached, hits
 
     @staticmethod
     def _slower_along(
@@ -280,10 +281,10 @@ class JointFollower:
         low: FloatArray,
         high: FloatArray,
     ) -> FloatArray:
-        """`reached`, within its bounds, such that it is no faster along `row` than `allowed`."""
+        """`reached`, within its bounds, no faster along `row` than `allowed`."""
         for way in (first, row, row):
             excess = float(row @ reached) - allowed
-            # Joints that are on their bound already cannot help.
+            # Joints at their bound cannot contribute.
             free = np.where(np.where(way > 0, reached > low, reached < high), way, 0.0)
             gain = float(row @ free)
             if excess <= 0 or gain <= 0:
@@ -330,21 +331,21 @@ class JointFollower:
     def _share_near_singularity(
         self, joints: FloatArray, wanted: FloatArray, singular_value: float
     ) -> float:
-        """Part of the velocities `wanted` at which a singularity comes near slowly enough."""
+        """Factor on `wanted` at which a singularity is approached slowly enough."""
         settings = self.settings
         fastest = float(np.abs(wanted).max())
         if singular_value > WATCHED * settings.damped_below or fastest == 0.0:
             return 1.0
         ahead = joints + wanted * (PEEK_RAD / fastest)
         after = smallest_singular_value(self.kinematics.jacobian(ahead))
-        # At the speed it can really have, or the rate would be that of a wish.
+        # At the speed within the limits, or the rate would be that of an impossible velocity.
         share = 1.0 / max(1.0, float(np.max(np.abs(wanted) / self.velocity_rad_s)))
         fall_1_s = (singular_value - after) / PEEK_RAD * fastest * share
         allowed = settings.singularity_1_s * max(singular_value - settings.singularity_stop, 0.0)
         return share * allowed / fall_1_s if fall_1_s > allowed else 1.0
 
     def _reachable(self, wanted: FloatArray, now: JointMotion, dt_s: float) -> FloatArray:
-        """As near to `wanted` as one tick can get, on the way to having it without overshoot."""
+        """Velocity (n,) after one tick towards `wanted`, without overshoot later."""
         velocity, before = now.velocity_rad_s, now.wanted_rad_s
         most = self.acceleration_rad_s2
         rate = (wanted - (velocity if before is None else before)) / dt_s
@@ -355,14 +356,14 @@ class JointFollower:
         return velocity + acceleration * (dt_s / max(excess, 1.0))
 
     def _rampable(self, change: FloatArray, dt_s: float) -> FloatArray:
-        """Acceleration (n,) that comes down to nothing again within a change of velocity (n,)."""
+        """Acceleration (n,) that can return to zero within a change of velocity (n,)."""
         return _stoppable(change, self.jerk_rad_s3, dt_s)
 
     def _allowed(self, now: JointMotion, dt_s: float) -> tuple[FloatArray, FloatArray]:
-        """Least and greatest velocities (n,) that every joint can have one tick later.
+        """Least and greatest velocities (n,) of the joints one tick later.
 
-        Within jerk and acceleration, and such that it can stay within its velocity and range. Where
-        these disagree (put outside its range, or found too fast) the former win.
+        Within jerk and acceleration, and such that each joint can stay within its velocity and
+        range. Where these conflict (a joint outside its range, or too fast) the former win.
         """
         joints, velocity = now.position_rad, now.velocity_rad_s
         before = now.acceleration_rad_s2
@@ -403,15 +404,15 @@ def _towards_end(
     jerk: float,
     dt_s: float,
 ) -> float:
-    """Greatest acceleration after which what moves can still stop within `left`, by halving.
+    """Greatest acceleration after which a motion can still stop within `left`, by bisection.
 
     Args:
-        left: of its way.
-        velocity: towards its end.
-        least: acceleration that it can have.
-        greatest: likewise.
-        most: acceleration it can stop with.
-        jerk: likewise.
+        left: distance to the end.
+        velocity: towards the end.
+        least: least acceleration.
+        greatest: greatest acceleration.
+        most: acceleration for the stop.
+        jerk: for the stop.
         dt_s: of the tick.
     """
 
@@ -429,10 +430,10 @@ def _towards_end(
 
 
 def _stop_way(velocity: float, acceleration: float, most: float, jerk: float) -> float:
-    """How far a joint gets until it stops, as soon as acceleration and jerk allow."""
+    """Stopping distance within an acceleration and a jerk."""
     if velocity <= 0 and acceleration <= 0:
         return 0.0
-    # Reckoned from where its acceleration will be nothing, or was.
+    # Relative to when its acceleration becomes zero, or was zero.
     ramp_s = abs(acceleration) / jerk
     fastest = velocity + 0.5 * abs(acceleration) * ramp_s
     if fastest <= 0:
@@ -447,7 +448,7 @@ def _stop_way(velocity: float, acceleration: float, most: float, jerk: float) ->
 
 
 def _stoppable(distance: FloatArray, acceleration: FloatArray, dt_s: float) -> FloatArray:
-    """Greatest velocity from which joints that change it once a tick stop within `distance`.
+    """Greatest velocity from which joints that change it once per tick stop within `distance`.
 
     After ``v dt`` come ``(v - a dt) dt``, ``(v - 2 a dt) dt``, ...: with k whole ticks of braking
     ``distance = (k + 1) v dt - k (k + 1) / 2 a dt^2``.

@@ -1,23 +1,23 @@
-"""What the measured joints say while the arm moves: how near it really is to what, and its elbow.
+"""Monitoring of the measured joints: how near the moving arm is to its bounds, and its elbow.
 
-Goals are bounded by an arm that is reckoned with. This looks at the one there is. Of every bound
-(end of a joint's range, singular value, distances of the arm to itself and to the table)::
+Goals are bounded on a model of the arm; this monitors the arm itself. For every bound (end of a
+joint's range, singular value, distances of the arm to itself and to the table)::
 
-    inside its zone (slow to stop) and getting nearer    speed sqrt(what is left / zone)
-    past the stop by `PAST` and getting nearer           the arm has to brake
+    inside its zone (slow to stop) and approaching    speed sqrt(distance left / zone)
+    past the stop by `PAST` and approaching           the arm has to brake
 
-An arm may be that much off its command, and leans on a stop while it works there. A value gets
-nearer when it leaves a band that follows it: noise within the band is none, a creep is one. And no
-joint may be far from where it is commanded, or, where poses are, from where the arm that is
-reckoned with has it when its TCP is led along the measured one: beyond ``limits.elbow_rad`` the arm
-gets slower, and brakes at twice that.
+`PAST` allows for the tracking error of an arm that works at a stop. A value approaches when it
+leaves a band that follows it: noise within the band does not count, a slow drift does. In addition,
+no joint may be far from its command or, where poses are commanded, from where a model has it whose
+TCP follows the measured one: beyond ``limits.elbow_rad`` the arm slows down, at twice that it
+brakes.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from vla_zenoh.control.limits import SLOWEST, LimitHit, Slowdown
+from vla_zenoh.control.limits import SLOWEST, LimitHit, Slowdown, slowest
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
@@ -28,15 +28,15 @@ PAST_MARGIN = 0.5
 """Part of ``joint_margin_rad``."""
 BAND_RAD, BAND_M, BAND_SINGULAR = 2e-3, 5e-4, 5e-4
 STEPS = 20
-"""A share of the speed is one of so many, so that it does not change at every look."""
+"""Number of speed shares, so that the share does not change at every update."""
 
 
 class JointMonitor:
-    """See the module.
+    """Slowdown and braking by the measured joints.
 
     Args:
-        profile: limits, and whether joints or poses are commanded.
-        reach: the arm that is reckoned with.
+        profile: its limits.
+        reach: the model of the arm.
     """
 
     def __init__(self, profile: Profile, reach: ReachabilityFilter) -> None:
@@ -48,36 +48,36 @@ class JointMonitor:
         self._slow = np.concatenate([np.full(joints, 2 * margin_rad), barriers.slow])
         self._past = _each(joints, distances, PAST_MARGIN * margin_rad, PAST_SINGULAR, PAST_M)
         self._band = _each(joints, distances, BAND_RAD, BAND_SINGULAR, BAND_M)
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
-        """Nothing moves the arm: where it is then is no approach."""
+    def reset(self) -> None:
+        """Forget the last values: the arm is not being moved."""
         self._edge: FloatArray | None = None
-        self._believed_rad: FloatArray | None = None
+        self._expected_rad: FloatArray | None = None
         self._next_ns = 0
         self._elbow_next = False
         self.elbow_rad = 0.0
-        """How far the worst joint is from where the arm is believed to have it."""
-        self._slower: dict[bool, Slowdown | None] = {}
+        """Greatest distance of a joint from where it is expected."""
+        self._bound_slowdown: Slowdown | None = None
+        self._elbow_slowdown: Slowdown | None = None
 
     @property
     def slowdown(self) -> Slowdown | None:
-        """Why the arm has to be slower, None for full speed."""
-        found = [slower for slower in self._slower.values() if slower is not None]
-        return min(found, key=lambda slower: slower.share, default=None)
+        """The slowdown of the arm, None for full speed."""
+        return slowest(self._bound_slowdown, self._elbow_slowdown)
 
-    def look(
+    def update(
         self, measured_rad: FloatArray, commanded_rad: FloatArray | None, now_ns: int
     ) -> LimitHit | None:
-        """Look when it is time: at the bounds and at the elbow in turns.
+        """Check the bounds and the elbow in turn, one of them every half `PERIOD_NS`.
 
         Args:
             measured_rad: (n,) in chain order.
-            commanded_rad: (n,) where joints are commanded; None: poses are.
+            commanded_rad: (n,) joint commands; None: poses are commanded.
             now_ns: time of this tick.
 
         Returns:
-            why the arm has to brake, None where it does not.
+            the bound for which the arm has to brake, None without one.
         """
         if now_ns < self._next_ns:
             return None
@@ -99,35 +99,35 @@ class JointMonitor:
         worst = int(np.argmin(past))
         if past[worst] < 0:
             stop = float(self._stop[worst])
-            name, where = self._named(worst)
+            name, where = self._bound_name(worst)
             return LimitHit(name, float(left[worst]) + stop, stop, where=where)
         zone = np.maximum(self._slow - self._stop, 1e-12)
         shares = np.where(nearer, np.sqrt(np.clip(left / zone, 0.0, 1.0)), 1.0)
         worst = int(np.argmin(shares))
-        name, where = self._named(worst)
+        name, where = self._bound_name(worst)
         value, limit = float(left[worst] + self._stop[worst]), float(self._slow[worst])
-        self._slower[True] = _slower(name, float(shares[worst]), value, limit, where)
+        self._bound_slowdown = _slowdown(name, float(shares[worst]), value, limit, where)
         return None
 
     def _elbow(self, measured_rad: FloatArray, commanded_rad: FloatArray | None) -> LimitHit | None:
-        believed_rad = commanded_rad
-        if believed_rad is None:
-            start_rad = measured_rad if self._believed_rad is None else self._believed_rad
+        expected_rad = commanded_rad
+        if expected_rad is None:
+            start_rad = measured_rad if self._expected_rad is None else self._expected_rad
             pose = self._reach.kinematics.forward(measured_rad)
-            believed_rad = self._believed_rad = self._reach.followed(pose, start_rad)
-        if believed_rad is None:
+            expected_rad = self._expected_rad = self._reach.solve(pose, start_rad)
+        if expected_rad is None:
             return None
-        apart_rad = np.abs(measured_rad - believed_rad)
+        apart_rad = np.abs(measured_rad - expected_rad)
         worst = int(np.argmax(apart_rad))
         self.elbow_rad, limit_rad = float(apart_rad[worst]), self._elbow_limit_rad
         where = self._reach.kinematics.arm_joints[worst]
         if self.elbow_rad > 2 * limit_rad:
             return LimitHit("elbow_rad", self.elbow_rad, 2 * limit_rad, where=where)
         share = min(2.0 - self.elbow_rad / limit_rad, 1.0)
-        self._slower[False] = _slower("elbow_rad", share, self.elbow_rad, limit_rad, where)
+        self._elbow_slowdown = _slowdown("elbow_rad", share, self.elbow_rad, limit_rad, where)
         return None
 
-    def _named(self, index: int) -> tuple[str, str]:
+    def _bound_name(self, index: int) -> tuple[str, str]:
         joints = self._reach.kinematics.arm_joints
         if index < len(joints):
             return "joint_limit", joints[index]
@@ -141,6 +141,6 @@ def _each(
     return np.array([of_joint] * joints + [of_singular] + [of_distance] * distances)
 
 
-def _slower(name: str, share: float, value: float, limit: float, where: str) -> Slowdown | None:
+def _slowdown(name: str, share: float, value: float, limit: float, where: str) -> Slowdown | None:
     share = max(float(np.ceil(share * STEPS)) / STEPS, SLOWEST)
     return None if share >= 1.0 else Slowdown(name, share, value, limit, where)

@@ -1,18 +1,16 @@
-"""Bounds on what a model may ask for. Each says when it acted, with value and limit.
+"""Limits on what a model may ask for, and slowdowns near the bounds of the arm.
 
-How fast the arm may go where it comes near to a bound of its kinematics.
-
-A barrier ``h`` (singular value or distance, minus its stop) that is inside of its zone ``z`` (slow
-minus stop) and shrinks bounds the speed of the TCP to a share of the profile's::
+A barrier ``h`` (singular value or distance, minus its stop) that is inside its zone ``z`` (slow
+minus stop) and shrinks limits the speed of the TCP to a share of the profile's::
 
     share = sqrt(h / z), at least SLOWEST
 
-which is the speed that a constant deceleration can stop within what is left, when full speed can be
-stopped within the zone. Away from a bound the arm goes at full speed.
+the speed that a constant deceleration can stop within the distance left, if it can stop full speed
+within the zone. Away from a bound the arm moves at full speed.
 
-A step for which the joints are too slow takes the time that they need, and a target that is far is
-approached at a speed of its own. The arm comes later than the steps ask for then, and the slower
-speed lasts until it has caught up (`going_on`): where it was needed is where the arm still is.
+A step for which the joints are too slow takes the time that they need, and a far target is
+approached at a speed of its own. The arm is then later than the steps ask for, and the slowdown
+lasts until it has caught up (`keep_slowdown`): until then it is still where it needs that speed.
 """
 
 from __future__ import annotations
@@ -29,17 +27,17 @@ from vla_zenoh.profile import REJECT_FACTOR, Limits
 from vla_zenoh.types import FloatArray
 
 APPROACH = "approach"
-"""Name of the slowdown to a target that is further away than a step."""
+"""Name of the slowdown towards a target that is further away than a step."""
 SLOWEST = 0.1
-"""Share of its speed that is left to the arm close to a stop: it has to be able to work there."""
+"""Least share of the speed close to a stop: the arm has to be able to work there."""
 LEAST = 0.02
-"""Likewise where the joints are too slow, or a far target is approached."""
+"""Least share where the joints are too slow, or a far target is approached."""
 SHRINKING = 1e-6
-"""A barrier that changes by less stays as it is."""
+"""A barrier that changes by less counts as constant."""
 
 
 class JointMotionLimits(NamedTuple):
-    """(n,) each: rad/s, rad/s^2, rad/s^3."""
+    """Limits of joint motion, (n,) each: rad/s, rad/s^2, rad/s^3."""
 
     velocity_rad_s: FloatArray
     acceleration_rad_s2: FloatArray
@@ -47,15 +45,15 @@ class JointMotionLimits(NamedTuple):
 
 
 class LimitHit(NamedTuple):
-    """A bound that acted.
+    """A limit that acted.
 
     Args:
         name: ``step_m``, ``step_rad``, ``workspace``, ``lead_m``, ``lead_rad``; from the arm's
             kinematics ``reach``, ``joint_limit``, ``joint_velocity``, ``singularity``,
             ``self_collision``, ``table_distance``.
-        value: what was asked for.
-        limit: what is allowed.
-        fatal: too far off to be shortened.
+        value: the value asked for.
+        limit: the value allowed.
+        fatal: too far beyond the limit to be shortened.
         where: the joint, the two links, or the link over the table; empty for the whole arm.
     """
 
@@ -65,12 +63,17 @@ class LimitHit(NamedTuple):
     fatal: bool = False
     where: str = ""
 
+    @property
+    def at(self) -> str:
+        """ " at WHERE" for a sentence, empty for the whole arm."""
+        return f" at {self.where}" if self.where else ""
+
 
 def bound_step(limits: Limits, before: Pose, asked: Pose) -> tuple[Pose, list[LimitHit]]:
     """Shorten the step from `before` to `asked` to its limits and the workspace.
 
     Returns:
-        the bounded pose and what acted; with a fatal hit the pose must not be used.
+        the bounded pose, and the limits that acted; after a fatal hit the pose must not be used.
     """
     hits: list[LimitHit] = []
     translation = asked.position_m - before.position_m
@@ -106,13 +109,13 @@ def workspace_corners(limits: Limits) -> tuple[FloatArray, FloatArray]:
 def into_workspace(
     limits: Limits, position_m: FloatArray, before_m: FloatArray | None = None
 ) -> tuple[FloatArray, float]:
-    """The nearest position inside the workspace box, and how far that is (m).
+    """The nearest position inside the workspace box, and the distance to it (m).
 
     Args:
         limits: the box.
         position_m: (3,) in the base frame.
-        before_m: (3,) where the step to it begins. From outside the box it may come back or stay,
-            and goes no further out.
+        before_m: (3,) start of the step. From outside the box a step may lead back or stay, but no
+            further out.
     """
     box = limits.workspace
     x, y, z = position_m.tolist()
@@ -130,7 +133,7 @@ def into_workspace(
 
 
 def leash(limits: Limits, goal: Pose, commanded: Pose) -> tuple[Pose, list[LimitHit]]:
-    """Keep the goal within reach of the commanded pose, so that no backlog builds up."""
+    """Keep the goal near the commanded pose, so that no backlog builds up."""
     hits: list[LimitHit] = []
     ahead = goal.position_m - commanded.position_m
     turn = log3(goal.rotation @ commanded.rotation.T)
@@ -149,15 +152,15 @@ def leash(limits: Limits, goal: Pose, commanded: Pose) -> tuple[Pose, list[Limit
 
 # -- slowing down ---------------------------------------------------------------------------------
 class Slowdown(NamedTuple):
-    """Why the arm goes slower.
+    """Why the arm moves slower than at full speed.
 
     Args:
         name: the bound, as in `vla_zenoh.control.limits.LimitHit`.
-        share: of the speed limit that is left.
+        share: of the speed limits.
         value: singular value or distance there.
-        limit: below which it slows down.
+        limit: the value below which it slows down.
         where: the joint, the two links, or the link over the table; empty for the whole arm.
-        late_s: by so much the arm comes later than asked for because of it.
+        late_s: time by which the arm arrives later because of it.
     """
 
     name: str
@@ -167,9 +170,14 @@ class Slowdown(NamedTuple):
     where: str
     late_s: float = 0.0
 
+    @property
+    def at(self) -> str:
+        """ " at WHERE" for a sentence, empty for the whole arm."""
+        return f" at {self.where}" if self.where else ""
+
 
 def slowest(*reasons: Slowdown | None) -> Slowdown | None:
-    """Of several reasons the one that leaves least speed."""
+    """The slowdown with the least share, None without any."""
     return min((r for r in reasons if r is not None), key=lambda r: r.share, default=None)
 
 
@@ -181,15 +189,15 @@ def slowdown(
     names: Sequence[str],
     where: Callable[[int], str],
 ) -> Slowdown | None:
-    """The bound that slows a step most, None for full speed.
+    """The barrier that slows a step most, None for full speed.
 
     Args:
-        before: (n,) barriers where the step begins.
-        after: (n,) where it ends.
-        stop: (n,) what a barrier is measured from.
-        slow: (n,) where its zone begins.
+        before: (n,) barriers at the start of the step.
+        after: (n,) barriers at its end.
+        stop: (n,) value at which a barrier is zero.
+        slow: (n,) value at which its zone begins.
         names: of the barriers.
-        where: what of the arm barrier i is about.
+        where: the part of the arm that barrier i is about.
     """
     zone = np.maximum(slow - stop, 1e-12)
     if (after >= zone).all():
@@ -213,16 +221,16 @@ def full_speed_s(limits: Limits, before: Pose, after: Pose) -> float:
     )
 
 
-def going_on(
+def keep_slowdown(
     before: Slowdown | None, now: Slowdown | None, dt_s: float, most_s: float
 ) -> Slowdown | None:
-    """The slowdown of a step whose beginning the arm comes late to.
+    """The slowdown of a step that the arm starts late.
 
     Args:
         before: of the step before it.
-        now: its own.
-        dt_s: time it has.
-        most_s: at full speed nobody is later than this: the leash sees to it.
+        now: of the step itself.
+        dt_s: duration of the step.
+        most_s: greatest lateness at full speed, which the leash bounds.
     """
     if before is None or before.late_s <= 0.0:
         return now

@@ -1,14 +1,15 @@
-"""From goals on a time axis to commands: leash, smoothing, joints, braking, and when to stream."""
+"""From the goals on the timeline to commands: leash, smoothing, joints, braking, streaming."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from vla_zenoh.control.aggregate import PlanAggregator
 from vla_zenoh.control.chunk_planner import ChunkPlanner
-from vla_zenoh.control.commander_io import Outputs
+from vla_zenoh.control.commander_io import limit_events, make_event
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
 from vla_zenoh.control.limits import (
@@ -39,8 +40,11 @@ from vla_zenoh.kinematics.so3 import (
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     Cause,
+    Event,
     FloatArray,
+    GripperCommand,
     GripperState,
+    JointCommand,
     JointState,
     PoseCommand,
     PoseState,
@@ -49,18 +53,26 @@ from vla_zenoh.types import (
 )
 
 LINGER_NS = 500_000_000
-"""The stream goes on for this long after the arm stands, so that its last pose is not lost."""
+"""The stream continues for this long after the arm stands, so that its last pose is not lost."""
 SAME_WIDTH_M = 0.005
-"""A gripper this near to the width last sent has reached it."""
+"""A gripper this near to the width sent last has reached it."""
 HELD_M, HELD_RAD = 0.002, 0.01
-"""A robot that holds a pose this near to what is streamed to it obeys: no stream begins."""
+"""A robot that holds a pose this near to the stream follows it: the stream continues."""
 HELD_JOINT_RAD = 0.004
 SETTLED, SETTLED_NS = 5e-4, 100_000_000
-"""One that moves by less, in m and rad, for so long stands."""
+"""A robot that moves by less than this, in m and rad, for this long stands."""
+
+
+class MotionCommands(NamedTuple):
+    """Commands of one tick, each None where there is none."""
+
+    pose: PoseCommand | None = None
+    joint: JointCommand | None = None
+    gripper: GripperCommand | None = None
 
 
 class MotionPipeline:
-    """See the module.
+    """Follows the goals of the timeline, or brakes, in a smooth command stream.
 
     Args:
         profile: limits, rate, and whether poses or joints are commanded.
@@ -89,31 +101,31 @@ class MotionPipeline:
         self.goal: Goal | None = None
         self.streaming = False
         self.speed = 1.0
-        """Share of the speed limits that the arm has to its goal, the override aside."""
+        """Share of the speed limits on the way to the goal, without the speed override."""
         self._override, self._slowing = 1.0, False
-        self._held_back: Slowdown | None = None
-        self.pressed: Slowdown | None = None
-        """What presses against the arm, and makes it slower wherever it goes."""
+        self.contact_slowdown: Slowdown | None = None
+        self.joint_slowdown: Slowdown | None = None
+        """Of the measured joints; both apply whatever the goal allows."""
         self.contact = Contact(profile.limits.contact)
         self.retreat = Retreat(profile.limits, self.contact)
         self._back: Pose | None = None
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
-        self._stands: tuple[Pose, int] | None = None
+        self._standing: tuple[Pose, int] | None = None
         self._timing: StepTiming | None = None
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
 
-    # -- where it is --------------------------------------------------------------------------
+    # -- state --------------------------------------------------------------------------------
     @property
     def at_rest(self) -> bool:
-        """What is commanded stands still."""
+        """The commanded motion stands still."""
         still = self._joints is None or self._joints.at_rest
         return self._smoother is None or (self._smoother.at_rest and still)
 
     @property
     def commanded(self) -> Pose | None:
-        """The pose last streamed, None while nothing is."""
+        """The pose streamed last, None while nothing is streamed."""
         return self._smoother.motion.pose if self._smoother and self.streaming else None
 
     @property
@@ -121,21 +133,17 @@ class MotionPipeline:
         """(n,) joints commanded, None where poses are."""
         return None if self._joints is None else self._joints.position_rad
 
-    def hold_back(self, slower: Slowdown | None) -> None:
-        """Go no faster than this from now on, whatever the goal allows; None: as it allows."""
-        self._held_back = slower
-
     @property
     def stuck(self) -> str:
-        """Why joints that are commanded will not come to the pose, empty while they follow."""
+        """Why commanded joints will not reach the pose, empty while they follow."""
         return "" if self._joints is None else self._joints.stuck
 
     @property
     def failures(self) -> int:
-        """Times Ruckig found no way and the arm was braked instead."""
+        """Times Ruckig found no trajectory and the arm braked instead."""
         return self._smoother.failures if self._smoother else 0
 
-    # -- beginning ----------------------------------------------------------------------------
+    # -- activation ---------------------------------------------------------------------------
     def anchor(
         self,
         measured: PoseState,
@@ -145,24 +153,24 @@ class MotionPipeline:
         *,
         blocked: bool,
     ) -> None:
-        """Begin where the robot's own controller stands, so that nothing jumps.
+        """Start at the set-point of the robot's controller, so that nothing jumps.
 
         Args:
-            measured: TCP pose, with the controller's reference where the robot tells it.
-            gripper: what it holds, it keeps.
+            measured: TCP pose, with the controller's set-point if the robot reports it.
+            gripper: its width is kept.
             joint: newest joints.
             now_ns: time of this tick.
-            blocked: the arm is far from its controller's reference.
+            blocked: the arm is far from its controller's set-point.
         """
         self._slowed_by.clear()
-        self._held_back = None
+        self.joint_slowdown = None
         self.retreat.end()
         if self._reach is not None and joint is not None:
             self._reach.reset(self._reach.kinematics.joints_of(joint))
         actual, start = pose_of(measured), held_pose(measured)
         standing = not self.streaming or self.at_rest
         if self._smoother is None:
-            # Joints that are commanded have walls of their own.
+            # Commanded joints have distance constraints of their own.
             inside = workspace_corners(self._limits) if self._joints is None else None
             self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits), inside)
             self._timing = StepTiming(self._smoother.box)
@@ -178,8 +186,8 @@ class MotionPipeline:
             self._joints.keep_elbow()
         width_m = self._width_to_keep(gripper)
         self.gripper.restart(width_m)
-        # A blocked arm's controller is led back to where the arm is. Otherwise a brake under way
-        # goes on to its end, and the goal is where it ends.
+        # The goal of a blocked arm is where it is. Otherwise a brake continues, and the goal is
+        # where it ends.
         goal = Goal(actual if blocked else self._smoother.resting_pose(), width_m)
         assert self._timing is not None
         self._timing.restart()
@@ -189,38 +197,38 @@ class MotionPipeline:
             self.timeline.restart(goal, now_ns)
         self.goal = None if blocked else goal
 
-    def look_at(self, measured: PoseState, now_ns: int) -> None:
-        """See whether the robot still moves where the stream stands already."""
+    def measure(self, measured: PoseState, now_ns: int) -> None:
+        """Track whether the robot still moves while the stream stands."""
         if not self.streaming or not self.at_rest:
-            self._stands = None
+            self._standing = None
             return
         held = held_pose(measured)
-        if self._stands is None or max(pose_distance(held, self._stands[0])) > SETTLED:
-            self._stands = held, now_ns
+        if self._standing is None or max(pose_distance(held, self._standing[0])) > SETTLED:
+            self._standing = held, now_ns
 
     def unsettled(self, now_ns: int) -> list[str]:
-        """Why no activation may begin yet: the robot is on its way to where the stream ended.
+        """Reasons against an activation now: the robot still moves to the end of the stream.
 
-        A robot that braked by itself stands elsewhere: a new stream begins there.
+        A robot that has braked by itself stands elsewhere: a new stream begins there.
         """
-        if self._stands is None or self._smoother is None:
+        if self._standing is None or self._smoother is None:
             return []
-        held, since_ns = self._stands
+        held, since_ns = self._standing
         apart_m, apart_rad = pose_distance(self._smoother.motion.pose, held)
         if self._near(apart_m, apart_rad) or now_ns - since_ns > SETTLED_NS:
             return []
         return [
-            f"the robot is still {apart_m:.3f} m and {apart_rad:.3f} rad from where it was sent "
-            f"last; activate again in {LINGER_NS / 1e9:g} s"
+            f"the robot is still {apart_m:.3f} m and {apart_rad:.3f} rad from its last command; "
+            f"activate again in {LINGER_NS / 1e9:g} s"
         ]
 
     @staticmethod
     def _near(apart_m: float, apart_rad: float) -> bool:
-        """The robot holds what is streamed to it: to begin anew would be a step in the stream."""
+        """The robot holds the streamed pose: to restart there would be a step in the stream."""
         return apart_m <= HELD_M and apart_rad <= HELD_RAD
 
     def _held_joints(self, joint: JointState) -> FloatArray:
-        """Joints the robot's controller holds, or where they are."""
+        """Joint set-points of the robot's controller, or the measured joints."""
         assert self._reach is not None
         kinematics = self._reach.kinematics
         if joint.reference_rad is not None:
@@ -228,7 +236,7 @@ class MotionPipeline:
         return kinematics.joints_of(joint)
 
     def _width_to_keep(self, gripper: GripperState) -> float:
-        """The width last sent while the gripper obeys it, because a grip ends with another."""
+        """The width sent last while the gripper obeys it: another one would end a grasp."""
         sent_m = self.gripper.sent_m
         if sent_m is not None and (
             abs(sent_m - gripper.width_m) < SAME_WIDTH_M
@@ -239,36 +247,34 @@ class MotionPipeline:
 
     # -- one tick -----------------------------------------------------------------------------
     def advance(
-        self, state: State, task: Task, overdue_ns: int, now_ns: int, ticks: int, out: Outputs
-    ) -> bool:
-        """Move on by `ticks` periods: after the goal in force where active, else braking.
+        self, state: State, task: Task, overdue_ns: int, now_ns: int, ticks: int
+    ) -> tuple[bool, list[Event]]:
+        """Advance by `ticks` periods: follow the goal in force if active, else brake.
 
         Args:
             state: of the command node.
             task: its rate and speed override.
-            overdue_ns: when the watchdog brakes unless a chunk comes.
+            overdue_ns: when the watchdog brakes unless a chunk arrives.
             now_ns: time of this tick.
             ticks: see `Commander.step`.
-            out: what happened.
 
         Returns:
-            whether a trajectory could be computed; where not, the arm brakes.
+            whether a trajectory was found (if not, the arm brakes), and events.
         """
         if self._smoother is None or self.timeline is None:
-            return True
-        self._cause = None
-        self._take_override(task.speed, self.timeline, now_ns)
+            return True, []
+        self._set_override(task.speed, self.timeline, now_ns)
         if state is State.ACTIVE:
-            self._cause = self._follow(
-                self._smoother, self.timeline, task, overdue_ns, now_ns, ticks, out
-            )
+            self._cause = self.timeline.plan.cause
+            events = self._follow(self._smoother, self.timeline, task, overdue_ns, now_ns, ticks)
         else:
-            self._retreat_or_brake(self._smoother, self.timeline, state, now_ns, out)
+            self._cause = None
+            events = self._retreat_or_brake(self._smoother, self.timeline, state, now_ns)
         went_on, self.streaming = self.streaming, self._must_stream(state, now_ns)
         if not self.streaming:
-            return True
+            return True, events
         failures = self._smoother.failures
-        # A stream that begins has nothing to make up for: the robot takes one that begins at rest.
+        # A stream that begins must begin at rest: no ticks are made up for.
         for _ in range(ticks if went_on else 1):
             if self._joints is None:
                 self._smoother.tick()
@@ -276,23 +282,25 @@ class MotionPipeline:
                 active = state is State.ACTIVE and self._override > 0.0
                 braking = not active and self._back is None
                 self._joints.tick(self._smoother, braking=braking, elbow=active)
-        return self._smoother.failures == failures
+        return self._smoother.failures == failures, events
 
-    def command(
-        self, state: State, now_ns: int, gripper: Stamped[GripperState] | None, out: Outputs
-    ) -> None:
-        """Say where robot and gripper have to be now, while streaming."""
+    def commands(
+        self, state: State, now_ns: int, gripper: Stamped[GripperState] | None
+    ) -> MotionCommands:
+        """The set-points of robot and gripper, while streaming."""
         if not self.streaming or self._smoother is None:
-            return
+            return MotionCommands()
+        pose = joint = width = None
         if self._joints is not None:
-            out.joint = self._joints.command(state.value, self._cause)
+            joint = self._joints.command(state.value, self._cause)
         else:
-            out.pose = self._pose_command(self._smoother.motion, state)
+            pose = self._pose_command(self._smoother.motion, state)
         if state is State.ACTIVE:
-            out.gripper = self.gripper.step(now_ns, gripper)
+            width = self.gripper.step(now_ns, gripper)
+        return MotionCommands(pose, joint, width)
 
-    def _take_override(self, override: float, timeline: GoalTimeline, now_ns: int) -> None:
-        """Let plan time pass at the speed override, and plan the way to the goal anew."""
+    def _set_override(self, override: float, timeline: GoalTimeline, now_ns: int) -> None:
+        """Let plan time pass at the speed override, and replan the motion to the goal."""
         if override != self._override or override != timeline.clock.override:
             self._override = override
             timeline.clock.set(override, now_ns)
@@ -306,38 +314,35 @@ class MotionPipeline:
         overdue_ns: int,
         now_ns: int,
         ticks: int,
-        out: Outputs,
-    ) -> Cause | None:
+    ) -> list[Event]:
         plans = self._aggregator.plans(timeline, now_ns)
-        out.shortened(self._planner.bound_until(plans, now_ns))
+        events = limit_events(self._planner.bound_due(plans, now_ns))
         goal = self._aggregator.goal(plans, now_ns)
         if self._override == 0.0:
-            self._stand(smoother)
-            return timeline.plan.cause
+            self._pause(smoother)
+            return events
         slowed = self._slowing and _within(smoother, self._override)
-        # Of where the arm will be with this tick: it may be on its way from there.
+        # The leash starts at the pose of this tick: the arm may be moving away from the last one.
         pose, hits = leash(self._limits, goal.pose, _ahead(smoother.motion, ticks * self._dt_s))
-        slower = slowest(goal.slowdown, self.pressed, self._held_back)
+        slower = slowest(goal.slowdown, self.contact_slowdown, self.joint_slowdown)
         slowed |= (slower.share if slower else 1.0) != self.speed
         if goal is not self.goal or hits or slowed:
             if hits:
-                cut = self._shorten(plans, goal, pose, now_ns)
                 if goal is not self.goal:
-                    out.tell(
-                        "warning", "limit", hits[0].name, "leash", hits[0].value, hits[0].limit
-                    )
-                goal = cut
-            self._slow_down(slower, out)
+                    name, value, limit = hits[0][:3]
+                    events.append(make_event("warning", "limit", name, "leash", value, limit))
+                goal = self._shorten(plans, goal, pose, now_ns)
+            events += self._slow_down(slower)
             shares = self._shares(smoother, goal.pose, timeline.plan, task, overdue_ns, now_ns)
             hard = self._slowing and self._joints is None
             enough = smoother.target(goal.pose, shares, all_to_stop=hard)
             self._slowing &= not (enough and _within(smoother, self._override))
             self.goal = goal
-            self.gripper.want(goal.width_m)
-        return timeline.plan.cause
+            self.gripper.request(goal.width_m)
+        return events
 
-    def _stand(self, smoother: Smoother) -> None:
-        """Stop on the way, to go on from there when the override allows it again."""
+    def _pause(self, smoother: Smoother) -> None:
+        """Stop on the path, to continue from there when the override allows it again."""
         if self._joints is None:
             smoother.brake(FULL)
         else:
@@ -353,7 +358,7 @@ class MotionPipeline:
         overdue_ns: int,
         now_ns: int,
     ) -> Shares:
-        """Parts of its limits that the arm has on the way to a goal."""
+        """Shares of the limits that the arm has on the way to a goal."""
         override, speed = self._override, self.speed * self._override
         if not plan.soonest:
             assert self._timing is not None
@@ -366,31 +371,32 @@ class MotionPipeline:
                 plan, index, now_ns, 1.0 / task.rate_hz, left_s, way, velocity
             )
             speed = min(speed, share)
-        # The same motion in more time: its acceleration shrinks with the square of the override,
-        # its jerk with the cube. Until a faster arm has slowed down it brakes as hard as it may.
+        # The same motion in more time: acceleration scales with the square of the override, jerk
+        # with the cube. Until a faster arm has slowed down it brakes as hard as it may.
         slow = _within(smoother, override)
         most = Shares(1.0, override**2, override**3) if slow else FULL
-        return self._of_joints(smoother, goal, Shares(speed, most.acceleration, most.jerk))
+        return self._within_joints(smoother, goal, Shares(speed, most.acceleration, most.jerk))
 
-    def _of_joints(self, smoother: Smoother, goal: Pose, shares: Shares) -> Shares:
-        """No more than the joints can follow, where they are commanded."""
+    def _within_joints(self, smoother: Smoother, goal: Pose, shares: Shares) -> Shares:
+        """`shares`, reduced to what commanded joints can follow."""
         if self._joints is None:
             return shares
         joints = self._joints.shares(smoother.motion, goal, smoother.box)
         return Shares(*map(min, joints, shares))
 
-    def _slow_down(self, slower: Slowdown | None, out: Outputs) -> None:
-        """Take over the speed of a goal; tell each reason once in every activation."""
-        if slower is not None and slower.name not in (APPROACH, *self._slowed_by):
-            self._slowed_by.add(slower.name)
-            where = f" at {slower.where}" if slower.where else ""
-            out.tell("info", "limit", slower.name, f"slower{where}", slower.value, slower.limit)
+    def _slow_down(self, slower: Slowdown | None) -> list[Event]:
+        """Set the speed share; report each reason once per activation."""
         self.speed = 1.0 if slower is None else slower.share
+        if slower is None or slower.name in (APPROACH, *self._slowed_by):
+            return []
+        self._slowed_by.add(slower.name)
+        why = f"slower{slower.at}"
+        return [make_event("info", "limit", slower.name, why, slower.value, slower.limit)]
 
     def _shorten(self, plans: Sequence[Plan], goal: Goal, pose: Pose, now_ns: int) -> Goal:
-        """Move all that is ahead by what the leash cut off, or the cut way would come back.
+        """Shift all later goals by what the leash cut off, or the cut part would come back.
 
-        What is moved lies between goals that were bounded.
+        A shifted goal lies between bounded goals.
         """
         cut = Goal(pose, goal.width_m, slowdown=goal.slowdown)
         if len(plans) == 1:
@@ -403,24 +409,27 @@ class MotionPipeline:
         return cut
 
     def _retreat_or_brake(
-        self, smoother: Smoother, timeline: GoalTimeline, state: State, now_ns: int, out: Outputs
-    ) -> None:
+        self, smoother: Smoother, timeline: GoalTimeline, state: State, now_ns: int
+    ) -> list[Event]:
         if state is not State.INACTIVE:
             self.retreat.end()
-        back = self.retreat.turn(smoother.motion.pose, now_ns, out, at_rest=self.at_rest)
+        back, event = self.retreat.step(smoother.motion.pose, now_ns, at_rest=self.at_rest)
         if back is None:
             self._brake(smoother, timeline, now_ns)
         elif back is not self._back:
-            # Whatever the speed override: an arm that presses has to come free.
+            # Whatever the speed override: an arm in contact has to come free.
             inside_m, _ = into_workspace(
                 self._limits, back.position_m, smoother.motion.pose.position_m
             )
             inside = Pose(inside_m, back.rotation)
-            smoother.target(inside, self._of_joints(smoother, inside, Shares(self.retreat.speed)))
+            smoother.target(
+                inside, self._within_joints(smoother, inside, Shares(self.retreat.speed))
+            )
         self._back = back
+        return [] if event is None else [event]
 
     def _brake(self, smoother: Smoother, timeline: GoalTimeline, now_ns: int) -> None:
-        """Stop, and let the goal be where the arm stops, so that nothing pulls it further."""
+        """Stop, and move the goal to where the arm stops, so that nothing pulls it further."""
         if self._joints is None:
             smoother.brake()
         else:
@@ -454,17 +463,17 @@ class MotionPipeline:
 
 
 def _ahead(motion: Motion, dt_s: float) -> Pose:
-    """Where a motion will be in a moment."""
+    """The pose of a motion `dt_s` later."""
     (position_m, rotation), twist, acceleration = motion
     way = dt_s * (twist + 0.5 * dt_s * acceleration)
     return Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
 
 
 def _within(smoother: Smoother, override: float) -> bool:
-    """Whether the arm moves as slowly as it would at this override, and will go on so."""
+    """Whether the arm moves as slowly as it would at this override, and will continue so."""
     most = smoother.box * override ** np.array([[1.0], [2.0], [3.0]])
     (_, rotation), *motion = smoother.motion
-    # The limits of rotation are those of the axes that turn with the arm.
+    # The limits of rotation apply to axes that turn with the arm.
     speed, change = (np.abs(np.append(part[:3], rotation.T @ part[3:])) for part in motion)
     return bool(
         (change <= most[1]).all() and (speed + change**2 / (2 * most[2]) <= most[0] * 1.001).all()

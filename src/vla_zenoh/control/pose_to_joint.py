@@ -1,10 +1,10 @@
-"""Joint commands out of the smoothed pose stream, for arms that take joint positions.
+"""Joint commands from the smoothed pose stream, for arms that take joint positions.
 
-The pose stream has limits of its own, and joints have theirs. What joints cannot do is met in three
-places: the way to a goal is planned with the shares of the pose's limits that the joints can take
-(`PoseToJoint.shares`); where they lag behind all the same the pose waits for them (`pace`), for a
-while; and a brake that finds them lagging is theirs: they stop within their limits, and the pose is
-then where they have brought it. An arm that is told to stop does not make up for what it lagged.
+The pose stream has its limits, and joints have theirs. Those of the joints act in three places: the
+motion to a goal is planned with the shares of the pose's limits that the joints can follow
+(`PoseToJoint.shares`); where they lag behind nevertheless, the pose waits for them (`pace`), up to
+`STUCK_S`; and if they lag when the arm brakes, the joints stop within their own limits and the pose
+follows them. An arm that stops does not make up for its lag.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from vla_zenoh.types import Cause, FloatArray, JointCommand
 
 REST_RAD_S = 1e-5
 PULL_1_S = 25.0
-"""How fast the pull to the posture comes and goes, as a critically damped spring does."""
+"""Rate at which the pull to the posture rises and falls, as a critically damped spring."""
 PULL_JERK = 1.4
-"""Greatest jerk of that, whenever it turns round, in speeds times `PULL_1_S` squared."""
+"""Greatest jerk of that when it reverses, in speeds times `PULL_1_S` squared."""
 NEAR_M, NEAR_RAD = 0.002, 0.01
-"""Joints that are nearer to the pose than this follow it."""
+"""Joints nearer to the pose than this follow it."""
 FAR = 5.0
-"""So many times as far from it, and it waits for them."""
+"""At this multiple of that distance the pose waits for them."""
 SLOWEST = 1e-3
-"""Part of its pace that is always left: to stand is no motion to plan with."""
+"""Least pace: a standing pose cannot be planned with."""
 ROOM = (0.95, 0.9, 0.9)
-"""Parts of the joints' velocity, acceleration and jerk that are planned with: the way is curved,
-and the elbow moves besides."""
+"""Parts of the joints' velocity, acceleration and jerk used for planning: the path is curved in
+joint space, and the elbow moves as well."""
 BEND = 0.5
-"""Part of the acceleration that the way's bend may take, in the joints' space."""
+"""Part of the acceleration that the curvature of the path in joint space may take."""
 PLACES = 3
-"""Places of a way at which it is looked."""
+"""Places of a path at which the joints are computed."""
 BRAKE_BEND = 0.15
-"""Likewise of a brake, which takes what it can get: it bends less and less as it gets slower."""
-LOOK_TICKS = 4
-"""Ticks from one look at what the arm is near to until the next."""
+"""The same for a brake, whose curvature effect falls with its speed."""
+CONSTRAINT_TICKS = 4
+"""Ticks between updates of the distance constraints."""
 BRAKE_S = 0.1
-"""A brake leads about as far as the arm goes in this time."""
+"""A brake covers about the distance that the arm moves in this time."""
 CREEPING, STUCK_S = 0.05, 0.5
-"""A pose that goes on at less than this part of its pace for so long will not be reached."""
+"""A pose that advances at less than this pace for this long will not be reached."""
 OUTSIDE_M = 1e-3
-"""An arm that is further outside of the box began there, and is led in."""
+"""An arm further outside the box than this started there, and is led in."""
 LEAST_SHARE = 0.02
 NOTHING = 1e-9
 DAMPING = 1e-5
@@ -86,8 +86,8 @@ class PoseToJoint:
             singularity_stop=limits.reach.singularity_stop,
         )
         self._bounds = limits
-        self._walls = DistanceConstraints(limits, barriers)
-        self._follower = JointFollower(kinematics, home_rad, settings, self._walls)
+        self._constraints = DistanceConstraints(limits, barriers)
+        self._follower = JointFollower(kinematics, home_rad, settings, self._constraints)
         most = float(jerk.min()) / PULL_JERK / settings.posture_rad_s
         self._pull_1_s = min(PULL_1_S, most**0.5)
         self._longest_rad = settings.posture_rad_s / settings.posture_1_s
@@ -97,27 +97,27 @@ class PoseToJoint:
         self.restart(home_rad)
 
     def restart(self, joints_rad: FloatArray) -> None:
-        """Stand at these joints (chain order); only for an arm that is not streamed to."""
+        """Stand at these joints (n,) in chain order; only while nothing is streamed."""
         still = np.zeros(len(joints_rad))
         self._now = JointMotion(np.array(joints_rad, dtype=np.float64), still)
         self._pull = self._pull_rate_1_s = 0.0
         self._stopping, self._ticks = False, 0
         self.keep_elbow()
         self.pace = 1.0
-        """Part of its own pace at which the pose goes on."""
+        """Rate of the pose's time, 0 to 1."""
 
     def keep_elbow(self) -> None:
-        """An activation begins: the posture is that of these joints, or home."""
+        """Start an activation: the posture is that of the present joints, or home."""
         here_rad = self._now.position_rad
         self._posture_rad = here_rad if self._home_rad is None else self._home_rad
-        self._waited_s = 0.0
+        self._waiting_s = 0.0
 
     def shares(self, motion: Motion, goal: Pose, box: FloatArray, *, bend: float = BEND) -> Shares:
-        """Of the limits of a straight motion to a pose, what the joints can follow.
+        """Shares of the limits of a straight motion to a pose that the joints can follow.
 
         Args:
-            motion: where it begins, near to the joints, and how fast.
-            goal: where it ends.
+            motion: its start, near to the joints.
+            goal: its end.
             box: (3, 6) velocity, acceleration and jerk of every axis, see `Smoother.box`.
             bend: see `BEND`.
         """
@@ -127,7 +127,7 @@ class PoseToJoint:
         length = float(np.linalg.norm(ways))
         if length < NOTHING:
             return FULL
-        # All axes go together: the slowest one of the pose says how fast the way is taken.
+        # All axes move together, as fast as the slowest one.
         rates = (box / np.maximum(np.abs(ways), NOTHING)).min(axis=1)
         now = float(np.linalg.norm(twist)) / length
         joint_ways, bends = self._ways(np.concatenate([ways[:3], rotation @ turn]))
@@ -141,9 +141,9 @@ class PoseToJoint:
         return Shares(*(float(part) for part in parts))
 
     def _ways(self, way: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """How far (n,) each joint goes on a way (6,) of the TCP, and how much (n,) that changes.
+        """Joint displacements (n,) of a displacement (6,) of the TCP, and their change (n,).
 
-        Both of the whole way taken in one unit of time.
+        Both for the whole path in one unit of time.
         """
         found: list[FloatArray] = []
         joints = self._now.position_rad
@@ -156,7 +156,7 @@ class PoseToJoint:
         return np.abs(found).max(axis=0), np.maximum(bends, NOTHING)
 
     def brake(self, smoother: Smoother) -> None:
-        """Let the pose come to rest as fast as the joints can."""
+        """Bring the pose to rest as fast as the joints can."""
         if smoother.braking:
             return
         (position_m, rotation), twist, _ = smoother.motion
@@ -165,35 +165,35 @@ class PoseToJoint:
         smoother.brake(self.shares(smoother.motion, ahead, smoother.box, bend=BRAKE_BEND))
 
     def tick(self, smoother: Smoother, *, braking: bool = False, elbow: bool = True) -> None:
-        """Follow the pose for one tick, or stop; `smoother` is moved on.
+        """Advance `smoother` by one tick and follow its pose, or stop.
 
         Args:
             smoother: the pose.
-            braking: it comes to rest. An arm that brakes leaves its elbow where it is.
-            elbow: it may go to its posture.
+            braking: come to rest, with the elbow where it is.
+            elbow: move the elbow towards the posture.
         """
         here = self._kinematics.forward(self._now.position_rad)
         lag = self._lag(here, smoother.motion.pose)
-        self._look()
+        self._update_constraints()
         self._stopping = braking and (self._stopping or lag > 1.0)
         if self._stopping:
             self._stop(smoother)
             return
         self.pace = min(max((FAR - lag) / (FAR - 1.0), SLOWEST), 1.0)
-        waits = self.pace < CREEPING
-        self._waited_s = self._waited_s + self._dt_s if waits else 0.0
+        waiting = self.pace < CREEPING
+        self._waiting_s = self._waiting_s + self._dt_s if waiting else 0.0
         motion = smoother.tick(self.pace)
         self._follower.posture_rad = self._pulled_to(1.0 if elbow and not braking else 0.0)
         twist = self.pace * motion.twist
         pose = self._inside(here, motion.pose)
         self._now, hits = self._follower.step(self._now, pose, twist, self._dt_s)
         found = {f"{hit.name} {hit.where}".strip() for hit in hits}
-        self._held = found | (self._held if waits else set())
+        self._held = found | (self._held if waiting else set())
 
     @property
     def stuck(self) -> str:
-        """Why the pose waits for the joints for good, empty while it does not."""
-        if self._waited_s < STUCK_S:
+        """Why the joints will never reach the pose, empty while they follow."""
+        if self._waiting_s < STUCK_S:
             return ""
         held = sorted(self._held)
         return (
@@ -202,35 +202,34 @@ class PoseToJoint:
         )
 
     def _inside(self, here: Pose, pose: Pose) -> Pose:
-        """A pose in the box, of an arm that is in it."""
+        """`pose`, kept in the box if the TCP is in it."""
         inside_m, outside_m = into_workspace(self._bounds, pose.position_m)
         if not outside_m or into_workspace(self._bounds, here.position_m)[1] > OUTSIDE_M:
             return pose
         return Pose(inside_m, pose.rotation)
 
     def _lag(self, here: Pose, pose: Pose) -> float:
-        """How far the joints, whose TCP is here, are from a pose, in times of what is near."""
+        """Distance of the TCP from `pose`, in units of `NEAR_M` and `NEAR_RAD`."""
         apart_m, apart_rad = pose_distance(here, self._inside(here, pose))
         return max(apart_m / NEAR_M, apart_rad / NEAR_RAD)
 
-    def _look(self) -> None:
-        """See now and then what the arm is near to."""
-        if self._ticks % LOOK_TICKS == 0:
-            self._walls.look(self._now.position_rad)
+    def _update_constraints(self) -> None:
+        if self._ticks % CONSTRAINT_TICKS == 0:
+            self._constraints.update(self._now.position_rad)
         self._ticks += 1
 
     def _stop(self, smoother: Smoother) -> None:
-        """The joints stop by themselves, and the pose is where that brings the TCP."""
+        """Stop the joints within their limits; the pose follows them."""
         self._now = self._follower.brake(self._now, self._dt_s)
         position, velocity = self._now[:2]
         self._pull = self._pull_rate_1_s = 0.0
         pose, jacobian = self._kinematics.pose_and_jacobian(position)
-        # Whoever takes this stop back plans from here: with no more than a plan may have.
+        # A motion planned from here must start within its limits.
         change = np.clip(jacobian @ self._acceleration, -smoother.box[1], smoother.box[1])
         smoother.brake_from(Motion(pose, jacobian @ velocity, change))
 
     def _pulled_to(self, share: float) -> FloatArray:
-        """The posture (n,) of this tick: its pull comes and goes without a jerk of the elbow."""
+        """The posture (n,) of this tick; its pull changes without a jerk of the elbow."""
         w, dt_s = self._pull_1_s, self._dt_s
         self._pull_rate_1_s += (w * w * (share - self._pull) - 2 * w * self._pull_rate_1_s) * dt_s
         self._pull += self._pull_rate_1_s * dt_s
@@ -240,20 +239,20 @@ class PoseToJoint:
 
     @property
     def position_rad(self) -> FloatArray:
-        """(n,) where the joints are to be now."""
+        """(n,) the commanded joints."""
         return self._now.position_rad
 
     @property
     def at_rest(self) -> bool:
-        """No joint moves."""
+        """No commanded joint moves."""
         return float(np.abs(self._now.velocity_rad_s).max()) < REST_RAD_S
 
     def command(self, state: str, cause: Cause | None) -> JointCommand:
-        """Where the joints have to be now."""
+        """The joint command of this tick."""
         motion = self._now
         return JointCommand(self._names, *motion[:2], self._acceleration, state=state, cause=cause)
 
     @property
     def _acceleration(self) -> FloatArray:
-        told = self._now.acceleration_rad_s2
-        return np.zeros(len(self._now.position_rad)) if told is None else told
+        known = self._now.acceleration_rad_s2
+        return np.zeros(len(self._now.position_rad)) if known is None else known

@@ -1,22 +1,22 @@
-"""What the arm can do: a kinematic shadow of the robot walks ahead of every goal.
+"""Reachability: steps are shortened to what the arm can do, by a kinematic model that moves ahead.
 
 A step whose end has no joint solution, or comes too near to a singularity, to the arm itself or to
-the table, is shortened to the part of it that is feasible; the rest of the step is not remembered.
-Each barrier is a number ``h`` that must not become negative: singular value or distance minus its
-stop. A step from ``h0`` must end with::
+the table, is shortened to its feasible part; the rest of the step is dropped. Each barrier is a
+number ``h`` that must not become negative: singular value or distance minus its stop. A step from
+``h0`` must end with::
 
     h >= min(slow - stop, h0 / 2)     where h0 > 0: beyond `slow` it takes half of what is left,
     h >= h0                           where h0 <= 0: a violated barrier may only be left
 
 which is a control barrier function in discrete time (Agrawal, Sreenath, "Discrete control barrier
 functions for safety-critical control of discrete systems", RSS 2017) with a decay of one half.
-A joint outside of its range may only move inwards. The elbow of a redundant arm is where pose and
-posture put it, because that is what a Cartesian controller does with it: a solution that would need
-the elbow to swing aside is none. `free_elbow` is for arms whose joints are commanded.
+A joint outside its range may only move inwards. The elbow of a redundant arm is where pose and
+posture put it, as with a Cartesian controller: a solution that needs another elbow position does
+not count. `free_elbow` is for arms whose joints are commanded.
 
-A step for which the joints alone are too slow is kept and told to be taken slower, see
-`vla_zenoh.control.limits`; only where that would take more than ten times as long it is
-shortened: such joints leap to another solution.
+A step for which only the joints are too slow is kept with a slowdown, see
+`vla_zenoh.control.limits`; it is shortened only if it would take more than ten times as long, for
+then the joints jump to another solution.
 """
 
 from __future__ import annotations
@@ -39,25 +39,24 @@ from vla_zenoh.types import FloatArray
 HALVINGS = 4
 REFINEMENTS = 4
 SMALLEST_FRACTION = 1 / 128
-"""Less than this of a step is nothing."""
+"""A smaller part of a step counts as nothing."""
 GUESS_SHORT = 0.95
-"""A linear guess of the feasible part is taken a little shorter: most barriers bend downwards."""
+"""Factor on a linear guess of the feasible part: most barriers are concave."""
 SOLVER_ITERATIONS = 12
-"""Steps are short and the start is near: who has not arrived by then will not."""
+"""Steps are short and start near their end: a solver that needs more does not converge."""
 EFFORT = 5
-"""Iterations of the solver that an evaluation may have; with more it counts as several."""
+"""Iterations of the solver per evaluation; one with more counts as several."""
 SAME_POSE = 1e-9
 
 
-class Bounded(NamedTuple):
-    """What became of a step.
+class BoundedStep(NamedTuple):
+    """A step within what the arm can do.
 
     Args:
-        pose: where it ends: the pose asked for itself where nothing acted, that from where it began
-            where nothing is left of it.
-        hits: what acted.
-        joints_rad: (n,) of the shadow there.
-        slowdown: why it is to be taken slower than at full speed.
+        pose: its end: the very pose asked for if no limit acted, its start if nothing is left.
+        hits: limits that acted.
+        joints_rad: (n,) of the model at its end.
+        slowdown: why it is slower than full speed.
     """
 
     pose: Pose
@@ -66,8 +65,8 @@ class Bounded(NamedTuple):
     slowdown: Slowdown | None
 
 
-class _Stand(NamedTuple):
-    """The shadow in one place: `pose` was asked for, `barriers` are those at `joints_rad`."""
+class _Configuration(NamedTuple):
+    """The model at one pose: `pose` is the pose asked for, `barriers` belong to `joints_rad`."""
 
     pose: Pose
     joints_rad: FloatArray
@@ -76,27 +75,26 @@ class _Stand(NamedTuple):
 
 
 class _Start(NamedTuple):
-    """Where a step begins, and what its end must keep: barriers, and joints' ranges."""
+    """The start of a step, and the bounds of its end: barriers, and ranges of the joints."""
 
-    here: _Stand
+    here: _Configuration
     floor: FloatArray
     lower_rad: FloatArray
     upper_rad: FloatArray
 
 
 class ReachabilityFilter:
-    """See the module. Not a moment of time in it: the same questions get the same answers.
+    """Bounds steps of the TCP by the kinematics of the arm. Independent of time.
 
     Args:
         kinematics: of the arm.
-        joints_rad: (n,) where the robot stands.
-        limits: how near it may come to what, and how fast its TCP may be: a step takes at least
-            as long as that.
+        joints_rad: (n,) of the robot at present.
+        limits: stop and slow of the barriers, and the speed of the TCP at which a step is taken.
         free_elbow: a redundant arm may leave its posture where a joint meets its range.
-        posture_rad: (n,) what the robot's controller pulls a redundant arm to; None: where the
-            robot stood at the last `reset`.
+        posture_rad: (n,) the posture that the robot's controller pulls a redundant arm to; None:
+            the joints at the last `reset`.
         known_good_rad: configurations known to be free, besides `joints_rad`.
-        velocity_rad_s: (n,) how fast the joints may be; None: as the description has it.
+        velocity_rad_s: (n,) limits of the joints; None: those of the URDF.
 
     Raises:
         RecordError: joints of the wrong number.
@@ -128,7 +126,7 @@ class ReachabilityFilter:
         self.reset(joints_rad)
 
     def reset(self, joints_rad: ArrayLike) -> None:
-        """The robot is here: stand where it stands.
+        """Move the model to the joints of the robot.
 
         Raises:
             RecordError: not one finite number per arm joint.
@@ -141,30 +139,30 @@ class ReachabilityFilter:
         if self._follow_posture:
             self._solver.posture_rad = joints.copy()
         pose, jacobian = self.kinematics.pose_and_jacobian(joints)
-        self._here = _Stand(pose, joints, 0.0, self.barriers.at(joints, jacobian))
-        self._seat_rad: FloatArray | None = None
+        self._here = _Configuration(pose, joints, 0.0, self.barriers.at(joints, jacobian))
+        self._measured_rad: FloatArray | None = None
         self.slowdown: Slowdown | None = None
-        """Why the step bounded last is to be taken slower than at full speed."""
+        """Of the step bounded last."""
         self.cost = 1
-        """For how many the last evaluation counts."""
+        """Number of evaluations that the last one counts as."""
 
-    def reseat(self, joints_rad: FloatArray) -> None:
-        """The arm itself has these joints (n,): the next step begins with its elbow."""
-        self._seat_rad = joints_rad
+    def set_elbow(self, joints_rad: FloatArray) -> None:
+        """Start the next step with the elbow of these joints (n,) of the robot."""
+        self._measured_rad = joints_rad
 
-    def followed(self, pose: Pose, joints_rad: FloatArray) -> FloatArray | None:
-        """Joints (n,) of an arm that went there from these (n,), None where it has none."""
+    def solve(self, pose: Pose, joints_rad: FloatArray) -> FloatArray | None:
+        """Joints (n,) for `pose`, solved from `joints_rad` (n,); None without a solution."""
         found = self._solver.approach(pose, joints_rad, bounded=False)
         return found.joints_rad if found.solved else None
 
     @property
     def joints_rad(self) -> FloatArray:
-        """(n,) of the shadow: those of the last bounded pose."""
+        """(n,) of the model: those of the last bounded pose."""
         return self._here.joints_rad.copy()
 
     @property
     def margins(self) -> Margins:
-        """Room left where the shadow stands."""
+        """Margins of the model where it is."""
         return self.barriers.margins(self._here.joints_rad, self._here.barriers)
 
     def bound(
@@ -174,36 +172,38 @@ class ReachabilityFilter:
         dt_s: float = 0.1,
         start_rad: FloatArray | None = None,
     ) -> tuple[Pose, list[LimitHit]]:
-        """`bounding` at once: where the step ends, and what acted."""
-        pieces = self.bounding(before, asked, dt_s, start_rad)
+        """`bound_in_pieces` at once: the end of the step, and the limits that acted."""
+        pieces = self.bound_in_pieces(before, asked, dt_s, start_rad)
         while True:
             try:
                 next(pieces)
             except StopIteration as end:
                 return end.value.pose, end.value.hits
 
-    def bounding(
+    def bound_in_pieces(
         self, before: Pose, asked: Pose, dt_s: float, start_rad: FloatArray | None = None
-    ) -> Generator[None, None, Bounded]:
-        """The furthest pose on the way from `before` to `asked` that the arm can take, in pieces.
+    ) -> Generator[None, None, BoundedStep]:
+        """The furthest pose from `before` towards `asked` that the arm can take, in pieces.
 
-        It stops before every evaluation (joints for a pose, and how near that is to what): what
-        one costs is known, see `cost`, and how many there are is not, some 10 where a limit cuts.
+        Yields before every evaluation (joints of a pose, and their barriers): the cost of one is
+        known, see `cost`, their number is not, about 10 where a limit cuts.
 
         Args:
-            before: where the step starts, usually the pose bounded last.
-            asked: where it is to end.
-            dt_s: time the step has.
-            start_rad: joints at `before`, where known; None: near those of the last bounded pose.
+            before: start of the step, usually the pose bounded last.
+            asked: its end.
+            dt_s: its duration.
+            start_rad: (n,) joints at `before`; None: near those of the last bounded pose.
 
         Returns:
-            what became of it. The shadow stands there afterwards.
+            the step within bounds, at whose end the model is afterwards.
         """
         here = self._here
-        stands = start_rad is None or np.array_equal(start_rad, here.joints_rad)
-        if self._seat_rad is not None or not stands or not _same(before, here.pose):
+        is_here = start_rad is None or np.array_equal(start_rad, here.joints_rad)
+        if self._measured_rad is not None or not is_here or not _same(before, here.pose):
             yield
-            here = self._stand_at(before, here.joints_rad if start_rad is None else start_rad)
+            here = self._configuration_at(
+                before, here.joints_rad if start_rad is None else start_rad
+            )
         start = _Start(here, self._floor(here), *self._solver.bounds(here.joints_rad))
         yield
         end, hits = self._try(start, asked, dt_s)
@@ -233,18 +233,18 @@ class ReachabilityFilter:
         return self._settle(start, best, best.pose if low > 0.0 else before, hits, dt_s)
 
     def _settle(
-        self, start: _Start, end: _Stand, pose: Pose, hits: list[LimitHit], dt_s: float
-    ) -> Bounded:
+        self, start: _Start, end: _Configuration, pose: Pose, hits: list[LimitHit], dt_s: float
+    ) -> BoundedStep:
         self._here = end
         slower = self.barriers.slowdown(start.here.barriers, end.barriers)
         late = self._late(start.here, end, dt_s)
         if slower is None or (late is not None and late.share < slower.share):
             slower = late
         self.slowdown = slower
-        return Bounded(pose, hits, end.joints_rad, slower)
+        return BoundedStep(pose, hits, end.joints_rad, slower)
 
-    def _guess(self, start: _Start, end: _Stand, hits: Sequence[LimitHit]) -> float:
-        """Where to begin to look for the feasible part, from how the whole step failed."""
+    def _guess(self, start: _Start, end: _Configuration, hits: Sequence[LimitHit]) -> float:
+        """First guess of the feasible part, from how the whole step failed."""
         here = start.here
         if end is here or here.error > 0 or here.barriers.min() <= 0:
             return 0.5
@@ -254,31 +254,31 @@ class ReachabilityFilter:
         fall = np.maximum(here.barriers - end.barriers, 1e-12)
         return GUESS_SHORT * min(1.0, float((room / fall).min()))
 
-    # -- one place ----------------------------------------------------------------------------
-    def _stand_at(self, pose: Pose, start_rad: FloatArray) -> _Stand:
-        seat_rad, self._seat_rad = self._seat_rad, None
-        found = None if seat_rad is None else self._approach(pose, seat_rad)
+    # -- one evaluation -----------------------------------------------------------------------
+    def _configuration_at(self, pose: Pose, start_rad: FloatArray) -> _Configuration:
+        measured_rad, self._measured_rad = self._measured_rad, None
+        found = None if measured_rad is None else self._approach(pose, measured_rad)
         if found is None or not found.solved:
             found = self._approach(pose, start_rad)
-        self._here = self._stand(pose, found)
+        self._here = self._configuration(pose, found)
         return self._here
 
-    def _stand(self, pose: Pose, found: Approach) -> _Stand:
+    def _configuration(self, pose: Pose, found: Approach) -> _Configuration:
         error = 0.0 if found.solved else found.error_m + found.error_rad
         barriers = self.barriers.at(found.joints_rad, found.jacobian)
-        return _Stand(pose, found.joints_rad, error, barriers)
+        return _Configuration(pose, found.joints_rad, error, barriers)
 
-    def _try(self, start: _Start, pose: Pose, dt_s: float) -> tuple[_Stand, list[LimitHit]]:
-        """Where a step would lead, and what forbids it."""
+    def _try(self, start: _Start, pose: Pose, dt_s: float) -> tuple[_Configuration, list[LimitHit]]:
+        """The end of a step to `pose`, and the limits that forbid it."""
         here = start.here
         found = self._approach(pose, here.joints_rad)
-        # Where the start has no solution itself, coming nearer to having one is the way out.
+        # From a start without a solution, a step that comes nearer to one is allowed.
         if not found.solved and found.error_m + found.error_rad >= here.error * (1 - 1e-6):
             return here, [self._out_of_range(start, found.wanted_rad) or self._out_of_reach(found)]
         outside = self._out_of_range(start, found.joints_rad)
         if outside is not None:
             return here, [outside]
-        end = self._stand(pose, found)
+        end = self._configuration(pose, found)
         hits = [
             LimitHit(
                 self.barriers.names[index],
@@ -295,10 +295,10 @@ class ReachabilityFilter:
                 hits = [LimitHit(late.name, late.value, late.limit, where=late.where)]
         return end, hits
 
-    def _floor(self, start: _Stand) -> FloatArray:
-        """What the barriers may come down to in one step from there."""
+    def _floor(self, start: _Configuration) -> FloatArray:
+        """The least values of the barriers after one step from `start`."""
         floor = self.barriers.floor(start.barriers)
-        if start.error > 0:  # an arm that points to what it cannot reach is singular
+        if start.error > 0:  # an arm stretched towards a pose out of reach is singular
             floor[0] = -np.inf
         return floor
 
@@ -321,8 +321,8 @@ class ReachabilityFilter:
         tolerance = self._solver.settings.position_tolerance_m
         return LimitHit("reach", found.error_m + found.error_rad, tolerance)
 
-    def _late(self, start: _Stand, end: _Stand, dt_s: float) -> Slowdown | None:
-        """Why a step takes longer than the `dt_s` it has, where its joints are too slow for it."""
+    def _late(self, start: _Configuration, end: _Configuration, dt_s: float) -> Slowdown | None:
+        """The slowdown of a step whose joints need longer than `dt_s`, None where they do not."""
         joint_s = np.abs(end.joints_rad - start.joints_rad) / self._velocity_rad_s
         joint = int(joint_s.argmax())
         needed_s = float(joint_s[joint])
@@ -351,7 +351,7 @@ def _same(a: Pose, b: Pose) -> bool:
 
 
 def _part(before: Pose, step: FloatArray, fraction: float) -> Pose:
-    """`fraction` of a step (6,) m and rad on the straight line and the shortest turn."""
+    """The pose after `fraction` of a step (6,) m and rad, on the line and the geodesic."""
     turned = exp3(fraction * step[3:]) @ before.rotation
     return Pose(before.position_m + fraction * step[:3], orthonormal(turned))
 
@@ -359,16 +359,16 @@ def _part(before: Pose, step: FloatArray, fraction: float) -> Pose:
 def make_reachability_filter(
     profile: Profile, kinematics: Kinematics | None = None
 ) -> ReachabilityFilter:
-    """The kinematic shadow that bounds goals, standing at home.
+    """The reachability filter of the profile's robot, at its home pose.
 
     Raises:
-        ResourceError: description or collision shapes are not there.
+        ResourceError: description or collision shapes are missing.
         ProfileError: frames or joints that the description does not have.
     """
     kinematics = kinematics or make_kinematics(profile)
     names = profile.robot.arm_joints
     home_rad = kinematics.ordered(names, profile.robot.home_rad)
-    # Its joints are ours to command, and to hold back, only where the profile says so.
+    # Elbow and joint velocities are ours only where joints are commanded.
     commanded = profile.robot.command == "joint"
     most_rad_s = profile.limits.joint.of("velocity_rad_s", len(names))
     return ReachabilityFilter(

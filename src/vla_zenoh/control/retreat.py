@@ -1,15 +1,14 @@
-"""The way back of an arm that was blocked: what it is commanded is led back to where it is.
+"""Retreat of a blocked arm: its command moves back to the arm, and on until the contact ends.
 
-A controller presses with what lies between command and arm, and with what its integral action has
-piled up. So after the brake the command goes
+A controller presses with the distance between command and arm, and with what its integral action
+has accumulated. So after the brake the command moves
 
-1. from where the brake ended, inside of the obstacle, to where the arm was measured then, once: an
-   arm that somebody pushes about is not run after;
-2. to where the arm was when it was noticed, and on along the way on which it came there, `STEP_M`
-   at a time, until nothing presses any more, but `RELIEF_M` at most.
+1. from the end of the brake, inside the obstacle, to the pose measured then, once: it does not
+   follow an arm that is pushed about;
+2. to the pose at which the contact was detected, and on along the path on which the arm came,
+   `STEP_M` at a time, until nothing presses any more, but `RELIEF_M` at most.
 
-Where the robot tells no wrench nobody knows whether anything presses: then it goes all of
-`RELIEF_M`, at once.
+Without a measured wrench the contact cannot be seen: then it moves all of `RELIEF_M` at once.
 """
 
 from __future__ import annotations
@@ -18,46 +17,46 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.commander_io import Outputs
+from vla_zenoh.control.commander_io import make_event
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.kinematics.so3 import Pose, norm3, pose_distance
 from vla_zenoh.profile import Limits
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import Event, FloatArray
 
 STEP_M = 0.005
 RELIEF_M = 0.02
 SETTLE_NS = 50_000_000
-"""After each step it is looked at for so long before the next one."""
+"""Wait after each step, for the external load to settle."""
 SPARE_NS = 4_000_000_000
-"""What a retreat may take beyond the time of its way."""
+"""Time that a retreat may take beyond that of its path."""
 SPACE_M = 0.002
-"""Distance of the places of a trail."""
+"""Distance between the poses of a trail."""
 PLACES = 60
 RAD_AS_M = 0.05
-"""A turn by 1 rad counts like this way."""
+"""A rotation by 1 rad counts as this distance."""
 STRAY_M, STRAY_RAD = 0.01, 0.05
-"""An arm that stands further than it was found blocked, and the brake, and this, is not there."""
+"""An arm further away than when it was blocked, plus the brake and this, is not led back."""
 
 
 class CommandTrail:
-    """The way on which the arm came: measured poses, `SPACE_M` apart, newest last.
+    """The path on which the arm came: measured poses, `SPACE_M` apart, newest last.
 
-    What was gone there and back again is left out, so it never turns round.
+    Detours that came back to a pose of the path are left out, so it never reverses.
     """
 
     def __init__(self) -> None:
         self._poses: list[Pose] = []
         self._places: list[FloatArray] = []
 
-    def go(self, pose: Pose) -> None:
-        """The arm is here now."""
+    def add(self, pose: Pose) -> None:
+        """Add a measured pose."""
         place = _place(pose)
         if self._places and np.linalg.norm(self._places[-1] - place) < SPACE_M:
             return
         if self._places:
             apart = np.linalg.norm(np.array(self._places) - place, axis=1)
             if apart[-1] > 10 * SPACE_M:
-                self.forget()  # it was not watched meanwhile
+                self.clear()  # poses in between are missing
             elif (apart < SPACE_M).any():
                 keep = int(np.flatnonzero(apart < SPACE_M)[0]) + 1
                 del self._poses[keep:], self._places[keep:]
@@ -66,13 +65,13 @@ class CommandTrail:
         self._places.append(place)
         del self._poses[:-PLACES], self._places[:-PLACES]
 
-    def forget(self) -> None:
-        """Begin anew."""
+    def clear(self) -> None:
+        """Drop all poses."""
         self._poses.clear()
         self._places.clear()
 
     def back(self, way_m: float) -> list[Pose]:
-        """Poses of the last `way_m`, newest first, without the very last: there it is."""
+        """Poses of the last `way_m`, newest first, without the present one."""
         found: list[Pose] = []
         gone_m = 0.0
         for index in range(len(self._poses) - 2, -1, -1):
@@ -88,92 +87,97 @@ def _place(pose: Pose) -> FloatArray:
     return np.concatenate([pose.position_m, pose.rotation.ravel() * (RAD_AS_M / np.sqrt(2))])
 
 
-class _Begun(NamedTuple):
+class _Contact(NamedTuple):
+    """Poses at which the retreat was requested."""
+
     commanded: Pose
     measured: Pose
 
 
-class Retreat:
-    """See the module. It says where to head for; who asks moves the arm.
+class RetreatStep(NamedTuple):
+    """The command of one tick.
 
     Args:
-        limits: how fast, and how far an arm may be from its command.
-        contact: what presses.
+        target: the pose to move to; None: brake, or stand.
+        event: the end of the retreat, None: it continues or did not run.
+    """
+
+    target: Pose | None
+    event: Event | None = None
+
+
+class Retreat:
+    """Where a blocked arm moves to, from `begin` until it is free.
+
+    Args:
+        limits: its speed, and how far an arm may be from its command.
+        contact: the external load.
     """
 
     def __init__(self, limits: Limits, contact: Contact) -> None:
         self._limits, self._contact = limits, contact
         self.speed = min(1.0, limits.contact.retreat_m_s / limits.translation.velocity_m_s)
-        """Share of the speed limits that it has."""
+        """Its share of the speed limits."""
         self._trail = CommandTrail()
         self._measured: Pose | None = None
-        self._begun: _Begun | None = None
+        self._begun: _Contact | None = None
         self._target: Pose | None = None
         self._ahead: list[Pose] = []
         self._until_ns = self._rest_ns = 0
 
     @property
     def busy(self) -> bool:
-        """It is under way, or waits for the brake to end."""
+        """It is running, or waits for the brake to end."""
         return self._begun is not None
 
-    def see(self, measured: Pose) -> None:
-        """The arm was measured here."""
+    def measure(self, measured: Pose) -> None:
+        """Record the measured pose."""
         self._measured = measured
         if not self.busy:
-            self._trail.go(measured)
+            self._trail.add(measured)
 
     def begin(self, commanded: Pose) -> None:
-        """The arm is blocked, or something presses against it; the brake begins.
-
-        Args:
-            commanded: where the command is.
-        """
+        """Retreat from `commanded` after the brake: the arm is blocked or in contact."""
         if self._measured is not None:
-            self._begun = _Begun(commanded, self._measured)
+            self._begun = _Contact(commanded, self._measured)
             self._target = None
 
     def end(self) -> None:
-        """Whatever it was doing, it does it no more: the arm brakes and stands."""
+        """Stop the retreat: the arm brakes and stands."""
         self._begun = self._target = None
 
-    def turn(self, commanded: Pose, now_ns: int, out: Outputs, *, at_rest: bool) -> Pose | None:
-        """Where to head for in this tick; None: brake, or stand.
+    def step(self, commanded: Pose, now_ns: int, *, at_rest: bool) -> RetreatStep:
+        """The target of this tick.
 
         Args:
-            commanded: where the command is.
+            commanded: the present command.
             now_ns: time of this tick.
-            out: what it did is told.
-            at_rest: what was commanded last is reached.
+            at_rest: the command has reached its target.
         """
         begun, measured = self._begun, self._measured
         if begun is None or measured is None:
-            return None
+            return RetreatStep(None)
         if not at_rest:
             self._rest_ns = now_ns
             if self._target is not None and now_ns > self._until_ns:
-                self._finish(out, "it took too long")
-                return None
-            return self._target
+                return self._finish("it took too long")
+            return RetreatStep(self._target)
         if self._target is None:
-            return self._set_out(begun, commanded, measured, now_ns, out)
+            return self._set_out(begun, commanded, measured, now_ns)
         if now_ns - self._rest_ns < SETTLE_NS:
-            return self._target
-        told = self._contact.told
-        if told and self._contact.quiet:
-            self._finish(out, "it stands")
-        elif not self._ahead or now_ns > self._until_ns:
-            self._finish(out, "something still presses" if told else "it stands")
-        else:
-            self._step_back(STEP_M if told else RELIEF_M)
-        return self._target
+            return RetreatStep(self._target)
+        known = self._contact.known
+        if known and self._contact.quiet:
+            return self._finish("it stands")
+        if not self._ahead or now_ns > self._until_ns:
+            return self._finish("something still presses" if known else "it stands")
+        return RetreatStep(self._step_back(self._target, STEP_M if known else RELIEF_M))
 
     def _set_out(
-        self, begun: _Begun, commanded: Pose, measured: Pose, now_ns: int, out: Outputs
-    ) -> Pose | None:
-        if self._contact.told and self._contact.quiet:
-            self._finish(out, "no further than the brake, nothing presses any more")
-            return None
+        self, begun: _Contact, commanded: Pose, measured: Pose, now_ns: int
+    ) -> RetreatStep:
+        if self._contact.known and self._contact.quiet:
+            return self._finish("no further than the brake, nothing presses any more")
         apart_m, apart_rad = pose_distance(commanded, measured)
         braked_m, braked_rad = pose_distance(begun.commanded, commanded)
         most_m = self._limits.tracking_m + braked_m + STRAY_M
@@ -181,10 +185,10 @@ class Retreat:
         if apart_m > most_m or apart_rad > most_rad:
             self.end()
             where = f"{apart_m:.3f} m and {apart_rad:.2f} rad from its command"
-            out.tell("warning", "notice", "retreat", f"the arm is not led back: it is {where}")
-            return None
+            why = f"the arm is not led back: it is {where}"
+            return RetreatStep(None, make_event("warning", "notice", "retreat", why))
         on_m = norm3(measured.position_m - begun.measured.position_m)
-        # Where it was pushed back since, by a person, it does not come again.
+        # It does not return to where a person has pushed it away from since.
         into = _place(commanded) - _place(measured)
         self._ahead = [
             pose
@@ -197,18 +201,20 @@ class Retreat:
         self._until_ns = now_ns + round(2e9 * way_s) + SPARE_NS
         self._rest_ns = now_ns
         self._target = measured
-        return measured
+        return RetreatStep(measured)
 
-    def _step_back(self, step_m: float) -> None:
-        assert self._target is not None
-        start = _place(self._target)
+    def _step_back(self, target: Pose, step_m: float) -> Pose:
+        start = _place(target)
         while self._ahead:
-            self._target = self._ahead.pop(0)
-            if np.linalg.norm(_place(self._target) - start) >= step_m:
+            target = self._ahead.pop(0)
+            if np.linalg.norm(_place(target) - start) >= step_m:
                 break
+        self._target = target
+        return target
 
-    def _finish(self, out: Outputs, why: str) -> None:
-        felt_n = self._contact.force_n
-        felt = "" if felt_n is None else f", external force {felt_n:.1f} N"
-        out.tell("info", "notice", "retreat", f"the arm was led back: {why}{felt}")
+    def _finish(self, why: str) -> RetreatStep:
         self.end()
+        force_n = self._contact.force_n
+        force = "" if force_n is None else f", external force {force_n:.1f} N"
+        why = f"the arm was led back: {why}{force}"
+        return RetreatStep(None, make_event("info", "notice", "retreat", why))

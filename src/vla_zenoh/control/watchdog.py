@@ -1,4 +1,4 @@
-"""Reasons to stop obeying: what fell silent, what came late, an arm that does not follow."""
+"""Reasons to brake: lost or late messages, overdue chunks, a blocked arm, a deadman gone."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from vla_zenoh.types import GripperState, PoseState, Stamped
 
 NEVER_NS = 1 << 62
 FIRST_CHUNK_PATIENCE_S = 1.0
-"""After activation a new observation, an inference and a chunk have to happen first."""
+"""Extra time for the first chunk after activation: it needs an observation and an inference."""
 BACK_OFF_M, BACK_OFF_RAD = 0.005, 0.02
-"""A blocked arm that is led back may stray by this much more before it counts as blocked again."""
+"""A blocked arm that is led back counts as blocked again if it strays by this much more."""
 
 
 class Watchdog:
-    """See the module.
+    """Deadline of the next chunk, tracking error, and the peers that the arm depends on.
 
     Args:
-        profile: how far and how long.
+        profile: its limits and timeouts.
     """
 
     def __init__(self, profile: Profile) -> None:
@@ -34,34 +34,34 @@ class Watchdog:
 
     # -- chunks -------------------------------------------------------------------------------
     def expect_first(self, now_ns: int, rate_hz: float, speed: float = 1.0) -> None:
-        """An episode begins at `now_ns`; its first chunk takes longer than the others."""
+        """Set the deadline of the first chunk of an episode that begins at `now_ns`."""
         self._expect(now_ns, rate_hz, speed, FIRST_CHUNK_PATIENCE_S)
 
     def expect_next(self, end_ns: int, rate_hz: float, now_ns: int, speed: float = 1.0) -> None:
-        """The newest chunk runs out at `end_ns`, or where it would be followed too long."""
+        """Set the deadline after a chunk that ends at `end_ns`, or at ``max_open_loop_s``."""
         open_loop_ns = int(self._timing.max_open_loop_s * 1e9 / speed) if speed else 0
         self._expect(min(end_ns, now_ns + open_loop_ns), rate_hz, speed)
 
     def _expect(self, end_ns: int, rate_hz: float, speed: float, extra_s: float = 0.0) -> None:
-        """One period at the asked rate after that, and the watchdog; none of an arm that stands."""
+        """One period at the requested rate later, plus the watchdog; never at override 0."""
         period_s = 1.0 / rate_hz / speed if speed else 0.0
         self.deadline_ns = end_ns + int((period_s + self._timing.watchdog_s + extra_s) * 1e9)
         if not speed:
             self.deadline_ns = NEVER_NS
 
-    def starved(self, now_ns: int) -> bool:
+    def overdue(self, now_ns: int) -> bool:
         """The next chunk is overdue."""
         return now_ns > self.deadline_ns
 
-    def forsaken(self, now_ns: int) -> bool:
-        """It is overdue for so long that nobody may still expect the arm to go on by itself."""
+    def given_up(self, now_ns: int) -> bool:
+        """It is overdue by ``max_hold_s``: the arm must not resume by itself any more."""
         return now_ns > self.deadline_ns + int(self._timing.max_hold_s * 1e9)
 
     # -- tracking -----------------------------------------------------------------------------
     def begin(self, held: Pose, actual: Pose) -> bool:
-        """The activation begins; says whether the arm is far from where it is held.
+        """Start an activation; returns whether the arm is far from its controller's set-point.
 
-        Such an arm is given the way back: it is not blocked as long as it comes nearer.
+        Such an arm may come back: it does not count as blocked while the distance shrinks.
         """
         apart_m, apart_rad = pose_distance(held, actual)
         blocked = apart_m > self._limits.tracking_m or apart_rad > self._limits.tracking_rad
@@ -69,13 +69,13 @@ class Watchdog:
         return blocked
 
     def measure(self, commanded: Pose | None, actual: Pose) -> None:
-        """How far the arm is from its command; `commanded` is None while nothing is streamed."""
+        """Update the tracking error; `commanded` is None while nothing is streamed."""
         self.tracking_m, self.tracking_rad = (
             (0.0, 0.0) if commanded is None else pose_distance(commanded, actual)
         )
 
     def blocked(self) -> str:
-        """Why the arm counts as blocked, empty when it follows."""
+        """Why the arm counts as blocked, empty while it follows."""
         limits = self._limits
         for apart, limit, excused, back_off, unit in (
             (self.tracking_m, limits.tracking_m, self._excused[0], BACK_OFF_M, "m"),
@@ -87,16 +87,18 @@ class Watchdog:
                     f"the arm does not follow: {apart:.3f} {unit} from its command, "
                     f"at most {allowed:.3g} {unit} (is it blocked?)"
                 )
-        # What was won back on the way out of a blockade is not given away again.
+        # The allowance of an arm that comes back only shrinks.
         self._excused = (
             min(self._excused[0], self.tracking_m),
             min(self._excused[1], self.tracking_rad),
         )
         return ""
 
-    # -- everything around --------------------------------------------------------------------
-    def unheard(self, pose: Stamped[PoseState], gripper: Stamped[GripperState], now_ns: int) -> str:
-        """What the robot does not say any more, empty when it says all."""
+    # -- peers --------------------------------------------------------------------------------
+    def state_lost(
+        self, pose: Stamped[PoseState], gripper: Stamped[GripperState], now_ns: int
+    ) -> str:
+        """Which state of the robot is missing or late, empty if none is."""
         patience_s = self._timing.state_timeout_s
         for what, state in (("pose", pose), ("gripper", gripper)):
             silent_s = (now_ns - state.received_ns) / 1e9
@@ -116,10 +118,10 @@ class Watchdog:
         lease: Lease,
         now_ns: int,
     ) -> str:
-        """What is not there any more, empty when all is."""
-        silent = self.unheard(pose, gripper, now_ns)
-        if silent:
-            return silent
+        """Which state, node or camera is lost, empty if none is."""
+        lost = self.state_lost(pose, gripper, now_ns)
+        if lost:
+            return lost
         needed = [peers.robot_node, worker_node(worker)]
         cameras = [camera.camera for camera in lease.spec.observation.cameras]
         needed += [peers.camera_nodes.get(camera, "camera") for camera in cameras]
@@ -130,37 +132,43 @@ class Watchdog:
             if camera in peers.camera_faults:
                 return f"camera {camera!r} {peers.camera_faults[camera]}"
         if peers.spec_sources.get(worker) != lease.source:
-            return f"worker {worker!r} was started anew"
+            return f"worker {worker!r} was restarted"
         return ""
 
 
 class Deadman:
-    """See the module. `name` is whose hand it is, empty while nobody's is needed."""
+    """A deadman's handle on the bus: the client whose presence keeps the arm active.
+
+    Its liveliness token disappears with its process, host or network; the arm then brakes.
+    """
 
     def __init__(self) -> None:
         self.name = ""
+        """Of the client; empty: none is needed."""
 
     def begin(self, holder: str) -> None:
-        """An activation begins, which `holder` holds, if not empty."""
+        """Start an activation that depends on `holder`, if not empty."""
         self.name = holder
 
-    def refused(self, holder: str, there: AbstractSet[str], *, obeying: bool = False) -> list[str]:
-        """Why `holder` cannot hold the arm active, empty when he can.
+    def reasons_against(
+        self, holder: str, present: AbstractSet[str], *, obeying: bool = False
+    ) -> list[str]:
+        """Why `holder` cannot hold the arm active, empty if it can.
 
         Args:
-            holder: empty: nobody, which is no reason.
-            there: whose tokens are there.
-            obeying: the arm obeys already.
+            holder: name of the client; empty: none.
+            present: names of the clients whose tokens exist.
+            obeying: the arm is active already.
         """
         reasons = []
-        if holder and holder not in there:
+        if holder and holder not in present:
             reasons.append(f"{holder!r}, who is to hold the arm active, {NO_DEADMAN_TOKEN}")
         if obeying and holder and self.name and holder != self.name:
-            reasons.append(f"it obeys already, while {self.name!r} holds it; deactivate it first")
+            reasons.append(f"the arm is active already, held by {self.name!r}; deactivate it first")
         return reasons
 
-    def lost(self, there: AbstractSet[str]) -> str:
-        """Why the arm must brake, empty when it need not."""
-        if not self.name or self.name in there:
+    def lost(self, present: AbstractSet[str]) -> str:
+        """Why the arm must brake, empty while the client is present."""
+        if not self.name or self.name in present:
             return ""
         return f"{self.name!r}, who held the arm active, is gone"

@@ -171,7 +171,7 @@ def test_steps_are_counted_as_the_way_is(horizon: int, requests: list[tuple[int,
         observed_ns = now_ns + wait_ms * MS
         made = plan(observed_ns // MS, rising(timeline.at(observed_ns), horizon))
         before = timeline.in_force(observed_ns)
-        made.begun = before.steps_until(observed_ns) if before.cause else 0.0
+        made.steps_before = before.steps_until(observed_ns) if before.cause else 0.0
         now_ns = observed_ns + latency_ms * MS
         made.effective_ns = now_ns
         timeline.add(made, now_ns)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from panda_arm import HOME_RAD, panda, tool_down_at
 
 from vla_zenoh.control.chunk_planner import PATIENCE, ChunkPlan, ChunkPlanner
-from vla_zenoh.control.limits import Slowdown, going_on
+from vla_zenoh.control.limits import Slowdown, keep_slowdown
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.ik import Approach
@@ -94,16 +94,16 @@ def whole_plan(
     planner.budget = budget
     timeline = GoalTimeline(Goal(START, 0.08), START_NS)
     spec = model_spec(**{**FAST_STEPS, **action}).action
-    plan = planner.begin(chunk_of(steps), spec, timeline)
+    plan = planner.plan(chunk_of(steps), spec, timeline)
     assert isinstance(plan, ChunkPlan), plan
     ready: Any = False
     while not ready:
-        planner.tick()
-        ready = planner.go_on(plan, START_NS)
+        planner.begin_tick()
+        ready = planner.bound(plan, START_NS)
     assert ready is True
     while plan.bounded < len(plan.goals):
-        planner.tick()
-        planner.bound_until([plan], plan.end_ns)
+        planner.begin_tick()
+        planner.bound_due([plan], plan.end_ns)
     return plan
 
 
@@ -396,14 +396,14 @@ def test_a_target_for_which_the_joints_are_too_slow_is_reached_slower() -> None:
 
 def test_what_slowed_a_step_lasts_until_the_arm_is_through_with_it() -> None:
     slow = Slowdown("joint_velocity", 0.5, 3.0, 2.0, "joint1", late_s=0.15)
-    then = going_on(slow, None, 0.1, 0.3)
+    then = keep_slowdown(slow, None, 0.1, 0.3)
     assert then is not None
     assert (then.name, then.share, then.late_s) == ("joint_velocity", 0.5, pytest.approx(0.05))
-    assert going_on(then, None, 0.1, 0.3) is None
-    twice = going_on(slow, slow._replace(share=0.8), 0.1, 0.3)
+    assert keep_slowdown(then, None, 0.1, 0.3) is None
+    twice = keep_slowdown(slow, slow._replace(share=0.8), 0.1, 0.3)
     assert twice is not None
     assert (twice.share, twice.late_s) == (0.5, pytest.approx(0.3))
     # Never longer than the way takes by which the leash lets the goal be ahead.
-    long = going_on(slow._replace(late_s=9.0), slow, 0.1, 0.3)
+    long = keep_slowdown(slow._replace(late_s=9.0), slow, 0.1, 0.3)
     assert long is not None
     assert long.late_s == pytest.approx(0.6)

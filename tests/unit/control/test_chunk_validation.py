@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 from command_rig import MS, SOURCE, START_NS, WORKER, model_spec
 
-from vla_zenoh.control.chunk_validation import FUTURE_TOLERANCE_NS, Lease, Rejection, refuse
+from vla_zenoh.control.chunk_validation import (
+    FUTURE_TOLERANCE_NS,
+    Lease,
+    Rejection,
+    validate_chunk,
+)
 from vla_zenoh.types import ActionChunk, Header, Stamped, Task
 
 NOW_NS = START_NS + 10**10
@@ -41,7 +46,7 @@ def chunk(*, seq: int = 4, source: str = SOURCE, **fields: Any) -> Stamped[Actio
 
 
 def judge(lease: Lease, given: Stamped[ActionChunk]) -> Rejection | None:
-    return refuse(given, lease, TASK, MAX_AGE_S, NOW_NS)
+    return validate_chunk(given, SOURCE, lease, TASK, MAX_AGE_S, NOW_NS)
 
 
 def test_a_good_chunk_is_carried_out(lease: Lease) -> None:
@@ -51,12 +56,16 @@ def test_a_good_chunk_is_carried_out(lease: Lease) -> None:
 @pytest.mark.parametrize(
     ("reason", "match", "change"),
     [
-        ("foreign", "by 'somebody-9'; the lease is held by", {"source": "somebody-9"}),
-        ("replayed", "chunk 3 came again", {"seq": 3}),
-        ("replayed", "chunk 0 came again", {"seq": 0}),
+        (
+            "foreign",
+            f"by 'somebody-9'; the source of this worker is {SOURCE!r}",
+            {"source": "somebody-9"},
+        ),
+        ("replayed", "chunk 3 came twice", {"seq": 3}),
+        ("replayed", "chunk 0 came twice", {"seq": 0}),
         ("spec_mismatch", "chunk of spec 'another'", {"spec_hash": "another"}),
-        ("superseded", "for episode 6, now is 7", {"episode": 6}),
-        ("superseded", "for episode 8, now is 7", {"episode": 8}),
+        ("superseded", "for episode 6, the current one is 7", {"episode": 6}),
+        ("superseded", "for episode 8, the current one is 7", {"episode": 8}),
         ("stale", "1.001 s old, at most 1 s", {"observation_stamp_ns": NOW_NS - 1001 * MS}),
         (
             "future",

@@ -498,7 +498,7 @@ def test_a_worker_that_was_started_anew_has_to_be_activated_anew() -> None:
     rig.peers = replace(rig.peers, spec_sources={WORKER: "worker-scripted-2"})
     rig.tick()
     assert rig.state == "inactive"
-    assert "started anew" in rig.commander.why
+    assert "was restarted" in rig.commander.why
     rig.put("active", True)
     assert rig.state == "inactive"  # its chunks of before do not count
     rig.activate()
@@ -711,7 +711,7 @@ def test_slower_only_ever_lowers_the_speed() -> None:
     assert rig.commander.task.speed_percent == 40.0
     assert rig.refused == {"slower_refused": 1}
     assert [event.why for event in out.events] == [
-        "40.5 % is more than the 40 % in force; put it on speed to go faster"
+        "40.5 % is more than the 40 % in force; use the setting speed to go faster"
     ]
     rig.put("slower", 40.0)
     rig.put("slower", 0.0)

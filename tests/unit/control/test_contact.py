@@ -33,13 +33,13 @@ class Arm:
     def says(self, wrench: np.ndarray | None) -> None:
         self.now_ns += round(PERIOD_S * 1e9)
         state = PoseState(np.zeros(3), np.array([0.0, 0, 0, 1]), np.zeros(6), wrench)
-        self.contact.take_pose(Stamped(Header(self.now_ns, 1, "sim-1"), state, self.now_ns))
+        self.contact.update_pose(Stamped(Header(self.now_ns, 1, "sim-1"), state, self.now_ns))
 
     def strains(self, *effort_nm: float, s: float = 1.0) -> None:
         for _ in range(round(s / PERIOD_S)):
             self.now_ns += round(PERIOD_S * 1e9)
             state = JointState(JOINTS, np.zeros(2), np.zeros(2), np.array(effort_nm))
-            self.contact.take_joints(Stamped(Header(self.now_ns, 1, "sim-1"), state, self.now_ns))
+            self.contact.update_joints(Stamped(Header(self.now_ns, 1, "sim-1"), state, self.now_ns))
 
 
 def active(**limits: Any) -> Arm:
@@ -52,7 +52,7 @@ def active(**limits: Any) -> Arm:
 def test_a_free_arm_has_all_its_speed() -> None:
     arm = active()
     arm.feels(0.5, -1.0, 0.5)
-    assert arm.contact.pressed() is None
+    assert arm.contact.overload() is None
     assert arm.contact.slowdown() is None
     assert arm.contact.quiet
 
@@ -63,7 +63,7 @@ def test_a_force_above_its_limit_is_named_with_value_and_limit(
 ) -> None:
     arm = active()
     arm.feels(*(1.3 * LIMITS.force_stop_n * np.array(direction)), s=0.2)
-    pressed = arm.contact.pressed()
+    pressed = arm.contact.overload()
     assert pressed is not None
     assert (pressed.name, pressed.limit, pressed.unit) == (
         "contact_force",
@@ -76,7 +76,7 @@ def test_a_force_above_its_limit_is_named_with_value_and_limit(
 def test_a_torque_above_its_limit_is_named_too() -> None:
     arm = active()
     arm.feels(0.0, 0.0, 0.0, torque_nm=(0.0, 2 * LIMITS.torque_stop_nm, 0.0), s=0.2)
-    pressed = arm.contact.pressed()
+    pressed = arm.contact.overload()
     assert pressed is not None
     assert pressed.name == "contact_torque"
 
@@ -91,7 +91,7 @@ def test_between_slow_and_stop_the_arm_gets_slower_the_more_it_presses() -> None
         assert slower is not None
         assert slower.name == "contact_force"
         shares.append(slower.share)
-        assert arm.contact.pressed() is None
+        assert arm.contact.overload() is None
     assert 1.0 >= shares[0] > shares[1] > shares[2] >= 0.1
 
 
@@ -99,12 +99,12 @@ def test_a_blow_that_is_over_at_once_and_noise_do_not_stop_it() -> None:
     arm = active()
     arm.says(np.array([3 * LIMITS.force_stop_n, 0, 0, 0, 0, 0]))
     assert PERIOD_S < FILTER_S / 2
-    assert arm.contact.pressed() is None
+    assert arm.contact.overload() is None
     noise = np.random.default_rng(1).normal(0.0, LIMITS.force_slow_n / 2, (1000, 6))
     noise[:, 3:] *= 0.2
     for wrench in noise:
         arm.says(wrench)
-        assert arm.contact.pressed() is None
+        assert arm.contact.overload() is None
 
 
 def test_what_was_there_when_it_was_activated_is_no_contact_up_to_slow() -> None:
@@ -117,7 +117,7 @@ def test_what_was_there_when_it_was_activated_is_no_contact_up_to_slow() -> None
     wedged = Arm()
     wedged.feels(0.0, 0.0, -3 * LIMITS.force_stop_n)
     wedged.contact.begin()
-    assert wedged.contact.pressed() is not None
+    assert wedged.contact.overload() is not None
 
 
 def test_a_load_that_is_taken_up_is_got_used_to_but_no_more_than_slow() -> None:
@@ -139,23 +139,23 @@ def test_an_arm_that_is_not_active_gets_used_to_nothing() -> None:
 
 def test_a_robot_that_tells_no_wrench_is_not_felt() -> None:
     arm = active()
-    assert arm.contact.told
+    assert arm.contact.known
     arm.says(None)
-    assert not arm.contact.told
+    assert not arm.contact.known
     assert arm.contact.force_n is None
-    assert arm.contact.pressed() is None
+    assert arm.contact.overload() is None
     assert arm.contact.slowdown() is None
 
 
 def test_efforts_count_only_where_a_limit_says_that_they_are_external() -> None:
     arm = active()
     arm.strains(80.0, -80.0)
-    assert arm.contact.pressed() is None
+    assert arm.contact.overload() is None
     told = Arm(effort_slow_nm=5.0, effort_stop_nm=12.0)
     told.strains(1.0, 1.0)
     told.contact.begin()
     told.strains(1.0, -12.5)
-    pressed = told.contact.pressed()
+    pressed = told.contact.overload()
     assert pressed is not None
     assert pressed.name == "contact_effort"
     assert pressed.value == pytest.approx(13.5, rel=0.2)

@@ -25,14 +25,14 @@ def gripper() -> GripperArbiter:
 
 def test_what_it_has_already_is_not_sent(gripper: GripperArbiter) -> None:
     assert gripper.step(0, None) is None
-    gripper.want(0.08 - 0.9 * PROFILE.dead_band_m)
+    gripper.request(0.08 - 0.9 * PROFILE.dead_band_m)
     assert gripper.step(0, None) is None
 
 
 def test_a_new_width_is_sent_once_with_the_profiles_speed_and_force(
     gripper: GripperArbiter,
 ) -> None:
-    gripper.want(0.03)
+    gripper.request(0.03)
     command = gripper.step(0, None)
     assert command is not None
     assert (command.width_m, command.speed_m_s, command.force_n) == (0.03, 0.07, 12.0)
@@ -44,7 +44,7 @@ def test_a_width_outside_is_brought_inside(
     gripper: GripperArbiter, wanted_m: float, sent_m: float
 ) -> None:
     gripper.restart(0.04)
-    gripper.want(wanted_m)
+    gripper.request(wanted_m)
     command = gripper.step(0, None)
     assert command is not None
     assert command.width_m == sent_m
@@ -53,16 +53,16 @@ def test_a_width_outside_is_brought_inside(
 def test_small_wishes_add_up_until_they_leave_the_dead_band(gripper: GripperArbiter) -> None:
     sent = []
     for k in range(1, 11):
-        gripper.want(0.08 - k * 0.0003)
+        gripper.request(0.08 - k * 0.0003)
         sent.append(gripper.step(0, None))
     assert [k for k, command in enumerate(sent, 1) if command] == [4]
 
 
 def test_while_one_is_in_flight_only_the_last_wish_is_kept(gripper: GripperArbiter) -> None:
-    gripper.want(0.0)
+    gripper.request(0.0)
     assert gripper.step(0, None) is not None
     for wish in (0.05, 0.02, 0.07):
-        gripper.want(wish)
+        gripper.request(wish)
         assert gripper.step(100 * MS, state(100 * MS, moving=True)) is None
     assert gripper.in_flight
     command = gripper.step(300 * MS, state(300 * MS, moving=False))
@@ -72,9 +72,9 @@ def test_while_one_is_in_flight_only_the_last_wish_is_kept(gripper: GripperArbit
 
 
 def test_standing_still_right_after_a_command_is_not_its_end(gripper: GripperArbiter) -> None:
-    gripper.want(0.0)
+    gripper.request(0.0)
     gripper.step(0, None)
-    gripper.want(0.08)
+    gripper.request(0.08)
     assert gripper.step(10 * MS, state(10 * MS, moving=False)) is None
     late_ns = SETTLE_NS + 1
     assert gripper.step(late_ns, state(late_ns, moving=False)) is not None
@@ -83,9 +83,9 @@ def test_standing_still_right_after_a_command_is_not_its_end(gripper: GripperArb
 def test_a_gripper_that_never_answers_gets_the_next_command_after_a_while(
     gripper: GripperArbiter,
 ) -> None:
-    gripper.want(0.0)
+    gripper.request(0.0)
     gripper.step(0, None)
-    gripper.want(0.08)
+    gripper.request(0.08)
     limit_ns = int(PROFILE.command_timeout_s * 1e9)
     assert gripper.step(limit_ns, state(limit_ns, moving=True)) is None
     assert gripper.step(limit_ns + 1, state(limit_ns, moving=True)) is not None
@@ -93,7 +93,7 @@ def test_a_gripper_that_never_answers_gets_the_next_command_after_a_while(
 
 
 def test_restart_takes_the_width_as_given(gripper: GripperArbiter) -> None:
-    gripper.want(0.0)
+    gripper.request(0.0)
     gripper.step(0, None)
     gripper.restart(0.03)
     assert not gripper.in_flight

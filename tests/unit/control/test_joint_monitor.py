@@ -34,7 +34,7 @@ class Watching:
     def at(self, joints_rad: FloatArray, ticks: int = TICKS_A_LOOK) -> LimitHit | None:
         for _ in range(ticks):
             self.now_ns += TICK_NS
-            hit = self.watch.look(joints_rad, self.commanded_rad, self.now_ns)
+            hit = self.watch.update(joints_rad, self.commanded_rad, self.now_ns)
             if hit is not None:
                 return hit
         return None

@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.chunk_planner import ChunkPlanner
-from vla_zenoh.control.commander_io import Outputs
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.pose_to_joint import PoseToJoint
 from vla_zenoh.control.reachability import make_reachability_filter
@@ -68,14 +67,13 @@ class Moved:
         )
 
     def tick(self, ticks: int = 1) -> JointCommand:
-        out = Outputs()
         self.now_ns += ticks * TICK_NS
         task = Task(0, True, "hold", "scripted", 5.0)
         overdue_ns = self.now_ns + 10**9
-        self.mover.advance(State.ACTIVE, task, overdue_ns, self.now_ns, ticks, out)
-        self.mover.command(State.ACTIVE, self.now_ns, None, out)
-        assert out.joint is not None
-        return out.joint
+        self.mover.advance(State.ACTIVE, task, overdue_ns, self.now_ns, ticks)
+        joint = self.mover.commands(State.ACTIVE, self.now_ns, None).joint
+        assert joint is not None
+        return joint
 
 
 def test_an_arm_of_which_the_elbow_alone_moves_is_activated_without_a_step() -> None:

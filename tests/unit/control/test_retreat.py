@@ -243,7 +243,7 @@ def at(x_m: float, y_m: float = 0.0) -> Pose:
 def test_a_trail_leads_back_over_the_last_places_newest_first() -> None:
     trail = CommandTrail()
     for x_m in np.arange(0, 0.05, 0.0005):
-        trail.go(at(x_m))
+        trail.add(at(x_m))
     back = [float(pose.position_m[0]) for pose in trail.back(0.01)]
     assert back == sorted(back, reverse=True)
     assert 0.009 < 0.0495 - back[-1] < 0.0125
@@ -252,15 +252,15 @@ def test_a_trail_leads_back_over_the_last_places_newest_first() -> None:
 def test_what_was_gone_there_and_back_is_left_out() -> None:
     trail = CommandTrail()
     for x_m in [*np.arange(0, 0.03, 0.001), *np.arange(0.03, 0.01, -0.001)]:
-        trail.go(at(x_m))
+        trail.add(at(x_m))
     assert max(pose.position_m[0] for pose in trail.back(0.05)) <= 0.012
 
 
 def test_an_arm_that_turned_up_elsewhere_has_no_way_from_there() -> None:
     trail = CommandTrail()
     for x_m in np.arange(0, 0.03, 0.001):
-        trail.go(at(x_m))
-    trail.go(at(0.2))
+        trail.add(at(x_m))
+    trail.add(at(0.2))
     assert trail.back(0.1) == []
 
 
@@ -268,5 +268,5 @@ def test_a_watch_says_which_state_is_missing() -> None:
     rig = Rig()
     watch = Watchdog(rig.profile)
     pose, gripper = rig.pose_state(), rig.gripper_state()
-    assert watch.unheard(pose, gripper, rig.now_ns) == ""
-    assert "pose" in watch.unheard(pose, gripper, rig.now_ns + 10**9)
+    assert watch.state_lost(pose, gripper, rig.now_ns) == ""
+    assert "pose" in watch.state_lost(pose, gripper, rig.now_ns + 10**9)
