@@ -24,8 +24,8 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import console, errors, print_json, styled
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
-from vla_zenoh.lab.doctor.access import access
-from vla_zenoh.lab.doctor.access_check import AccessVerdict, check_access, read_access, try_identity
+from vla_zenoh.lab.doctor.access import AccessVerdict, access
+from vla_zenoh.lab.doctor.access_check import check_access, read_access, try_identity
 from vla_zenoh.lab.doctor.software import robot
 from vla_zenoh.profile import Profile, SessionProfile
 
