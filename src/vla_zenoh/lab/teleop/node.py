@@ -116,7 +116,7 @@ class Teleop:
         elif client is None:
             self._lines.append("this key needs the certificate of an operator on this computer")
         elif command == STOP:
-            client.publish(client.keys.stop, "stop")
+            client.stop()
         elif command == ACTIVATE:
             active = client.task is not None and client.task.active
             client.publish(client.keys.active, "false" if active else "true")
