@@ -232,7 +232,7 @@ def test_who_has_not_the_role_is_told_and_nothing_is_heard_of_him(
     heard = Heard(lab.chain.session, Keys(GHOST))
     done = replay(lab, run_file, place, GHOST)
     assert done.returncode == 1
-    assert f"the certificate of the role {PLACES[place]}" in done.stderr
+    assert f"the certificate of this computer has the role {PLACES[place]}" in done.stderr
     assert heard.counts == {}
 
 
