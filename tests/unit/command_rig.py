@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
+from vla_zenoh.control.kinematics import Kinematics
 from vla_zenoh.control.preflight import Surroundings
 from vla_zenoh.control.reach import Shadow
 from vla_zenoh.control.so3 import exp3, log3, quat_from_rotation, rotation_from_quat
@@ -140,6 +141,11 @@ class Rig:
         """Let the arm come to where it is to go."""
         self.run(duration_s)
         assert self.commander.at_rest
+
+    def stand_at(self, kinematics: Kinematics, joints_rad: FloatArray) -> None:
+        """The measured joints, and their TCP."""
+        pose, self.joints_rad = kinematics.forward(joints_rad), joints_rad
+        self.position_m, self.quat_xyzw = pose.position_m, quat_from_rotation(pose.rotation)
 
     # -- what the others say ------------------------------------------------------------------
     def pose_state(self) -> Stamped[PoseState]:
