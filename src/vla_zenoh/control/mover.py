@@ -298,7 +298,7 @@ class Mover:
         if self._override == 0.0:
             self._stand(smoother)
             return timeline.plan.cause
-        slowed = self._slowing and _within(smoother, self._override)
+        slowed = smoother.slowed_down or (self._slowing and _within(smoother, self._override))
         # Of where the arm will be with this tick: it may be on its way from there.
         pose, hits = leash(self._limits, goal.pose, _ahead(smoother.motion, ticks * self._dt_s))
         slower = slowest(goal.slowdown, self.pressed, self._held_back)
