@@ -56,6 +56,9 @@ ASTRAY = 1e-6
 
 BESIDE = 0.01
 """Part of the limits that motion beside the way may have: a goal is a float32, and 30 nm aside."""
+ASIDE = 2e-7
+"""m and rad: a goal is on the line that the arm moves along. What direction it is in says nothing
+where the arm is about to pass it."""
 TINY, MOST = 1e-12, 1e9
 
 ROTATION_BOX = 0.55
@@ -180,7 +183,7 @@ class Smoother:
         self._target = self._state.position
         self._plan: _Plan | None = None
         self._elapsed_s = 0.0
-        self.braking = False
+        self.braking = self._slowing = False
         self.motion = Motion(
             Pose(np.array(pose.position_m, dtype=np.float64), self._anchor),
             np.zeros(6),
@@ -206,9 +209,17 @@ class Smoother:
         limits = self.box * np.array(shares._replace(jerk=self._enough_jerk(shares)))[:, None]
         way = self._target - self._state.position
         way[np.abs(way) < QUIET[0]] = 0.0
+        _, velocity, acceleration = self._state
+        slows = velocity * acceleration < 0
+        self._slowing = bool((slows & (np.abs(velocity) > limits[0])).any())
         plan, enough = self._towards(way, limits, all_to_stop)
         self._begin(plan)
         return enough
+
+    @property
+    def slowed_down(self) -> bool:
+        """It was too fast for the shares of its target, and is not any more: these hold now."""
+        return self._slowing and not (self._state.velocity * self._state.acceleration < 0).any()
 
     def brake(self, shares: Shares | None = None) -> None:
         """Come to rest as fast as the limits allow, each axis by itself.
@@ -223,7 +234,8 @@ class Smoother:
         self._anchor_here()
         limits = self.box
         if shares is not None:
-            limits = limits * np.array(shares._replace(jerk=self._enough_jerk(shares)))[:, None]
+            jerk = self._enough_jerk(shares._replace(velocity=1.0))
+            limits = limits * np.array(shares._replace(jerk=jerk))[:, None]
         self.braking = True
         self._begin(self._stop(limits, together=shares is not None))
 
@@ -312,13 +324,18 @@ class Smoother:
     ) -> tuple[FloatArray, list[float]]:
         """The same of three axes: (3, k), with `way` (3,) and `limits` (3, 3) of those."""
         motion = np.array([self._state.velocity[axes], self._state.acceleration[axes]])
-        length = norm3(way)
-        if length == 0.0:
-            return (np.eye(3), [1.0] * 3) if motion.any() else (np.zeros((3, 0)), [])
-        along = way / length
+        length, speed = norm3(way), norm3(motion[0])
+        if length == 0.0 and not motion.any():
+            return np.zeros((3, 0)), []
+        along = way / max(length, TINY)
         beside = motion - np.outer(motion @ along, along)
-        if (np.abs(beside) <= np.array(QUIET[1:])[:, None]).all():
+        if length > 0.0 and (np.abs(beside) <= np.array(QUIET[1:])[:, None]).all():
             return along[:, None], [1.0]
+        ahead = motion[0] / max(speed, TINY)
+        if speed > 0.0 and norm3(way - (way @ ahead) * ahead) < ASIDE:
+            along, beside = ahead, motion - np.outer(motion @ ahead, ahead)
+        elif length == 0.0:
+            return np.eye(3), [1.0] * 3
         least = np.eye(3)[int(np.argmin(np.abs(along)))]
         across = cross3(along, least)
         across /= norm3(across)
@@ -398,12 +415,12 @@ class Smoother:
     def _enough_jerk(self, shares: Shares) -> float:
         """At least that part of the jerk limits that an acceleration needs to end in time.
 
-        Before its axis is faster than its limit where it speeds up, before that turns round where
+        Before its axis is faster than its share where it speeds up, before that turns round where
         it slows down. With less of it the arm would go on speeding up for a while, to any speed.
         """
         _, velocity, acceleration = self._state
         speed = np.abs(velocity)
-        room = np.where(velocity * acceleration < 0, speed, self.box[0] - speed)
+        room = np.where(velocity * acceleration < 0, speed, shares.velocity * self.box[0] - speed)
         needed = acceleration**2 / (2 * np.maximum(room, REST_VELOCITY)) / self.box[2]
         return max(shares.jerk, min(float(needed.max()), 1.0))
 
