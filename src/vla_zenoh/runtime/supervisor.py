@@ -120,7 +120,7 @@ class Supervisor:
             child.start_again_s = 0.0
             self._tell(
                 child.command.name,
-                f"{said}; not restarting it. The other nodes keep running. See its last lines above",
+                f"{said}; not restarting it. The other nodes keep running; see its output above",
             )
         return True
 
