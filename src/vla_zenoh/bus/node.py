@@ -320,6 +320,7 @@ class Node:
         kind: type[Record],
         arrival: ReceivedSample,
         writer_filter: SingleWriterFilter | None = None,
+        header: Header | None = None,
     ) -> Stamped[Record] | None:
         """Decode a stream sample; a refusal is counted and told, and None is returned.
 
@@ -329,10 +330,11 @@ class Node:
             kind: the record.
             arrival: the sample.
             speaker: of its key: only he is heard, and each of his records once.
+            header: of the sample, if it is decoded already.
         """
         sample = arrival.sample
         try:
-            header = self.header(arrival)
+            header = header or self.header(arrival)
             if writer_filter is not None:  # before the payload: who shouts nonsense costs least
                 writer_filter.check(header, arrival.mono_ns)
             record = records.decode(kind, bytes_of(sample.payload))
