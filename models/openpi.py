@@ -4,7 +4,7 @@
 # ///
 """Asks a policy server that speaks openpi's wire.
 
-vllm-omni does so too, and ``vla-zenoh serve openpi``.
+vllm-omni does so too, and ``vla-zenoh lab serve-openpi``.
 """
 
 from __future__ import annotations

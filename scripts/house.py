@@ -198,7 +198,8 @@ def trace(src: Path) -> list[str]:
 
         programs = []
         for program in PROGRAMS:
-            words = [program, *(["look"] if program == "worker" else []), "--profile", str(profile)]
+            word = ["worker", "look"] if program == "worker" else ["node", program]
+            words = [*word, "--profile", str(profile)]
             whole = [sys.executable, __file__, "--as", str(folder / f"{program}.json"), *words]
             programs.append(subprocess.Popen(whole, env=environment, cwd=folder))
         try:

@@ -107,7 +107,7 @@ class Chain:
         self._up.callback(self._node.close)
         camera = self.profile.cameras[CAMERA]
         self._outlet = CameraPublisher(CAMERA, camera, "benchmark", self._node, self._node.emit)
-        self._outlet.change(OK)
+        self._outlet.set_state(OK)
         keys = self._node.keys
         self._chunks = self._node.subscribe(keys.delta(WORKER), LatestSample())
         self._poses = self._node.subscribe(keys.command_pose, CallbackRing(4096))
@@ -148,8 +148,8 @@ class Chain:
     def _publish(self, rgb: NDArray[np.uint8]) -> tuple[int, int]:
         """Returns when, on the monotonic and on the wall clock."""
         mono_ns, wall_ns = time.monotonic_ns(), self._node.clock.wall_ns()
-        self._outlet.seen(mono_ns)
-        self._outlet.put_rgb(rgb, mono_ns, wall_ns)
+        self._outlet.captured(mono_ns)
+        self._outlet.publish_rgb(rgb, mono_ns, wall_ns)
         return mono_ns, wall_ns
 
     def request(self, rgb: NDArray[np.uint8]) -> Answer:

@@ -132,7 +132,8 @@ class Host:
 
     def kill(self, node: str) -> float:
         """Kill a node of this kind without its notice; when, on the monotonic clock."""
-        found = [pid for pid in self.pids() if _arguments(pid)[1:4] == ["-m", "vla_zenoh", node]]
+        commands = {pid: _arguments(pid)[1:5] for pid in self.pids()}
+        found = [p for p, c in commands.items() if c[:2] == ["-m", "vla_zenoh"] and node in c[2:]]
         assert found, f"no {node} runs on {self.name}"
         killed_s = time.monotonic()
         for pid in found:

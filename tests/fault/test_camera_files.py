@@ -54,7 +54,7 @@ def test_a_folder_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
         assert rig.camera("front")["state"] == "waiting"
         assert rig.camera("front")["age_s"] is None
         folder.mkdir()
-        until("another reason", lambda: "no picture in the folder" in rig.camera("front")["why"])
+        until("another reason", lambda: "no image in the folder" in rig.camera("front")["why"])
         (folder / "late.png").write_bytes(cv2.imencode(".png", grey(50))[1].tobytes())
         rig.wait_for("front", "ok")
         assert rig.happened("front:waiting->ok")

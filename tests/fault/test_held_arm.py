@@ -88,4 +88,4 @@ def test_a_stop_by_somebody_else_ends_it_with_the_reason(ready: Chain) -> None:
         ready.client.publish(ready.client.keys.stop, "stop")
         said, _ = process.communicate(timeout=ENDS_S)
         assert process.returncode == 1
-        assert "the arm obeys no more: emergency stop" in said
+        assert "the arm is no longer active: emergency stop" in said

@@ -21,10 +21,9 @@ import numpy as np
 import typer
 
 from vla_zenoh.bus.clock_sync import decode_stamps
-from vla_zenoh.cli import decode as cli_decode
+from vla_zenoh.cli import inspect as cli_inspect
 from vla_zenoh.cli import keys as cli_keys
 from vla_zenoh.cli import net as cli_net
-from vla_zenoh.cli import seen as cli_seen
 from vla_zenoh.cli import status as cli_status
 from vla_zenoh.cli.options import model_options, number_list
 from vla_zenoh.cli.output import Screen, plain_types
@@ -112,7 +111,7 @@ def _in_file(suffix: str, read: Callable[[Path], Any], data: bytes) -> Any:
 def _cli(data: bytes) -> None:
     """What ``echo`` and ``keys`` do with anybody's payload, for people and for programs."""
     words, _, payload = data.partition(b"\n")
-    found = cli_decode.read(payload, _text(words))
+    found = cli_keys.decode(payload, _text(words))
     json.dumps(found)
     json.dumps(plain_types(found))
     _display(str(found))
@@ -135,21 +134,21 @@ def _told(data: bytes) -> None:
     other = replace(found, host="elsewhere")
     nodes = {"command": found, "a\x1b[2J[/b]": other}
     heard = {name: (status, 0.1, True) for name, status in nodes.items()}
-    assert _display(cli_status.picture("panda", heard, [])) < MAX_SHOWN
+    assert _display(cli_status.render("panda", heard, [])) < MAX_SHOWN
     pairs, lines = cli_net.pairs_of(nodes, []), cli_net.lines_of(nodes)
     _display(*cli_net.tables("panda", pairs, lines, 100.0))
-    _display(cli_keys.table(cli_keys.pictures_of(Keys("panda"), heard)))
+    _display(cli_keys.table(cli_keys.image_keys(Keys("panda"), heard)))
 
 
 def _event_told(data: bytes) -> None:
     event = records.decode(Event, data)
     happened = [("a\x1b[2J", Header(1, 2, "sim#1"), event)] * 9
-    assert _display(cli_status.picture("panda", {}, happened)) < MAX_SHOWN
+    assert _display(cli_status.render("panda", {}, happened)) < MAX_SHOWN
 
 
 def _sight(data: bytes) -> None:
     sight = InferenceView(records.decode(InferenceDebug, data), {"front": data})
-    assert _display(cli_seen.table({"w": sight})) < MAX_SHOWN
+    assert _display(cli_inspect.table({"w": sight})) < MAX_SHOWN
 
 
 def _options(data: bytes) -> None:

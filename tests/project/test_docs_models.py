@@ -36,7 +36,6 @@ from vla_zenoh.policy import (
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.policy.state_vector import COORDINATES, PARTS, read_parts
 from vla_zenoh.profile import load_profile
-from vla_zenoh.profile.profile import workers_of
 from vla_zenoh.simulation.world import build_world
 
 ROOT = Path(__file__).parents[2]
@@ -135,8 +134,8 @@ def test_its_profiles_are_right_and_each_host_knows_what_it_runs(tmp_path: Path)
     left, right = profiles["left.yaml"], profiles["right.yaml"]
     assert left.serves == right.serves
     assert left.session.connect == left.session.listen
-    assert workers_of(right, right.hosts["gpu"]) == ("mine",)
-    assert workers_of(left, left.hosts["gpu"]) == ("mine", "scripted")
+    assert right.workers_of(right.hosts["gpu"]) == ("mine",)
+    assert left.workers_of(left.hosts["gpu"]) == ("mine", "scripted")
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.ros2 import ros2_app
+from vla_zenoh.cli.profile import profile_app
 from vla_zenoh.cli.secure import secure_app
 
 TEXT = (Path(__file__).parents[2] / "docs" / "how-to" / "ros2.md").read_text("utf-8")
@@ -27,9 +27,9 @@ def bridge_file(folder: Path, plain: str, *more: str) -> str:
     done = RUNNER.invoke(secure_app, [*init, "--folder", str(folder / "certificates")])
     assert done.exit_code == 0, done.output
     words = ["bridge-config", "--profile", "./lab_secure.yaml", *more]
-    done = RUNNER.invoke(ros2_app, words)
+    done = RUNNER.invoke(profile_app, words)
     assert done.exit_code == 0, done.output
-    assert f"  vla-zenoh {' '.join(['ros2', *words])} > bridge.json5" in TEXT
+    assert f"  vla-zenoh {' '.join(['profile', *words])} > bridge.json5" in TEXT
     assert "ROS_DISTRO=jazzy zenoh-bridge-ros2dds -c bridge.json5" in done.stderr
     return done.stdout
 

@@ -216,8 +216,5 @@ def test_the_command_line_knows_every_command_without_any_optional_library() -> 
 def test_a_command_that_is_not_called_is_not_imported() -> None:
     """Every node and every word of a person waits for the import of the command line."""
     loaded = loaded_after("vla_zenoh.cli.main")
-    assert {name for name in loaded if name.startswith("vla_zenoh.cli.")} == {
-        "vla_zenoh.cli.lazy_group",
-        "vla_zenoh.cli.main",
-    }
+    assert {name for name in loaded if name.startswith("vla_zenoh.cli.")} == {"vla_zenoh.cli.main"}
     assert loaded.isdisjoint({"numpy", "pydantic", "vla_zenoh.nodes"})

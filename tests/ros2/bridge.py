@@ -29,7 +29,7 @@ def load_script() -> ModuleType:
 
 
 def generated(profile_file: Path, *, beside: bool = False, all_names: bool = False) -> str:
-    """The bridge's settings as ``vla-zenoh ros2 bridge-config`` gives them.
+    """The bridge's settings as ``vla-zenoh profile bridge-config`` gives them.
 
     Args:
         profile_file: of a profile whose bridge is reached without certificates.

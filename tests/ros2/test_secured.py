@@ -128,7 +128,7 @@ def running(folder: Path, program: Path, protocol: str) -> Iterator[SecuredLab]:
         (folder / "by_tls.yaml").write_text(BY_TLS.format(theirs=theirs))
         lab = "by_tls"
         command(folder, "secure", "add", "robot", "--renew", "--profile", f"./{lab}.yaml")
-    settings = command(folder, "ros2", "bridge-config", "--profile", f"./{lab}.yaml")
+    settings = command(folder, "profile", "bridge-config", "--profile", f"./{lab}.yaml")
     certificates = {}
     for host in ("robot", "gpu"):
         own = certificates[host] = folder / f"of_{host}"

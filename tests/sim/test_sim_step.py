@@ -33,7 +33,7 @@ STILL_TWIST = 0.005
 def lockstep_sim(folder: Path) -> Iterator[tuple[zenoh.Session, Profile]]:
     path = write_profile(folder)
     profile = load_profile(str(path))
-    words = [sys.executable, "-m", "vla_zenoh", "sim", "--lockstep", "--profile", str(path)]
+    words = [sys.executable, "-m", "vla_zenoh", "node", "sim", "--lockstep", "--profile", str(path)]
     with open_session(profile.session, mode="router"), open_session(profile.session) as session:
         process = subprocess.Popen(words)
         try:

@@ -80,7 +80,7 @@ def shared_chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
 LIES = {
     "frozen": (
         lambda: [noisy(scene())],
-        r"camera 'front' shows the same picture since \d+\.\d s, less than 0\.6 s is allowed "
+        r"camera 'front' shows the same image for \d+\.\d s, less than 0\.6 s is allowed "
         r"\(cameras\.front\.check\.same_s\)",
         "same_s",
     ),

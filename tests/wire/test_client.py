@@ -99,7 +99,7 @@ def test_nobody_shows_what_another_worker_saw_nor_names_a_folder_elsewhere(
                 )
                 there.put(key, records.encode(record), attachment=who)
                 there.put(f"{key}/..", b"", attachment=who)
-            seen.extend(sight.record.worker for sight in listener.take())
+            seen.extend(sight.record.worker for sight in listener.poll())
             return len(seen) > MAX_SEEN
 
         until("some are shown", shown)
@@ -123,6 +123,6 @@ def test_what_is_no_picture_does_not_wait_for_who_looks(profile: Profile) -> Non
         for number in range(MAX_SAMPLES + 1):
             there.put(f"{key}{number}", b"jpeg", attachment=who, congestion_control=SURELY)
         until("the oldest made room", lambda: listener.left_out["late"] == 1)
-        assert listener.take() == []
+        assert listener.poll() == []
         assert listener.left_out["cameras"] == MAX_SAMPLES - MAX_CAMERAS
         listener.close()

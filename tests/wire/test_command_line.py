@@ -108,7 +108,7 @@ def test_echo_decodes_what_is_written(chain: Chain) -> None:
 def test_echo_of_a_silent_key_fails(chain: Chain) -> None:
     done = run(chain, "echo", "no/such/key", "--seconds", "0.3")
     assert done.returncode == REFUSED
-    assert "nothing was written on vla/panda/no/such/key" in done.stderr
+    assert "nothing was published on vla/panda/no/such/key" in done.stderr
 
 
 def test_without_a_router_a_command_says_where_it_looked_and_what_to_do(chain: Chain) -> None:

@@ -137,8 +137,8 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
 
 @contextmanager
 def simulator(profile: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """``vla-zenoh sim`` in a process of its own."""
-    words = [sys.executable, "-m", "vla_zenoh", "sim", "--profile", str(profile)]
+    """``vla-zenoh node sim`` in a process of its own."""
+    words = [sys.executable, "-m", "vla_zenoh", "node", "sim", "--profile", str(profile)]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
     try:
         yield process

@@ -185,12 +185,12 @@ def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer(
         def comes(stream: Publisher) -> bool:
             """Whether a picture that is put there is what is taken next."""
             stream.publish(jpeg, encoding=zenoh.Encoding.IMAGE_JPEG)
-            heard = ears.take()
+            heard = ears.pop()
             if heard is None:
                 return False
             header = worker.header(heard.arrival)
-            heard.speaker.check(header, heard.arrival.mono_ns)
-            heard.speaker.heard(header, heard.arrival.mono_ns)
+            heard.writer.check(header, heard.arrival.mono_ns)
+            heard.writer.heard(header, heard.arrival.mono_ns)
             return str(heard.arrival.sample.key_expr) == stream.key
 
         until("a reader", lambda: own.has_subscribers)
@@ -225,11 +225,11 @@ def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all(
         wanted = CameraSpec(camera="front", width=32, height=32, resize="pad")
         changed = threading.Condition()
         ears = subscribe_to_camera(wanted, worker, jpeg=True, host=host, changed=changed)
-        until("its own", lambda: outs[own].wanted)
-        assert not any(out.wanted for size, out in outs.items() if size != own)
+        until("its own", lambda: outs[own].has_subscribers)
+        assert not any(out.has_subscribers for size, out in outs.items() if size != own)
 
         def takes_plain() -> bool:
-            assert ears.take() is None
+            assert ears.pop() is None
             return for_all.has_subscribers
 
         until("plain ones", takes_plain)

@@ -53,7 +53,7 @@ def test_whoever_opens_links_keeps_his_own_priority() -> None:
 
 def test_the_links_of_a_router_go_before_other_programs() -> None:
     endpoint = free_endpoint()
-    words = [sys.executable, "-m", "vla_zenoh", "router", "--listen", endpoint]
+    words = [sys.executable, "-m", "vla_zenoh", "node", "router", "--listen", endpoint]
     with subprocess.Popen(words, stdout=subprocess.DEVNULL) as router:
         try:
             open_session(SessionProfile(connect=(endpoint,)), wait_s=20.0).close()

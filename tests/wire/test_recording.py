@@ -148,7 +148,7 @@ def test_a_replayed_run_evaluates_as_the_original(
     ghost, again = ghost_of(chain), tmp_path / "again.mcap"
     with recording(chain, again, ghost):
         done = command_line(
-            "replay", str(run_file), "--as", "ghost", "--json", profile=chain.profile_file
+            "replay", str(run_file), "--robot", "ghost", "--json", profile=chain.profile_file
         )
         assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
@@ -172,7 +172,7 @@ def test_a_worker_infers_on_a_replayed_run(run_file: Path, chain: Chain, tmp_pat
         lambda s: statuses.append(records.decode(NodeStatus, s.payload.to_bytes())),
     )
     only = [word for part in ("cameras", "state", "task") for word in ("--only", part)]
-    words = ("replay", str(run_file), "--as", "ghost", "--loop", *only)
+    words = ("replay", str(run_file), "--robot", "ghost", "--loop", *only)
     with process("worker", "scripted", profile=profile), process(*words, profile=profile):
         until(
             "the worker infers",

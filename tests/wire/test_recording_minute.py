@@ -47,7 +47,7 @@ def test_a_minute_of_two_cameras_is_recorded_whole_and_replayed(tmp_path: Path) 
         thread.join()
         with recording(chain, again, ghost_of(chain)):
             done = command_line(
-                *("replay", str(first), "--as", "ghost", "--json"),
+                *("replay", str(first), "--robot", "ghost", "--json"),
                 profile=lab,
                 timeout_s=2 * LAB_S,
             )

@@ -1,4 +1,4 @@
-"""``vla-zenoh router``: ours, or the program zenohd with the same configuration."""
+"""``vla-zenoh node router``: ours, or the program zenohd with the same configuration."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_zenohd_gets_the_configuration_that_our_own_router_has(tmp_path: Path) -
     (programs / "zenohd").write_text(STAND_IN)
     (programs / "zenohd").chmod(0o755)
     given = subprocess.run(
-        [sys.executable, "-m", "vla_zenoh", "router", "--profile", str(file)],
+        [sys.executable, "-m", "vla_zenoh", "node", "router", "--profile", str(file)],
         capture_output=True,
         text=True,
         timeout=LIMIT_S,
@@ -83,7 +83,7 @@ def test_zenohd_gets_the_configuration_that_our_own_router_has(tmp_path: Path) -
 def test_a_real_zenohd_lets_each_do_its_part_and_no_more(tmp_path: Path) -> None:
     file = secured(tmp_path, "  router: zenohd\n")
     profile = load_profile(str(file))
-    words = [sys.executable, "-m", "vla_zenoh", "router", "--profile", str(file)]
+    words = [sys.executable, "-m", "vla_zenoh", "node", "router", "--profile", str(file)]
     program = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     keys, heard = profile.keys, CallbackRing(16)
     try:
@@ -148,4 +148,4 @@ def test_status_says_in_red_that_strangers_may_command(
         stop.set()
         thread.join(LIMIT_S)
     red = [line for line in shown.output.splitlines() if "\x1b[1;31m" in line]
-    assert any("insecure: everybody on the network can command" in line for line in red), shown
+    assert any("insecure: anyone on the network can command" in line for line in red), shown

@@ -192,7 +192,7 @@ def test_a_viewer_has_no_hands(lab: Lab) -> None:
 
 
 def replay(lab: Lab, file: Path, place: str, robot: str) -> subprocess.CompletedProcess[str]:
-    words = ("replay", str(file), "--as", robot, "--speed", "4", "--json")
+    words = ("replay", str(file), "--robot", robot, "--speed", "4", "--json")
     return command_line(*words, profile=lab.profile(place), timeout_s=READY_PATIENCE_S)
 
 

@@ -170,7 +170,7 @@ def test_a_computer_of_viewers_stops_with_the_certificate_of_an_operator_that_li
     assert done.exit_code == 1
     assert lab.stopped() == ["panda"]
     found = re.search(
-        r"certificate of people here is viewer@gpu, .* `(vla-zenoh reset [^`]*)`",
+        r"certificate of this computer is viewer@gpu, .* `(vla-zenoh reset [^`]*)`",
         str(done.exception),
     )
     assert found is not None, str(done.exception)
@@ -197,7 +197,7 @@ def test_who_may_only_look_is_told_that_nothing_was_stopped(lab: Lab) -> None:
         done = lab.at("stop")
     assert done.exit_code == 1
     assert lab.stopped() == []
-    assert "the certificate of people here is viewer@gpu" in done.stderr
+    assert "the certificate of this computer is viewer@gpu" in done.stderr
     assert "`vla-zenoh secure add HOST --role operator` makes one" in done.stderr
 
 

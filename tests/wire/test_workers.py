@@ -203,7 +203,7 @@ def test_what_a_model_sees_is_shown_with_its_prompt_raw_output_and_steps(
         sights: list[InferenceView] = []
 
         def shown() -> bool:
-            sights.extend(listener.take())
+            sights.extend(listener.poll())
             return len([sight for sight in sights if sight.jpegs]) >= 3
 
         chain.until("it is shown", shown)
@@ -220,7 +220,8 @@ def test_what_a_model_sees_is_shown_with_its_prompt_raw_output_and_steps(
 
         out = tmp_path / "out"
         said = command_line(
-            *("seen", "--count", "2", "--json", "--out", str(out)), profile=chain.profile_file
+            *("lab", "inspect", "--count", "2", "--json", "--out", str(out)),
+            profile=chain.profile_file,
         )
         assert said.returncode == 0, said.stderr
         lines = [json.loads(line) for line in said.stdout.splitlines()]
@@ -238,8 +239,8 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
         infers = "the riser infers"
         chain.until(infers, lambda: chain.state("worker-riser") == "inferring", READY_PATIENCE_S)
         chain.move()
-        words = ("compare", "scripted", "riser", "--seconds", "2", "--tolerance", "0.2", "--json")
-        said = command_line(*words, profile=chain.profile_file)
+        words = ("lab", "compare", "scripted", "riser", "--seconds", "2", "--tolerance", "0.2")
+        said = command_line(*words, "--json", profile=chain.profile_file)
         assert said.returncode == 0, said.stderr
         found = json.loads(said.stdout)
         assert found["pairs"] >= 5
@@ -254,20 +255,20 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
         keys = {json.loads(line)["key"].rsplit("/", 1)[-1] for line in said.stdout.splitlines()}
         assert keys == {"scripted", "riser"}
         shown = command_line("status", "--once", profile=chain.profile_file).stdout
-        assert "obeyed" in shown
-        assert "in the shadow" in shown
+        assert "moves the arm" in shown
+        assert "shadow mode" in shown
 
 
 @pytest.mark.slow
 def test_a_worker_that_is_not_there_cannot_be_compared(chain: Chain) -> None:
-    said = command_line("compare", "scripted", "ghost", profile=chain.profile_file)
+    said = command_line("lab", "compare", "scripted", "ghost", profile=chain.profile_file)
     assert said.returncode == 1
     assert "worker 'ghost' publishes no spec; is it alive?" in said.stderr
 
 
 @pytest.mark.slow
 def test_who_shows_nothing_is_named(chain: Chain) -> None:
-    said = command_line("seen", "ghost", "--json", profile=chain.profile_file)
+    said = command_line("lab", "inspect", "ghost", "--json", profile=chain.profile_file)
     assert said.returncode == 1
-    assert "ghost of robot panda" in said.stderr
-    assert "shows nothing; does it infer?" in said.stderr
+    assert "no inference of ghost of robot panda" in said.stderr
+    assert "does it run?" in said.stderr

@@ -77,7 +77,7 @@ def _install(node: str, path: str) -> None:
     Publisher.publish = put_and_keep
 
 
-_node = sys.orig_argv[3] if sys.orig_argv[1:3] == ["-m", "vla_zenoh"] else ""
+_node = sys.orig_argv[4] if sys.orig_argv[1:4] == ["-m", "vla_zenoh", "node"] else ""
 _folder = os.environ.get("FLIGHT_FOLDER")
 if _folder and _node in RECORDED:
     _install(_node, os.path.join(_folder, f"{_node}.flight"))

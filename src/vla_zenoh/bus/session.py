@@ -190,9 +190,9 @@ def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
         return SessionError(
             f"no Zenoh router answers at {where}, or it refuses the certificate "
             f"{tls['connect_certificate']}. `vla-zenoh secure show` says whether that is good; "
-            "start a router with `vla-zenoh router` or `vla-zenoh up`"
+            "start a router with `vla-zenoh node router` or `vla-zenoh up`"
         )
     return SessionError(
-        f"no Zenoh router answers at {where}. Start one with `vla-zenoh router`, or everything "
-        "with `vla-zenoh up`; another address is given with --connect or session.connect"
+        f"no Zenoh router answers at {where}. Start one with `vla-zenoh node router`, or all "
+        "nodes with `vla-zenoh up`; another address is given with --connect or session.connect"
     )

@@ -1,1 +1,1 @@
-"""The command line, one file a command."""
+"""The command line of vla-zenoh. ``main.py`` lists all commands and where each is."""

@@ -1,41 +1,43 @@
-"""vla-zenoh keys."""
+"""vla-zenoh keys, echo: which keys there are, and what is published on one."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import threading
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 import zenoh
+from rich.pretty import pretty_repr
 from rich.table import Table
 
+from vla_zenoh.bus.buffers import CallbackRing, bytes_of, header_of
 from vla_zenoh.bus.client import Client
-from vla_zenoh.cli import decode
-from vla_zenoh.cli.options import (
-    DEFAULT_PROFILE,
-    ConnectOption,
-    HostOption,
-    JsonOption,
-    ProfileOption,
-    RobotOption,
-)
-from vla_zenoh.cli.output import console, fail, print_json
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.cli.options import JsonOption, options
+from vla_zenoh.cli.output import console, fail, print_json, styled
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.errors import ProfileError
+from vla_zenoh.codec import message
+from vla_zenoh.codec.image import MAX_IMAGE_BYTES
+from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.keys import Keys
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import NodeStatus
 
-MAX_NUMBER = 40
+MAX_NUMBER, MAX_TEXT = 40, 400
+"""Characters."""
+POLL_S = 0.02
 SETTINGS = ("prompt", "active", "worker", "rate", "speed")
 
 
 @dataclass(slots=True)
 class KeyTraffic:
-    """A key and what is written on it."""
+    """A key and what is published on it."""
 
     key: str
     type: str
@@ -46,31 +48,28 @@ class KeyTraffic:
     bytes_s: float = 0.0
 
 
+@options
 def keys(
-    profile: ProfileOption = DEFAULT_PROFILE,
-    connect: ConnectOption = None,
-    host: HostOption = None,
-    robot: RobotOption = None,
+    target: RobotTarget,
     seconds: Annotated[float, typer.Option("--seconds", "-s", help="How long to listen.")] = 2.0,
-    pictures: Annotated[
+    images: Annotated[
         bool,
         typer.Option(
-            "--pictures", help="Listen to pictures too; else their rates are the cameras' word."
+            "--images", help="Subscribe to images too; default: take their rates from the cameras."
         ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show which keys exist, who writes them, their type and rate."""
-    aim = RobotTarget(profile, connect, host, robot)
-    with aim.client() as client:
-        found = _listen(client, seconds, pictures)
+    """Show which keys exist, who publishes them, their type and rate."""
+    with target.client() as client:
+        found = _listen(client, seconds, images)
         found += _settings(client)
-        if not pictures:
-            found += pictures_of(client.keys, client.snapshot())
-        why = "" if found else aim.silent(client, "keys")
-    found.sort(key=lambda seen: seen.key)
+        if not images:
+            found += image_keys(client.keys, client.snapshot())
+        why = "" if found else target.no_node(client, "keys")
+    found.sort(key=lambda traffic: traffic.key)
     if as_json:
-        print_json([asdict(seen) for seen in found])
+        print_json([asdict(traffic) for traffic in found])
     else:
         console().print(table(found))
     if why:
@@ -78,55 +77,56 @@ def keys(
 
 
 def table(found: Iterable[KeyTraffic]) -> Table:
-    """What a person sees."""
+    """A table of keys."""
     out = Table(header_style="bold")
     for column in ("key", "type", "writer", "rate", "bytes/s"):
         out.add_column(column, overflow="fold")
-    for seen in found:
+    for traffic in found:
         out.add_row(
-            one_line(seen.key),
-            one_line(seen.type),
-            one_line(seen.writer),
-            one_line(f"{seen.rate_hz:.1f} Hz" if seen.rate_hz else "", MAX_NUMBER),
-            f"{seen.bytes_s:,.0f}" if seen.bytes_s else "",
+            one_line(traffic.key),
+            one_line(traffic.type),
+            one_line(traffic.writer),
+            one_line(f"{traffic.rate_hz:.1f} Hz" if traffic.rate_hz else "", MAX_NUMBER),
+            f"{traffic.bytes_s:,.0f}" if traffic.bytes_s else "",
         )
     return out
 
 
-def _listen(robot: Client, seconds: float, pictures: bool) -> list[KeyTraffic]:
-    seen: dict[str, KeyTraffic] = {}
+def _listen(robot: Client, seconds: float, images: bool) -> list[KeyTraffic]:
+    found: dict[str, KeyTraffic] = {}
     lock = threading.Lock()
 
-    def take(sample: zenoh.Sample) -> None:
+    def count(sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         with lock:
-            entry = seen.get(key)
-            if entry is None:
-                header = decode.head(sample)
-                entry = seen[key] = KeyTraffic(
-                    key, decode.encoding_of(sample), header["source"] if header else "?"
+            traffic = found.get(key)
+            if traffic is None:
+                header = header_fields(sample)
+                traffic = found[key] = KeyTraffic(
+                    key, str(sample.encoding), header["source"] if header else "?"
                 )
-            entry.count += 1
-            entry.bytes += len(sample.payload)
+            traffic.count += 1
+            traffic.bytes += len(sample.payload)
 
-    listening = [
-        robot.session.declare_subscriber(key, zenoh.handlers.Callback(take, indirect=False))
-        for key in _expressions(robot, pictures)
+    subscribers = [
+        robot.session.declare_subscriber(key, zenoh.handlers.Callback(count, indirect=False))
+        for key in _expressions(robot, images)
     ]
     began = time.monotonic()
     time.sleep(seconds)
     took = time.monotonic() - began
-    for subscriber in listening:
+    for subscriber in subscribers:
         subscriber.undeclare()
-    for entry in seen.values():
-        entry.rate_hz, entry.bytes_s = round(entry.count / took, 2), round(entry.bytes / took)
-    return list(seen.values())
+    for traffic in found.values():
+        traffic.rate_hz = round(traffic.count / took, 2)
+        traffic.bytes_s = round(traffic.bytes / took)
+    return list(found.values())
 
 
-def _expressions(robot: Client, pictures: bool) -> Iterable[str]:
-    if pictures:
+def _expressions(robot: Client, images: bool) -> Iterable[str]:
+    if images:
         return [robot.keys.all_keys]
-    # One expression a group, without the pictures: listening makes cameras encode and send.
+    # One expression per group, without images: a subscription makes cameras encode and send.
     below = robot.keys.all_keys.removesuffix("**")
     groups = ("state/*", "command/*", "delta/*", "spec/*", "status/*", "event/*", "sim/*", "task")
     return [below + group for group in groups]
@@ -138,13 +138,13 @@ def _settings(robot: Client) -> list[KeyTraffic]:
         key = getattr(robot.keys, name)
         for reply in robot.session.get(key, timeout=1.0):
             if reply.ok is not None:
-                value = decode.text(reply.ok.payload)
+                value = bytes_of(reply.ok.payload)[:MAX_TEXT].decode("utf-8", "replace")
                 out.append(KeyTraffic(key, f"text, now {value!r}", "anyone; kept by command"))
     return out
 
 
-def pictures_of(of: Keys, nodes: Mapping[str, tuple[NodeStatus, float, bool]]) -> list[KeyTraffic]:
-    """Keys of pictures, by the word of the nodes that make them."""
+def image_keys(of: Keys, nodes: Mapping[str, tuple[NodeStatus, float, bool]]) -> list[KeyTraffic]:
+    """Keys of images, as the status of the nodes that publish them reports them."""
     out: list[KeyTraffic] = []
     for name, (found, _, _) in nodes.items():
         cameras = found.detail.get("cameras")
@@ -152,8 +152,106 @@ def pictures_of(of: Keys, nodes: Mapping[str, tuple[NodeStatus, float, bool]]) -
             rate_hz = round(float(found.rates_hz.get(camera, 0.0)), 2)
             try:
                 raw, jpeg = of.camera_raw(camera), of.camera_jpeg(camera)
-            except ProfileError:  # no camera of ours: anybody can write a status
+            except ProfileError:  # not a camera's name: anyone can publish a status
                 continue
             out.append(KeyTraffic(raw, "pixels, on demand", name, rate_hz=rate_hz))
             out.append(KeyTraffic(jpeg, "image/jpeg, on demand", name))
     return out
+
+
+@options
+def echo(
+    key: Annotated[
+        str,
+        typer.Argument(help="Below <root>/<robot>/, such as state/pose or 'event/*'; or whole."),
+    ],
+    target: RobotTarget,
+    count: Annotated[
+        int | None, typer.Option("--count", "-n", help="End after this many samples.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", "-s", help="End after this time.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Print what is published on a key, decoded."""
+    profile = target.load()
+    below = f"{profile.root}/{profile.robot.name}"
+    whole = key if key.startswith(f"{profile.root}/") else f"{below}/{key}"
+    inbox, printed = CallbackRing(256, MAX_IMAGE_BYTES), 0
+    with open_session(profile.session) as session:
+        try:
+            subscriber = session.declare_subscriber(
+                whole, zenoh.handlers.Callback(inbox, indirect=False)
+            )
+        except zenoh.ZError as error:
+            fail(f"{whole!r} is not a key expression: {error}", 2)
+        end = time.monotonic() + seconds if seconds is not None else None
+        while (count is None or printed < count) and (end is None or time.monotonic() < end):
+            for arrival in inbox.drain():
+                _print_sample(arrival.sample, as_json)
+                printed += 1
+                if count is not None and printed >= count:
+                    break
+            time.sleep(POLL_S)
+        subscriber.undeclare()
+    if not printed:
+        fail(f"nothing was published on {whole}")
+
+
+def _print_sample(sample: zenoh.Sample, as_json: bool) -> None:
+    header, value = header_fields(sample), _content(sample)
+    if as_json:
+        line = {"key": str(sample.key_expr), "header": header, "value": value}
+        print(json.dumps(line), flush=True)
+        return
+    stamp = f" seq {header['seq']} by {header['source']}" if header else ""
+    out = console()
+    out.print(styled(sample.key_expr, "bold cyan"), styled(stamp, "dim"), sep="")
+    out.print(value if isinstance(value, str) else pretty_repr(value, max_width=out.width))
+
+
+def header_fields(sample: zenoh.Sample) -> dict[str, Any] | None:
+    """The header of a sample; None where there is none that can be decoded."""
+    try:
+        return dataclasses.asdict(header_of(sample))
+    except CodecError:
+        return None
+
+
+def _content(sample: zenoh.Sample) -> Any:
+    encoding = str(sample.encoding)
+    try:
+        return decode(bytes_of(sample.payload, message.MAX_PAYLOAD_BYTES), encoding)
+    except CodecError as error:
+        return f"<{encoding}: {error}>"
+
+
+def decode(payload: bytes, encoding: str) -> Any:
+    """Decode a payload as its encoding says, else as text; of images and other bytes the size."""
+    if encoding.startswith("application/msgpack"):
+        try:
+            return _json_types(message.unpack(payload))
+        except CodecError as error:
+            return f"<{error}>"
+    if "rgb8" in encoding or encoding.startswith("image/"):
+        return f"<{encoding}, {len(payload)} bytes>"
+    try:
+        return payload[:MAX_TEXT].decode("utf-8")
+    except UnicodeDecodeError:
+        return f"<{len(payload)} bytes>"
+
+
+def _json_types(value: Any) -> Any:
+    """Arrays as lists, bytes as their number, so that JSON can carry it."""
+    if isinstance(value, np.ndarray):
+        return [round(float(v), 6) for v in value] if value.ndim == 1 else value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, dict):
+        return {str(key): _json_types(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_json_types(item) for item in value]
+    if isinstance(value, bytes):
+        return f"<{len(value)} bytes>"
+    return value

@@ -1,15 +1,17 @@
-"""``vla-zenoh``: puts the commands together. One file a command, imported when it is called."""
+"""``vla-zenoh``: the table of all commands, each imported only when it is called."""
 
 from __future__ import annotations
 
 import sys
-from typing import NoReturn
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import Any, NamedTuple, NoReturn
 
 import typer
 import zenoh
+from typer.core import TyperGroup
 
 from vla_zenoh import __version__
-from vla_zenoh.cli.lazy_group import Part, commands_of
 from vla_zenoh.errors import VlaZenohError, how_to_install
 
 EXTRA_OF = {
@@ -24,53 +26,143 @@ EXTRA_OF = {
     "rosbags": "record",
     "rerun": "view",
 }
-"""Modules of the extras, for whoever starts a node whose extra is not installed."""
-NODES = frozenset({"up", "router", "sim", "ros2", "arm", "camera", "worker", "command"})
-"""Commands whose output is a log: that of Zenoh belongs to it."""
-RUN, DRIVE, LOOK = "Run", "Drive the robot", "Look"
+"""Module -> extra that brings it, for the error of a missing import."""
+NODES = frozenset({"up", "worker", "node"})
+"""Commands that write a log; Zenoh's own log belongs into it."""
 
-PARTS = (
-    Part(RUN, "demo", "lab.cli.demo:demo"),
-    Part(RUN, "up", "cli.up:up"),
-    Part(RUN, "router", "cli.router:router"),
-    Part(RUN, "sim", "cli.sim:sim"),
-    Part(RUN, "ros2", "cli.ros2:ros2_app"),
-    Part(RUN, "arm", "cli.arm:arm"),
-    Part(RUN, "camera", "cli.camera:camera"),
-    Part(RUN, "worker", "cli.worker:worker"),
-    Part(RUN, "command", "cli.command:command"),
-    Part(RUN, "teleop", "lab.cli.teleop:teleop"),
-    Part(DRIVE, "prompt", "cli.prompt:prompt"),
-    Part(DRIVE, "activate", "cli.switches:activate"),
-    Part(DRIVE, "deactivate", "cli.switches:deactivate"),
-    Part(DRIVE, "use", "cli.switches:use"),
-    Part(DRIVE, "rate", "cli.switches:rate"),
-    Part(DRIVE, "speed", "cli.switches:speed"),
-    Part(DRIVE, "stop", "cli.switches:stop"),
-    Part(DRIVE, "reset", "cli.switches:reset"),
-    Part(DRIVE, "trial", "lab.cli.trial:trial"),
-    Part(LOOK, "view", "lab.cli.view:view"),
-    Part(LOOK, "record", "lab.cli.record:record"),
-    Part(LOOK, "replay", "lab.cli.replay:replay"),
-    Part(LOOK, "eval", "lab.cli.evaluate:evaluation"),
-    Part(LOOK, "status", "cli.status:status"),
-    Part(LOOK, "echo", "cli.echo:echo"),
-    Part(LOOK, "keys", "cli.keys:keys"),
-    Part(LOOK, "seen", "cli.seen:seen"),
-    Part(LOOK, "compare", "lab.cli.compare:compare"),
-    Part(LOOK, "check", "lab.cli.check:check"),
-    Part(LOOK, "net", "cli.net:net"),
-    Part(LOOK, "doctor", "lab.cli.doctor:doctor"),
-    Part(LOOK, "bench", "lab.cli.bench:bench_app"),
-    Part(LOOK, "dataset", "lab.cli.dataset:dataset_app"),
-    Part(LOOK, "profile", "cli.profile:profile_app"),
-    Part(RUN, "serve", "cli.serve:serve_app"),
-    Part(RUN, "secure", "cli.secure:secure_app"),
-)
+
+class Group(NamedTuple):
+    """Several commands under one word.
+
+    Args:
+        help: one line.
+        commands: name -> ``module:function`` inside the package.
+    """
+
+    help: str
+    commands: Mapping[str, str]
+
+
+COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
+    "Run": {
+        "demo": "lab.cli.demo:demo",
+        "up": "cli.up:up",
+        "worker": "cli.worker:worker",
+        "teleop": "lab.cli.teleop:teleop",
+        "node": Group(
+            "Run one node by hand; `up` runs all nodes of a host, `worker` a model.",
+            {
+                "router": "cli.nodes:router",
+                "sim": "cli.nodes:sim",
+                "ros2": "cli.nodes:ros2",
+                "arm": "cli.nodes:arm",
+                "camera": "cli.nodes:camera",
+                "command": "cli.nodes:command",
+            },
+        ),
+    },
+    "Drive the robot": {
+        "prompt": "cli.drive:prompt",
+        "activate": "cli.drive:activate",
+        "deactivate": "cli.drive:deactivate",
+        "use": "cli.drive:use",
+        "rate": "cli.drive:rate",
+        "speed": "cli.drive:speed",
+        "stop": "cli.drive:stop",
+        "reset": "cli.drive:reset",
+    },
+    "Watch and record": {
+        "status": "cli.status:status",
+        "view": "lab.cli.view:view",
+        "record": "lab.cli.record:record",
+        "replay": "lab.cli.replay:replay",
+        "eval": "lab.cli.evaluate:evaluation",
+        "keys": "cli.keys:keys",
+        "echo": "cli.keys:echo",
+    },
+    "Check and measure": {
+        "check": "lab.cli.check:check",
+        "doctor": "lab.cli.doctor:doctor",
+        "profile": "cli.profile:profile_app",
+        "secure": "cli.secure:secure_app",
+        "dataset": "lab.cli.dataset:dataset_app",
+        "bench": Group(
+            "Measure this computer, and how well models do tasks.",
+            {
+                "motion": "lab.cli.bench_motion:motion",
+                "command": "lab.cli.bench_command:command",
+                "task": "lab.cli.bench_task:task",
+                "compare": "lab.cli.bench_compare:compare",
+            },
+        ),
+        "lab": Group(
+            "Compare and inspect models, and the network between the hosts.",
+            {
+                "trial": "lab.cli.trial:trial",
+                "compare": "lab.cli.compare:compare",
+                "inspect": "cli.inspect:inspect",
+                "net": "cli.net:net",
+                "serve-openpi": "cli.serve:serve_openpi",
+            },
+        ),
+    },
+}
+
+
+class _LazyCommands(Mapping[str, Any]):
+    """Name -> command, imported when it is first looked up."""
+
+    def __init__(self, panels: Mapping[str | None, Mapping[str, str | Group]]) -> None:
+        self._entries = {
+            name: (entry, panel)
+            for panel, entries in panels.items()
+            for name, entry in entries.items()
+        }
+        self._loaded: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._loaded:
+            self._loaded[name] = _load(name, *self._entries[name])
+        return self._loaded[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+
+def _load(name: str, entry: str | Group, panel: str | None) -> Any:
+    if isinstance(entry, Group):
+        found: Any = typer.Typer(
+            cls=_lazy_group({None: entry.commands}), help=entry.help, no_args_is_help=True
+        )
+    else:
+        module, _, attribute = entry.partition(":")
+        found = getattr(import_module(f"vla_zenoh.{module}"), attribute)
+    around = typer.Typer(rich_markup_mode="rich", add_completion=False)
+    around.callback()(lambda: None)  # makes it a group even with a single command
+    if isinstance(found, typer.Typer):
+        around.add_typer(found, name=name, rich_help_panel=panel)
+    else:
+        around.command(name, rich_help_panel=panel)(found)
+    group = typer.main.get_command(around)
+    assert isinstance(group, TyperGroup)
+    return group.commands[name]
+
+
+def _lazy_group(panels: Mapping[Any, Mapping[str, str | Group]]) -> type[TyperGroup]:
+    class LazyGroup(TyperGroup):
+        def __init__(self, **attributes: Any) -> None:
+            super().__init__(**attributes)
+            self.commands = _LazyCommands(panels)  # pyright: ignore[reportAttributeAccessIssue]
+
+    return LazyGroup
+
 
 app = typer.Typer(
     name="vla-zenoh",
-    cls=commands_of(PARTS),
+    cls=_lazy_group(COMMANDS),
     help="Connects vision-language-action models to robots over Zenoh.",
     no_args_is_help=True,
     rich_markup_mode="rich",
@@ -92,21 +184,21 @@ def _main(
         False, "--version", callback=_version, is_eager=True, help="Print the version."
     ),
 ) -> None:
-    # Zenoh logs to stdout, where the others write what a script reads.
+    # Zenoh logs to stdout, where the other commands write what a script reads.
     zenoh.init_log_from_env_or("error" if context.invoked_subcommand in NODES else "off")
 
 
 def app_entry() -> None:
-    """Run the command line. Our own errors become one clear line and exit code 1."""
+    """Run the command line. Errors of this package become one line and exit code 1."""
     try:
         app()
     except VlaZenohError as error:
-        _complain(str(error))
+        _fail(str(error))
     except ImportError as error:
         extra = EXTRA_OF.get((error.name or "").partition(".")[0])
         if extra is None and ".so" not in str(error):
             raise
-        _complain(
+        _fail(
             f"{error}; install it with: {how_to_install(extra)}"
             if extra
             else f"{error}; `vla-zenoh doctor` names the system package"
@@ -115,7 +207,7 @@ def app_entry() -> None:
         sys.exit(130)
 
 
-def _complain(message: str) -> NoReturn:
+def _fail(message: str) -> NoReturn:
     from vla_zenoh.cli.output import complain
 
     complain(message)

@@ -1,4 +1,4 @@
-"""vla-zenoh net."""
+"""vla-zenoh lab net: round trips and clocks between hosts, and what each key costs."""
 
 from __future__ import annotations
 
@@ -12,14 +12,7 @@ from rich.table import Table
 
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.clock_sync import ClockSync
-from vla_zenoh.cli.options import (
-    DEFAULT_PROFILE,
-    ConnectOption,
-    HostOption,
-    JsonOption,
-    ProfileOption,
-    RobotOption,
-)
+from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, fail, print_json, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.sanitize import one_line
@@ -29,23 +22,23 @@ HERE = "this computer"
 NOBODY = "-"
 POLL_S = 0.05
 SHOWN_OF_BOOT = 8
-"""Characters, which are drawn at random."""
+"""Characters of a boot id."""
 MAX_NUMBER = 40
-"""Characters: anybody may say 1e308."""
+"""Characters: a status may hold 1e308."""
 
 
 @dataclass(frozen=True, slots=True)
 class HostPair:
-    """Two hosts, as the first one sees the second.
+    """Round trip and clock offset from one host to another.
 
     Args:
-        seen_from: a host.
+        seen_from: the measuring host.
         host: the other one.
-        by: node that measured, on the first.
-        of: node that was asked, on the second.
-        round_trip_ms: there and back, through the router.
-        offset_ms: the second clock minus the first.
-        uncertainty_ms: of that.
+        by: node that measured.
+        of: node that answered.
+        round_trip_ms: through the router.
+        offset_ms: the other clock minus the measuring one.
+        uncertainty_ms: of the offset.
         links: of the measuring node, to its router.
     """
 
@@ -61,15 +54,15 @@ class HostPair:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """What one node writes on one key.
+    """Traffic of one node on one key.
 
     Args:
         key: short.
-        node: who; "-" where nobody writes there now, and some records were lost before.
-        host: where.
-        rate_hz: records a second.
-        bytes_s: bytes a second, once, however many listen.
-        lost: listener -> records that never reached it.
+        node: publisher; "-" where there is none now and records were lost before.
+        host: of the publisher.
+        rate_hz: records per second.
+        bytes_s: bytes per second, counted once for all subscribers.
+        lost: subscriber -> records that did not reach it.
     """
 
     key: str
@@ -80,26 +73,18 @@ class Line:
     lost: dict[str, int]
 
 
+@options
 def net(
-    profile: ProfileOption = DEFAULT_PROFILE,
-    connect: ConnectOption = None,
-    host: HostOption = None,
-    robot: RobotOption = None,
+    target: RobotTarget,
     seconds: Annotated[
         float, typer.Option("--seconds", "-s", min=1.0, help="How long to listen.")
     ] = 3.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Show every pair of hosts: link, round trip, clock offset; and what each key costs."""
-    aim = RobotTarget(profile, connect, host, robot)
-    with aim.client() as client:
-        clocks = ClockSync(
-            client.session,
-            client.keys,
-            Clock(),
-            HERE,
-            client.profile.timing.max_clock_offset_s,
-        )
+    """Show link, round trip and clock offset between hosts, and the bandwidth of each key."""
+    with target.client() as client:
+        bound_s = client.profile.timing.max_clock_offset_s
+        clocks = ClockSync(client.session, client.keys, Clock(), HERE, bound_s)
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
             for node in tuple(client.alive):
@@ -110,8 +95,8 @@ def net(
         own_links = tuple(sorted(str(link.dst) for link in client.session.info.links()))
         pairs = pairs_of(statuses, _own(clocks, statuses, own_links))
         lines = lines_of(statuses)
-        why = "" if statuses else aim.silent(client, "net")
-    bound_ms = client.profile.timing.max_clock_offset_s * 1e3
+        why = "" if statuses else target.no_node(client, "lab", "net")
+    bound_ms = bound_s * 1e3
     if as_json:
         print_json({"hosts": pairs, "keys": lines, "max_clock_offset_ms": bound_ms})
     else:
@@ -124,7 +109,7 @@ def net(
 def _own(
     clocks: ClockSync, statuses: Mapping[str, NodeStatus], links: tuple[str, ...]
 ) -> list[HostPair]:
-    """Each host as seen from here."""
+    """Each host as measured from here."""
     hosts = hosts_of(statuses)
     return [
         HostPair(
@@ -143,10 +128,9 @@ def _own(
 
 
 def hosts_of(statuses: Mapping[str, NodeStatus]) -> dict[str, str]:
-    """Node -> its host; where computers have the same name, with a piece of what tells them apart.
+    """Node -> its host, with a part of the boot id where several computers have the same name.
 
-    Whoever starts a node by hand need not say which host of the profile that is, and computers of a
-    laboratory are often copies of one, name included.
+    Computers of a laboratory are often copies of one, host name included.
     """
     boots: dict[str, set[str]] = {}
     for status in statuses.values():
@@ -160,17 +144,17 @@ def hosts_of(statuses: Mapping[str, NodeStatus]) -> dict[str, str]:
 
 
 def pairs_of(statuses: Mapping[str, NodeStatus], own: list[HostPair]) -> list[HostPair]:
-    """The best measurement of each pair of hosts: `own`, and what nodes tell."""
+    """The most certain measurement of each pair of hosts, of `own` and of the statuses."""
     best: dict[tuple[str, str], HostPair] = {}
-    for pair in [*own, *_told(statuses)]:
+    for pair in [*own, *_measured(statuses)]:
         hosts = (pair.seen_from, pair.host)
         if hosts not in best or pair.uncertainty_ms < best[hosts].uncertainty_ms:
             best[hosts] = pair
     return [best[hosts] for hosts in sorted(best)]
 
 
-def _told(statuses: Mapping[str, NodeStatus]) -> list[HostPair]:
-    """What nodes say of nodes on other hosts."""
+def _measured(statuses: Mapping[str, NodeStatus]) -> list[HostPair]:
+    """Measurements of nodes, of nodes on other hosts."""
     out: list[HostPair] = []
     hosts = hosts_of(statuses)
     for name, status in statuses.items():
@@ -198,7 +182,7 @@ def _told(statuses: Mapping[str, NodeStatus]) -> list[HostPair]:
 
 
 def lines_of(statuses: Mapping[str, NodeStatus]) -> list[Line]:
-    """What nodes say that they write, the most bytes first, and what was lost of who is silent."""
+    """Traffic of each node and key, most bytes first, and losses of publishers now silent."""
     hosts = hosts_of(statuses)
     lost: dict[str, dict[str, int]] = {}
     for name, status in statuses.items():
@@ -211,8 +195,9 @@ def lines_of(statuses: Mapping[str, NodeStatus]) -> list[Line]:
                 rate_hz, bytes_s = (_number(rate) or 0.0 for rate in rates)
                 line = Line(key, name, hosts[name], rate_hz, bytes_s, lost.get(key, {}))
                 out.append(line)
-    spoken = {line.key for line in out}
-    out += [Line(key, NOBODY, NOBODY, 0.0, 0.0, lost[key]) for key in sorted(lost.keys() - spoken)]
+    published = {line.key for line in out}
+    silent = sorted(lost.keys() - published)
+    out += [Line(key, NOBODY, NOBODY, 0.0, 0.0, lost[key]) for key in silent]
     return sorted(out, key=lambda line: -line.bytes_s)
 
 
@@ -221,8 +206,8 @@ def _map(value: Any) -> dict[str, Any]:
 
 
 def _number(value: Any) -> float | None:
-    fine = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return float(value) if fine else None
+    valid = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return float(value) if valid else None
 
 
 def _texts(value: Any) -> tuple[str, ...]:
@@ -232,16 +217,16 @@ def _texts(value: Any) -> tuple[str, ...]:
 def tables(
     robot: str, pairs: list[HostPair], lines: list[Line], bound_ms: float
 ) -> tuple[Table, ...]:
-    """What a person sees: the pairs of hosts, and the keys.
+    """A table of the pairs of hosts and one of the keys.
 
     Args:
         robot: its name.
         pairs: of hosts.
         lines: of nodes and keys.
-        bound_ms: clocks that differ by more are marked.
+        bound_ms: a larger clock offset is marked.
     """
     hosts = Table(header_style="bold", title=f"robot {robot}", title_justify="left")
-    for column in ("from", "to", "round trip", "clock is ahead by", "link", "measured by"):
+    for column in ("from", "to", "round trip", "clock ahead by", "link", "measured by"):
         hosts.add_column(column, overflow="fold")
     for pair in pairs:
         wrong = abs(pair.offset_ms) > bound_ms
@@ -255,7 +240,7 @@ def tables(
             one_line(f"{pair.by} of {pair.of}"),
         )
     keys = Table(header_style="bold")
-    for column in ("key", "node", "host", "rate", "kbit/s", "lost on the way to"):
+    for column in ("key", "node", "host", "rate", "kbit/s", "lost by"):
         keys.add_column(column, overflow="fold")
     for line in lines:
         lost = ", ".join(f"{node} {count}" for node, count in sorted(line.lost.items()))

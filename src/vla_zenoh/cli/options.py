@@ -1,12 +1,18 @@
-"""Options that many commands share, and the profile they lead to."""
+"""Options that several commands share, and `options`, which turns a dataclass into options."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
 from vla_zenoh.bus.host_id import HOST_VARIABLE
+from vla_zenoh.policy.loader import ModelFile, find_worker
 from vla_zenoh.profile import Profile, load_profile, override
 
 DEFAULT_PROFILE = "panda_sim"
@@ -16,13 +22,16 @@ ProfileOption = Annotated[
     str,
     typer.Option("--profile", "-p", envvar=PROFILE_VARIABLE, help="Name or path of a profile."),
 ]
+SimulatedProfileOption = Annotated[
+    str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
+]
 ConnectOption = Annotated[
     list[str] | None,
     typer.Option(
         "--connect",
         "-e",
         envvar="VLA_ZENOH_CONNECT",
-        help="Router to connect to, as tcp/HOST:PORT; may be given more than once.",
+        help="Router to connect to, as tcp/HOST:PORT; repeatable.",
     ),
 ]
 ListenOption = Annotated[
@@ -31,7 +40,7 @@ ListenOption = Annotated[
         "--listen",
         "-l",
         envvar="VLA_ZENOH_LISTEN",
-        help="Where the router listens, as tcp/HOST:PORT; may be given more than once.",
+        help="Where the router listens, as tcp/HOST:PORT; repeatable.",
     ),
 ]
 HostOption = Annotated[
@@ -40,21 +49,136 @@ HostOption = Annotated[
         "--host", envvar=HOST_VARIABLE, help="Which host of the profile this computer is."
     ),
 ]
-RobotOption = Annotated[
-    str | None,
-    typer.Option("--robot", help="Another robot at the same router than that of the profile."),
-]
 AlsoOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--also", help="Profile of another robot that the router serves; may be given repeatedly."
-    ),
+    typer.Option("--also", help="Profile of another robot that the router serves; repeatable."),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for a script.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def options(command: Callable[..., None]) -> Callable[..., None]:
+    """Let `command` take dataclasses whose fields are its options.
+
+    Typer reads options from a function's signature. A parameter annotated with a dataclass is
+    replaced there by the fields of that dataclass, in their order; the command is called with the
+    instance made of their values. Fields are annotated as parameters of a Typer command are.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, Any] = {
+        name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)
+    }
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command).parameters.items():
+        if name in groups:
+            parameters += inspect.signature(groups[name], eval_str=True).parameters.values()
+        else:
+            parameters.append(parameter.replace(annotation=hints[name]))
+    # Keyword only: a field without a default may follow one that has one.
+    keywords = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        for name, group in groups.items():
+            fields = dataclasses.fields(group)
+            given[name] = group(**{field.name: given.pop(field.name) for field in fields})
+        command(**given)
+
+    setattr(run, "__signature__", inspect.Signature(keywords))  # noqa: B010
+    run.__annotations__ = {each.name: each.annotation for each in keywords}
+    return run
+
+
+def effective_profile(
+    name: str,
+    connect: list[str] | None = None,
+    listen: list[str] | None = None,
+    host: str | None = None,
+) -> Profile:
+    """Load a profile, with endpoints of the command line in place of its own.
+
+    Args:
+        name: of the profile, or its path.
+        connect: in place of session.connect.
+        listen: in place of session.listen.
+        host: which of the profile's hosts this computer is; selects the certificates.
+
+    Raises:
+        ProfileError: the profile is invalid.
+    """
+    profile = load_profile(name)
+    changes: dict[str, Any] = {}
+    if host is not None and profile.session.security is not None:
+        changes["security"] = {"host": host}
+    if connect:
+        changes["connect"] = connect
+    if listen:
+        changes["listen"] = listen
+    return override(profile, {"session": changes}) if changes else profile
+
+
+@dataclass(frozen=True)
+class NodeOptions:
+    """Options of a command that runs a node."""
+
+    profile: ProfileOption = DEFAULT_PROFILE
+    connect: ConnectOption = None
+
+    def load(self) -> Profile:
+        """Load the effective profile."""
+        return effective_profile(self.profile, self.connect)
+
+
+@dataclass(frozen=True)
+class WorkerChoice:
+    """The worker to run.
+
+    Args:
+        name: in its keys.
+        model: file that it runs.
+        options: of the model: the profile's, overridden by those of the command line.
+    """
+
+    name: str
+    model: ModelFile
+    options: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """Options of a command that loads a model."""
+
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", help="Option of the model as name=value, overrides the profile's; repeatable."
+        ),
+    ] = None
+    python: Annotated[
+        str | None, typer.Option("--python", help="Interpreter of a prepared environment.")
+    ] = None
+
+    def choose(self, profile: Profile | None, word: str, name: str | None = None) -> WorkerChoice:
+        """Find the worker that `word` names.
+
+        Args:
+            profile: with workers and options; None: without a profile.
+            word: a worker of the profile, the name of a model, or a path to one.
+            name: of the worker, in place of its own.
+
+        Raises:
+            ResourceError: there is no such model.
+            WorkerError: its header cannot be read.
+            typer.BadParameter: an option is not ``name=value``.
+        """
+        given = model_options(self.settings or [])
+        own, model = find_worker(word, profile.models if profile is not None else {})
+        called = name or own
+        usual = profile.options.get(called, {}) if profile is not None else {}
+        return WorkerChoice(called, model, {**usual, **given})
 
 
 def model_options(given: list[str]) -> dict[str, str]:
-    """``name=value`` texts as a map.
+    """Parse ``name=value`` texts.
 
     Raises:
         typer.BadParameter: one is not of this form.
@@ -68,39 +192,11 @@ def model_options(given: list[str]) -> dict[str, str]:
     return out
 
 
-def effective_profile(
-    name: str,
-    connect: list[str] | None = None,
-    listen: list[str] | None = None,
-    host: str | None = None,
-) -> Profile:
-    """The profile, with endpoints from the command line in place of its own.
-
-    Args:
-        name: of the profile, or its path.
-        connect: in place of session.connect.
-        listen: in place of session.listen.
-        host: which of the profile's hosts this computer is; decides whose certificates are used.
-
-    Raises:
-        ProfileError: it is wrong.
-    """
-    profile = load_profile(name)
-    changes: dict[str, Any] = {}
-    if host is not None and profile.session.security is not None:
-        changes["security"] = {"host": host}
-    if connect:
-        changes["connect"] = connect
-    if listen:
-        changes["listen"] = listen
-    return override(profile, {"session": changes}) if changes else profile
-
-
 def number_list(option: str, text: str, low: float, high: float) -> list[float]:
-    """Numbers separated by commas.
+    """Parse numbers separated by commas.
 
     Raises:
-        BadParameter: not numbers, or out of bounds; names the option.
+        typer.BadParameter: not numbers, or out of [low, high]; names the option.
     """
     try:
         numbers = [float(part) for part in text.split(",")]

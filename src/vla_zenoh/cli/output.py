@@ -1,9 +1,8 @@
-"""How every command prints: tables and text for people, JSON for programs, errors on stderr.
+"""Output of all commands: tables and text, JSON, errors on stderr.
 
-What is printed is mostly somebody else's: names, states and sentences of nodes, lines of a model, a
-prompt. It is printed as it stands, never read as Rich's markup, and what would steer the terminal
-is written as an escape. Colour is given by `styled`. Everything a person sees goes through a
-`Screen`. They are made at each call, so that they see the terminal, colours and streams of then.
+Most of the text comes from elsewhere: names, states and messages of nodes, lines of a model, a
+prompt. A `Screen` prints it as it is, never as Rich's markup, with control characters escaped.
+Colours come from `styled`. A `Screen` is made for each call, for the terminal and streams of then.
 """
 
 from __future__ import annotations
@@ -26,19 +25,19 @@ from vla_zenoh.sanitize import printable
 
 
 class Screen(Console):
-    """A console for words of anybody, see the module. Takes what Rich's own takes."""
+    """A Rich console for untrusted text. Takes the arguments of Rich's own."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **settings)
 
     def render_str(self, text: str, **how: Any) -> Text:
-        """`text` as it stands, whatever is asked for: also cells, titles and columns of tables."""
+        """`text` as it is, also for cells, titles and columns of tables."""
         return super().render_str(printable(text), **{**how, "markup": False, "emoji": False})
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
-        """What Rich makes of it, where only Rich itself steers the terminal."""
+        """Segments of Rich, with control characters only from Rich itself."""
         for segment in super().render(renderable, options):
             if segment.control or segment.text.isprintable():
                 yield segment
@@ -50,7 +49,7 @@ def console(least_width: int = 0) -> Screen:
     """A console on stdout.
 
     Args:
-        least_width: for a wide table, which shall rather wrap on a narrow screen than lose figures.
+        least_width: of a wide table, which on a narrow screen wraps rather than lose figures.
     """
     screen = Screen()
     screen.width = max(screen.width, least_width)
@@ -58,37 +57,37 @@ def console(least_width: int = 0) -> Screen:
 
 
 def errors() -> Screen:
-    """A console on stderr: errors, progress, and whatever is not the result."""
+    """A console on stderr: errors, progress, and all that is not the result."""
     return Screen(stderr=True)
 
 
 def styled(text: object, style: str) -> Text:
-    """`text` of anybody in a colour."""
+    """Untrusted `text` in a colour."""
     return Text(printable(str(text)), style=style)
 
 
 def print_json(value: Any) -> None:
-    """`value` as indented JSON on stdout, without colours.
-
-    Records, profiles, arrays, paths, sets and numpy numbers are written as what they hold; NaN and
-    infinity, which JSON does not have, as null.
-    """
+    """Print `value` as indented JSON on stdout, without colours; see `plain_types`."""
     print(json.dumps(plain_types(value), indent=2))
 
 
 def complain(message: str) -> None:
-    """Prints ``error: message`` on stderr."""
+    """Print ``error: message`` on stderr."""
     errors().print(Text.assemble(("error: ", "bold red"), printable(message)), soft_wrap=True)
 
 
 def fail(message: str, code: int = 1) -> NoReturn:
-    """Prints ``error: message`` on stderr and ends the command with `code`."""
+    """Print ``error: message`` on stderr and exit with `code`."""
     complain(message)
     raise typer.Exit(code)
 
 
 def plain_types(value: Any) -> Any:
-    """`value` made of what JSON knows, see `print_json`."""
+    """`value` in types of JSON.
+
+    Records, profiles, arrays, paths, sets and numpy numbers become what they hold; NaN and infinity
+    become null.
+    """
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

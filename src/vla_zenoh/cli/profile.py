@@ -1,4 +1,4 @@
-"""vla-zenoh profile: the profiles there are, what one comes to, and whether it is right."""
+"""vla-zenoh profile: list, show and check profiles; configure the bridge for one."""
 
 from __future__ import annotations
 
@@ -8,27 +8,24 @@ import typer
 from rich.syntax import Syntax
 from rich.table import Table
 
-from vla_zenoh.cli.options import HostOption
+from vla_zenoh.cli.bridge_config import bridge_config
+from vla_zenoh.cli.options import HostOption, JsonOption
 from vla_zenoh.cli.output import console, errors, fail, print_json, styled
 from vla_zenoh.errors import MissingExtraError, ProfileError, RecordError, ResourceError
 from vla_zenoh.profile import Profile, load_profile, profile_file, profile_names, to_yaml
 from vla_zenoh.profile.advice import advice
 
-profile_app = typer.Typer(
-    help="Profiles: what there is, what one comes to, and whether it is right.",
-    no_args_is_help=True,
-)
+profile_app = typer.Typer(help="List, show and check profiles.", no_args_is_help=True)
+profile_app.command("bridge-config")(bridge_config)
 
 LONG_BRAKE_S = 2.5
-"""`up` ends a robot's node 2.8 s after Ctrl-C; a part of that goes by until this node hears of it.
+"""`up` ends a robot's node 2.8 s after Ctrl-C, less the time until the node gets the signal.
 See `STOP_ORDER` in `vla_zenoh.runtime.supervisor`."""
-
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for a script.")]
 
 
 @profile_app.command("list")
 def list_profiles(as_json: JsonOption = False) -> None:
-    """List the profiles that can be found: your own of VLA_ZENOH_PATH, then the shipped ones."""
+    """List your profiles on VLA_ZENOH_PATH, then the shipped ones."""
     rows = [_row(name) for name in profile_names()]
     if as_json:
         print_json(rows)
@@ -41,9 +38,8 @@ def list_profiles(as_json: JsonOption = False) -> None:
             wrong = styled(row["fault"], "red")
             table.add_row(row["name"], wrong, "", "", "", row["file"])
         else:
-            told = ("name", "about", "robot", "driver")
-            cells = [*(row[key] for key in told), ", ".join(row["hosts"]), row["file"]]
-            table.add_row(*cells)
+            cells = [row[key] for key in ("name", "about", "robot", "driver")]
+            table.add_row(*cells, ", ".join(row["hosts"]), row["file"])
     console().print(table)
 
 
@@ -52,7 +48,7 @@ def show(
     name: Annotated[str, typer.Argument(help="Name or path of a profile.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Print a profile as it is in force, with what it extends and every default written out."""
+    """Print the effective profile, with what it extends and every default."""
     try:
         profile = load_profile(name)
     except ProfileError as error:
@@ -72,17 +68,17 @@ def check(
     names: Annotated[list[str], typer.Argument(help="Names or paths of profiles.", metavar="NAME")],
     host: HostOption = None,
 ) -> None:
-    """Check profiles: every fault with file and line, then what is worth a second look.
+    """Check profiles: every error with file and line, then advice.
 
-    The robot's description has to have the joints and links that a profile names. On the host that
-    runs the command node it has to be there with its meshes: say which host this is with --host,
-    where there are several. Exits with 1 when a profile is wrong; advice leaves the exit code at 0.
+    The robot's description must have the joints and links that a profile names. The host of the
+    command node also needs the file and its meshes; --host names this host where there are several.
+    Exits with 1 when a profile is invalid, with 0 when there is only advice.
     """
     wrong = False
     for name in names:
         try:
             profile = load_profile(name)
-            hints = [*advice(profile), *_arm(profile, name, host), *_brake(profile)]
+            hints = [*advice(profile), *_check_arm(profile, name, host), *_check_brake(profile)]
         except ProfileError as error:
             wrong = True
             for line in str(error).splitlines():
@@ -95,54 +91,53 @@ def check(
         raise typer.Exit(1)
 
 
-def _arm(profile: Profile, name: str, host: str | None) -> list[str]:
-    """Builds the arm as the command node does; gives advice where this computer need not.
+def _check_arm(profile: Profile, name: str, host: str | None) -> list[str]:
+    """Build the arm as the command node does; advice where this host does not run that node.
 
     Raises:
-        ProfileError: its description does not have what the profile names, or cannot be read; or
-            it is not here, nor are its meshes, and the command node is to run here.
+        ProfileError: the description lacks what the profile names or cannot be read; or files are
+            missing on the host of the command node.
     """
-    commands = _runs_command(profile, name, host)
+    needed = _runs_command(profile, name, host)
     try:
         from vla_zenoh.control.reachability import make_reachability_filter
 
         make_reachability_filter(profile)
     except ResourceError as error:
-        if commands:
+        if needed:
             raise ProfileError(f"{profile_file(name)}: robot.description: {error}") from error
         return [f"robot.description: {error}"]
     except MissingExtraError as error:
         return [f"robot.description: {error}"]
     except ImportError as error:
-        return [f"robot: its joints and links were not looked at: {error}"]
+        return [f"robot: its joints and links were not checked: {error}"]
     except (ProfileError, RecordError) as error:
         raise ProfileError(f"{profile_file(name)}: robot: {error}") from error
-    except ValueError as error:  # Pinocchio's, of a file that is no URDF
+    except ValueError as error:  # from Pinocchio, for a file that is no URDF
         what = f"{profile.robot.description!r} cannot be read: {error}"
         raise ProfileError(f"{profile_file(name)}: robot.description: {what}") from error
     return []
 
 
-def _brake(profile: Profile) -> list[str]:
-    """Where `up` would end the robot's node while that still brakes."""
+def _check_brake(profile: Profile) -> list[str]:
+    """Advice where `up` would end the robot's node while it still brakes."""
     if profile.robot.driver == "sim":
         return []
     try:
         from vla_zenoh.guard.arm_guard import max_braking_time_s
     except ImportError:
-        return []  # the arm was not looked at either, which is told
+        return []  # `_check_arm` has already said so
     brake_s = max_braking_time_s(profile)
     if brake_s <= LONG_BRAKE_S:
         return []
     return [
-        f"limits: a brake from full speed may take {brake_s:.1f} s, and `vla-zenoh up` ends the "
-        "robot's node within 3 s of Ctrl-C, braked or not: less velocity, or more acceleration and "
-        "jerk"
+        f"limits: braking from full speed may take {brake_s:.1f} s, but `vla-zenoh up` ends the "
+        "robot's node within 3 s of Ctrl-C: lower the velocity, or raise acceleration and jerk"
     ]
 
 
 def _runs_command(profile: Profile, name: str, host: str | None) -> bool:
-    """Whether this computer does, as far as is known which host it is.
+    """Whether this computer runs the command node, as far as its host is known.
 
     Raises:
         ProfileError: the profile has no such host.

@@ -1,4 +1,4 @@
-"""vla-zenoh secure: certificates of a lab, and who may do what."""
+"""vla-zenoh secure: the certificate authority of a lab, certificates of its hosts and roles."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Annotated, Literal
 import typer
 from rich.table import Table
 
-from vla_zenoh.cli.free_endpoint import is_own
+from vla_zenoh.cli.addresses import is_own
 from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, ProfileOption
 from vla_zenoh.cli.output import console, errors, fail, print_json, styled
-from vla_zenoh.cli.secure_copying import copying
+from vla_zenoh.cli.secure_copying import copy_commands
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
 from vla_zenoh.profile import Profile, load_profile, profile_file
@@ -34,27 +34,26 @@ from vla_zenoh.security.store import Entry, Store
 from vla_zenoh.security.unused_certificates import unused_certificates
 
 secure_app = typer.Typer(
-    help="Certificates for a lab: nobody else is heard, and each role does only its part.",
+    help="Certificates for a lab, so that only its hosts connect, with the rights of their roles.",
     no_args_is_help=True,
 )
 
 FolderOption = Annotated[
-    str | None, typer.Option("--folder", help=f"Of the certificates; else {DEFAULT_FOLDER}.")
+    str | None, typer.Option("--folder", help=f"Of the certificates; default: {DEFAULT_FOLDER}.")
 ]
 AddressOption = Annotated[
     list[str] | None,
-    typer.Option("--address", help="Another name or address of the router; may be repeated."),
+    typer.Option("--address", help="Another name or address of the router; repeatable."),
 ]
-DaysOption = Annotated[
-    int, typer.Option("--days", min=1, max=AUTHORITY_DAYS, help="How long they are valid.")
-]
+DaysOption = Annotated[int, typer.Option("--days", min=1, max=AUTHORITY_DAYS, help="Validity.")]
 
 
 @secure_app.command("init")
 def init(
     profile: ProfileOption = DEFAULT_PROFILE,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Profile to write; NAME_secure.yaml else.")
+        Path | None,
+        typer.Option("--output", "-o", help="File to write; default: NAME_secure.yaml."),
     ] = None,
     folder: FolderOption = None,
     lab: Annotated[str, typer.Option("--lab", help="Name of the lab, in its certificates.")] = (
@@ -62,35 +61,35 @@ def init(
     ),
     at: Annotated[
         list[str] | None,
-        typer.Option("--at", help="HOST=ADDRESS of a router on the network; may be repeated."),
+        typer.Option("--at", help="HOST=ADDRESS of a router on the network; repeatable."),
     ] = None,
     address: AddressOption = None,
     days: DaysOption = CERTIFICATE_DAYS,
     host: HostOption = None,
 ) -> None:
-    """Make the lab's authority, certificates for all hosts of a profile, and a secured profile."""
+    """Make an authority, certificates for all hosts of a profile, and a secured profile."""
     plain = load_profile(profile)
     if host is not None and host not in plain.hosts:
         raise typer.BadParameter(
-            f"profile {plain.name} has no host {host!r}, it has: {', '.join(plain.hosts)}. A "
-            "computer of people alone is named afterwards, with `vla-zenoh secure add` and `here`"
+            f"profile {plain.name} has no host {host!r}, it has: {', '.join(plain.hosts)}. Add a "
+            "computer without nodes afterwards, with `vla-zenoh secure add` and `here`"
         )
     if plain.session.security is not None:
-        fail(f"profile {plain.name} is secured already; `vla-zenoh secure add HOST` adds to it")
+        fail(f"profile {plain.name} is already secured; `vla-zenoh secure add HOST` adds to it")
     file = output or Path(f"{plain.name}_secure.yaml")
     if file.exists():
-        fail(f"{file} is there already and is not overwritten; give another one with --output")
+        fail(f"{file} already exists and is not overwritten; give another one with --output")
     store, now = Store(folder or DEFAULT_FOLDER), _now()
-    addresses = _places(at or ())
-    places = moved_hosts(plain, addresses)
-    text = profile_text(plain, _extends(profile, file), store.folder.absolute(), places)
+    addresses = _router_addresses(at or ())
+    endpoints = moved_hosts(plain, addresses)
+    text = profile_text(plain, _extends(profile, file), store.folder.absolute(), endpoints)
     _write(file, text)
     try:
         written = load_profile(str(file))
         made = [store.make_authority(lab, now)]
         serving = serving_addresses(plain, (*addresses.values(), *(address or ())))
-        everybody = [*identities(plain), *bridges(plain)]
-        made += store.add(everybody, now, days=days, addresses=serving)
+        everyone = [*identities(plain), *bridges(plain)]
+        made += store.add(everyone, now, days=days, addresses=serving)
         here = host or _this_host(plain, addresses)
         if here is not None:
             store.remember_host(here)
@@ -104,13 +103,13 @@ def init(
     others = [name for name in written.hosts if name != here]
     if others:
         which = "each of the others" if here is not None else "each host but this one"
-        out.print(f"\nGive {which} its own folder, and all of them the profile:")
-    for line in copying(written, file, store, others):
+        out.print(f"\nCopy to {which} its own folder, and to all of them the profile:")
+    for line in copy_commands(written, file, store, others):
         out.print(line, soft_wrap=True)
     _print_here(here, RobotTarget(_typed(file)))
-    kept = f"Keep {store.folder / 'ca.key'} here: who has it can make certificates."
-    out.print(kept, soft_wrap=True)
-    _complain_about_places(written)
+    key = store.folder / "ca.key"
+    out.print(f"Keep {key} here: anyone with it can make certificates.", soft_wrap=True)
+    _warn_of_loopback(written)
 
 
 @secure_app.command("add")
@@ -119,19 +118,17 @@ def add(
     profile: ProfileOption = DEFAULT_PROFILE,
     role: Annotated[
         Literal["operator", "viewer", "replay"] | None,
-        typer.Option("--role", help="What people at that computer may do."),
+        typer.Option("--role", help="What a person at that computer may do."),
     ] = None,
     address: AddressOption = None,
     days: DaysOption = CERTIFICATE_DAYS,
-    renew: Annotated[
-        bool, typer.Option("--renew", help="Make new ones in place of those that are there.")
-    ] = False,
+    renew: Annotated[bool, typer.Option("--renew", help="Replace existing ones.")] = False,
 ) -> None:
-    """Make the certificates of one more host, or of people at a computer."""
+    """Make the certificates of one more host, or of a person at a computer."""
     loaded = load_profile(profile)
     security = loaded.session.security
     if security is None:
-        fail(f"profile {loaded.name} is not secured: begin with `vla-zenoh secure init`")
+        fail(f"profile {loaded.name} is not secured: run `vla-zenoh secure init` first")
     new = ""
     if role is not None:
         path = profile_file(profile)
@@ -161,29 +158,33 @@ def add(
         errors().print(f"{path} {why}", style="yellow", highlight=False, soft_wrap=True)
     here, file = store.known_host(), profile_file(profile)
     routers = [name for name, part in loaded.hosts.items() if "router" in part.nodes]
-    told = [name for name in routers if new and name not in (host, here)]
-    for line in copying(loaded, file, store, [name for name in (host,) if name != here], told):
+    changed = [name for name in routers if new and name not in (host, here)]
+    for line in copy_commands(
+        loaded, file, store, [name for name in (host,) if name != here], changed
+    ):
         out.print(line, soft_wrap=True)
     if here is None:
         out.print(f"Is {host} this computer? Then instead: vla-zenoh secure here {host}")
     if new:
         where = " and ".join(routers)
-        out.print(f"{host} is in {file} now: start the router of {where} again", soft_wrap=True)
+        out.print(f"{host} is now in {file}: restart the router of {where}", soft_wrap=True)
 
 
 @secure_app.command("here")
 def here(
-    host: Annotated[str, typer.Argument(help="Host that certificates here are of.")],
+    host: Annotated[str, typer.Argument(help="Host whose certificates are here.")],
     profile: ProfileOption = DEFAULT_PROFILE,
     folder: FolderOption = None,
 ) -> None:
-    """Say which host this computer is, where the certificates of several are."""
+    """Note which host this computer is, where it has certificates of several."""
     security = load_profile(profile).session.security
     store = Store(folder or (security.folder if security is not None else DEFAULT_FOLDER))
     if host not in store.hosts():
         known = ", ".join(store.hosts()) or "none"
         fail(f"{store.folder} has no certificates of {host!r}; it has those of: {known}")
-    console().print(f"this computer is {host}, says {store.remember_host(host)}", soft_wrap=True)
+    console().print(
+        f"this computer is {host}, noted in {store.remember_host(host)}", soft_wrap=True
+    )
 
 
 @secure_app.command("show")
@@ -192,7 +193,7 @@ def show(
     folder: FolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show every certificate here: whose, how long, and what is wrong. Exits with 1 if any is."""
+    """Show every certificate here: owner, validity, faults. Exits with 1 on a fault."""
     loaded = load_profile(profile)
     security = loaded.session.security
     store = Store(folder or (security.folder if security is not None else DEFAULT_FOLDER))
@@ -205,7 +206,7 @@ def show(
             for entry in entries
         ]
     if as_json:
-        print_json([_plain(entry, now) for entry in entries])
+        print_json([_mapping(entry, now) for entry in entries])
     else:
         _print(entries, now)
         if (host := store.known_host()) is not None:
@@ -216,7 +217,7 @@ def show(
         raise typer.Exit(1)
 
 
-def _places(given: Sequence[str]) -> dict[str, str]:
+def _router_addresses(given: Sequence[str]) -> dict[str, str]:
     out: dict[str, str] = {}
     for text in given:
         host, equals, address = text.partition("=")
@@ -227,7 +228,7 @@ def _places(given: Sequence[str]) -> dict[str, str]:
 
 
 def _this_host(profile: Profile, addresses: dict[str, str]) -> str | None:
-    """Which host this computer is, as far as that can be known."""
+    """Which host this computer is, if that can be known."""
     found = [name for name, address in addresses.items() if is_own(address)]
     if not addresses and len(profile.hosts) == 1:
         found = list(profile.hosts)
@@ -235,23 +236,23 @@ def _this_host(profile: Profile, addresses: dict[str, str]) -> str | None:
 
 
 def _typed(file: Path) -> str:
-    """A profile's file as it is named on the command line."""
+    """A profile's file as a command line names it."""
     return str(file) if "/" in str(file) else f"./{file}"
 
 
-def _print_here(host: str | None, aim: RobotTarget) -> None:
+def _print_here(host: str | None, target: RobotTarget) -> None:
     out = console()
     if host is not None:
         out.print(
-            f"This computer is {host}: vla-zenoh up {aim.profile} --host {host}", soft_wrap=True
+            f"This computer is {host}: vla-zenoh up {target.profile} --host {host}", soft_wrap=True
         )
     else:
         out.print(
-            "Which host this computer is was not said (--host): `vla-zenoh secure here HOST` notes "
-            "it. Until then people here drive with the certificate of any operator.",
+            "This computer could be any of the hosts (--host): `vla-zenoh secure here HOST` notes "
+            "which. Until then commands here use the certificate of any operator.",
             soft_wrap=True,
         )
-    out.print(f"For people, here: {aim.typed('status')}", soft_wrap=True)
+    out.print(f"To watch, here: {target.typed('status')}", soft_wrap=True)
 
 
 def _now() -> dt.datetime:
@@ -259,11 +260,11 @@ def _now() -> dt.datetime:
 
 
 def _extends(name: str, output: Path) -> str:
-    """How the new profile names the one it stands on: by its name, or its way from there."""
+    """How the new profile names the one it extends: by name, or by relative path."""
     if not is_path(name):
         return name
-    way = os.path.relpath(profile_file(name), output.resolve().parent)
-    return Path(way).stem if "/" not in way else way
+    path = os.path.relpath(profile_file(name), output.resolve().parent)
+    return Path(path).stem if "/" not in path else path
 
 
 def _write(file: Path, text: str) -> None:
@@ -273,13 +274,13 @@ def _write(file: Path, text: str) -> None:
         raise SecurityError(f"{file} cannot be written: {error.strerror}") from error
 
 
-def _complain_about_places(profile: Profile) -> None:
-    """A router that several hosts are to find has to listen on the network."""
+def _warn_of_loopback(profile: Profile) -> None:
+    """A router for several hosts has to listen on the network."""
     if len(profile.hosts) > 1 and all(
         "127.0.0.1" in endpoint for endpoint in profile.session.listen
     ):
         errors().print(
-            "the router listens on its own computer only; for a network say where it is: "
+            "the router listens on its own computer only; for a network give its address: "
             "--at HOST=ADDRESS",
             style="yellow",
         )
@@ -306,7 +307,7 @@ def _print(entries: list[Entry], now: dt.datetime) -> None:
     console().print(table)
 
 
-def _plain(entry: Entry, now: dt.datetime) -> dict[str, object]:
+def _mapping(entry: Entry, now: dt.datetime) -> dict[str, object]:
     found = entry.certificate
     return {
         "host": entry.host,

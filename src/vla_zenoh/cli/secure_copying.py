@@ -1,4 +1,4 @@
-"""What is typed to bring certificates and a profile with all of its files to other computers."""
+"""Shell commands that copy certificates, a profile and all its files to other computers."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from vla_zenoh.profile.files import FileUse, NeededFiles, needed_files
 from vla_zenoh.security.store import Store
 
 SEARCHED = "vla-zenoh"
-"""Folder at home on the other computer for what is found by its name."""
+"""Folder in the home on the other computer, for files that a profile finds by name."""
 
 
-def copying(
+def copy_commands(
     profile: Profile, file: Path, store: Store, hosts: Collection[str], more: Collection[str] = ()
 ) -> Iterator[str]:
-    """Lines to type, and what is said on the other computers then.
+    """Lines to type here, then on the other computers.
 
     Args:
         profile: the secured one.
         file: of that profile.
         store: of the certificates.
-        hosts: computers that get their certificates and the profile.
-        more: those that get the profile alone.
+        hosts: get their certificates and the profile.
+        more: get only the profile.
     """
     needed = needed_files(str(file))
     for host in (*hosts, *more):
@@ -32,7 +32,7 @@ def copying(
             yield from _certificates(profile, store, host)
         yield from _files(needed, file, host)
     for what in needed.missing:
-        yield f"Not on this computer, so not among them: {what}"
+        yield f"Not on this computer, so not copied: {what}"
     if not (hosts or more):
         return
     if needed.searched:
@@ -40,12 +40,12 @@ def copying(
     there = shlex.quote(f"./{needed.profile}")
     if any(host in profile.hosts for host in hosts):
         yield f"There: vla-zenoh up {there} --host NAME"
-    yield f"For people, there: vla-zenoh status --profile {there}"
+    yield f"To watch, there: vla-zenoh status --profile {there}"
 
 
 def _certificates(profile: Profile, store: Store, host: str) -> Iterator[str]:
     assert profile.session.security is not None
-    # ssh and scp begin at home.
+    # ssh and scp start in the home folder.
     target = shlex.quote(profile.session.security.folder.removeprefix("~/"))
     yield f"  ssh {host} mkdir -p {target}"
     yield f"  scp -rp {shlex.quote(str(store.folder / host))} {host}:{target}/"
@@ -68,13 +68,13 @@ def _files(needed: NeededFiles, file: Path, host: str) -> Iterator[str]:
 
 
 def _packed(part: FileUse, host: str, there: str = "") -> str:
-    """Files with their folders, below home or another folder there."""
+    """Files with their folders, copied below the home or another folder there."""
     names = " ".join(map(shlex.quote, part.names))
     into = f"-C {there} " if there else ""
     return f"  tar -C {shlex.quote(str(part.base))} -chf - {names} | ssh {host} tar {into}-xf -"
 
 
 def _shown(path: Path) -> str:
-    """As short as it can be typed here."""
+    """The shortest path from here."""
     here = Path.cwd()
     return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)

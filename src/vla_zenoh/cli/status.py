@@ -1,4 +1,4 @@
-"""vla-zenoh status."""
+"""vla-zenoh status: state, rates, counters and events of all nodes."""
 
 from __future__ import annotations
 
@@ -14,28 +14,19 @@ from rich.table import Table
 from rich.text import Text
 
 from vla_zenoh.bus.client import DROPPED_HINT, Client
-from vla_zenoh.cli.options import (
-    DEFAULT_PROFILE,
-    ConnectOption,
-    HostOption,
-    JsonOption,
-    ProfileOption,
-    RobotOption,
-)
+from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, fail, print_json, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, Header, NodeStatus
 
-Heard = Mapping[str, tuple[NodeStatus, float, bool]]
-"""Node -> (status, seconds since it came, alive)."""
+Statuses = Mapping[str, tuple[NodeStatus, float, bool]]
+"""Node -> (its last status, seconds since it came, alive)."""
 LISTEN_S = 1.2
 REFRESH_HZ = 4.0
 MAX_EVENTS = 8
-MAX_LINES = 12
-"""Of one cell."""
-MAX_LINE = 60
-"""Characters of each."""
+MAX_LINES, MAX_LINE = 12, 60
+"""Lines of one cell, and characters of each."""
 MAX_WORDS = 400
 """Characters of one sentence."""
 STALE_S = 1.5
@@ -58,25 +49,22 @@ STYLES = {
 }
 
 
+@options
 def status(
-    profile: ProfileOption = DEFAULT_PROFILE,
-    connect: ConnectOption = None,
-    host: HostOption = None,
-    robot: RobotOption = None,
+    target: RobotTarget,
     as_json: JsonOption = False,
-    once: Annotated[bool, typer.Option("--once", help="Print the table once and end.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Print the table once and exit.")] = False,
 ) -> None:
-    """Show every node: state, rates, ages, latencies, counters, and what happened last."""
-    aim = RobotTarget(profile, connect, host, robot)
-    with aim.client() as client:
+    """Show every node: state, age, rates, latencies, counters, and the last events."""
+    with target.client() as client:
         if as_json or once or not console().is_terminal:
             time.sleep(LISTEN_S)
             if as_json:
-                print_json(_plain(client))
+                print_json(_mapping(client))
             else:
                 console().print(_now(client, client.pop_events()))
             if not client.snapshot():
-                fail(aim.silent(client, "status"))
+                fail(target.no_node(client, "status"))
             return
         _live(client)
 
@@ -90,7 +78,7 @@ def _live(robot: Client) -> None:
             time.sleep(1.0 / REFRESH_HZ)
 
 
-def _plain(robot: Client) -> dict[str, object]:
+def _mapping(robot: Client) -> dict[str, object]:
     return {
         name: {**dataclasses.asdict(found), "age_s": round(age_s, 3), "alive": alive}
         for name, (found, age_s, alive) in robot.snapshot().items()
@@ -98,7 +86,7 @@ def _plain(robot: Client) -> dict[str, object]:
 
 
 def _now(robot: Client, events: Sequence[tuple[str, Header, Event]]) -> Group:
-    return picture(
+    return render(
         robot.keys.robot,
         robot.snapshot(),
         events,
@@ -107,25 +95,25 @@ def _now(robot: Client, events: Sequence[tuple[str, Header, Event]]) -> Group:
     )
 
 
-def picture(
+def render(
     robot: str,
-    nodes: Heard,
+    nodes: Statuses,
     events: Sequence[tuple[str, Header, Event]],
     *,
     insecure: bool = False,
     left_out: int = 0,
 ) -> Group:
-    """What a person sees. Warnings stand first: no table can push them from the screen.
+    """The table of nodes and the events. Warnings come first: no table pushes them off the screen.
 
     Args:
         robot: its name.
-        nodes: what each said of itself. A node is who its key says it is.
+        nodes: the status of each, by the node name in its key.
         events: oldest first.
-        insecure: the profile says that strangers may command the robot.
-        left_out: statuses of strangers that were not kept.
+        insecure: the profile lets anyone command the robot.
+        left_out: statuses of unknown nodes that were not kept.
     """
     table = Table(header_style="bold", title=f"robot {robot}", title_justify="left")
-    for column in ("node", "state", "age", "rate", "refused", "what it says"):
+    for column in ("node", "state", "age", "rate", "rejected", "message"):
         table.add_column(column, overflow="fold")
     for name, (found, age_s, alive) in nodes.items():
         state = found.state if alive else "dead"
@@ -134,54 +122,53 @@ def picture(
             styled(one_line(state, MAX_LINE), STYLES.get(state, "white")),
             styled(f"{age_s:.1f} s", "red" if age_s > STALE_S else "white"),
             _lines(_rates(found)),
-            _lines(_refused(found)),
-            _word(name, found),
+            _lines(_rejected(found)),
+            _message(name, found),
         )
     lines = [_latency(name, found) for name, (found, _, _) in nodes.items()]
-    news = [_event(*happened) for happened in events[-MAX_EVENTS:]]
-    warnings = _open_to_all(nodes, insecure=insecure)
-    warnings += _ending(nodes)
+    happened = [_event(*each) for each in events[-MAX_EVENTS:]]
+    warnings = [*_insecure(nodes, insecure=insecure), *_bad_certificates(nodes)]
     if left_out:
         warnings.append(styled(f"{left_out} {DROPPED_HINT}", "yellow"))
-    return Group(*warnings, table, *(line for line in lines if line), *news)
+    return Group(*warnings, table, *(line for line in lines if line), *happened)
 
 
-def _open_to_all(nodes: Heard, *, insecure: bool) -> list[Text]:
-    """In red: that strangers may command the robot, by the profile's word or a router's."""
-    said = {
+def _insecure(nodes: Statuses, *, insecure: bool) -> list[Text]:
+    """Warning in red that anyone may command the robot, by the profile or a router's status."""
+    open_routers = {
         name: found.detail.get("listen")
         for name, (found, _, _) in nodes.items()
         if found.detail.get("security") == "insecure"
     }
-    if not said and not insecure:
+    if not open_routers and not insecure:
         return []
     where = "; ".join(
         f"{name} listens on {', '.join(map(str, listen))}"
-        for name, listen in said.items()
+        for name, listen in open_routers.items()
         if isinstance(listen, (list, tuple))
     )
-    words = "insecure: everybody on the network can command this robot"
+    words = "insecure: anyone on the network can command this robot"
     more = f" ({one_line(where, MAX_WORDS)})" if where else ""
     return [styled(f"{words}{more}", "bold red")]
 
 
-def _ending(nodes: Heard) -> list[Text]:
-    """What routers say of certificates that are of no use, or soon are."""
+def _bad_certificates(nodes: Statuses) -> list[Text]:
+    """Warnings of routers about certificates that are invalid, or soon will be."""
     out: list[Text] = []
     for name, (found, _, _) in nodes.items():
-        said = found.detail.get("certificates")
-        wrong = said.get("wrong") if isinstance(said, dict) else None
+        certificates = found.detail.get("certificates")
+        wrong = certificates.get("wrong") if isinstance(certificates, dict) else None
         if isinstance(wrong, (list, tuple)) and wrong:
             words = f"certificates of {name} on {found.host}: {'; '.join(map(str, wrong))}"
             out.append(styled(one_line(words, MAX_WORDS), "bold yellow"))
     return out
 
 
-def _days_left(said: object) -> str:
-    """Of a router's certificates."""
-    if not isinstance(said, dict):
+def _days_left(certificates: object) -> str:
+    """How long a router's certificates last."""
+    if not isinstance(certificates, dict):
         return ""
-    days, unknown = said.get("days"), said.get("unknown")
+    days, unknown = certificates.get("days"), certificates.get("unknown")
     if isinstance(days, (int, float)):
         return f"certificates last {days:g} days"
     return one_line(unknown, MAX_WORDS) if isinstance(unknown, str) else ""
@@ -206,40 +193,40 @@ def _rates(found: NodeStatus) -> list[str]:
     return [one_line(f"{key} {value:.0f} Hz", MAX_LINE) for key, value in found.rates_hz.items()]
 
 
-def _refused(found: NodeStatus) -> list[str]:
-    refused = {
+def _rejected(found: NodeStatus) -> list[str]:
+    counts = {
         name.removeprefix("refused."): count
         for name, count in found.counters.items()
         if name.startswith("refused.")
     }
-    return [one_line(f"{reason} {count}", MAX_LINE) for reason, count in sorted(refused.items())]
+    return [one_line(f"{reason} {count}", MAX_LINE) for reason, count in sorted(counts.items())]
 
 
-def _word(name: str, found: NodeStatus) -> str:
+def _message(name: str, found: NodeStatus) -> str:
     detail = found.detail
     if name == "command":
         rate_hz = detail.get("rate_hz")
         rate = f"{rate_hz:g}" if isinstance(rate_hz, (int, float)) else "?"
         speed = detail.get("speed_percent")
         slowed = isinstance(speed, (int, float)) and speed < 100
-        doing = (
+        task = (
             f"prompt {detail.get('prompt', '')!r}, worker {detail.get('worker', '')}, {rate} Hz, "
             f"{detail.get('accepted_chunks', 0)} chunks carried out"
             f"{f', speed {speed:g} %' if slowed else ''}"
         )
-        return f"{one_line(detail.get('why', ''), MAX_WORDS)}\n{one_line(doing, MAX_WORDS)}"
+        return f"{one_line(detail.get('why', ''), MAX_WORDS)}\n{one_line(task, MAX_WORDS)}"
     if bad := _bad_cameras(detail.get("cameras")):
         return _lines([one_line(each, MAX_WORDS) for each in bad])
-    word = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
-    if not word and "obeyed" in detail:
-        return "obeyed" if detail["obeyed"] else "in the shadow"
-    return one_line(word or _days_left(detail.get("certificates")), MAX_WORDS)
+    text = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
+    if not text and "obeyed" in detail:
+        return "moves the arm" if detail["obeyed"] else "shadow mode"
+    return one_line(text or _days_left(detail.get("certificates")), MAX_WORDS)
 
 
-def _bad_cameras(said: object) -> list[str]:
+def _bad_cameras(cameras: object) -> list[str]:
     """What is wrong with each camera of a node."""
     out: list[str] = []
-    for name, fields in said.items() if isinstance(said, Mapping) else ():
+    for name, fields in cameras.items() if isinstance(cameras, Mapping) else ():
         bad = fields.get("bad") if isinstance(fields, Mapping) else None
         if isinstance(bad, Mapping):
             out.append(f"camera {name!r} {bad.get('why', '')}")
@@ -250,5 +237,5 @@ def _event(node: str, header: Header, event: Event) -> Text:
     when = time.strftime("%H:%M:%S", time.localtime(header.stamp_wall_ns / 1e9))
     style = {"info": "white", "warning": "yellow", "error": "red"}.get(event.level, "white")
     again = f" (x{event.count})" if event.count > 1 else ""
-    said = f"{one_line(event.what)}{again}: {one_line(event.why, 160)}"
-    return styled(f"{when} {one_line(node):>16} {said}", style)
+    text = f"{one_line(event.what)}{again}: {one_line(event.why, 160)}"
+    return styled(f"{when} {one_line(node):>16} {text}", style)

@@ -1,4 +1,4 @@
-"""Which robot a person's command is for, and how that is typed."""
+"""The robot that a client command is for, and how to type a command for it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,22 @@ import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Annotated
 
+import typer
 import zenoh
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.liveliness import alive_robots
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.cli.options import DEFAULT_PROFILE, PROFILE_VARIABLE, effective_profile
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    PROFILE_VARIABLE,
+    ConnectOption,
+    HostOption,
+    ProfileOption,
+    effective_profile,
+)
 from vla_zenoh.cli.output import errors, styled
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.profile import Profile, as_robot
@@ -21,29 +30,32 @@ from vla_zenoh.security.identity import Role, operator_role
 from vla_zenoh.security.operator_identity import local_role, operator_hosts
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class RobotTarget:
-    """What was given on the command line.
+    """Options that select a robot, and the client that they lead to.
 
     Args:
         profile: name or path.
         connect: routers, in place of the profile's.
-        host: which host of the profile this computer is, or whose certificate people show.
+        host: which host of the profile this computer is; selects the operator's certificate.
         robot: in place of the profile's.
     """
 
-    profile: str = DEFAULT_PROFILE
-    connect: Sequence[str] | None = None
-    host: str | None = None
-    robot: str | None = None
+    profile: ProfileOption = DEFAULT_PROFILE
+    connect: ConnectOption = None
+    host: HostOption = None
+    robot: Annotated[
+        str | None,
+        typer.Option("--robot", help="Another robot on this router than the profile's."),
+    ] = None
 
     def typed(self, *command: str, host: str | None = None, robot: str | None = None) -> str:
-        """The whole of another command that means the same.
+        """The command line of another command for this robot.
 
         Args:
             command: its words, such as ``status``.
             host: in place of its own.
-            robot: likewise.
+            robot: in place of its own.
         """
         words = ["vla-zenoh", *command]
         if self.profile != DEFAULT_PROFILE or PROFILE_VARIABLE in os.environ:
@@ -56,16 +68,16 @@ class RobotTarget:
 
     # -- the profile --------------------------------------------------------------------------
     def load(self) -> Profile:
-        """The profile, with the certificate of whoever people here are.
+        """Load the profile, with the best certificate that this computer has for an operator.
 
         Raises:
-            ProfileError: it is wrong.
+            ProfileError: the profile is invalid.
         """
         return self._choices(stop=False)[0]
 
     def _choices(self, *, stop: bool) -> list[Profile]:
-        """The same for each of those who people here may be, best first."""
-        profile = effective_profile(self.profile, list(self.connect or ()), host=self.host)
+        """The profile with each certificate that this computer has for a person, best first."""
+        profile = effective_profile(self.profile, self.connect, host=self.host)
         if self.robot is not None:
             profile = as_robot(profile, self.robot)
         hosts = operator_hosts(profile, stop=stop)
@@ -74,14 +86,14 @@ class RobotTarget:
     # -- sessions -----------------------------------------------------------------------------
     @contextmanager
     def client(self, *, stop: bool = False) -> Iterator[Client]:
-        """A connected client that already hears the nodes.
+        """A connected client that already knows the nodes.
 
         Args:
-            stop: as somebody who may stop the robot, if any who lie here may; tries all of them.
+            stop: prefer a certificate that may stop the robot, and try every one.
 
         Raises:
-            ProfileError: the profile is wrong.
-            SecurityError: there is no certificate for people.
+            ProfileError: the profile is invalid.
+            SecurityError: there is no certificate for a person.
             SessionError: no router answers.
         """
         profile, session = _first(self._choices(stop=stop)[: None if stop else 1])
@@ -89,47 +101,43 @@ class RobotTarget:
             yield Client(profile, session).subscribe()
 
     @contextmanager
-    def driver(self, *command: str) -> Iterator[Client]:
-        """Likewise, to put a setting; an error names the robot and tells of others.
+    def operator(self, *command: str) -> Iterator[Client]:
+        """A connected client that may change settings; errors name the robot and the others.
 
         Args:
-            command: what is done, in words as they are typed.
+            command: the words of this command, for the errors.
 
         Raises:
-            SecurityError: people here may not drive.
-            SessionError: what goes wrong in the block, as well.
+            SecurityError: the certificate here is not an operator's.
+            SessionError: the session or the block failed.
         """
         with self.client() as client:
-            if why := self.powerless(client.profile, *command):
+            if why := self.not_operator(client.profile, *command):
                 raise SecurityError(why)
             try:
                 yield client
             except SessionError as error:
                 if "command" in client.alive:
                     raise
-                raise SessionError(self.absent(client, *command)) from error
+                raise SessionError(self.no_command_node(client, *command)) from error
 
-    # -- words --------------------------------------------------------------------------------
+    # -- messages -----------------------------------------------------------------------------
     def named(self, client: Client) -> str:
         """Robot and profile."""
         return f"robot {client.keys.robot} (profile {self.profile})"
 
-    def absent(self, client: Client, *command: str) -> str:
-        """That nobody obeys for this robot, and what to type for those that are there."""
-        return f"no command node of {self.named(client)} is alive. {self.there(client, *command)}"
+    def no_command_node(self, client: Client, *command: str) -> str:
+        """Message that this robot has no command node, with `command` for the other robots."""
+        return f"no command node of {self.named(client)} is alive. {self._others(client, *command)}"
 
-    def silent(self, client: Client, *command: str) -> str:
-        """That nothing is heard of this robot, and what to type for those that are there."""
-        return f"nothing is heard of {self.named(client)}. {self.there(client, *command)}"
+    def no_node(self, client: Client, *command: str) -> str:
+        """Message that this robot has no node, with `command` for the other robots."""
+        return f"no node of {self.named(client)} is alive. {self._others(client, *command)}"
 
-    def there(self, client: Client, *command: str) -> str:
-        """Which other robots are alive on this router, with what to type."""
+    def _others(self, client: Client, *command: str) -> str:
         others = [f"{name} (`{self.typed(*command, robot=name)}`)" for name in self.others(client)]
         if not others:
-            return (
-                "Nor is another robot alive on this router, as far as one may know here; "
-                "`vla-zenoh up` starts one"
-            )
+            return "Nor is another robot visible on this router; `vla-zenoh up` starts one"
         return f"Alive on this router: {', '.join(others)}"
 
     def others(self, client: Client) -> list[str]:
@@ -138,8 +146,8 @@ class RobotTarget:
             name for name in alive_robots(client.session, client.keys) if name != client.keys.robot
         ]
 
-    def powerless(self, profile: Profile, *command: str) -> str:
-        """Why people here drive no robot, empty where they may, with what to type if that helps."""
+    def not_operator(self, profile: Profile, *command: str) -> str:
+        """Why the certificate here may not drive, with what to type; empty where it may."""
         role = local_role(profile)
         if role is None or role is Role.OPERATOR:
             return ""
@@ -151,13 +159,13 @@ class RobotTarget:
             if operator_role(profile, host) is Role.OPERATOR
         ]
         what = (
-            f"here lies that of an operator: `{self.typed(*command, host=able[0])}`"
+            f"this computer also has an operator's: `{self.typed(*command, host=able[0])}`"
             if able
-            else "`vla-zenoh secure add HOST --role operator` makes one of somebody who may"
+            else "`vla-zenoh secure add HOST --role operator` makes an operator's"
         )
         return (
-            f"the certificate of people here is {who}, and the router drops what a {role.value} "
-            f"says; {what}"
+            f"the certificate of this computer is {who}, and the router drops what a {role.value} "
+            f"publishes; {what}"
         )
 
 
@@ -171,11 +179,11 @@ def _with_host(profile: Profile, host: str | None) -> Profile:
 
 
 def _first(choices: Sequence[Profile]) -> tuple[Profile, zenoh.Session]:
-    """A session with the first certificate that the router takes.
+    """A session with the first certificate that the router accepts.
 
     Raises:
-        SecurityError: as the first of them, where none is taken.
-        SessionError: likewise.
+        SecurityError: of the first certificate, where none is accepted.
+        SessionError: the same.
     """
     failed: list[SecurityError | SessionError] = []
     for profile in choices:
@@ -184,13 +192,13 @@ def _first(choices: Sequence[Profile]) -> tuple[Profile, zenoh.Session]:
         except (SecurityError, SessionError) as error:
             failed.append(error)
             if profile is not choices[-1]:
-                _tell_next(profile, error)
+                _warn_next(profile, error)
     raise failed[0]
 
 
-def _tell_next(profile: Profile, error: SecurityError | SessionError) -> None:
+def _warn_next(profile: Profile, error: SecurityError | SessionError) -> None:
     security = profile.session.security
     assert security is not None
-    why = error if isinstance(error, SecurityError) else "there is no router that takes it"
-    told = f"not with the certificate of {security.host} ({why}); trying the next one here"
-    errors().print(styled(told, "yellow"), soft_wrap=True)
+    why = error if isinstance(error, SecurityError) else "no router accepts it"
+    text = f"not with the certificate of {security.host} ({why}); trying the next one here"
+    errors().print(styled(text, "yellow"), soft_wrap=True)

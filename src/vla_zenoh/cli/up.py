@@ -1,4 +1,4 @@
-"""vla-zenoh up."""
+"""vla-zenoh up: all nodes of this host."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def up(
         bool, typer.Option("--dry-run", help="Compute and check everything, command nothing.")
     ] = False,
 ) -> None:
-    """Start and supervise all nodes that belong on this host. Ctrl-C brakes the arm first."""
+    """Start and supervise all nodes of this host. Ctrl-C brakes the arm, then ends them."""
     stop = stop_on_signals()
     die_with_parent()
     loaded = effective_profile(profile, connect, listen)
@@ -59,17 +59,18 @@ def up(
         where = ", ".join(running.profile.session.connect)
         tell("up", f"profile {loaded.name}, host {running.host}, router at {where}")
         if dry_run:
-            tell("up", "dry run: the robot is commanded nothing")
-        aim = aim_of(profile, running)
-        look, drive, end = (aim.typed(word) for word in ("status", "activate", "stop"))
-        tell("up", f"look: {look}; drive: {drive}, likewise prompt; stop: {end}; end: Ctrl-C")
+            tell("up", "dry run: the robot gets no commands")
+        target = target_of(profile, running)
+        status, activate, end = (target.typed(word) for word in ("status", "activate", "stop"))
+        tell("up", f"watch: {status}; drive: {activate}, also prompt; stop: {end}; end: Ctrl-C")
         running.serve(stop)
         tell("up", "braking the arm, then ending every node")
     tell("up", "all nodes have ended")
 
 
-def aim_of(profile: str, running: Host) -> RobotTarget:
-    """What leads other commands to this robot, from any folder and terminal of this computer."""
+def target_of(profile: str, running: Host) -> RobotTarget:
+    """Options that reach this robot from any folder and terminal of this computer."""
     there = running.profile.session.connect
     name = str(profile_file(profile)) if is_path(profile) else profile
-    return RobotTarget(name, None if there == load_profile(profile).session.connect else there)
+    own = load_profile(profile).session.connect
+    return RobotTarget(name, None if there == own else list(there))

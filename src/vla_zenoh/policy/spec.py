@@ -203,7 +203,7 @@ class ActionSteps(NamedTuple):
         steps: (H, D), H at most the declared horizon; anything numpy can read.
         done: the task is finished with these steps, as far as the model can tell.
         raw: what stood before `steps`, for people: tokens, normalised actions, whatever the model
-            has, as text and numbers. Shown by ``vla-zenoh seen``, used by nobody.
+            has, as text and numbers. Shown by ``vla-zenoh lab inspect``, used by nobody.
         pictures: camera -> (H, W, 3) RGB uint8 as it went into the network, where the model itself
             changes what it is given (a crop).
     """

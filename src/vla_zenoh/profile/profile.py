@@ -137,7 +137,7 @@ class Profile(Section):
     def camera_servers(self) -> dict[str, str]:
         """Camera -> name of the node that serves it.
 
-        A camera that no host runs belongs to a ``vla-zenoh camera`` started by hand.
+        A camera that no host runs belongs to a ``vla-zenoh node camera`` started by hand.
         """
         servers = dict.fromkeys(self.cameras, "camera")
         for host, part in self.hosts.items():

@@ -100,15 +100,17 @@ def node_commands(
                     arguments += ["--set", option]
                 commands.append(NodeCommand(worker_node(worker), kind, tuple(arguments)))
         elif kind == "camera":
-            arguments = ["camera", *(part.cameras or ()), *common, "--name", name]
+            arguments = ["node", "camera", *(part.cameras or ()), *common, "--name", name]
             commands.append(NodeCommand(name, kind, tuple(arguments)))
         elif kind == "router":
             others = [word for file in also_files for word in ("--also", str(file))]
-            commands.append(NodeCommand(name, kind, (kind, *common, "--host", host, *others)))
+            commands.append(
+                NodeCommand(name, kind, ("node", kind, *common, "--host", host, *others))
+            )
         elif kind == "command" and dry_run:
-            commands.append(NodeCommand(kind, kind, (kind, *common, "--dry-run")))
+            commands.append(NodeCommand(kind, kind, ("node", kind, *common, "--dry-run")))
         else:
-            commands.append(NodeCommand(kind, kind, (kind, *common)))
+            commands.append(NodeCommand(kind, kind, ("node", kind, *common)))
     return commands
 
 

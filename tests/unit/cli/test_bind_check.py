@@ -9,18 +9,18 @@ from threading import Event
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.bind_check import refuse_beyond_here
+from vla_zenoh.cli.addresses import require_loopback
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.profile import Profile, load_profile, override, to_yaml
 
-SERVE = ("serve", "openpi", "--worker", "no_such_model", "--port", "8123")
+SERVE = ("lab", "serve-openpi", "--worker", "no_such_model", "--port", "8123")
 VIEW = ("view", "--serve", "--port", "9123", "--seconds", "0.1")
 
 
 def door(profile: Profile, address: str) -> None:
-    refuse_beyond_here(profile, "--bind", address, "look", "leave it out")
+    require_loopback(profile, "--bind", address, "look", "leave it out")
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1", "127.3.2.1", "::1", "localhost"])
@@ -30,7 +30,7 @@ def test_on_this_computer_a_door_may_be_plain(address: str) -> None:
 
 @pytest.mark.parametrize("address", ["0.0.0.0", "::", "10.0.0.2", "fe80::1%eth0", "", "a-computer"])
 def test_on_a_network_it_may_not(address: str) -> None:
-    with pytest.raises(SecurityError, match="everybody on that network look: leave it out"):
+    with pytest.raises(SecurityError, match="anyone on that network look: leave it out"):
         door(load_profile("panda_sim"), address)
 
 
@@ -43,7 +43,7 @@ def test_a_secured_profile_is_not_told_to_become_insecure() -> None:
     session = {"listen": endpoints, "connect": endpoints, "security": {}}
     with pytest.raises(SecurityError, match=r"look: leave it out$"):
         door(override(load_profile("panda_sim"), {"session": session}), "0.0.0.0")
-    with pytest.raises(SecurityError, match=r"profile panda_sim say session\.insecure: true$"):
+    with pytest.raises(SecurityError, match=r"set session\.insecure: true in profile panda_sim$"):
         door(load_profile("panda_sim"), "0.0.0.0")
 
 
@@ -56,7 +56,7 @@ def said(*words: str) -> str:
 
 def test_pictures_are_not_served_to_a_network() -> None:
     why = said(*VIEW, "--bind", "0.0.0.0")
-    assert "--bind 0.0.0.0 lets everybody on that network look through the cameras" in why
+    assert "--bind 0.0.0.0 lets anyone on that network look through the cameras" in why
     assert "`ssh -L 9123:127.0.0.1:9123 -L 9124:127.0.0.1:9124 THIS_COMPUTER`" in why
 
 
@@ -70,7 +70,7 @@ def test_nor_those_of_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_a_model_is_not_served_to_a_network_without_a_key(tmp_path: Path) -> None:
     why = said(*SERVE, "--host", "0.0.0.0")
-    assert "--host 0.0.0.0 lets everybody on that network drive with this model" in why
+    assert "--host 0.0.0.0 lets anyone on that network use this model without a key" in why
     assert "give --api-key KEY" in why
     for more in (("--host", "0.0.0.0", "--api-key", "k"), ("--host", "127.0.0.1")):
         assert "no_such_model" in said(*SERVE, *more)  # which is looked for only then

@@ -180,7 +180,7 @@ def test_a_brake_that_up_would_cut_short_is_told(
     )
     result = RUNNER.invoke(profile_app, ["check", "lab"])
     assert result.exit_code == 0
-    told = "advice limits: a brake from full speed may take 2.6 s" in result.stderr
+    told = "advice limits: braking from full speed may take 2.6 s" in result.stderr
     assert told == (said and driver == "ros2"), result.stderr
 
 

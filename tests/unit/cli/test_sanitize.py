@@ -127,7 +127,7 @@ PEER = {"round_trip_ms": 1.0, "offset_ms": 1.0, "uncertainty_ms": 1.0}
 @pytest.mark.parametrize("name", ["command", EVIL])
 def test_no_status_breaks_or_steers_what_people_look_at(found: NodeStatus, name: str) -> None:
     out = screen()
-    out.print(status.picture("panda", {name: (found, 0.1, True)}, []))
+    out.print(status.render("panda", {name: (found, 0.1, True)}, []))
     nodes = {name: found, "other": said_by(host="elsewhere")}
     for table in net.tables("panda", net.pairs_of(nodes, []), net.lines_of(nodes), 100.0):
         out.print(table)
@@ -148,7 +148,7 @@ def test_a_link_is_shown_with_its_brackets() -> None:
 def test_only_the_node_of_that_key_is_shown_as_the_command_node() -> None:
     out = screen()
     liar = said_by("command", detail={"prompt": "HARD: go up"})
-    out.print(status.picture("panda", {"worker-a": (liar, 0.1, True)}, []))
+    out.print(status.render("panda", {"worker-a": (liar, 0.1, True)}, []))
     assert "carried out" not in printed(out)
 
 
@@ -162,9 +162,9 @@ def test_no_table_pushes_the_red_line_from_the_screen() -> None:
     event = Event("info", "notice", "\n" * MANY, "\n" * MANY)
     out = screen()
     happened = [("n", Header(1, 2, "n#1"), event)] * 20
-    out.print(status.picture("panda", {"n": (tall, 0.1, True)}, happened, insecure=True))
+    out.print(status.render("panda", {"n": (tall, 0.1, True)}, happened, insecure=True))
     lines = printed(out).splitlines()
-    assert lines[0].startswith("insecure: everybody on the network can command this robot")
+    assert lines[0].startswith("insecure: anyone on the network can command this robot")
     assert len(lines) < 40
 
 
@@ -234,9 +234,9 @@ def fault(node: ast.AST, rich: set[str]) -> str:
 
 PRINTS = {
     "cli/main.py": "the version",
-    "cli/router.py": "the profile's name, for a program that waits for it",
+    "cli/nodes.py": "the profile's name, for a program that waits for it",
     "cli/profile.py": "a profile as a file",
-    "cli/ros2.py": "a bridge's configuration as a file",
+    "cli/bridge_config.py": "a bridge's configuration as a file",
     "runtime/environments.py": "the packages of a model that is about to run here",
 }
 """Where `print` gets something else than JSON, and what."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.cli.up import aim_of
+from vla_zenoh.cli.up import target_of
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.runtime.launch import Host
 
@@ -64,7 +64,7 @@ def test_up_tells_what_leads_to_its_robot_from_any_folder(
         profile = override(profile, {"session": {"connect": list(connect)}})
     host = Host(profile, None, log=print, tell=print)
     try:
-        typed = aim_of("./ur5.yaml", host).typed("stop")
+        typed = target_of("./ur5.yaml", host).typed("stop")
     finally:
         host.stop()
     assert shlex.split(typed) == ["vla-zenoh", "stop", "--profile", str(file), *words]
@@ -73,7 +73,7 @@ def test_up_tells_what_leads_to_its_robot_from_any_folder(
 def test_up_tells_of_a_router_that_its_host_alone_goes_to() -> None:
     host = Host(load_profile("panda_sim_two_sites"), "gpu", log=print, tell=print)
     try:
-        typed = aim_of("panda_sim_two_sites", host).typed("status")
+        typed = target_of("panda_sim_two_sites", host).typed("status")
     finally:
         host.stop()
     assert typed == ("vla-zenoh status --profile panda_sim_two_sites --connect tcp/127.0.0.1:7467")

@@ -12,7 +12,7 @@ import yaml
 import zenoh
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.ros2 import ros2_app
+from vla_zenoh.cli.profile import profile_app
 from vla_zenoh.cli.secure import secure_app
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.interop.ros2.bridge import bridge_command, bridge_config, bridge_text
@@ -235,7 +235,7 @@ def test_a_bridge_on_another_computer_gets_a_certificate_and_serves_the_node_alo
     made = ca.read((folder / "bridge.pem").read_bytes())
     assert (made.common_name, made.addresses) == ("bridge@robot", ("10.0.0.5",))
 
-    done = RUNNER.invoke(ros2_app, ["bridge-config", "--profile", str(file)])
+    done = RUNNER.invoke(profile_app, ["bridge-config", "--profile", str(file)])
     assert done.exit_code == 0, done.output
     config_file = tmp_path / "bridge.json5"
     config_file.write_text(done.stdout)
@@ -282,7 +282,7 @@ def test_a_renewed_host_has_a_new_certificate_for_its_bridge(tmp_path: Path) -> 
 
 # -- the command ----------------------------------------------------------------------------------
 def test_the_command_prints_the_file_alone_and_says_beside_it_how_to_start_the_bridge() -> None:
-    done = RUNNER.invoke(ros2_app, ["bridge-config", "--profile", "panda_ros2"])
+    done = RUNNER.invoke(profile_app, ["bridge-config", "--profile", "panda_ros2"])
     profile = load_profile("panda_ros2")
     assert done.stdout == bridge_text(profile, bridge_config(profile))
     assert "ROS_DISTRO=jazzy zenoh-bridge-ros2dds -c bridge.json5" in done.stderr
@@ -296,6 +296,6 @@ def test_the_command_prints_the_file_alone_and_says_beside_it_how_to_start_the_b
     ],
 )
 def test_options_that_would_be_overlooked_are_refused(words: list[str]) -> None:
-    done = RUNNER.invoke(ros2_app, words)
+    done = RUNNER.invoke(profile_app, words)
     assert done.exit_code == 2
     assert done.stdout == ""

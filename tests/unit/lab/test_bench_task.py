@@ -239,7 +239,7 @@ def test_what_cannot_run_is_told_before_anything_starts(
     assert "--set wants name=value" in told("--model", "brick", "--set", "file", *how)
     (tmp_path / "hold.py").write_text("")
     said = told("--model", str(tmp_path / "hold.py"), *how)
-    assert "hold is what the others are held against" in said
+    assert "hold is the name of a baseline" in said
 
 
 LONG = "worker-nod | " + "x" * 300 + " takes: step_m"

@@ -57,7 +57,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 def test_their_difference_is_found(recording: Path) -> None:
-    done = command_line("compare", "a", "b", "--recording", str(recording), "--json")
+    done = command_line("lab", "compare", "a", "b", "--recording", str(recording), "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert (found["pairs"], found["only_a"], found["only_b"]) == (PAIRS, 0, 0)
@@ -66,6 +66,6 @@ def test_their_difference_is_found(recording: Path) -> None:
 
 
 def test_a_worker_that_is_not_in_it_is_named_with_those_that_are(recording: Path) -> None:
-    done = command_line("compare", "a", "ghost", "--recording", str(recording))
+    done = command_line("lab", "compare", "a", "ghost", "--recording", str(recording))
     assert done.returncode == 1
     assert "has no chunks of 'ghost'; it has: a, b" in done.stderr

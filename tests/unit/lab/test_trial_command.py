@@ -1,4 +1,4 @@
-"""``vla-zenoh trial`` without a robot: what a person types, what is refused, and the report."""
+"""``vla-zenoh lab trial`` without a robot: what a person types, what is refused, and the report."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def test_the_report_says_who_succeeded_how_often(begun: Path) -> None:
     rows = {line.split()[1]: line.split("│") for line in done.stdout.splitlines() if "│" in line}
     assert [cell.strip() for cell in rows["ann"][1:5]] == ["ann", "2", "2", "100.0%"]
     assert [cell.strip() for cell in rows["bob"][1:5]] == ["bob", "0", "1", "0.0%"]
-    assert "ann less bob over 1 setups that both did: +100.0%" in done.stdout
+    assert "ann minus bob over 1 setups that both did: +100.0%" in done.stdout
     assert "exact McNemar p = 1;" in done.stdout
 
 
@@ -236,7 +236,7 @@ def test_other_arguments_than_those_it_was_begun_with_are_refused(
     done = run("--out", str(begun), *words)
     assert done.exit_code == 1
     said = " ".join(done.stderr.split())
-    assert "was begun otherwise: workers ann, bob, not bob, ann;" in said
+    assert "has another plan: workers ann, bob, not bob, ann;" in said
     assert "setups left, right, not left, right, middle; blind True, not False" in said
     assert "give another --out" in said
 
@@ -244,8 +244,8 @@ def test_other_arguments_than_those_it_was_begun_with_are_refused(
 @pytest.mark.parametrize(
     ("words", "code", "why"),
     [
-        (["--prompt", "wave"], 2, "--workers is needed"),
-        (["--workers", "ann"], 2, "--prompt is needed"),
+        (["--prompt", "wave"], 2, "--workers is required"),
+        (["--workers", "ann"], 2, "--prompt is required"),
         (["--workers", "ann", "--setups", "x", "--episodes", "3"], 2, "leave --episodes out"),
         (["--workers", "ann", "--setups", "/no/such/file"], 1, "cannot be read"),
         (["--report"], 1, "holds no trial"),

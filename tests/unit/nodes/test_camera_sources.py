@@ -144,7 +144,7 @@ def test_a_folder_shows_its_pictures_and_skips_other_files(tmp_path: Path) -> No
     reel = open_frames(tmp_path)
     levels = []
     while reel.step():
-        picture = reel.picture()
+        picture = reel.image()
         assert picture is not None
         levels.append(int(picture[4, 4, 0]))
     assert levels == [0, 10, 20]
@@ -187,10 +187,10 @@ def test_a_stalled_reader_is_not_served_a_burst(tmp_path: Path) -> None:
 def test_a_file_that_is_not_there_or_no_picture_says_so(tmp_path: Path) -> None:
     with pytest.raises(NodeError, match=r"there is no file or folder .*nothing"):
         FileSource(str(tmp_path / "nothing"), 30.0, True).open()
-    with pytest.raises(NodeError, match="no picture in the folder"):
+    with pytest.raises(NodeError, match="no image in the folder"):
         FileSource(str(tmp_path), 30.0, True).open()
     (tmp_path / "a.mp4").write_bytes(b"not a video" * 100)
-    with pytest.raises(NodeError, match=r"a\.mp4 is neither a picture nor a video"):
+    with pytest.raises(NodeError, match=r"a\.mp4 is neither an image nor a video"):
         FileSource(str(tmp_path / "a.mp4"), 30.0, True).open()
 
 
@@ -243,7 +243,7 @@ def test_a_forbidden_device_names_the_group(tmp_path: Path) -> None:
 
 
 def test_grabbing_from_a_device_that_is_gone_is_a_loss() -> None:
-    with pytest.raises(NodeError, match="gave no picture"):
+    with pytest.raises(NodeError, match="gave no image"):
         V4l2Source("0", CameraProfile(source="v4l2:0")).grab(threading.Event())
 
 

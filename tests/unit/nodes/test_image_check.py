@@ -60,7 +60,7 @@ def judged(
     check = ImageCheck("wrist", CameraCheck(**limits), same_s)
     for nth in range(round(seconds * RATE_HZ)):
         picture, stamp_ns = next(shots)
-        found = check.look(picture, round(nth * 1e9 / RATE_HZ), stamp_ns)
+        found = check.update(picture, round(nth * 1e9 / RATE_HZ), stamp_ns)
         if found is not None:
             return nth / RATE_HZ, found
     return None
@@ -109,9 +109,9 @@ def test_a_picture_that_comes_twice_of_a_slow_camera_is_no_lie() -> None:
     check = ImageCheck("wrist", CameraCheck(), 1.0)
     one, other = noisy(scene()), noisy(scene())
     for nth, picture in enumerate([one, one, other, other, one]):
-        assert check.look(picture, nth * 2_000_000_000) is None
-    assert check.look(one, 10_000_000_000) is None
-    assert check.look(one, 12_000_000_000) is not None
+        assert check.update(picture, nth * 2_000_000_000) is None
+    assert check.update(one, 10_000_000_000) is None
+    assert check.update(one, 12_000_000_000) is not None
 
 
 # -- lies -----------------------------------------------------------------------------------------
@@ -120,26 +120,26 @@ LIES: dict[str, tuple[Callable[[], Iterator[Shot]], float, str, dict[str, float]
     "same": (
         lambda: repeated(noisy(scene())),
         1.0,
-        r"shows the same picture since 1\.\d s, less than 1 s is allowed "
+        r"shows the same image for 1\.\d s, less than 1 s is allowed "
         r"\(cameras\.wrist\.check\.same_s\)",
         {},
     ),
     "stamps": (
         lambda: ((picture, 7) for picture, _ in shown(lambda: noisy(scene()))),
         0.5,
-        r"driver time stamp does not go forward since 0\.\d s, .* 0\.5 s .*check\.stamp_s",
+        r"driver time stamp does not advance for 0\.\d s, .* 0\.5 s .*check\.stamp_s",
         {},
     ),
     "black": (
         lambda: shown(lambda: noisy(np.full((480, 640, 3), 1.0))),
         0.5,
-        r"is black: 100\.0% of the picture, at most 98\.0% .*check\.clipped_share",
+        r"is black: 100\.0% of the image, at most 98\.0% .*check\.clipped_share",
         {},
     ),
     "white": (
         lambda: shown(lambda: noisy(np.full((480, 640, 3), 254.0))),
         0.5,
-        r"is overexposed: 100\.0% of the picture is white, at most 98\.0%",
+        r"is overexposed: 100\.0% of the image is white, at most 98\.0%",
         {},
     ),
     "flat": (
@@ -151,7 +151,7 @@ LIES: dict[str, tuple[Callable[[], Iterator[Shot]], float, str, dict[str, float]
     "even": (
         lambda: shown(hand_before_the_lens),
         0.5,
-        r"shows one even area: 8\d% of the picture, at most 70% .*check\.uniform_share",
+        r"shows one even area: 8\d% of the image, at most 70% .*check\.uniform_share",
         {"uniform_share": 0.7},
     ),
 }
@@ -202,9 +202,9 @@ def test_a_camera_that_is_good_again_is_said_to_be() -> None:
     check = ImageCheck("wrist", CameraCheck(), 1.0)
     lie = noisy(scene())
     for nth in range(30):
-        check.look(lie, nth * 100_000_000)
+        check.update(lie, nth * 100_000_000)
     assert check.finding is not None
-    assert check.look(noisy(scene()), 3_000_000_000) is None
+    assert check.update(noisy(scene()), 3_000_000_000) is None
     assert check.finding is None
 
 

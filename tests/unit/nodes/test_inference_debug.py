@@ -95,7 +95,7 @@ def test_a_worker_that_names_more_cameras_than_a_model_can_have_is_refused() -> 
         kept.add("liar", 1, "one_more", b"jpeg")
     kept.add("liar", 1, "cam0", b"newer")
     kept.add("liar", 2, "one_more", b"jpeg")
-    found = kept.take("liar", 1)
+    found = kept.pop("liar", 1)
     assert len(found) == MAX_CAMERAS
     assert found["cam0"] == b"newer"
 
@@ -111,9 +111,7 @@ def test_pictures_without_a_record_are_counted_and_fill_nothing() -> None:
     kept.add("worker", 100, "front", b"x" * 10)  # in place of the large one
     kept.add("worker", 101, "front", b"x" * 989)
     assert left_out == {"no_record": 2 + MAX_WAITING - 1}
-    assert {camera: len(jpeg) for camera, jpeg in kept.take("worker", 101).items()} == {
-        "front": 989
-    }
-    assert kept.take("worker", 101) == {}
+    assert {camera: len(jpeg) for camera, jpeg in kept.pop("worker", 101).items()} == {"front": 989}
+    assert kept.pop("worker", 101) == {}
     kept.add("worker", 102, "front", b"x" * 989)
     assert left_out == {"no_record": 2 + MAX_WAITING - 1}

@@ -12,7 +12,7 @@ RATE_HZ = 30.0
 def settle(coarseness: RenderBudget, full_s: float, pictures: int = 200) -> int:
     """Draw with a cost proportional to the pixels drawn."""
     for _ in range(pictures):
-        coarseness.took(full_s / coarseness.step**2)
+        coarseness.add(full_s / coarseness.step**2)
     return coarseness.step
 
 
@@ -34,6 +34,6 @@ def test_it_does_not_swing_between_two_steps() -> None:
     settle(coarseness, 0.040)
     seen = {coarseness.step}
     for _ in range(300):
-        coarseness.took(0.040 / coarseness.step**2)
+        coarseness.add(0.040 / coarseness.step**2)
         seen.add(coarseness.step)
     assert len(seen) == 1

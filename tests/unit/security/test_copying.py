@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.free_endpoint import is_own
+from vla_zenoh.cli.addresses import is_own
 from vla_zenoh.cli.secure import secure_app
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.security.operator_identity import operator_hosts
@@ -191,7 +191,7 @@ def test_the_computer_of_init_notes_which_host_it_is_where_that_can_be_known(
     said = world.secure("init", "-p", "panda_sim_two_hosts", "--at", "robot=127.0.0.1")
     assert f"This computer is robot: vla-zenoh up ./{secured} --host robot" in said
     assert "ssh robot" not in said
-    assert f"For people, here: vla-zenoh status --profile ./{secured}" in said
+    assert f"To watch, here: vla-zenoh status --profile ./{secured}" in said
     store = Store("~/.config/vla-zenoh/lab")
     assert store.known_host() == "robot"
     said = world.secure("add", "desk", "--role", "operator", "-p", secured)
@@ -205,7 +205,7 @@ def test_where_it_is_not_known_people_drive_all_the_same_until_it_is_said(world:
     (world.home("me") / ".config").rename(world.home("me") / "first")
     said = world.secure("init", "-p", "panda_sim_two_hosts", "--at", "robot=192.0.2.1")
     assert "ssh robot" in said
-    assert "`vla-zenoh secure here HOST` notes it" in said
+    assert "`vla-zenoh secure here HOST` notes which" in said
     profile = load_profile("panda_sim_two_hosts_secure.yaml")
     assert operator_hosts(profile) == ["robot", "gpu"]
     world.secure("here", "gpu", "-p", "panda_sim_two_hosts_secure.yaml")

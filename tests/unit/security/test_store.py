@@ -316,7 +316,7 @@ def test_a_lab_is_secured_by_one_command(tmp_path: Path, monkeypatch: pytest.Mon
     done = runner.invoke(secure_app, add)
     assert done.exit_code == 0, done.output
     assert f"  scp -rp {folder}/desk desk:{folder}/" in done.output.splitlines()
-    assert f"For people, there: vla-zenoh status --profile ./{secured}" in done.output
+    assert f"To watch, there: vla-zenoh status --profile ./{secured}" in done.output
     assert " up " not in done.output
     assert (folder / "desk" / "operator.pem").exists()
 

@@ -34,7 +34,7 @@ KINDS = (*ALLOWED_AS.values(), "action_clients")
 
 WIDTH = 80
 HEAD = """\
-// {program} for the profile {name}. Written by `vla-zenoh ros2 bridge-config`.
+// {program} for the profile {name}. Written by `vla-zenoh profile bridge-config`.
 // What the profile uses of the robot's ROS graph is let through, by its whole name, and nothing
 // else. What a listener does not take in time is dropped: the next joint state is on its way, and
 // a slow listener must not hold up the others.

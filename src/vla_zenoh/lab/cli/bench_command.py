@@ -1,4 +1,4 @@
-"""vla-zenoh bench command."""
+"""vla-zenoh bench command: time per tick of the command node."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ from rich.box import SIMPLE
 from rich.progress import track
 from rich.table import Table
 
-from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    SimulatedProfileOption,
+    effective_profile,
+    number_list,
+)
 from vla_zenoh.cli.output import console, errors
 from vla_zenoh.lab.cli.bench_file import JsonFileOption, kept_rows
 
@@ -19,25 +24,23 @@ SHARES = ("p50", "p95", "p99", "max")
 
 def command(
     rates: Annotated[
-        str, typer.Option("--rates", help="Ticks a second, separated by commas.")
+        str, typer.Option("--rates", help="Ticks per second, separated by commas.")
     ] = "250,500,1000",
     seconds: Annotated[
-        float, typer.Option("--seconds", min=8, max=600, help="How long at each rate.")
+        float, typer.Option("--seconds", min=8, max=600, help="Duration at each rate.")
     ] = 10.0,
     busy: Annotated[
         int,
-        typer.Option("--busy", min=0, max=64, help="Programs that only compute, beside it."),
+        typer.Option("--busy", min=0, max=64, help="Busy processes beside it."),
     ] = 0,
-    profile: Annotated[
-        str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
-    ] = DEFAULT_PROFILE,
+    profile: SimulatedProfileOption = DEFAULT_PROFILE,
     json_file: JsonFileOption = None,
 ) -> None:
-    """Measure what a tick of the command node costs while the simulated arm moves.
+    """Measure the time per tick of the command node while the simulated arm moves.
 
-    The real chain is started once for every rate.
+    The real nodes are started once per rate.
     """
-    from vla_zenoh.cli.free_endpoint import own_address
+    from vla_zenoh.cli.addresses import own_address
     from vla_zenoh.lab.bench.command_runner import measure_command
     from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
 
@@ -49,7 +52,7 @@ def command(
         for rate_hz in track(rates_hz, "command node", console=errors()):
             rows.append(measure_command(loaded, rate_hz, seconds, stop, rows.log, busy))
     table = Table(box=SIMPLE, pad_edge=False)
-    for column in ("asked Hz", "held Hz", "missed", "core share"):
+    for column in ("set Hz", "held Hz", "missed", "core share"):
         table.add_column(column, justify="right", no_wrap=True)
     for name in ("tick us", "late us", "pose ms"):
         for share in SHARES:
@@ -64,7 +67,9 @@ def command(
             *(f"{row['late_us'][share]:.0f}" for share in SHARES),
             *(f"{row['pose_age_ms'][share]:.0f}" for share in SHARES),
         )
-    told = "tick: from waking until the command is out. late: waking behind its time. pose: its age"
+    text = (
+        "tick: from wake-up to the published command. late: wake-up after its time. pose: its age"
+    )
     realtime = all(row["realtime"] for row in rows)
-    table.caption = told if realtime else f"{told} (no real-time priority here)"
+    table.caption = text if realtime else f"{text} (no real-time priority here)"
     console(WIDTH).print(table)

@@ -1,4 +1,4 @@
-"""The file a benchmark writes; of one that takes long it is kept, however that ends."""
+"""The result file of a benchmark, and the log lines of its nodes."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ LAST_LINES = 20
 
 
 def write_json(json_file: Path | None, result: Any) -> None:
-    """Write `result` where a file was asked for; its folder is made."""
+    """Write `result` to `json_file`, if given; creates its folder."""
     if json_file is not None:
         json_file.parent.mkdir(parents=True, exist_ok=True)
         json_file.write_text(json.dumps(result, indent=2) + "\n", "utf-8")
 
 
 class Rows(list[dict[str, Any]]):
-    """One row of figures each, and what the nodes wrote meanwhile."""
+    """Result rows, and the log lines of the nodes."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
 
     def log(self, node: str, line: str) -> None:
-        """Keep a line of a node."""
+        """Keep a log line of a node."""
         self.lines.append(f"{node:>16} | {line}")
 
 
 @contextmanager
 def kept_rows(json_file: Path | None) -> Iterator[Rows]:
-    """Rows that are written to `json_file` at the end; the last lines are shown where it fails.
+    """Rows that are written to `json_file` even after a failure, which shows the last log lines.
 
     Raises:
-        typer.Exit: somebody ended it.
+        typer.Exit: Ctrl-C.
     """
     from vla_zenoh.lab.episode import Interrupted
 
@@ -62,11 +62,11 @@ def kept_rows(json_file: Path | None) -> Iterator[Rows]:
 
 @contextmanager
 def up_with_last_lines(host: Host, lines: Collection[str]) -> Iterator[Host]:
-    """`host`, up; where what is done with it fails, the last of `lines` is shown.
+    """`host`, up; a failure of the block shows the last log lines.
 
     Args:
         host: not up yet.
-        lines: what its nodes write, growing.
+        lines: log lines of its nodes, growing.
     """
     from vla_zenoh.lab.episode import Interrupted
 
@@ -76,7 +76,7 @@ def up_with_last_lines(host: Host, lines: Collection[str]) -> Iterator[Host]:
             try:
                 yield running
             except Exception:
-                failed_at += lines  # before the nodes take their leave
+                failed_at += lines  # before the nodes end
                 raise
     except Interrupted:
         raise

@@ -1,4 +1,4 @@
-"""vla-zenoh bench task."""
+"""vla-zenoh bench task: how often a model does tasks in the simulator."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,9 +16,14 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    ModelOptions,
+    SimulatedProfileOption,
+    effective_profile,
+    options,
+)
 from vla_zenoh.cli.output import console, errors
-from vla_zenoh.cli.worker_choice import chosen_worker
 from vla_zenoh.lab.bench.task import BASELINES, SCENE, TaskPlan, TaskScore
 from vla_zenoh.lab.cli.bench_file import (
     LAST_LINES,
@@ -32,120 +38,137 @@ from vla_zenoh.resources import is_path
 
 VARIATIONS = ("lights", "table", "camera", "distractors")
 UNSEEN_SEED = 1_000_000
-"""Layouts from here on are for measuring; data for training are made from smaller seeds."""
+"""First seed for measuring; training data has smaller seeds."""
 
 
+@dataclass(frozen=True)
+class EpisodeOptions:
+    """Options for the episodes."""
+
+    episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, max=100_000)] = 30
+    seed: Annotated[
+        int, typer.Option("--seed", "-s", min=0, help="Of the first layout; the next ones follow.")
+    ] = UNSEEN_SEED
+    family: Annotated[
+        str | None,
+        typer.Option(
+            "--family", help="put, stack, push, or stay (nonsense); default: all but stay."
+        ),
+    ] = None
+    delay_ms: Annotated[
+        float, typer.Option("--delay", min=0, max=5000, help="ms added to every inference.")
+    ] = 0.0
+    rate_hz: Annotated[
+        float | None, typer.Option("--rate", min=0.05, max=100, help="Chunks per second.")
+    ] = None
+    held_out: Annotated[
+        bool, typer.Option("--held-out", help="Prompts in words that no model was trained with.")
+    ] = False
+    pairs: Annotated[
+        bool, typer.Option("--pairs", help="Every layout twice, with another brick to fetch.")
+    ] = False
+    prompt: Annotated[
+        str | None, typer.Option("--prompt", help="Prompt in place of the episode's.")
+    ] = None
+    limit_s: Annotated[
+        float, typer.Option("--limit", min=1, max=600, help="Seconds per episode.")
+    ] = LIMIT_S
+
+    def plan(self, model: str) -> TaskPlan:
+        """The plan for `model`."""
+        if self.family not in (None, "stay", *FAMILIES):
+            raise typer.BadParameter(f"--family is one of {', '.join(FAMILIES)}, stay")
+        return TaskPlan(model, **asdict(self))
+
+
+@dataclass(frozen=True)
+class TaskOutput:
+    """Options for where the result goes."""
+
+    json_file: JsonFileOption = None
+    folder: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for result.json, nodes.log and failures.jpg."),
+    ] = None
+
+    def write(self, score: TaskScore) -> None:
+        """Write the result, and images of failures."""
+        from vla_zenoh.lab.bench.task_sheet import failure_sheet
+
+        write_json(self.json_file, score.to_dict())
+        if self.folder is not None:
+            write_json(self.folder / "result.json", score.to_dict())
+            sheet = failure_sheet(score.ended)
+            if sheet is not None:
+                (self.folder / "failures.jpg").write_bytes(sheet)
+
+
+@options
 def task(
     model: Annotated[
         str,
         typer.Option(
             "--model",
             "-m",
-            help="A worker of the profile, name of a model, or path to one; or hold, scripted: "
-            "what gives nothing.",
+            help="A worker of the profile, name of a model, or path to one; or the baselines hold "
+            "and scripted.",
         ),
     ],
-    episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, max=100_000)] = 30,
-    seed: Annotated[
-        int, typer.Option("--seed", "-s", min=0, help="Of the first layout; the next ones follow.")
-    ] = UNSEEN_SEED,
-    family: Annotated[
-        str | None,
-        typer.Option("--family", help="put, stack, push, or stay (nonsense); all three else."),
-    ] = None,
-    delay_ms: Annotated[
-        float, typer.Option("--delay", min=0, max=5000, help="ms added to every inference.")
-    ] = 0.0,
-    rate_hz: Annotated[
-        float | None, typer.Option("--rate", min=0.05, max=100, help="Chunks asked per second.")
-    ] = None,
-    held_out: Annotated[
-        bool, typer.Option("--held-out", help="Prompts in words that no model was trained with.")
-    ] = False,
-    pairs: Annotated[
-        bool, typer.Option("--pairs", help="Every layout twice, with another brick to fetch.")
-    ] = False,
-    camera_jitter: Annotated[
-        bool, typer.Option("--camera-jitter", help="Same as --vary camera.")
-    ] = False,
+    episodes: EpisodeOptions,
+    model_options: ModelOptions,
+    output: TaskOutput,
     vary: Annotated[
         list[str] | None,
-        typer.Option("--vary", help="lights, table, camera or distractors; may be repeated; all."),
-    ] = None,
-    prompt: Annotated[
-        str | None, typer.Option("--prompt", help="Put this in place of the episode's prompt.")
-    ] = None,
-    limit_s: Annotated[
-        float | None, typer.Option("--limit", min=1, max=600, help="Seconds for an episode.")
+        typer.Option("--vary", help="lights, table, camera, distractors or all; repeatable."),
     ] = None,
     lockstep: Annotated[
         bool,
         typer.Option("--lockstep", help="On a virtual clock, faster than real time, no nodes."),
     ] = False,
     processes: Annotated[
-        int | None, typer.Option("--processes", min=1, help="With --lockstep; one a core else.")
+        int | None,
+        typer.Option(
+            "--processes", min=1, help="Processes with --lockstep; default: one per core."
+        ),
     ] = None,
-    options: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Option of the model as name=value; may be repeated."),
-    ] = None,
-    python: Annotated[
-        str | None, typer.Option("--python", help="Interpreter of a prepared environment.")
-    ] = None,
-    profile: Annotated[
-        str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
-    ] = DEFAULT_PROFILE,
-    json_file: JsonFileOption = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder for result.json, nodes.log and failures.jpg."),
-    ] = None,
+    profile: SimulatedProfileOption = DEFAULT_PROFILE,
 ) -> None:
-    """Let a model do tasks by prompt in the simulator, through the real chain, and judge it.
+    """Measure how often a model does tasks by prompt in the simulator, through the real nodes.
 
-    The judge looks at the true poses of the objects. Tasks come from the scene's layouts: put a
-    brick in the box, stack it on another one, push it somewhere.
+    A task is to put a brick in the box, stack it on another one, or push it. The verdict is by the
+    true poses of the objects.
     """
     from vla_zenoh.runtime.environments import run_in_own_environment
     from vla_zenoh.runtime.process import stop_on_signals
 
-    if family not in (None, "stay", *FAMILIES):
-        raise typer.BadParameter(f"--family is one of {', '.join(FAMILIES)}, stay")
-    varied = _varied([*(vary or []), *(["camera"] if camera_jitter else [])])
+    varied = _varied(vary or [])
     named, path = _named(model)
-    plan = TaskPlan(
-        named,
-        episodes,
-        seed,
-        family=family,
-        held_out=held_out,
-        pairs=pairs,
-        prompt=prompt,
-        limit_s=limit_s or LIMIT_S,
-        rate_hz=rate_hz,
-        delay_ms=delay_ms,
-    )
+    plan = episodes.plan(named)
     loaded = _with_bricks(effective_profile(profile), plan.worker, varied, path)
-    chosen = chosen_worker(loaded, plan.worker, options or [])
-    if lockstep:  # the model is made here; comes back only where that can be done
-        run_in_own_environment(chosen.model, python, extra="sim")
+    chosen = model_options.choose(loaded, plan.worker)
+    if lockstep:  # this process makes the model; returns only where that can be done
+        run_in_own_environment(chosen.model, model_options.python, extra="sim")
     stop = stop_on_signals()
-    camera = "front" if "front" in loaded.cameras else next(iter(loaded.cameras), None)
     mode = "lockstep" if lockstep else "real_time"
     score = TaskScore(plan, mode, loaded.name, varied, options=chosen.options)
     began_s = time.monotonic()
     try:
-        with _bar(episodes) as advance:
+        with _bar(plan.episodes) as advance:
             if lockstep:
-                _lockstep(loaded, profile, score, camera, stop, processes, advance)
+                _lockstep(loaded, profile, score, stop, processes, advance)
             else:
-                _real_time(loaded, score, options or [], python, camera, stop, out, advance)
+                _real_time(loaded, score, model_options, output.folder, stop, advance)
     finally:
         score.wall_s = time.monotonic() - began_s
-        _write(score, json_file, out)
+        output.write(score)
     _print(score.to_dict())
     if stop.is_set():
         raise typer.Exit(130)
+
+
+def _camera(profile: Profile) -> str | None:
+    """The camera whose images show the failures."""
+    return "front" if "front" in profile.cameras else next(iter(profile.cameras), None)
 
 
 def _varied(names: list[str]) -> list[str]:
@@ -158,20 +181,19 @@ def _varied(names: list[str]) -> list[str]:
 
 
 def _named(model: str) -> tuple[str, str]:
-    """What a model is called, and where it is if that was given."""
+    """Name of a model, and its path if that was given."""
     if not is_path(model):
         return model, ""
     found = find_model(model)
     if found.name in BASELINES:
         raise typer.BadParameter(
-            f"--model {model}: {found.name} is what the others are held against; call the file "
-            "otherwise"
+            f"--model {model}: {found.name} is the name of a baseline; rename the file"
         )
     return found.name, str(found.path)
 
 
 def _with_bricks(profile: Profile, worker: str, vary: list[str], path: str = "") -> Profile:
-    """The profile with the scene of the tasks and the worker in it, at `path` if it has one."""
+    """The profile with the scene of the tasks and the worker, whose file is `path` if not empty."""
     workers = [*dict.fromkeys([worker, *profile.workers])]
     return override(
         profile,
@@ -203,11 +225,11 @@ def _bar(episodes: int) -> Iterator[Callable[[TaskScore], None]]:
         def advance(score: TaskScore) -> None:
             done = sum(each.success for each in score.ended)
             last = score.ended[-1]
-            word = "done" if last.success else last.failure
+            outcome = "done" if last.success else last.failure
             bars.update(
                 bar,
                 completed=len(score.ended),
-                description=f"{done} of {len(score.ended)} done; the last: {word}",
+                description=f"{done} of {len(score.ended)} done; the last: {outcome}",
             )
 
         yield advance
@@ -217,7 +239,6 @@ def _lockstep(
     profile: Profile,
     named: str,
     score: TaskScore,
-    camera: str | None,
     stop: threading.Event,
     processes: int | None,
     advance: Callable[[TaskScore], None],
@@ -228,7 +249,7 @@ def _lockstep(
         profile,
         score.plan,
         score.options,
-        camera,
+        _camera(profile),
         stop,
         processes or os.cpu_count() or 1,
         named=named,
@@ -241,14 +262,12 @@ def _lockstep(
 def _real_time(
     profile: Profile,
     score: TaskScore,
-    options: list[str],
-    python: str | None,
-    camera: str | None,
-    stop: threading.Event,
+    model: ModelOptions,
     out: Path | None,
+    stop: threading.Event,
     advance: Callable[[TaskScore], None],
 ) -> None:
-    from vla_zenoh.cli.free_endpoint import own_address
+    from vla_zenoh.cli.addresses import own_address
     from vla_zenoh.lab.bench.task_runner import TaskRunner
     from vla_zenoh.lab.episode import Interrupted
     from vla_zenoh.runtime.launch import Host
@@ -259,7 +278,7 @@ def _real_time(
         out.mkdir(parents=True, exist_ok=True)
     plan = score.plan
     arguments = [*(["--delay", f"{plan.delay_ms:g}"] if plan.delay_ms else [])]
-    arguments += ["--python", python] if python else []
+    arguments += ["--python", model.python] if model.python else []
     last: deque[str] = deque(maxlen=LAST_LINES)
     with Path(os.devnull if out is None else out / "nodes.log").open("w", encoding="utf-8") as log:
 
@@ -274,29 +293,18 @@ def _real_time(
             log=write,
             tell=write,
             own_router=True,
-            worker_options={plan.worker: options},
+            worker_options={plan.worker: model.settings or []},
             worker_arguments=arguments,
         )
         try:
             with up_with_last_lines(host, last) as running:
-                run = TaskRunner(running, plan, stop, camera)
+                run = TaskRunner(running, plan, stop, _camera(profile))
                 for ended in run.run():
                     score.ended.append(ended)
                     score.latency_ms = run.latency_ms()
                     advance(score)
         except Interrupted:
             pass
-
-
-def _write(score: TaskScore, json_file: Path | None, out: Path | None) -> None:
-    from vla_zenoh.lab.bench.task_sheet import failure_sheet
-
-    write_json(json_file, score.to_dict())
-    if out is not None:
-        write_json(out / "result.json", score.to_dict())
-        sheet = failure_sheet(score.ended)
-        if sheet is not None:
-            (out / "failures.jpg").write_bytes(sheet)
 
 
 def _print(result: dict[str, Any]) -> None:

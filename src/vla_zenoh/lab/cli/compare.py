@@ -1,4 +1,4 @@
-"""vla-zenoh compare."""
+"""vla-zenoh lab compare."""
 
 from __future__ import annotations
 
@@ -12,13 +12,7 @@ from rich.live import Live
 from rich.table import Table
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.cli.options import (
-    DEFAULT_PROFILE,
-    ConnectOption,
-    HostOption,
-    JsonOption,
-    ProfileOption,
-)
+from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, fail, print_json
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import VlaZenohError
@@ -37,9 +31,11 @@ from vla_zenoh.types import ActionChunk
 POLL_S, REFRESH_S = 0.05, 1.0
 
 
+@options
 def compare(
     a: Annotated[str, typer.Argument(help="One worker.")],
     b: Annotated[str, typer.Argument(help="The other one.")],
+    target: RobotTarget,
     seconds: Annotated[
         float, typer.Option("--seconds", "-s", help="How long to listen.", min=0.1)
     ] = 10.0,
@@ -50,9 +46,6 @@ def compare(
         float,
         typer.Option("--tolerance", help="Seconds that two observations may lie apart.", min=0),
     ] = DEFAULT_TOLERANCE_S,
-    profile: ProfileOption = DEFAULT_PROFILE,
-    connect: ConnectOption = None,
-    host: HostOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show how far two workers are apart, of a live run or a recording.
@@ -60,7 +53,7 @@ def compare(
     Both may run in the shadow; one of them may be obeyed. Chunks are paired by the time of their
     observation and carried out in thought from where the arm then was.
     """
-    loaded = RobotTarget(profile, connect, host).load()
+    loaded = target.load()
     if recording is not None:
         found = _recorded(recording, loaded, a, b, tolerance_s)
     else:

@@ -14,7 +14,7 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from vla_zenoh.cli.free_endpoint import own_address
+from vla_zenoh.cli.addresses import own_address
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import Screen, errors
 from vla_zenoh.lab.demo.video import write_video

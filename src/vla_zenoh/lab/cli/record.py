@@ -1,4 +1,4 @@
-"""vla-zenoh record."""
+"""vla-zenoh record: a robot's keys in an MCAP file."""
 
 from __future__ import annotations
 
@@ -8,40 +8,31 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import (
-    DEFAULT_PROFILE,
-    ConnectOption,
-    HostOption,
-    JsonOption,
-    ProfileOption,
-)
+from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.runtime.process import run_node
 
 
+@options
 def record(
+    target: RobotTarget,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File; runs/record-<time>.mcap without it.")
+        Path | None, typer.Option("--out", "-o", help="File; default: runs/record-<time>.mcap.")
     ] = None,
     keys: Annotated[
         list[str] | None,
         typer.Option(
             "--keys",
             "-k",
-            help="These alone: a key expression below <root>/<robot>/, or whole; may be given more "
-            "than once. Without it, everything but raw pictures.",
+            help="Only these: a key expression below <root>/<robot>/, or whole; repeatable. "
+            "Default: everything but raw images.",
         ),
     ] = None,
-    raw: Annotated[
-        bool, typer.Option("--raw", help="Raw pictures too; they are 1 MB each.")
-    ] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="Raw images too; they are 1 MB each.")] = False,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", "-s", help="End after so long.", min=0.1)
+        float | None, typer.Option("--seconds", "-s", help="End after this time.", min=0.1)
     ] = None,
-    profile: ProfileOption = DEFAULT_PROFILE,
-    connect: ConnectOption = None,
-    host: HostOption = None,
     name: Annotated[
         str, typer.Option("--name", help="Node name; a second recorder needs another one.")
     ] = "recorder",
@@ -49,12 +40,12 @@ def record(
 ) -> None:
     """Record a robot's keys into an MCAP file, until Ctrl-C.
 
-    Foxglove, Rerun and `ros2 bag` open it. It is whole at any time, also when the recorder is
+    Foxglove, Rerun and `ros2 bag` open it. The file is valid at any time, also when the recorder is
     killed or the disk is full.
     """
     from vla_zenoh.lab.recording.recorder import Recorder, RecordingResult, recorded_keys
 
-    loaded = RobotTarget(profile, connect, host).load()
+    loaded = target.load()
     path = out or Path("runs") / time.strftime("record-%Y%m%d-%H%M%S.mcap")
     expressions = recorded_keys(loaded.keys, keys or (), raw=raw)
     done: list[RecordingResult] = []
@@ -90,9 +81,8 @@ def record(
         )
     if recorded.dropped:
         worst = ", ".join(f"{key} {count}" for key, count in recorded.dropped.most_common(5))
-        said = f"dropped, because the disk did not keep up: {worst}"
-        errors().print(said, style="yellow")
+        errors().print(f"dropped, because the disk did not keep up: {worst}", style="yellow")
     if recorded.failure:
         fail(recorded.failure)
     if not recorded.samples:
-        fail("nothing was said; is a robot up? (`vla-zenoh up`)")
+        fail("nothing was published; is a robot up? (`vla-zenoh up`)")

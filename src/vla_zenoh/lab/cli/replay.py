@@ -1,4 +1,4 @@
-"""vla-zenoh replay."""
+"""vla-zenoh replay: a recorded run on its keys."""
 
 from __future__ import annotations
 
@@ -7,13 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import (
-    DEFAULT_PROFILE,
-    ConnectOption,
-    HostOption,
-    JsonOption,
-    ProfileOption,
-)
+from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.profile import Profile, as_robot
@@ -22,39 +16,32 @@ from vla_zenoh.security.identity import Role
 from vla_zenoh.security.store import Store
 
 
+@options
 def replay(
     file: Annotated[Path, typer.Argument(help="A file of `vla-zenoh record`.")],
+    target: RobotTarget,
     speed: Annotated[
         float, typer.Option("--speed", help="2 is twice as fast.", min=0.01, max=100)
     ] = 1.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin anew at the end.")] = False,
-    robot: Annotated[
-        str | None, typer.Option("--as", help="Robot to replay it as; its own without it.")
-    ] = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Start again at the end.")] = False,
     only: Annotated[
         list[str] | None,
-        typer.Option(
-            "--only", help="cameras, state, task, ...: only this; may be given more than once."
-        ),
+        typer.Option("--only", help="Only this group: cameras, state, task, ...; repeatable."),
     ] = None,
-    profile: ProfileOption = DEFAULT_PROFILE,
-    connect: ConnectOption = None,
-    host: HostOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Put a recorded run on keys again, with its own timing.
+    """Publish a recorded run again with its own timing, as the recorded robot or as --robot.
 
-    A worker hears it as it would hear the robot. Stamps are moved to now, all by the same amount.
-    Refused where a robot lives on these keys, unless only pictures are replayed.
+    Workers receive it as from the robot. All stamps are moved to now by the same amount. Rejected
+    where a robot is alive on these keys, unless only images are replayed.
     """
     from vla_zenoh.lab.recording.reader import open_recording
     from vla_zenoh.lab.recording.replay import Replay, ReplayResult, parse_groups
 
     groups = parse_groups(only or ())
     run_file = open_recording(file)
-    loaded = RobotTarget(profile, connect, host).load()
-    loaded = as_robot(loaded, robot or run_file.keys.robot)
-    _refuse_without_the_right(loaded)
+    loaded = as_robot(target.load(), target.robot or run_file.keys.robot)
+    _require_replay_role(loaded)
     done: list[ReplayResult] = []
 
     def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
@@ -83,8 +70,8 @@ def replay(
         fail(replayed.failure)
 
 
-def _refuse_without_the_right(profile: Profile) -> None:
-    """The router would drop what this computer's people may not say, and tell nobody."""
+def _require_replay_role(profile: Profile) -> None:
+    """The router would silently drop what this computer's certificate may not publish."""
     security = profile.session.security
     if security is None:
         return
@@ -94,12 +81,12 @@ def _refuse_without_the_right(profile: Profile) -> None:
         return
     able = [host for host in store.hosts() if store.has(host, Role.REPLAY.value)]
     how = (
-        f"--host {able[0]} is one that may, and lies here"
+        f"--host {able[0]} has one that may"
         if able
         else f"`vla-zenoh secure add HOST --role {Role.REPLAY.value}` makes one that may, for a "
         "computer of its own"
     )
     fail(
-        f"this computer has the certificate of the role {who}, which may not play the part of "
-        f"others: {how}"
+        f"the certificate of this computer has the role {who}, which may not publish for other "
+        f"nodes: {how}"
     )

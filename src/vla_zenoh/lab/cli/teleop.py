@@ -1,4 +1,4 @@
-"""vla-zenoh teleop."""
+"""vla-zenoh teleop: a person as a worker."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 import zenoh
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.cli.options import DEFAULT_PROFILE, ConnectOption, HostOption, ProfileOption
+from vla_zenoh.cli.options import options
 from vla_zenoh.cli.output import errors
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError
@@ -18,46 +18,47 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.runtime.process import run_node
 
 
+@options
 def teleop(
+    target: RobotTarget,
     device: Annotated[
         Literal["keyboard", "gamepad", "spacemouse"],
-        typer.Option("--device", "-d", help="Sticks beside the keyboard, which always works."),
+        typer.Option("--device", "-d", help="Input besides the keyboard, which always works."),
     ] = "keyboard",
     frame: Annotated[
-        Literal["base", "tcp"], typer.Option(help="Axes of the motion: the robot's or the tool's.")
+        Literal["base", "tcp"],
+        typer.Option(help="Axes of the motion: robot base or TCP."),
     ] = "base",
-    speed: Annotated[int, typer.Option("--speed", min=1, max=5, help="Level at first.")] = 3,
-    profile: ProfileOption = DEFAULT_PROFILE,
-    connect: ConnectOption = None,
-    host: HostOption = None,
-    name: Annotated[str, typer.Option("--name", help="What the worker is called.")] = "teleop",
+    speed: Annotated[int, typer.Option("--speed", min=1, max=5, help="Initial speed level.")] = 3,
+    name: Annotated[str, typer.Option("--name", help="Name of the worker.")] = "teleop",
 ) -> None:
-    """Drive the arm by hand: a worker like any other, whose model is you.
+    """Drive the arm by hand, as a worker whose model is you.
 
-    `vla-zenoh use teleop` (or Tab) gives it the arm, also while a model moves it; what you do is
-    recorded as a model's run would be.
+    `vla-zenoh use teleop` (or Tab) selects it, also while a model moves the arm; it is recorded as
+    any worker is.
     """
     from vla_zenoh.lab.teleop.node import Teleop
     from vla_zenoh.lab.teleop.sticks import DEVICES
 
-    loaded = RobotTarget(profile, connect, host).load()
+    loaded = target.load()
     with ExitStack() as stack:
         stick = DEVICES[device]() if device in DEVICES else None
         if stick is not None:
             stack.callback(stick.close)
-            errors().print(f"{stick.name} is used beside the keyboard")
+            errors().print(f"using {stick.name} and the keyboard")
 
         def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
-            people = _people(loaded, stack)
-            Teleop(loaded, session, people, name, stick=stick, frame=frame, level=speed - 1).run(
-                stop
+            settings = _settings_session(loaded, stack)
+            node = Teleop(
+                loaded, session, settings, name, stick=stick, frame=frame, level=speed - 1
             )
+            node.run(stop)
 
         run_node(loaded, run, identity=worker_node(name))
 
 
-def _people(profile: Profile, stack: ExitStack) -> zenoh.Session | None:
-    """A session with the rights of whoever sits here: a worker may not put settings."""
+def _settings_session(profile: Profile, stack: ExitStack) -> zenoh.Session | None:
+    """A session with the operator's certificate: a worker may not publish settings."""
     try:
         return stack.enter_context(open_session(profile.session))
     except SecurityError as error:

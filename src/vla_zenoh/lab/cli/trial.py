@@ -1,11 +1,11 @@
-"""vla-zenoh trial."""
+"""vla-zenoh lab trial: models on a real arm, judged by a person."""
 
 from __future__ import annotations
 
 import secrets
 import signal
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,14 +13,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from vla_zenoh.cli.options import (
-    DEFAULT_PROFILE,
-    ConnectOption,
-    HostOption,
-    JsonOption,
-    ProfileOption,
-    RobotOption,
-)
+from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, print_json, printable
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.lab.trial.folder import TrialFolder
@@ -31,46 +24,61 @@ from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 EPISODES, SECONDS = 20, 60.0
 
 
-def trial(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder; one that is there goes on.")],
+@dataclass(frozen=True)
+class PlanOptions:
+    """Options for a new trial; one that is continued has them in its folder."""
+
     workers: Annotated[
         str | None, typer.Option("--workers", "-w", help="One or more, separated by commas.")
-    ] = None,
-    prompt: Annotated[str | None, typer.Option("--prompt", help="What they are to do.")] = None,
-    episodes: Annotated[
-        int | None, typer.Option("--episodes", "-n", min=1, help="Of every worker.")
-    ] = None,
+    ] = None
+    prompt: Annotated[str | None, typer.Option("--prompt", help="The task.")] = None
+    episodes: Annotated[int | None, typer.Option("--episodes", "-n", min=1, help="Per worker.")] = (
+        None
+    )
     setups: Annotated[
         Path | None,
-        typer.Option("--setups", help="Text file with a setup a line; every worker does each."),
-    ] = None,
+        typer.Option("--setups", help="Text file with a setup per line; every worker does each."),
+    ] = None
     seconds: Annotated[
-        float | None, typer.Option("--seconds", "-s", min=0.1, help="An episode ends after these.")
-    ] = None,
+        float | None, typer.Option("--seconds", "-s", min=0.1, help="Time limit of an episode.")
+    ] = None
     seed: Annotated[
-        int | None, typer.Option("--seed", help="Of the workers' order; drawn without it.")
-    ] = None,
+        int | None, typer.Option("--seed", help="Of the order of workers; default: random.")
+    ] = None
     is_open: Annotated[
-        bool, typer.Option("--open", help="Say which worker it is; else nobody is told.")
-    ] = False,
+        bool, typer.Option("--open", help="Show which worker runs; default: blind.")
+    ] = False
+
+    def asked(self, robot: str) -> dict[str, Any]:
+        """Fields of the plan that were given, None for the others."""
+        return {
+            "robot": robot,
+            "workers": None if self.workers is None else _names(self.workers),
+            "prompt": None if self.prompt is None else self.prompt.strip(),
+            "setups": _setups(self.episodes, self.setups),
+            "seconds": self.seconds,
+            "seed": self.seed,
+            "blind": False if self.is_open else None,
+        }
+
+
+@options
+def trial(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder; an existing one continues.")],
+    plan_options: PlanOptions,
+    target: RobotTarget,
     yes_setup: Annotated[
-        bool, typer.Option("--yes-setup", help="Every setup is laid already; do not ask.")
+        bool, typer.Option("--yes-setup", help="Every setup is prepared; do not ask.")
     ] = False,
-    report: Annotated[
-        bool, typer.Option("--report", help="Only show what was judged so far.")
-    ] = False,
-    profile: ProfileOption = DEFAULT_PROFILE,
-    connect: ConnectOption = None,
-    host: HostOption = None,
-    robot: RobotOption = None,
+    report: Annotated[bool, typer.Option("--report", help="Only show the results so far.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Try models on a real arm, where you say whether each episode succeeded.
+    """Try models on a real arm; you judge whether each episode succeeded.
 
-    Every setup is done by every worker, in an order that you are not told. Enter ends an episode,
-    Ctrl-C ends the trial, the arm brakes first; the same command goes on with it.
+    Every worker does every setup, in an order that you do not see. Enter ends an episode, Ctrl-C
+    the trial; the arm brakes first. The same command continues it.
     """
-    folder, aim = TrialFolder(out), RobotTarget(profile, connect, host, robot)
+    folder = TrialFolder(out)
     if report:
         plan = folder.plan()
         if plan is None:
@@ -78,23 +86,15 @@ def trial(
         found = folder.episodes()
         _warn_of_peeking(plan, found)
     else:
-        asked = {
-            "robot": aim.load().robot.name,
-            "workers": None if workers is None else _names(workers),
-            "prompt": None if prompt is None else prompt.strip(),
-            "setups": _setups(episodes, setups),
-            "seconds": seconds,
-            "seed": seed,
-            "blind": False if is_open else None,
-        }
+        asked = plan_options.asked(target.load().robot.name)
         with folder.lock():
-            plan = _begun(folder, asked)
+            plan = _plan(folder, asked)
             found = folder.episodes()
             if folder.truncated:
-                said = "the last line of trials.jsonl was cut off; its episode is done again"
-                errors().print(said, style="yellow", markup=False)
+                text = "the last line of trials.jsonl was cut off; its episode is repeated"
+                errors().print(text, style="yellow", markup=False)
             if plan.next_due(found) is not None:
-                found = _run(folder, plan, found, aim, yes_setup)
+                found = _run(folder, plan, found, target, yes_setup)
     result = score(plan, found)
     if as_json:
         print_json(_mapping(plan, result, found))
@@ -118,29 +118,27 @@ def _setups(episodes: int | None, file: Path | None) -> tuple[str, ...] | None:
     return tuple(line for line in lines if line)
 
 
-def _begun(folder: TrialFolder, asked: dict[str, Any]) -> TrialPlan:
-    """The plan of the folder, or one of what was asked for."""
+def _plan(folder: TrialFolder, asked: dict[str, Any]) -> TrialPlan:
+    """The plan of the folder, or a new one from `asked`."""
     plan = folder.plan()
     if plan is not None:
-        others = plan.differences(asked)
-        if others:
+        if others := plan.differences(asked):
             fail(
-                f"{folder.path} was begun otherwise: {'; '.join(others)}. Leave that out to go on "
-                "with it, or give another --out"
+                f"{folder.path} has another plan: {'; '.join(others)}. Leave that out to continue "
+                "it, or give another --out"
             )
         return plan
     for name in ("workers", "prompt"):
         if asked[name] is None:
-            raise typer.BadParameter(f"--{name} is needed: {folder.path} holds no trial yet")
-    usual = {
+            raise typer.BadParameter(f"--{name} is required: {folder.path} holds no trial yet")
+    defaults = {
         "setups": ("",) * EPISODES,
         "seconds": SECONDS,
         "seed": secrets.randbelow(2**32),
         "blind": True,
     }
-    plan = TrialPlan(
-        **{**usual, **{name: value for name, value in asked.items() if value is not None}}
-    )
+    given = {name: value for name, value in asked.items() if value is not None}
+    plan = TrialPlan(**{**defaults, **given})
     folder.begin(plan)
     return plan
 
@@ -149,7 +147,7 @@ def _run(
     folder: TrialFolder,
     plan: TrialPlan,
     found: list[EpisodeVerdict],
-    aim: RobotTarget,
+    target: RobotTarget,
     yes_setup: bool,
 ) -> list[EpisodeVerdict]:
     from vla_zenoh.lab.cli.trial_person import TrialPerson
@@ -162,16 +160,16 @@ def _run(
     signal.signal(signal.SIGHUP, lambda *_: stop.set())
     signal.signal(signal.SIGTSTP, signal.SIG_IGN)
     done = score(plan, found).done
-    blind = "; the order is not told" if plan.blind else ""
-    said = f"{folder.path}: {plan.prompt!r}, {done} of {plan.episodes} episodes done{blind}"
-    errors().print(said, markup=False)
+    blind = "; blind" if plan.blind else ""
+    text = f"{folder.path}: {plan.prompt!r}, {done} of {plan.episodes} episodes done{blind}"
+    errors().print(text, markup=False)
     person = TrialPerson(plan, sys.stdin.fileno(), stop, lays=yes_setup)
     try:
-        with aim.driver("trial", "--out", str(folder.path)) as client:
+        with target.operator("lab", "trial", "--out", str(folder.path)) as client:
             return TrialRunner(client, plan, folder, person, stop).run()
     except Interrupted:
         done = score(plan, folder.episodes()).done
-        errors().print(f"{done} of {plan.episodes} done; the same command goes on", markup=False)
+        errors().print(f"{done} of {plan.episodes} done; the same command continues", markup=False)
         raise typer.Exit(130) from None
 
 
@@ -180,7 +178,7 @@ def _warn_of_peeking(plan: TrialPlan, found: list[EpisodeVerdict]) -> None:
     if done < plan.episodes:
         errors().print(
             f"{done} of {plan.episodes} episodes done: p and intervals hold where the number of "
-            "episodes was fixed beforehand, not where a look at them decides when to stop",
+            "episodes was fixed beforehand, not where the results so far decide when to stop",
             style="yellow",
             markup=False,
         )
@@ -233,7 +231,7 @@ def _show(plan: TrialPlan, result: TrialScore) -> None:
         one, other = plan.workers
         low, high = pair.difference_95
         screen.print(
-            f"{one} less {other} over {pair.setups} setups that both did: {pair.difference:+.1%} "
+            f"{one} minus {other} over {pair.setups} setups that both did: {pair.difference:+.1%} "
             f"(95 %: {low:+.1%}..{high:+.1%}), exact McNemar p = {pair.p:.3g}; both {pair.both}, "
             f"{one} alone {pair.first}, {other} alone {pair.second}, neither {pair.neither}",
             markup=False,

@@ -1,4 +1,4 @@
-"""vla-zenoh view."""
+"""vla-zenoh view: a robot and its model in Rerun."""
 
 from __future__ import annotations
 
@@ -6,18 +6,14 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vla_zenoh.cli.bind_check import refuse_beyond_here
-from vla_zenoh.cli.options import (
-    DEFAULT_PROFILE,
-    ConnectOption,
-    HostOption,
-    ProfileOption,
-)
+from vla_zenoh.cli.addresses import require_loopback
+from vla_zenoh.cli.options import options
 from vla_zenoh.cli.output import errors, fail
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import MissingExtraError, ProfileError, RecordingError
@@ -35,184 +31,190 @@ PAGE_PORT = 9090
 SHOWN_REASONS = 5
 
 
-def view(
-    file: Annotated[
-        Path | None,
-        typer.Argument(help="A file of `vla-zenoh record`; without it, the robot that lives."),
-    ] = None,
+@dataclass(frozen=True)
+class ViewOutput:
+    """Options for where the view goes: a window, browsers, or a file."""
+
     serve: Annotated[
-        bool, typer.Option("--serve", help="Serve the view for browsers; no screen needed.")
-    ] = False,
+        bool, typer.Option("--serve", help="Serve the view for browsers; needs no screen.")
+    ] = False
     save: Annotated[
         Path | None,
-        typer.Option("--save", help="Write it to this file (.rrd), for Rerun; no screen needed."),
-    ] = None,
-    seconds: Annotated[
-        float | None, typer.Option("--seconds", "-s", help="Listen for so long.", min=0.1)
-    ] = None,
+        typer.Option("--save", help="Write it to this file (.rrd) for Rerun; needs no screen."),
+    ] = None
     bind: Annotated[
         str,
         typer.Option(
             "--bind",
-            help="With --serve: where to listen; elsewhere than here in an insecure profile alone.",
+            help="With --serve: address to listen at; a network's only with an insecure profile.",
         ),
-    ] = "127.0.0.1",
+    ] = "127.0.0.1"
     port: Annotated[
         int,
         typer.Option(
-            "--port", help="With --serve: of the page; data at the next port.", min=1, max=65534
+            "--port",
+            help="With --serve: of the page; the data is at the next port.",
+            min=1,
+            max=65534,
         ),
-    ] = PAGE_PORT,
-    profile: ProfileOption = DEFAULT_PROFILE,
-    connect: ConnectOption = None,
-    host: HostOption = None,
-) -> None:
-    """Look at a robot and its model in Rerun, live or from a recording.
+    ] = PAGE_PORT
 
-    Pictures, what the model sees and answers, the robot, poses with trails, chunks, latencies,
-    bounds, events. Ctrl-C or closing the window ends it.
+    def check(self, profile: Profile) -> None:
+        """Reject serving the view to a network: Rerun has neither password nor encryption.
+
+        Raises:
+            SecurityError: see `require_loopback`.
+        """
+        if not self.serve:
+            return
+        tunnel = " ".join(f"-L {each}:127.0.0.1:{each}" for each in (self.port, self.port + 1))
+        require_loopback(
+            profile,
+            "--bind",
+            self.bind,
+            "look through the cameras and send data to this view, as Rerun has neither password "
+            "nor encryption",
+            f"leave it out, and type on the other computer `ssh {tunnel} THIS_COMPUTER`: the page "
+            "is there as it is here; or take --save FILE.rrd there",
+        )
+
+    @contextmanager
+    def open(self, name: str) -> Iterator[tuple[Any, Viewer | None]]:
+        """Open a stream of Rerun called `name`, and the viewer unless it goes only to a file."""
+        import rerun as rr
+
+        from vla_zenoh.lab.view.rerun_logger import APPLICATION
+
+        sinks: list[Any] = []
+        if self.save is not None:
+            try:
+                self.save.parent.mkdir(parents=True, exist_ok=True)
+                self.save.open("wb").close()
+            except OSError as error:
+                raise RecordingError(f"{self.save} cannot be written: {error.strerror}") from error
+            sinks.append(rr.FileSink(str(self.save)))
+        viewer = None
+        if self.serve:
+            viewer = open_server(self.bind, self.port)
+            errors().print(f"open in a browser: {viewer.page_url}", soft_wrap=True)
+        elif self.save is None:
+            viewer = open_window()
+        try:
+            if viewer is not None:
+                sinks.append(rr.GrpcSink(viewer.data_url))
+            stream = rr.RecordingStream(APPLICATION)
+            stream.set_sinks(*sinks)
+            stream.send_recording_name(name)
+            yield stream, viewer
+            if viewer is None or not viewer.closed:
+                stream.flush(timeout_sec=FLUSH_S)
+            stream.disconnect()
+        finally:
+            if viewer is not None:
+                viewer.close()
+
+
+@options
+def view(
+    target: RobotTarget,
+    output: ViewOutput,
+    file: Annotated[
+        Path | None,
+        typer.Argument(help="A file of `vla-zenoh record`; default: the running robot."),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", "-s", help="End after this time.", min=0.1)
+    ] = None,
+) -> None:
+    """View a robot and its model in Rerun, live or from a recording.
+
+    Shows images, inputs and outputs of the model, the robot, poses with trails, chunks, latencies,
+    limits, events. Ctrl-C or closing the window ends it.
     """
     try:
         import rerun  # noqa: F401  # before anything is opened
     except ImportError as error:
         raise MissingExtraError("rerun", "view") from error
     if file is None:
-        _live(RobotTarget(profile, connect, host).load(), serve, save, seconds, bind, port)
+        _live(target.load(), output, seconds)
     else:
-        _recorded(file, profile, serve, save, bind, port)
+        _recorded(file, target.profile, output)
 
 
-def _live(
-    profile: Profile, serve: bool, save: Path | None, seconds: float | None, bind: str, port: int
-) -> None:
+def _live(profile: Profile, output: ViewOutput, seconds: float | None) -> None:
     from vla_zenoh.lab.view.listener import ViewListener
     from vla_zenoh.lab.view.rerun_logger import RerunLogger
 
     done: list[RerunLogger] = []
-    if serve:
-        _refuse_strangers(profile, bind, port)
+    output.check(profile)
 
     def run(session: Any, stop: threading.Event) -> None:
-        with _sink(profile.robot.name, serve, save, bind, port) as (stream, viewer):
-            show = RerunLogger(profile, stream, live=True)
+        with output.open(profile.robot.name) as (stream, viewer):
+            logger = RerunLogger(profile, stream, live=True)
             listener = ViewListener(session, profile)
-            errors().print(f"looking at robot {profile.robot.name}; Ctrl-C ends it")
+            errors().print(f"viewing robot {profile.robot.name}; Ctrl-C ends it")
             end_s = None if seconds is None else time.monotonic() + seconds
             while not stop.is_set() and not (viewer is not None and viewer.closed):
                 if end_s is not None and time.monotonic() >= end_s:
                     break
                 for sample in listener.take():
-                    show.log(sample)
-                show.dropped = listener.dropped.total()
+                    logger.log(sample)
+                logger.dropped = listener.dropped.total()
                 stop.wait(POLL_S)
             listener.close()
-            done.append(show)
+            done.append(logger)
 
     run_node(profile, run, identity=None)
     if not done:  # interrupted before it began
         raise typer.Exit(130)
-    _tell(done[0], save)
+    _summarise(done[0], output.save)
     if not done[0].shown:
-        fail("nothing was said; is a robot up? (`vla-zenoh up`)")
+        fail("nothing was published; is a robot up? (`vla-zenoh up`)")
 
 
-def _recorded(
-    path: Path, profile_name: str, serve: bool, save: Path | None, bind: str, port: int
-) -> None:
+def _recorded(path: Path, profile_name: str, output: ViewOutput) -> None:
     from vla_zenoh.lab.recording.reader import open_recording
     from vla_zenoh.lab.view.rerun_logger import RerunLogger
 
     stop = stop_on_signals()
     file = open_recording(path)
     profile = _profile_of(file, profile_name)
-    if serve:
-        _refuse_strangers(profile, bind, port)
-    with _sink(path.stem, serve, save, bind, port) as (stream, viewer):
-        show = RerunLogger(profile, stream, keys=file.keys)
+    output.check(profile)
+    with output.open(path.stem) as (stream, viewer):
+        logger = RerunLogger(profile, stream, keys=file.keys)
         for sample in file.entries(lambda key: not key.endswith("/raw")):
             if stop.is_set() or (viewer is not None and viewer.closed):
                 break
-            show.log(sample)
-        _tell(show, save)
+            logger.log(sample)
+        _summarise(logger, output.save)
         if file.damage:
             errors().print(f"{path} is {file.damage}", style="yellow")
         while viewer is not None and not stop.is_set() and not viewer.closed:
             stop.wait(POLL_S)
-    if not show.shown and not stop.is_set():
+    if not logger.shown and not stop.is_set():
         fail(f"{path} holds nothing that can be shown")
-
-
-def _refuse_strangers(profile: Profile, bind: str, port: int) -> None:
-    ways = " ".join(f"-L {each}:127.0.0.1:{each}" for each in (port, port + 1))
-    refuse_beyond_here(
-        profile,
-        "--bind",
-        bind,
-        "look through the cameras and send this view what it likes, as Rerun has neither password "
-        "nor encryption",
-        f"leave it out, and type on the other computer `ssh {ways} THIS_COMPUTER`: the page is "
-        "there as it is here; or take --save FILE.rrd there",
-    )
 
 
 def _profile_of(file: Recording, name: str) -> Profile:
     try:
         return read_profile(file.profile_yaml, f"profile in {file.path}")
     except ProfileError as error:
-        why = f"{error}; --profile {name} says what the robot looks like"
-        errors().print(why, style="yellow")
+        errors().print(f"{error}; showing the robot of --profile {name}", style="yellow")
         return RobotTarget(name).load()
 
 
-@contextmanager
-def _sink(
-    name: str, serve: bool, save: Path | None, bind: str, port: int
-) -> Iterator[tuple[Any, Viewer | None]]:
-    """A Rerun stream to a window, to browsers, into a file, and the viewer where there is one."""
-    import rerun as rr
-
-    from vla_zenoh.lab.view.rerun_logger import APPLICATION
-
-    sinks: list[Any] = []
-    if save is not None:
-        try:
-            save.parent.mkdir(parents=True, exist_ok=True)
-            save.open("wb").close()
-        except OSError as error:
-            raise RecordingError(f"{save} cannot be written: {error.strerror}") from error
-        sinks.append(rr.FileSink(str(save)))
-    viewer = None
-    if serve:
-        viewer = open_server(bind, port)
-        errors().print(f"open in a browser: {viewer.page_url}", soft_wrap=True)
-    elif save is None:
-        viewer = open_window()
-    try:
-        if viewer is not None:
-            sinks.append(rr.GrpcSink(viewer.data_url))
-        stream = rr.RecordingStream(APPLICATION)
-        stream.set_sinks(*sinks)
-        stream.send_recording_name(name)
-        yield stream, viewer
-        if viewer is None or not viewer.closed:
-            stream.flush(timeout_sec=FLUSH_S)
-        stream.disconnect()
-    finally:
-        if viewer is not None:
-            viewer.close()
-
-
-def _tell(show: RerunLogger, save: Path | None) -> None:
+def _summarise(logger: RerunLogger, save: Path | None) -> None:
     screen = errors()
     where = f" in {save}" if save is not None else ""
     screen.print(
-        f"{show.shown.total():,} samples of {len(show.shown)} keys{where}",
+        f"{logger.shown.total():,} samples of {len(logger.shown)} keys{where}",
         soft_wrap=True,
     )
-    if show.refused:
-        worst = show.refused.most_common(SHOWN_REASONS)
+    if logger.refused:
+        worst = logger.refused.most_common(SHOWN_REASONS)
         reasons = ", ".join(f"{why} ({count})" for why, count in worst)
         screen.print(f"not shown: {reasons}", style="yellow")
-    if show.dropped:
-        said = f"left out, because this was too slow: {show.dropped} samples"
-        screen.print(said, style="yellow")
+    if logger.dropped:
+        screen.print(
+            f"dropped, because this was too slow: {logger.dropped} samples", style="yellow"
+        )

@@ -104,7 +104,7 @@ def rules(tried: Tried) -> HostFinding:
         name,
         "fail",
         "\n".join(shown),
-        "write the router's rules anew: vla-zenoh router --config > FILE",
+        "write the router's rules anew: vla-zenoh node router --config > FILE",
     )
 
 

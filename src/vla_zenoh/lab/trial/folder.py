@@ -102,7 +102,7 @@ class TrialFolder:
             at = ".".join(map(str, fault["loc"]))
             raise RecordingError(
                 f"{self.path / where}: {at}{': ' if at else ''}{fault['msg']}; restore it as "
-                "`vla-zenoh trial` wrote it, or give another --out"
+                "`vla-zenoh lab trial` wrote it, or give another --out"
             ) from error
 
     # -- writing ------------------------------------------------------------------------------
@@ -123,7 +123,7 @@ class TrialFolder:
                 fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 raise RecordingError(
-                    f"another `vla-zenoh trial` is at work in {self.path}"
+                    f"another `vla-zenoh lab trial` is at work in {self.path}"
                 ) from error
             yield
         finally:

@@ -1,4 +1,4 @@
-"""The way out of one camera: its two keys, its pace, and what is known of it."""
+"""Publishes the images of one camera, and tracks its state, rate, latency and faults."""
 
 from __future__ import annotations
 
@@ -26,18 +26,21 @@ from vla_zenoh.types import Event, Image
 
 WAITING, OK, LOST, ENDED = "waiting", "ok", "lost", "ended"
 _SOURCE_LIMIT = 200
+_TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
 
 
 class CameraPublisher:
-    """One camera's keys. Written by one thread, read by the one that reports.
+    """Publisher of one camera: raw, JPEG and fitted streams, each only while it has subscribers.
+
+    Used by the camera's own thread; another thread may read its status.
 
     Args:
-        name: the camera's.
-        profile: what the profile says of it.
-        shown: its source as people may read it, without passwords.
-        node: the node on whose behalf it writes.
-        tell: writes an event; may be called from any thread.
-        same_s: so long its source may give the very same picture; 0: for ever.
+        name: of the camera.
+        profile: its section of the profile.
+        shown: its source, without passwords.
+        node: publishes the streams.
+        emit: emits an event; callable from any thread.
+        same_s: how long its source may repeat an identical image, s; 0: indefinitely.
     """
 
     def __init__(
@@ -46,21 +49,21 @@ class CameraPublisher:
         profile: CameraProfile,
         shown: str,
         node: Node,
-        tell: Callable[[Event], None],
+        emit: Callable[[Event], None],
         same_s: float = 0.0,
     ) -> None:
         self.name, self.profile = name, profile
         self.backend = ""
         self.state, self.why = WAITING, "it is being opened"
-        self.bad: ImageFault | None = None
+        self.fault: ImageFault | None = None
         self._check = ImageCheck(name, profile.check, same_s)
         self.counts: Counter[str] = Counter()
-        self.pace = RateLimiter(profile.rate_hz)
-        self._shown, self._clock, self._tell = shown[:_SOURCE_LIMIT], node.clock, tell
+        self._shown, self._clock, self._emit = shown[:_SOURCE_LIMIT], node.clock, emit
         self._raw = node.declare_publisher(node.keys.camera_raw(name), Kind.FRAME)
         self._jpeg = node.declare_publisher(node.keys.camera_jpeg(name), Kind.FRAME)
-        self.forms = FittedStreams(name, profile, node, tell)
-        self._jpeg_pace = RateLimiter(profile.jpeg_rate_hz)
+        self.fitted = FittedStreams(name, profile, node, emit)
+        self._limiter = RateLimiter(profile.rate_hz)
+        self._jpeg_limiter = RateLimiter(profile.jpeg_rate_hz)
         self._seq = 0
         self._newest_mono_ns: int | None = None
         self._sizes: set[tuple[int, ...]] = set()
@@ -69,95 +72,88 @@ class CameraPublisher:
         self._latency_ms = Percentiles(256)
 
     # -- state --------------------------------------------------------------------------------
-    def change(self, state: str, why: str = "") -> None:
-        """Be in `state`; a new state, or another reason for a bad one, is told."""
+    def set_state(self, state: str, why: str = "") -> None:
+        """Enter `state`; emits an event on a new state, or on a new reason for a bad one."""
         if (state, why) == (self.state, self.why):
             return
         was, self.state, self.why = self.state, state, why
         if state == ENDED:
-            self.bad = None
+            self.fault = None
         level = "info" if state in (OK, ENDED) else "warning"
         if state != was:
-            self._tell(Event(level, "transition", f"{self.name}:{was}->{state}", why[:1000]))
+            self._emit(Event(level, "transition", f"{self.name}:{was}->{state}", why[:1000]))
         else:
-            self._tell(Event(level, "fault", f"{self.name}:{state}", why[:1000]))
+            self._emit(Event(level, "fault", f"{self.name}:{state}", why[:1000]))
 
-    def wait(self, why: str) -> None:
-        """Wait for something that is about to come: nothing to be told."""
+    def set_waiting_reason(self, why: str) -> None:
+        """Change the reason of `WAITING`, without an event."""
         if self.state == WAITING:
             self.why = why
 
     def lose(self, why: str) -> None:
-        """No picture can be had for now."""
+        """Enter `LOST`, or `WAITING` before the first image: the source delivers nothing."""
         if self.state == OK:
             self.counts["losses"] += 1
-        self.change(WAITING if self._newest_mono_ns is None else LOST, why)
+        self.set_state(WAITING if self._newest_mono_ns is None else LOST, why)
 
-    def broken(self) -> None:
-        """A single picture could not be decoded, and is left out."""
+    def count_broken(self) -> None:
+        """Count an image that could not be decoded, and emit an event."""
         self.counts["broken"] += 1
-        self._tell(
-            Event(
-                "warning",
-                "fault",
-                f"{self.name}:broken_picture",
-                "a picture could not be decoded and was left out",
-            )
-        )
+        why = "an image could not be decoded and was left out"
+        self._emit(Event("warning", "fault", f"{self.name}:broken_picture", why))
 
-    def seen(self, mono_ns: int) -> None:
-        """A picture of this time is to be had, whether anybody wants it or not."""
+    def captured(self, mono_ns: int) -> None:
+        """The source has an image of this time, whether or not it is published."""
         self._newest_mono_ns = mono_ns
 
-    def in_time(self, now_ns: int) -> bool:
-        """Whether the picture of this time is one of the `rate_hz` a second."""
-        if not self.pace.due(now_ns):
+    def due(self, now_ns: int) -> bool:
+        """Whether the image of this time is within `rate_hz`; counts it as available."""
+        if not self._limiter.due(now_ns):
             return False
         with self._lock:
             self._rate.tick()
         return True
 
-    # -- what is wrong with it ----------------------------------------------------------------
+    # -- image faults -------------------------------------------------------------------------
     def opened(self, backend: str, same_s: float) -> None:
-        """Its source is open, anew: its pictures have nothing to do with those before."""
+        """The source was (re)opened: start the image check from scratch."""
         self.backend = backend
         self._check = ImageCheck(self.name, self.profile.check, same_s)
 
-    def look(self, picture: Pixels, mono_ns: int, stamp_ns: int | None = None) -> None:
-        """Judge the camera by a picture of this time, and by the time its driver says."""
-        before, self.bad = self.bad, self._check.look(picture, mono_ns, stamp_ns)
-        if self.bad is None:
+    def check(self, image: Pixels, mono_ns: int, stamp_ns: int | None = None) -> None:
+        """Update `fault` from an image captured at `mono_ns` with the driver's `stamp_ns`."""
+        before, self.fault = self.fault, self._check.update(image, mono_ns, stamp_ns)
+        if self.fault is None:
             if before is not None:
-                self._tell(Event("info", "notice", f"{self.name}:good", "its pictures are good"))
-        elif before is None or before.what != self.bad.what:
+                self._emit(Event("info", "notice", f"{self.name}:good", "its images are good"))
+        elif before is None or before.what != self.fault.what:
             self.counts["bad"] += 1
-            _, what, why, value, limit = self.bad
-            self._tell(Event("warning", "fault", f"{self.name}:{what}", why, value, limit))
+            _, what, why, value, limit = self.fault
+            self._emit(Event("warning", "fault", f"{self.name}:{what}", why, value, limit))
 
-    # -- pictures -----------------------------------------------------------------------------
+    # -- images -------------------------------------------------------------------------------
     @property
-    def wanted(self) -> bool:
-        """Somebody listens."""
-        return self._raw.has_subscribers or self._jpeg.has_subscribers or self.forms.wanted
+    def has_subscribers(self) -> bool:
+        """Whether any stream has a subscriber."""
+        return any(one.has_subscribers for one in (self._raw, self._jpeg, self.fitted))
 
-    def put(self, picture: Pixels, mono_ns: int) -> None:
-        """Write what OpenCV gave, captured at `mono_ns`, in the profile's size.
+    def publish(self, image: Pixels, mono_ns: int) -> None:
+        """Publish an image of OpenCV, captured at `mono_ns`, in the profile's size.
 
         Raises:
-            NodeError: it is no picture that can be shown.
+            NodeError: unknown image format.
         """
         width, height = self.profile.width, self.profile.height
-        if picture.shape[:2] != (height, width):
-            self._count_size(picture.shape[:2])
+        if image.shape[:2] != (height, width):
+            self._count_resized(image.shape[:2])
         stamp_ns = self._clock.wall_ns() - (time.monotonic_ns() - mono_ns)
-        self.put_rgb(to_rgb(resize(picture, width, height)), mono_ns, stamp_ns)
+        self.publish_rgb(to_rgb(resize(image, width, height)), mono_ns, stamp_ns)
 
-    def put_rgb(self, rgb: NDArray[np.uint8], mono_ns: int, stamp_wall_ns: int) -> None:
-        """Write a finished picture, in each form that somebody listens to."""
-        raw, jpeg = self._raw.has_subscribers, self._jpeg.has_subscribers
-        fitted = self.forms.due(mono_ns)
-        thinned = self.profile.jpeg_rate_hz is not None
-        jpeg = jpeg and self._jpeg_pace.due(mono_ns)
+    def publish_rgb(self, rgb: NDArray[np.uint8], mono_ns: int, stamp_wall_ns: int) -> None:
+        """Publish (H, W, 3) RGB of the profile's size on every stream that has subscribers."""
+        raw = self._raw.has_subscribers
+        fitted = self.fitted.due(mono_ns)
+        jpeg = self._jpeg.has_subscribers and self._jpeg_limiter.due(mono_ns)
         if not (raw or jpeg or fitted):
             return
         image = Image(rgb)
@@ -167,84 +163,79 @@ class CameraPublisher:
                 encode_raw(image), stamp_wall_ns=stamp_wall_ns, seq=self._seq, encoding=schema
             )
         if jpeg:
-            # Where not all of them go out, those that do have numbers of their own.
+            # A thinned stream numbers its own images.
+            thinned = self.profile.jpeg_rate_hz is not None
             self._jpeg.publish(
                 encode_jpeg(shrink(image, self.profile.jpeg_width), self.profile.jpeg_quality),
                 stamp_wall_ns=stamp_wall_ns,
                 seq=None if thinned else self._seq,
                 encoding=zenoh.Encoding.IMAGE_JPEG,
             )
-        for form in fitted:
-            self.forms.publish(form, image, stamp_wall_ns)
+        for one in fitted:
+            self.fitted.publish(one, image, stamp_wall_ns)
         self._seq += 1
         with self._lock:
             self._latency_ms.add((time.monotonic_ns() - mono_ns) / 1e6)
 
-    def _count_size(self, size: tuple[int, ...]) -> None:
+    def _count_resized(self, size: tuple[int, ...]) -> None:
         self.counts["resized"] += 1
         if size in self._sizes:
             return
         self._sizes.add(size)
-        self._tell(
-            Event(
-                "info",
-                "notice",
-                f"{self.name}:resized",
-                f"{self._shown} gives pictures of {size[1]}x{size[0]}; they are stretched to "
-                f"{self.profile.width}x{self.profile.height}, as the profile says",
-            )
+        why = (
+            f"{self._shown} delivers images of {size[1]}x{size[0]}; they are stretched to "
+            f"{self.profile.width}x{self.profile.height}, as the profile says"
         )
+        self._emit(Event("info", "notice", f"{self.name}:resized", why))
 
-    # -- what is reported ---------------------------------------------------------------------
+    # -- status -------------------------------------------------------------------------------
     def detail(self) -> dict[str, Any]:
-        """For status: state, source, back end, age of the newest picture, what is wrong with it."""
+        """For status: state, source, back end, age of the newest image in s, fault."""
         newest = self._newest_mono_ns
-        told: dict[str, Any] = {
+        detail: dict[str, Any] = {
             "state": self.state,
             "source": self._shown,
             "backend": self.backend,
             "age_s": None if newest is None else (time.monotonic_ns() - newest) / 1e9,
         }
-        if (bad := self.bad) is not None:
-            told["bad"] = {name: getattr(bad, name) for name in ("why", "check", "value", "limit")}
-        return told | ({"why": self.why} if self.why else {})
+        if (bad := self.fault) is not None:
+            names = ("why", "check", "value", "limit")
+            detail["bad"] = {name: getattr(bad, name) for name in names}
+        return detail | ({"why": self.why} if self.why else {})
 
     def figures(self) -> tuple[float, tuple[float, float] | None]:
-        """Pictures per second that are there to be had, and ms from capture until they are put."""
+        """Rate of available images in Hz, and latency from capture to publication in ms."""
         with self._lock:
             return self._rate.rate_hz, self._latency_ms.summary()
 
     def counters(self) -> dict[str, int]:
-        """For status, named after the camera."""
+        """Counters for status, each prefixed with the camera's name."""
         counts = dict(self.counts) | {"raw": self._raw.seq, "jpeg": self._jpeg.seq}
         return {f"{self.name}.{what}": count for what, count in counts.items()}
 
 
-_TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
-
-
-def resize(picture: Pixels, width: int, height: int) -> Pixels:
-    """Stretch to (height, width): averaging when it shrinks, linear when it grows."""
-    had_height, had_width = picture.shape[:2]
+def resize(image: Pixels, width: int, height: int) -> Pixels:
+    """Stretch to (height, width): by area averaging to shrink, linearly to enlarge."""
+    had_height, had_width = image.shape[:2]
     if (had_height, had_width) == (height, width):
-        return picture
+        return image
     shrinks = width * height < had_width * had_height
     method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return cv2.resize(picture, (width, height), interpolation=method)
+    return cv2.resize(image, (width, height), interpolation=method)
 
 
-def to_rgb(picture: Pixels) -> NDArray[np.uint8]:
-    """Grey, BGR or BGRA of 8 or 16 bits to RGB uint8 (H, W, 3).
+def to_rgb(image: Pixels) -> NDArray[np.uint8]:
+    """Convert grey, BGR or BGRA of 8 or 16 bits to RGB uint8 (H, W, 3).
 
     Raises:
-        NodeError: it is none of these.
+        NodeError: any other format.
     """
-    channels = 1 if picture.ndim == 2 else picture.shape[2] if picture.ndim == 3 else 0
-    if channels not in _TO_RGB or picture.dtype not in (np.uint8, np.uint16):
+    channels = 1 if image.ndim == 2 else image.shape[2] if image.ndim == 3 else 0
+    if channels not in _TO_RGB or image.dtype not in (np.uint8, np.uint16):
         raise NodeError(
-            f"a picture of shape {picture.shape} and type {picture.dtype} cannot be shown; "
+            f"an image of shape {image.shape} and type {image.dtype} cannot be shown; "
             "wanted 1, 3 or 4 channels of 8 or 16 bits"
         )
-    if picture.dtype == np.uint16:
-        picture = (picture >> 8).astype(np.uint8)
-    return np.asarray(cv2.cvtColor(picture, _TO_RGB[channels]), np.uint8)
+    if image.dtype == np.uint16:
+        image = (image >> 8).astype(np.uint8)
+    return np.asarray(cv2.cvtColor(image, _TO_RGB[channels]), np.uint8)

@@ -1,4 +1,4 @@
-"""A video file, a folder of pictures, or a single picture, shown as if a camera saw it now."""
+"""A video file, a folder of images, or a single image, replayed as a live camera."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ from vla_zenoh.nodes.camera.opencv import Capture
 from vla_zenoh.nodes.camera.source import Pixels
 
 LOOK_S = 0.5
-"""An open file can be read on after it was removed, so its name is looked up this often."""
+"""An open file stays readable after it was deleted, so its name is checked this often."""
 MAX_VIDEO_HZ = 1000.0
 
 
 class FrameReader(Protocol):
-    """Pictures in order, once."""
+    """Reads the images of a file or folder once, in order."""
 
     backend: str
     rate_hz: float | None
 
     def step(self) -> bool:
-        """Go to the next picture; False at the end."""
+        """Go to the next image; False at the end."""
         ...
 
-    def picture(self) -> Pixels | None:
-        """The picture stepped to, None when it is broken."""
+    def image(self) -> Pixels | None:
+        """The current image; None if it is corrupt."""
         ...
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         ...
 
 
 class VideoFile:
-    """A video file, with the rate it says it has.
+    """Reader of a video file.
 
     Raises:
-        NodeError: not a video that can be read.
+        NodeError: not a readable video.
     """
 
     def __init__(self, path: Path) -> None:
         self._capture = Capture()
         if not self._capture.open(str(path), cv2.CAP_FFMPEG):
-            raise NodeError(f"{path} is neither a picture nor a video that can be read")
+            raise NodeError(f"{path} is neither an image nor a video that can be read")
         self.backend = self._capture.backend
         rate_hz = self._capture.get(cv2.CAP_PROP_FPS)
         sane = math.isfinite(rate_hz) and 0 < rate_hz <= MAX_VIDEO_HZ
@@ -59,15 +59,15 @@ class VideoFile:
     def step(self) -> bool:
         return self._capture.grab()
 
-    def picture(self) -> Pixels | None:
+    def image(self) -> Pixels | None:
         return self._capture.retrieve()
 
     def close(self) -> None:
         self._capture.close()
 
 
-class ImageFolder:
-    """Picture files; they are read only when one is asked for."""
+class ImageFiles:
+    """Reader of image files; each is decoded on demand."""
 
     def __init__(self, paths: Iterable[Path]) -> None:
         self._rest = iter(paths)
@@ -79,7 +79,7 @@ class ImageFolder:
         self._path = next(self._rest, None)
         return self._path is not None
 
-    def picture(self) -> Pixels | None:
+    def image(self) -> Pixels | None:
         return cv2.imread(str(self._path), cv2.IMREAD_COLOR)
 
     def close(self) -> None:
@@ -93,88 +93,88 @@ def natural(path: Path) -> list[tuple[int, str]]:
 
 
 def open_frames(path: Path) -> FrameReader:
-    """What lies at `path`.
+    """Reader of the video, folder or image at `path`.
 
     Raises:
-        NodeError: nothing that can be shown.
+        NodeError: missing, or nothing that can be shown.
     """
     if path.is_dir():
-        pictures = [
+        images = [
             file
             for file in sorted(path.iterdir(), key=natural)
             if file.is_file() and cv2.haveImageReader(str(file))
         ]
-        if not pictures:
-            raise NodeError(f"there is no picture in the folder {path}")
-        return ImageFolder(pictures)
+        if not images:
+            raise NodeError(f"there is no image in the folder {path}")
+        return ImageFiles(images)
     if not path.exists():
-        raise NodeError(f"there is no file or folder {path}; it is looked for until it is there")
-    return ImageFolder([path]) if cv2.haveImageReader(str(path)) else VideoFile(path)
+        raise NodeError(f"there is no file or folder {path}; waiting until it exists")
+    return ImageFiles([path]) if cv2.haveImageReader(str(path)) else VideoFile(path)
 
 
 class FileSource:
-    """Shows a file in its own time: a video at its rate, pictures at `rate_hz`.
+    """Replays a file in real time: a video at its own rate, images at `rate_hz`.
 
     Args:
-        path: video, folder of pictures (in natural order of their names), or picture.
-        rate_hz: of pictures, and of a video that does not know its rate.
+        path: video, folder of images (in natural order of their names), or image.
+        rate_hz: of images, and of a video without a rate of its own.
         loop: start again at the end.
     """
 
-    same_s, stamp_ns = 0.0, None  # a picture may be shown for as long as one likes
+    same_s, stamp_ns = 0.0, None  # an image may be shown for any length of time
 
     def __init__(self, path: str, rate_hz: float, loop: bool) -> None:
         self._path = Path(path).expanduser()
         self._rate_hz, self._loop = rate_hz, loop
-        self._reel: FrameReader | None = None
+        self._frames: FrameReader | None = None
         self._identity: tuple[int, int] = (0, 0)
         self._next_s = self._look_s = 0.0
         self._period_s = 1.0 / rate_hz
 
     @property
     def backend(self) -> str:
-        return "" if self._reel is None else self._reel.backend
+        return "" if self._frames is None else self._frames.backend
 
     def open(self) -> None:
         self.close()
-        self._reel = open_frames(self._path)
-        self._identity = self._who()
-        self._period_s = 1.0 / (self._reel.rate_hz or self._rate_hz)
+        self._frames = open_frames(self._path)
+        self._identity = self._file_identity()
+        self._period_s = 1.0 / (self._frames.rate_hz or self._rate_hz)
         self._next_s = time.monotonic()
 
     def grab(self, stop: threading.Event) -> int | None:
         if stop.wait(max(0.0, self._next_s - time.monotonic())):
             return None
         now = time.monotonic()
-        # After a stall it goes on from here: what was missed is not shown in a hurry.
+        # After a stall the schedule restarts from now: missed images do not follow in a burst.
         late = now - self._next_s > self._period_s
         self._next_s = (now if late else self._next_s) + self._period_s
         if now >= self._look_s:
             self._look_s = now + LOOK_S
-            if self._who() != self._identity:
+            if self._file_identity() != self._identity:
                 raise NodeError(f"{self._path} was replaced by another file")
         return time.monotonic_ns() if self._step() else None
 
     def retrieve(self) -> Pixels | None:
-        return None if self._reel is None else self._reel.picture()
+        return None if self._frames is None else self._frames.image()
 
     def close(self) -> None:
-        if self._reel is not None:
-            self._reel.close()
-            self._reel = None
+        if self._frames is not None:
+            self._frames.close()
+            self._frames = None
 
     def _step(self) -> bool:
-        if self._reel is not None and self._reel.step():
+        if self._frames is not None and self._frames.step():
             return True
         if not self._loop:
             return False
         self.close()
-        self._reel = open_frames(self._path)
-        if not self._reel.step():
-            raise NodeError(f"there is no picture in {self._path}")
+        self._frames = open_frames(self._path)
+        if not self._frames.step():
+            raise NodeError(f"there is no image in {self._path}")
         return True
 
-    def _who(self) -> tuple[int, int]:
+    def _file_identity(self) -> tuple[int, int]:
         try:
             found = self._path.stat()
         except OSError as error:

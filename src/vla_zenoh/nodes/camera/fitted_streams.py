@@ -165,7 +165,7 @@ class FittedStreams:
 
     # -- called by the capture thread ---------------------------------------------------------
     @property
-    def wanted(self) -> bool:
+    def has_subscribers(self) -> bool:
         """Whether any of the streams has a subscriber."""
         with self._lock:
             return any(one.stream.has_subscribers for one in self._all())

@@ -1,4 +1,4 @@
-"""Takes pictures from one source for ever, whatever becomes of it."""
+"""Chooses the cameras of a node, opens their sources, and reads each one in a thread."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import CameraProfile
 
 SIM, ROS2 = "sim:", "ros2:"
+BACKOFF_S, MAX_BACKOFF_S = 0.2, 2.0
+BROKEN_IN_A_ROW = 5
 
 
 def choose_cameras(profile: Profile, cameras: tuple[str, ...] | None) -> dict[str, CameraProfile]:
-    """The cameras asked for, or all that are not ROS 2's.
+    """The named cameras, or all except those of ROS 2.
 
     Raises:
-        NodeError: there is no such camera, it is not ours to serve, or none is left.
+        NodeError: unknown camera, a camera of ROS 2, or no camera at all.
     """
     ours = {
         name: camera
@@ -38,10 +40,10 @@ def choose_cameras(profile: Profile, cameras: tuple[str, ...] | None) -> dict[st
 
 
 def make_source(profile: CameraProfile) -> Source:
-    """The source of a camera that has a thread of its own.
+    """The source of a camera, not open yet. Call it before threads start: it configures OpenCV.
 
     Raises:
-        NodeError: the source is none of these.
+        NodeError: unknown kind of source.
     """
     from vla_zenoh.nodes.camera.opencv import prepare
 
@@ -62,37 +64,33 @@ def make_source(profile: CameraProfile) -> Source:
     raise NodeError(f"no camera source called {kind!r}; there are: v4l2, rtsp, rtsps, file, sim")
 
 
-BACKOFF_S, MAX_BACKOFF_S = 0.2, 2.0
-BROKEN_IN_A_ROW = 5
-
-
 class Grabber:
-    """Body of a thread that serves one camera.
+    """Reads one source and reopens it after every failure; `run` is the body of a thread.
 
     Args:
-        source: where its pictures come from.
-        outlet: where they go.
+        source: of the images.
+        publisher: publishes them.
     """
 
-    def __init__(self, source: Source, outlet: CameraPublisher) -> None:
-        self._source, self._outlet = source, outlet
+    def __init__(self, source: Source, publisher: CameraPublisher) -> None:
+        self._source, self._publisher = source, publisher
         self._backoff_s = BACKOFF_S
 
     def run(self, stop: threading.Event) -> None:
-        """Grab until `stop` is set or the source ends; what fails is opened again."""
+        """Grab images until `stop` is set or the source ends."""
         while not stop.is_set():
             try:
                 self._source.open()
-                self._outlet.opened(self._source.backend, self._source.same_s)
+                self._publisher.opened(self._source.backend, self._source.same_s)
                 self._grab_all(stop)
-            except Exception as error:  # no camera may end the others, whatever its library does
+            except Exception as error:  # whatever a driver raises must not end the other cameras
                 if stop.is_set():
                     return
                 known = isinstance(error, VlaZenohError)
-                self._outlet.lose(str(error) if known else f"{type(error).__name__}: {error}")
+                self._publisher.lose(str(error) if known else f"{type(error).__name__}: {error}")
             else:
                 if not stop.is_set():
-                    self._outlet.change(ENDED, "the last picture was shown, and loop is false")
+                    self._publisher.set_state(ENDED, "the last image was shown, and loop is false")
                 return
             finally:
                 self._source.close()
@@ -100,33 +98,33 @@ class Grabber:
             self._backoff_s = min(2 * self._backoff_s, MAX_BACKOFF_S)
 
     def _grab_all(self, stop: threading.Event) -> None:
-        source, outlet = self._source, self._outlet
+        source, publisher = self._source, self._publisher
         opened = last_good = looked = time.monotonic()
         proved, broken = False, 0
         while (mono_ns := source.grab(stop)) is not None and not stop.is_set():
             now = time.monotonic()
             if proved:
-                outlet.seen(mono_ns)
-            # By the time now, not of capture: a backlog must not come out in a burst.
-            if not outlet.in_time(time.monotonic_ns()):
+                publisher.captured(mono_ns)
+            # The current time, not that of capture: a backlog must not come out in a burst.
+            if not publisher.due(time.monotonic_ns()):
                 continue
-            wanted = outlet.wanted or not proved
+            wanted = publisher.has_subscribers or not proved
             if not wanted and now - looked < LOOK_S:
                 last_good = now
                 continue
-            picture = source.retrieve()
-            if picture is None:
-                outlet.broken()
+            image = source.retrieve()
+            if image is None:
+                publisher.count_broken()
                 broken += 1
                 if broken >= BROKEN_IN_A_ROW and now - last_good > STALL_S:
-                    raise NodeError(f"the last {broken} pictures could not be decoded")
+                    raise NodeError(f"the last {broken} images could not be decoded")
                 continue
             looked = now
-            outlet.look(picture, mono_ns, source.stamp_ns)
+            publisher.check(image, mono_ns, source.stamp_ns)
             if wanted:
-                outlet.put(picture, mono_ns)
-            outlet.seen(mono_ns)
+                publisher.publish(image, mono_ns)
+            publisher.captured(mono_ns)
             last_good, proved, broken = now, True, 0
-            outlet.change(OK)
+            publisher.set_state(OK)
             if now - opened > STALL_S:
                 self._backoff_s = BACKOFF_S

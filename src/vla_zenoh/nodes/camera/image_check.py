@@ -1,8 +1,8 @@
-"""Whether a camera shows what is before it, by its own pictures: frozen, black, white, covered.
+"""Detects from its own images that a camera is frozen, black, overexposed or covered.
 
-A picture is sampled at about 96 x 128 points and looked at ten times a second at most, which costs
-some 0.1 ms whatever its size. What cannot be told from a true picture is not judged: blur, a loop
-of several pictures, a camera that was moved.
+An image is sampled at about 96 x 128 points, at most ten times a second, which costs about 0.1 ms
+whatever its size. What an image cannot prove is not judged: blur, a loop of several images, a
+camera that was moved.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from vla_zenoh.profile.schema import CameraCheck
 
 ROWS, COLUMNS = 96, 128
 BLOCK = 8
-"""Samples of a block's side: in the mean of 64 the noise of a dark sensor is an eighth."""
+"""Samples along a block's side: the mean of 64 cuts a dark sensor's noise to an eighth."""
 PERIOD_NS = 90_000_000
 REPEATS = 2
-"""A single picture that comes twice is no frozen camera, however slow it is."""
+"""Identical images in a row before a camera counts as frozen; a slow camera may repeat one."""
 CLOCK_SET_NS = 1_000_000_000
-"""A time stamp that is older by more is of a clock that was set: it counts anew."""
+"""A time stamp that goes back further means that the driver's clock was set, not that it froze."""
 BLACK_LEVEL, WHITE_LEVEL = 8, 247
 EVEN_LEVELS = 6
-"""Blocks whose means are within so many levels are of one even area."""
+"""Blocks whose means lie within this many levels form one even area."""
 FEW = 0.02
-"""Share of the blocks at either end that have no say in the contrast."""
+"""Share of the blocks that is ignored at either end of the contrast."""
 
 
 class ImageFault(NamedTuple):
-    """What is wrong with a camera.
+    """Why a camera cannot be trusted.
 
     Args:
-        check: the setting of `vla_zenoh.profile.schema.CameraCheck` that it met.
-        what: one short stable word: ``same``, ``stamps``, ``black``, ``white``, ``flat``, ``even``.
-        why: how a sentence that begins with ``camera NAME`` goes on, with value and limit.
-        value: what was found, in the unit of the setting.
-        limit: the setting.
+        check: the field of `vla_zenoh.profile.schema.CameraCheck` that is violated.
+        what: a stable identifier: ``same``, ``stamps``, ``black``, ``white``, ``flat``, ``even``.
+        why: continues a sentence that begins with ``camera NAME``; has value and limit.
+        value: measured, in the unit of the field.
+        limit: value of the field.
     """
 
     check: str
@@ -48,13 +48,12 @@ class ImageFault(NamedTuple):
 
 
 class ImageCheck:
-    """Judges the pictures of one camera from `open` to `close` of its source, one after the other.
+    """Checks the images of one camera, from the opening of its source to its end.
 
     Args:
-        name: the camera's, for sentences.
-        limits: what the profile says.
-        same_s: where it leaves that open, so long a source of this kind may give the very same
-            picture; 0: for ever.
+        name: of the camera, for messages.
+        limits: of the profile.
+        same_s: default of `CameraCheck.same_s` for this kind of source.
     """
 
     def __init__(self, name: str, limits: CameraCheck, same_s: float) -> None:
@@ -67,37 +66,37 @@ class ImageCheck:
         self._stamp_ns: int | None = None
         self._content: tuple[str, int] = ("", 0)
 
-    def look(
-        self, picture: NDArray[Any], now_ns: int, stamp_ns: int | None = None
+    def update(
+        self, image: NDArray[Any], now_ns: int, stamp_ns: int | None = None
     ) -> ImageFault | None:
-        """Take a picture, and say what is wrong with the camera.
+        """Check an image.
 
         Args:
-            picture: (H, W) or (H, W, 1, 3 or 4), uint8 or uint16, colours in any order.
-            now_ns: of a clock that only goes forward.
-            stamp_ns: what the driver says of its time, on any clock; None where it says nothing.
+            image: (H, W) or (H, W, 1, 3 or 4), uint8 or uint16, channels in any order.
+            now_ns: monotonic clock.
+            stamp_ns: the driver's time stamp, on any clock; None if there is none.
 
         Returns:
-            The first of the findings; None: nothing speaks against the camera.
+            The first fault found; None: the camera looks right.
         """
         if self._looked_ns is not None and 0 <= now_ns - self._looked_ns < PERIOD_NS:
             return self.finding
         self._looked_ns = now_ns
-        sample = _sampled(picture)
+        sample = _sampled(image)
         found = self._frozen_stamps(stamp_ns, now_ns)
-        found = self._same_picture(sample, now_ns) or found
+        found = self._same_image(sample, now_ns) or found
         self.finding = self._lasting(_content(sample, self._limits), now_ns) or found
         if self.finding is not None:
             why = f"{self.finding.why} (cameras.{self._name}.check.{self.finding.check})"
             self.finding = self.finding._replace(why=why)
         return self.finding
 
-    # -- what takes two pictures ---------------------------------------------------------------
-    def _same_picture(self, sample: NDArray[Any], now_ns: int) -> ImageFault | None:
+    # -- checks over several images ------------------------------------------------------------
+    def _same_image(self, sample: NDArray[Any], now_ns: int) -> ImageFault | None:
         before, self._sample = self._sample, sample
         again = before is not None and np.array_equal(before, sample)
         self._same = self._same.then(again, now_ns)
-        return self._same.finding("same_s", "same", "shows the same picture", now_ns, self._same_s)
+        return self._same.finding("same_s", "same", "shows the same image", now_ns, self._same_s)
 
     def _frozen_stamps(self, stamp_ns: int | None, now_ns: int) -> ImageFault | None:
         newest = self._stamp_ns
@@ -107,12 +106,11 @@ class ImageCheck:
         if not again:
             self._stamp_ns = stamp_ns
         self._stamps = self._stamps.then(again, now_ns)
-        why = "gives pictures whose driver time stamp does not go forward"
+        why = "delivers images whose driver time stamp does not advance"
         return self._stamps.finding("stamp_s", "stamps", why, now_ns, self._limits.stamp_s)
 
-    # -- what one picture shows ----------------------------------------------------------------
     def _lasting(self, found: ImageFault | None, now_ns: int) -> ImageFault | None:
-        """`found` where it has been so for a while: a hand that passes by is no covered lens."""
+        """`found` once it has lasted for `after_s`: a passing hand does not cover the lens."""
         what, since_ns = self._content
         if found is None or found.what != what:
             since_ns = now_ns
@@ -121,7 +119,7 @@ class ImageCheck:
 
 
 class _Run(NamedTuple):
-    """Looks in a row in which nothing changed: how many, and the time of the first."""
+    """Successive checks in which nothing changed: their number, and the time of the first."""
 
     times: int
     since_ns: int
@@ -135,16 +133,16 @@ class _Run(NamedTuple):
         lasted_s = (now_ns - self.since_ns) / 1e9
         if limit_s == 0 or self.times < REPEATS or lasted_s < limit_s:
             return None
-        why = f"{why} since {lasted_s:.1f} s, less than {limit_s:g} s is allowed"
+        why = f"{why} for {lasted_s:.1f} s, less than {limit_s:g} s is allowed"
         return ImageFault(check, what, why, lasted_s, limit_s)
 
 
-def _sampled(picture: NDArray[Any]) -> NDArray[Any]:
-    """(1 or 3, h, w) of about `ROWS` x `COLUMNS`, a copy: each colour by itself is quicker read."""
-    if picture.ndim == 2:
-        picture = picture[:, :, None]
-    down, across = max(1, picture.shape[0] // ROWS), max(1, picture.shape[1] // COLUMNS)
-    return np.ascontiguousarray(np.moveaxis(picture[::down, ::across, :3], 2, 0))
+def _sampled(image: NDArray[Any]) -> NDArray[Any]:
+    """(1 or 3, h, w) of about `ROWS` x `COLUMNS`, a copy by channel, which is faster to read."""
+    if image.ndim == 2:
+        image = image[:, :, None]
+    down, across = max(1, image.shape[0] // ROWS), max(1, image.shape[1] // COLUMNS)
+    return np.ascontiguousarray(np.moveaxis(image[::down, ::across, :3], 2, 0))
 
 
 def _content(sample: NDArray[Any], limits: CameraCheck) -> ImageFault | None:
@@ -152,11 +150,11 @@ def _content(sample: NDArray[Any], limits: CameraCheck) -> ImageFault | None:
         sample = (sample >> 8).astype(np.uint8)
     share, most = float(np.mean(sample.max(axis=0) <= BLACK_LEVEL)), limits.clipped_share
     if share > most:
-        why = f"is black: {share:.1%} of the picture, at most {most:.1%}"
+        why = f"is black: {share:.1%} of the image, at most {most:.1%}"
         return ImageFault("clipped_share", "black", why, share, most)
     share = float(np.mean(sample.min(axis=0) >= WHITE_LEVEL))
     if share > most:
-        why = f"is overexposed: {share:.1%} of the picture is white, at most {most:.1%}"
+        why = f"is overexposed: {share:.1%} of the image is white, at most {most:.1%}"
         return ImageFault("clipped_share", "white", why, share, most)
     levels = np.sort(_blocks(sample), axis=None)
     cut = round(FEW * len(levels))
@@ -171,15 +169,15 @@ def _content(sample: NDArray[Any], limits: CameraCheck) -> ImageFault | None:
     share, most = float(np.max(ends - np.arange(len(levels)))) / len(levels), limits.uniform_share
     if share > most:
         why = (
-            f"shows one even area: {share:.0%} of the picture, at most {most:.0%} "
-            "(is something before the lens?)"
+            f"shows one even area: {share:.0%} of the image, at most {most:.0%} "
+            "(is something in front of the lens?)"
         )
         return ImageFault("uniform_share", "even", why, share, most)
     return None
 
 
 def _blocks(sample: NDArray[Any]) -> NDArray[np.float64]:
-    """Mean level of each block, all colours alike."""
+    """Mean level of each block, over all channels."""
     grey = sample.sum(axis=0, dtype=np.uint32)
     down, across = (max(1, min(BLOCK, length)) for length in grey.shape)
     rows, columns = grey.shape[0] // down, grey.shape[1] // across

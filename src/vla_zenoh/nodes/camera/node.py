@@ -1,4 +1,4 @@
-"""Pictures on the bus: several cameras of a profile from one process."""
+"""The camera node: publishes cameras of a profile from one process."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from vla_zenoh.types.stream import SingleWriterFilter
 TICK_S = 0.05
 SPECS_A_TICK = 8
 SIZES_PERIOD_S = 0.5
-"""The sizes that models want are looked at so often, however often they change their minds."""
+"""Period at which the sizes requested by models are applied, however often they change."""
 GOODBYE_S = 0.3
 """Threads get this long to end; one that hangs in a driver is left behind."""
 
 
 class CameraNode:
-    """Serves cameras: each picture once, as raw pixels and as JPEG, while somebody listens.
+    """Publishes each image of its cameras as raw pixels and as JPEG, while there are subscribers.
 
     Args:
         profile: the effective profile.
-        session: an open session, closed by whoever opened it.
-        name: the node's; another one is needed for a second camera host.
-        cameras: which of the profile's to serve; None means all but those of ROS 2.
+        session: an open session; the caller closes it.
+        name: of the node; a second camera host needs another one.
+        cameras: of the profile, to be served; None: all except those of ROS 2.
 
     Raises:
-        NodeError: there is no such camera, or a node of this name is alive already.
+        NodeError: unknown camera, or a node of this name is alive already.
     """
 
     def __init__(
@@ -52,53 +52,53 @@ class CameraNode:
     ) -> None:
         chosen = choose_cameras(profile, cameras)
         self.node = Node(name, profile, session)
-        self._scene_speaker = SingleWriterFilter(STALL_S)
-        self._voice = threading.Lock()  # a Node speaks for one thread at a time
+        self._scene_writer = SingleWriterFilter(STALL_S)
+        self._node_lock = threading.Lock()  # a Node is used by one thread at a time
         self._halt = threading.Event()
-        self._outlets = {
+        self._publishers = {
             camera: CameraPublisher(
-                camera, settings, without_password(settings.source), self.node, self._tell
+                camera, settings, without_password(settings.source), self.node, self._emit
             )
             for camera, settings in chosen.items()
         }
-        self._told: tuple[tuple[str, ...], tuple[bool, ...]] = ((), ())
-        self._sim: Any = None
+        self._reported: tuple[tuple[str, ...], tuple[bool, ...]] = ((), ())
         self._threads = [
-            self._thread(camera, Grabber(make_source(settings), self._outlets[camera]).run)
+            self._thread(camera, Grabber(make_source(settings), self._publishers[camera]).run)
             for camera, settings in chosen.items()
             if not settings.source.startswith(SIM)
         ]
-        self._asked = RequestedSizes()
+        self._requested = RequestedSizes()
         self._sized_s = -1e9
         self._specs: ZenohRing | None = None
         if any(settings.fit_for_workers for settings in chosen.values()):
             self._specs = self.node.subscribe(self.node.keys.all_specs, ZenohRing(SPECS_A_TICK))
         views = [
-            (settings.source.removeprefix(SIM), self._outlets[camera])
+            (settings.source.removeprefix(SIM), self._publishers[camera])
             for camera, settings in chosen.items()
             if settings.source.startswith(SIM)
         ]
+        self._sim: Any = None
         if views:
             from vla_zenoh.nodes.camera.sim_cameras import SimCameras
 
-            slot = self.node.subscribe(self.node.keys.sim_scene, LatestSample())
-            self._sim = SimCameras(profile, views, slot, self._read_scene, self._refuse)
+            scenes = self.node.subscribe(self.node.keys.sim_scene, LatestSample())
+            self._sim = SimCameras(profile, views, scenes, self._decode_scene, self._reject)
             self._threads.append(self._thread("sim", self._sim.run))
 
     def run(self, stop: threading.Event) -> None:
-        """Serve until `stop` is set; ends within half a second of it."""
+        """Publish until `stop` is set; ends within half a second of it."""
         for thread in self._threads:
             thread.start()
         try:
             while not stop.wait(TICK_S):
-                self._watch()
-                self._hear_models()
+                self._report()
+                self._apply_specs()
         finally:
             self._halt.set()
             give_up = time.monotonic() + GOODBYE_S
             for thread in self._threads:
                 thread.join(max(0.0, give_up - time.monotonic()))
-            with self._voice:
+            with self._node_lock:
                 self.node.publish_status("stopped", now=True)
                 self.node.close()
 
@@ -106,58 +106,59 @@ class CameraNode:
         # A daemon: a driver that hangs must not keep the process alive.
         return threading.Thread(target=body, args=(self._halt,), name=f"camera {name}", daemon=True)
 
-    # -- for the threads ----------------------------------------------------------------------
-    def _tell(self, event: Event) -> None:
-        with self._voice:
+    # -- called by the threads ----------------------------------------------------------------
+    def _emit(self, event: Event) -> None:
+        with self._node_lock:
             if not self._halt.is_set():
                 self.node.emit(event)
 
-    def _refuse(self, reason: str, why: str) -> None:
-        with self._voice:
+    def _reject(self, reason: str, why: str) -> None:
+        with self._node_lock:
             self.node.reject(reason, why)
 
-    def _read_scene(self, arrival: ReceivedSample) -> Stamped[SceneState] | None:
-        with self._voice:
-            return self.node.decode(SceneState, arrival, self._scene_speaker)
+    def _decode_scene(self, arrival: ReceivedSample) -> Stamped[SceneState] | None:
+        with self._node_lock:
+            return self.node.decode(SceneState, arrival, self._scene_writer)
 
-    def _hear_models(self) -> None:
-        """Serve the sizes that models want, where the profile says so."""
+    # -- called by `run` ----------------------------------------------------------------------
+    def _apply_specs(self) -> None:
+        """Publish cameras with ``fit_for_workers`` in the sizes that models request."""
         if self._specs is None:
             return
         now_s = time.monotonic()
         for arrival in self._specs.drain():
             worker = last_chunk(str(arrival.sample.key_expr))
-            with self._voice:
+            with self._node_lock:
                 stamped = self.node.decode(ModelSpec, arrival)
-                if stamped is not None and not self._asked.add(worker, stamped.record, now_s):
-                    why = f"specs of {MAX_MODELS} workers are known; that of {worker!r} is not read"
+                if stamped is not None and not self._requested.add(worker, stamped.record, now_s):
+                    why = f"specs of {MAX_MODELS} workers are known; that of {worker!r} is ignored"
                     self.node.reject("too_many_models", why)
         if now_s - self._sized_s < SIZES_PERIOD_S:
             return
         self._sized_s = now_s
-        for name, outlet in self._outlets.items():
-            if outlet.profile.fit_for_workers:
-                outlet.forms.serve(self._asked.sizes(name, now_s))
+        for name, publisher in self._publishers.items():
+            if publisher.profile.fit_for_workers:
+                publisher.fitted.serve(self._requested.sizes(name, now_s))
 
-    # -- status -------------------------------------------------------------------------------
-    def _watch(self) -> None:
-        states = tuple(outlet.state for outlet in self._outlets.values())
-        bad = tuple(outlet.bad is not None for outlet in self._outlets.values())
+    def _report(self) -> None:
+        publishers = self._publishers
+        states = tuple(one.state for one in publishers.values())
+        bad = tuple(one.fault is not None for one in publishers.values())
         state = "degraded" if any(bad) else _summary(states)
-        with self._voice:
-            changed = (states, bad) != self._told
+        with self._node_lock:
+            changed = (states, bad) != self._reported
             if not changed and not self.node.status_due(state):
                 return
             self.node.adopt_system_time()
-            self._told = (states, bad)
-            figures = {name: outlet.figures() for name, outlet in self._outlets.items()}
-            for outlet in self._outlets.values():
-                for what, count in outlet.counters().items():
-                    self.node.counters[what] = count
+            self._reported = (states, bad)
+            figures = {name: one.figures() for name, one in publishers.items()}
+            for one in publishers.values():
+                for counter, count in one.counters().items():
+                    self.node.counters[counter] = count
             self.node.publish_status(
                 state,
                 detail={
-                    "cameras": {name: outlet.detail() for name, outlet in self._outlets.items()},
+                    "cameras": {name: one.detail() for name, one in publishers.items()},
                     **({} if self._sim is None else {"renderer": self._sim.renderer}),
                 },
                 rates_hz={name: rate_hz for name, (rate_hz, _) in figures.items()},

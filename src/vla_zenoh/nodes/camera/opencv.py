@@ -1,4 +1,4 @@
-"""OpenCV's way to devices, streams and video files."""
+"""Devices, streams and video files through OpenCV."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import cv2
 from vla_zenoh.nodes.camera.source import STALL_S, Pixels
 
 _SILENT = 0
-# OpenCV reads these when it first opens something, so they must be there before; a user's own win.
+# OpenCV reads these when it opens its first capture. A user's own values are kept.
 _ENVIRONMENT = {
     "OPENCV_FFMPEG_LOGLEVEL": "-8",  # FFmpeg's "quiet"
     "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT": f"{STALL_S:.0f}",
@@ -18,7 +18,7 @@ _ENVIRONMENT = {
 
 
 def prepare() -> None:
-    """Make OpenCV silent and impatient; call it before threads start."""
+    """Silence OpenCV's logging and shorten its time-outs; call it before threads start."""
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     if "OPENCV_LOG_LEVEL" not in os.environ:
@@ -31,10 +31,10 @@ class Capture:
     def __init__(self) -> None:
         self._capture: cv2.VideoCapture | None = None
 
-    def open(self, what: str, api: int, options: Sequence[int] = ()) -> bool:
-        """Open `what`; False when that does not work, without saying why."""
+    def open(self, target: str, api: int, options: Sequence[int] = ()) -> bool:
+        """Open a device, URL or file; False on failure (OpenCV gives no reason)."""
         self.close()
-        capture = cv2.VideoCapture(what, api, list(options))
+        capture = cv2.VideoCapture(target, api, list(options))
         if not capture.isOpened():
             capture.release()
             return False
@@ -43,26 +43,26 @@ class Capture:
 
     @property
     def backend(self) -> str:
-        """OpenCV's name of what reads it."""
+        """OpenCV's name of its back end; empty while closed."""
         return "" if self._capture is None else self._capture.getBackendName()
 
     def get(self, quantity: int) -> float:
-        """A property, 0 where unknown."""
+        """A capture property, 0 where unknown."""
         return 0.0 if self._capture is None else self._capture.get(quantity)
 
     def grab(self) -> bool:
-        """Wait for the next picture."""
+        """Wait for the next image; False on failure."""
         return self._capture is not None and self._capture.grab()
 
     def retrieve(self) -> Pixels | None:
-        """Decode the grabbed picture."""
+        """Decode the grabbed image; None if it is corrupt."""
         if self._capture is None:
             return None
-        good, picture = self._capture.retrieve()
-        return picture if good else None
+        good, image = self._capture.retrieve()
+        return image if good else None
 
     def close(self) -> None:
-        """Let go of it."""
+        """Release the capture."""
         if self._capture is not None:
             self._capture.release()
             self._capture = None

@@ -1,4 +1,4 @@
-"""Network cameras, through RTSP over TCP."""
+"""Network cameras: RTSP over TCP."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from vla_zenoh.nodes.camera.opencv import Capture
 from vla_zenoh.nodes.camera.source import STALL_S, Pixels, without_password
 
 OPEN_S = 10.0
-"""To log in and wait for a picture to begin with: cameras send one in several seconds."""
+"""To log in and to wait for a key frame, which some cameras send every few seconds only."""
 INSTANT_S = 0.015
 MAX_BACKLOG = 500
 SAME_S = 5.0
-"""Compression may repeat a still scene until its next whole picture, which is seldom later."""
+"""Compression may repeat a still scene until the next key frame, which rarely takes longer."""
 _OPTIONS = (
     *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(OPEN_S * 1000)),
     *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(STALL_S * 1000)),
-    # Each further decoding thread keeps one more picture back.
+    # Each additional decoding thread delays the stream by one image.
     *(cv2.CAP_PROP_N_THREADS, 1),
 )
 
 
 class RtspSource:
-    """A stream that is stamped when it arrives: its own clock is not ours.
+    """An RTSP stream. Images are stamped on arrival: the camera's clock is not ours.
 
     Args:
         url: ``rtsp://[user:password@]host[:port]/path``.
@@ -35,7 +35,7 @@ class RtspSource:
     same_s, stamp_ns = SAME_S, None
 
     def __init__(self, url: str) -> None:
-        self._url = url
+        self._url, self._shown = url, without_password(url)
         self._capture = Capture()
 
     @property
@@ -45,23 +45,21 @@ class RtspSource:
     def open(self) -> None:
         if not self._capture.open(self._url, cv2.CAP_FFMPEG, _OPTIONS):
             raise NodeError(
-                f"{without_password(self._url)} does not answer with a picture within "
-                f"{OPEN_S:g} s; is the camera on, and are address, user and password right?"
+                f"{self._shown} does not answer with an image within {OPEN_S:g} s; is the camera "
+                "on, and are address, user and password right?"
             )
         self._skip_backlog()
 
     def grab(self, stop: threading.Event) -> int | None:
         began = time.monotonic()
         good = self._capture.grab()
-        # After its time-out OpenCV first hands out what the decoder still had: that is old.
+        # After its time-out OpenCV first returns what was left in the decoder: those are old.
         if not good or time.monotonic() - began > 0.9 * STALL_S:
-            raise NodeError(
-                f"{without_password(self._url)} has ended, or sent nothing for {STALL_S:g} s"
-            )
+            raise NodeError(f"{self._shown} has ended, or sent nothing for {STALL_S:g} s")
         return time.monotonic_ns()
 
     def _skip_backlog(self) -> None:
-        """Leave out what came while OpenCV looked at the stream: it is old and comes at once."""
+        """Drop images that queued up while OpenCV probed the stream: they return at once."""
         for _ in range(MAX_BACKLOG):
             began = time.monotonic()
             if not self._capture.grab() or time.monotonic() - began > INSTANT_S:

@@ -1,7 +1,7 @@
 """Cameras of the simulated scene: one renderer draws for all of them.
 
-It draws in the camera node's process, from the scene the simulator publishes, so that drawing never
-disturbs the control loop. A picture has the stamp of the `SceneState` it was drawn from.
+Rendering runs in the camera node's process, from the scene that the simulator publishes, so that it
+never disturbs the control loop. An image carries the stamp of the `SceneState` it was drawn from.
 """
 
 from __future__ import annotations
@@ -23,17 +23,22 @@ from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.types import SceneState, Stamped
 
+RAYCAST = "raycast"
+WAKE_S = 0.1
+IDLE_PERIOD_S = 1.0
+"""Without subscribers one image in this time is drawn, to prove that rendering works."""
+BACKOFF_S, MAX_BACKOFF_S = 0.5, 10.0
 COARSEST = 4
 TOO_SLOW, WITH_EASE = 0.5, 0.25
-"""Share of a camera's period that drawing may take before it gets coarser, and to get finer."""
+"""Share of a camera's period above which rendering gets coarser, and below which finer."""
 MEMORY = 0.8
 
 
 class RenderBudget:
-    """Every how many pixels one is drawn, for one camera; the rest is interpolated.
+    """Adapts the resolution of ray casting to the time it takes: every `step`-th pixel is drawn.
 
     Args:
-        rate_hz: pictures per second that are wanted.
+        rate_hz: of the camera.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -41,8 +46,8 @@ class RenderBudget:
         self._mean_s: float | None = None
         self.step = 1
 
-    def took(self, seconds: float) -> None:
-        """A picture took this long to draw."""
+    def add(self, seconds: float) -> None:
+        """Account for an image that took this long to draw."""
         mean_s = seconds if self._mean_s is None else self._mean_s
         mean_s = MEMORY * mean_s + (1 - MEMORY) * seconds
         self._mean_s = mean_s
@@ -54,64 +59,56 @@ class RenderBudget:
                 self._change(finer)
 
     def _change(self, step: int) -> None:
-        # What was measured says nothing of the new step; scaled by pixels it is a fair guess.
+        # Time is about proportional to the number of pixels.
         if self._mean_s is not None:
             self._mean_s *= (self.step / step) ** 2
         self.step = step
 
 
-RAYCAST = "raycast"
-WAKE_S = 0.1
-IDLE_PERIOD_S = 1.0
-"""With nobody listening one picture in this time is drawn, to know that it can be."""
-BACKOFF_S, MAX_BACKOFF_S = 0.5, 10.0
-
-
 class SimCameras:
-    """Body of a thread that serves all simulated cameras.
+    """All simulated cameras of a node; `run` is the body of a thread.
 
     Args:
         profile: scene, robot and choice of renderer.
-        views: the scene's name of each camera, and where its pictures go.
-        slot: the newest scene.
-        read: decodes a scene, None when it is refused.
-        refuse: counts and tells a refusal: reason, why.
+        views: name of each camera in the scene, and its publisher.
+        buffer: the newest scene.
+        decode: decodes a scene; None if it was rejected.
+        reject: counts and reports a rejection: reason, why.
     """
 
     def __init__(
         self,
         profile: Profile,
         views: Sequence[tuple[str, CameraPublisher]],
-        slot: LatestSample,
-        read: Callable[[ReceivedSample], Stamped[SceneState] | None],
-        refuse: Callable[[str, str], None],
+        buffer: LatestSample,
+        decode: Callable[[ReceivedSample], Stamped[SceneState] | None],
+        reject: Callable[[str, str], None],
     ) -> None:
-        self._profile, self._views, self._slot = profile, tuple(views), slot
-        self._read, self._refuse = read, refuse
-        self._drawn_ns = {outlet.name: 0 for _, outlet in self._views}
-        self._coarseness = {
-            outlet.name: RenderBudget(outlet.profile.rate_hz) for _, outlet in self._views
-        }
-        self._heard_ns = time.monotonic_ns()
+        self._profile, self._views, self._buffer = profile, tuple(views), buffer
+        self._decode, self._reject = decode, reject
+        self._drawn_ns = {one.name: 0 for _, one in self._views}
+        self._budgets = {one.name: RenderBudget(one.profile.rate_hz) for _, one in self._views}
+        self._received_ns = time.monotonic_ns()
         self._seed: int | None = None
         self.renderer = "not ready yet"
 
     def run(self, stop: threading.Event) -> None:
-        """Draw until `stop` is set; a renderer that fails is made anew."""
+        """Render until `stop` is set; a renderer that fails is replaced."""
         backoff_s = BACKOFF_S
         while not stop.is_set():
             self._drawn_ns = dict.fromkeys(self._drawn_ns, 0)
             try:
                 with self._make_renderer() as renderer:
-                    self._draw_all(renderer, stop)
-            except Exception as error:  # drivers raise what they like, and that must not end us
+                    self._render_scenes(renderer, stop)
+            except Exception as error:  # drivers raise anything, and none of it may end the thread
                 if stop.is_set():
                     return
                 known = isinstance(error, VlaZenohError)
                 why = str(error) if known else f"{type(error).__name__}: {error}"
                 self.renderer = f"none: {why}"
-                self._lose_all(why)
-            if any(outlet.state == OK for _, outlet in self._views):
+                for _, publisher in self._views:
+                    publisher.lose(why)
+            if any(publisher.state == OK for _, publisher in self._views):
                 backoff_s = BACKOFF_S
             stop.wait(backoff_s)
             backoff_s = min(2 * backoff_s, MAX_BACKOFF_S)
@@ -124,7 +121,7 @@ class SimCameras:
             tcp_link=self._profile.robot.tcp_frame,
         )
         try:
-            # "auto" leaves the choice to the environment variable, where there is one.
+            # "auto" leaves the choice to the environment variable, if it is set.
             backend = choose_backend(None if wanted == AUTO else wanted)
             renderer = Renderer(self._profile.sim.scene, robot, backend)
         except ImportError as error:
@@ -135,38 +132,39 @@ class SimCameras:
         if backend.reason:
             advice = f"; on Debian: apt-get install {backend.install}" if backend.install else ""
             self.renderer += f", since {backend.reason}{advice}"
-        for _, outlet in self._views:
-            outlet.backend = backend.name
+        for _, publisher in self._views:
+            publisher.backend = backend.name
         return renderer
 
-    def _draw_all(self, renderer: Renderer, stop: threading.Event) -> None:
+    def _render_scenes(self, renderer: Renderer, stop: threading.Event) -> None:
         known = set(renderer.cameras)
-        views = [(camera, outlet) for camera, outlet in self._views if camera in known]
-        for camera, outlet in self._views:
+        views = [(camera, publisher) for camera, publisher in self._views if camera in known]
+        for camera, publisher in self._views:
             if camera not in known:
-                outlet.lose(
+                publisher.lose(
                     f"scene {self._profile.sim.scene!r} has no camera {camera!r}; there are: "
                     f"{', '.join(renderer.cameras)}"
                 )
         key = self._profile.keys.short(self._profile.keys.sim_scene)
-        self._heard_ns = max(self._heard_ns, time.monotonic_ns())
-        for _, outlet in views:
-            outlet.wait(f"no scene on {key} yet")
+        self._received_ns = max(self._received_ns, time.monotonic_ns())
+        for _, publisher in views:
+            publisher.set_waiting_reason(f"no scene on {key} yet")
         while not stop.is_set():
-            if not self._slot.wait(WAKE_S):
-                if time.monotonic_ns() - self._heard_ns > STALL_S * 1e9:
-                    for _, outlet in views:
-                        outlet.lose(f"no scene on {key} for {STALL_S:g} s; does the sim node run?")
+            if not self._buffer.wait(WAKE_S):
+                if time.monotonic_ns() - self._received_ns > STALL_S * 1e9:
+                    why = f"no scene on {key} for {STALL_S:g} s; does the sim node run?"
+                    for _, publisher in views:
+                        publisher.lose(why)
                 continue
-            arrival = self._slot.pop()
-            stamped = None if arrival is None else self._read(arrival)
+            arrival = self._buffer.pop()
+            stamped = None if arrival is None else self._decode(arrival)
             if arrival is not None and stamped is not None and self._show(renderer, stamped.record):
-                self._heard_ns = arrival.mono_ns
-                self._draw_due(renderer, views, stamped.header.stamp_wall_ns, arrival.mono_ns)
+                self._received_ns = arrival.mono_ns
+                self._render_due(renderer, views, stamped.header.stamp_wall_ns, arrival.mono_ns)
 
     def _show(self, renderer: Renderer, scene: SceneState) -> bool:
         if scene.scene != self._profile.sim.scene:
-            self._refuse(
+            self._reject(
                 "foreign_scene",
                 f"sim/scene is of scene {scene.scene[:60]!r}, the profile has "
                 f"{self._profile.sim.scene!r}: start both with one profile",
@@ -178,46 +176,44 @@ class SimCameras:
         try:
             renderer.set_qpos(scene.qpos)
         except RecordError as error:
-            self._refuse("invalid", f"sim/scene: {error}")
+            self._reject("invalid", f"sim/scene: {error}")
             return False
         return True
 
-    def _draw_due(
+    def _render_due(
         self,
         renderer: Renderer,
         views: Sequence[tuple[str, CameraPublisher]],
         stamp_ns: int,
         mono_ns: int,
     ) -> None:
-        for camera, outlet in views:
-            # By the world's own time, which in lockstep is not that of any clock here.
-            in_time = outlet.in_time(stamp_ns)
-            proof_due = mono_ns - self._drawn_ns[outlet.name] > IDLE_PERIOD_S * 1e9
-            if in_time if outlet.wanted else proof_due:
-                rgb = self._draw(renderer, camera, outlet)
-                outlet.look(rgb, mono_ns)
-                outlet.put_rgb(rgb, mono_ns, stamp_ns)
-                self._drawn_ns[outlet.name] = mono_ns
-                outlet.change(OK)
-            outlet.seen(mono_ns)
+        for camera, publisher in views:
+            # By the time of the world, which in lockstep is not that of any clock here.
+            due = publisher.due(stamp_ns)
+            proof_due = mono_ns - self._drawn_ns[publisher.name] > IDLE_PERIOD_S * 1e9
+            if due if publisher.has_subscribers else proof_due:
+                rgb = self._render(renderer, camera, publisher)
+                publisher.check(rgb, mono_ns)
+                publisher.publish_rgb(rgb, mono_ns, stamp_ns)
+                self._drawn_ns[publisher.name] = mono_ns
+                publisher.set_state(OK)
+            publisher.captured(mono_ns)
 
-    def _draw(self, renderer: Renderer, camera: str, outlet: CameraPublisher) -> NDArray[np.uint8]:
-        """One picture in full size; coarser inside where ray casting would be too slow."""
-        width, height = outlet.profile.width, outlet.profile.height
-        coarseness = self._coarseness[outlet.name]
+    def _render(
+        self, renderer: Renderer, camera: str, publisher: CameraPublisher
+    ) -> NDArray[np.uint8]:
+        """One image in full size, drawn coarser where ray casting would be too slow."""
+        width, height = publisher.profile.width, publisher.profile.height
+        budget = self._budgets[publisher.name]
         began = time.perf_counter()
-        step = coarseness.step
+        step = budget.step
         rgb = renderer.render(camera, -(-width // step), -(-height // step))
         if step > 1:
             scaled = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
             rgb = np.asarray(scaled, np.uint8)
         if rgb.shape != (height, width, 3):
-            raise NodeError(f"the renderer drew a picture of shape {rgb.shape}")
+            raise NodeError(f"the renderer drew an image of shape {rgb.shape}")
         if renderer.backend.name == RAYCAST:
-            coarseness.took(time.perf_counter() - began)
-            outlet.backend = RAYCAST if coarseness.step == 1 else f"{RAYCAST} 1/{coarseness.step}"
+            budget.add(time.perf_counter() - began)
+            publisher.backend = RAYCAST if budget.step == 1 else f"{RAYCAST} 1/{budget.step}"
         return rgb
-
-    def _lose_all(self, why: str) -> None:
-        for _, outlet in self._views:
-            outlet.lose(why)

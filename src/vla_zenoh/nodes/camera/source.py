@@ -1,4 +1,4 @@
-"""What the camera node asks of a source of pictures that it has to wait for."""
+"""Interface of the image sources that the camera node waits for."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 Pixels = NDArray[Any]
-"""What OpenCV gives: (H, W) or (H, W, 1, 3 or 4), blue first, uint8 or uint16."""
+"""An image as OpenCV returns it: (H, W) or (H, W, 1, 3 or 4), BGR, uint8 or uint16."""
 
 LOOK_S = 0.5
-"""A picture is looked at this often even when nobody wants it: a broken camera is to be seen."""
+"""Without subscribers one image in this time is still decoded, to detect a broken camera."""
 STALL_S = 2.0
-"""A source that gives no picture for this long is closed and opened again."""
-
+"""A source that delivers no image for this long is closed and opened again."""
 _USER = re.compile(r"(?<=://)[^/]*@")
 _SECRET = re.compile(r"(?i)(password|passwd|pass|pwd|token)=[^&/?]*")
 
@@ -25,33 +24,33 @@ class Source(Protocol):
 
     @property
     def backend(self) -> str:
-        """What reads it, known once it is open."""
+        """Name of the library or driver that reads it; known once it is open."""
         ...
 
     @property
     def same_s(self) -> float:
-        """So long it may give the very same picture and work; 0: for ever. Known likewise."""
+        """How long a working source may repeat an identical image, s; 0: indefinitely."""
         ...
 
     @property
     def stamp_ns(self) -> int | None:
-        """What the driver said of the time of the grabbed picture; None where it says nothing."""
+        """Driver's time stamp of the grabbed image, on any clock; None if there is none."""
         ...
 
     def open(self) -> None:
-        """Get ready.
+        """Open the source.
 
         Raises:
-            NodeError: not there or not readable; says what to do.
+            NodeError: missing or not readable; says what to do.
         """
         ...
 
     def grab(self, stop: threading.Event) -> int | None:
-        """Wait for the next picture without decoding more of it than must be.
+        """Wait for the next image, decoding as little of it as possible.
 
         Returns:
-            When it was captured, ns of the monotonic clock; None when there will be no more, or
-            `stop` was set.
+            Time of capture, ns of the monotonic clock; None if the source has ended or `stop` was
+            set.
 
         Raises:
             NodeError: the source is gone.
@@ -59,14 +58,14 @@ class Source(Protocol):
         ...
 
     def retrieve(self) -> Pixels | None:
-        """The grabbed picture, None when it is broken."""
+        """Decode the grabbed image; None if it is corrupt."""
         ...
 
     def close(self) -> None:
-        """Give the device back; harmless when it is not open."""
+        """Release the device; harmless if it is not open."""
         ...
 
 
 def without_password(url: str) -> str:
-    """`url` without user and password, in front or among its parameters: fit for logs."""
+    """`url` without its user, password and token parameters, for logs."""
     return _SECRET.sub(r"\1=***", _USER.sub("", url))

@@ -1,4 +1,4 @@
-"""Cameras of this computer, through Video4Linux."""
+"""Cameras of this computer: Video4Linux."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from vla_zenoh.profile.schema import CameraProfile
 
 DEV = Path("/dev")
 MAX_UNCOMPRESSED_PX = 640 * 480
-"""USB 2 carries this many pixels 30 times a second uncompressed, and no more."""
+"""USB 2 carries at most this many uncompressed pixels at 30 Hz."""
 SANE_AGE_S = 1.0
 SAME_S = 1.0
-"""No two pictures of a sensor are alike, in every bit of thousands of pixels."""
+"""Sensor noise makes any two images differ in some bit of thousands of pixels."""
 SYS = Path("/sys/class/video4linux")
 VIRTUAL = "/sys/devices/virtual/"
 
 
 class V4l2Source:
-    """A device such as ``/dev/video0`` or ``/dev/v4l/by-id/...``, or its number.
+    """A device such as ``/dev/video0`` or ``/dev/v4l/by-id/...``.
 
     Args:
         device: path or number.
-        profile: asks the device for this size and rate; it may give another.
+        profile: size and rate to request; the device may choose others.
     """
 
     def __init__(self, device: str, profile: CameraProfile) -> None:
@@ -56,19 +56,19 @@ class V4l2Source:
         ]
         if width * height > MAX_UNCOMPRESSED_PX:
             options = [cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"), *options]
-        # A device that cannot be set so refuses to open with options, and may do without.
+        # A device that does not support these settings may still open without them.
         if not self._capture.open(str(self._path), cv2.CAP_V4L2, options) and not (
             self._capture.open(str(self._path), cv2.CAP_V4L2)
         ):
             raise NodeError(
-                f"{self._path} is there but cannot be opened as a camera: does another program use "
-                f"it (fuser -v {self._path})? Where one camera has several devices, only the first "
-                "gives pictures"
+                f"{self._path} exists but cannot be opened as a camera: does another program use "
+                f"it (fuser -v {self._path})? Of a camera with several devices, only the first one "
+                "gives images"
             )
 
     def grab(self, stop: threading.Event) -> int | None:
         if not self._capture.grab():
-            raise NodeError(f"{self._path} gave no picture for {STALL_S:g} s, or was pulled out")
+            raise NodeError(f"{self._path} gave no image for {STALL_S:g} s, or was unplugged")
         position_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
         self.stamp_ns = round(position_ms * 1e6) if position_ms > 0 else None
         return captured_ns(position_ms, time.monotonic_ns())
@@ -81,28 +81,28 @@ class V4l2Source:
 
 
 def captured_ns(position_ms: float, now_ns: int) -> int:
-    """Time of capture, from the kernel's stamp where that is of the monotonic clock.
+    """Time of capture: the kernel's stamp if it is on the monotonic clock, else `now_ns`.
 
     Args:
-        position_ms: what the driver says; some say 0, or wall time.
-        now_ns: monotonic time right after the picture was grabbed.
+        position_ms: the driver's stamp; some drivers give 0, or wall time.
+        now_ns: monotonic time right after the image was grabbed.
     """
     stamp_ns = round(position_ms * 1e6)
     return stamp_ns if 0 <= now_ns - stamp_ns < SANE_AGE_S * 1e9 else now_ns
 
 
 def is_virtual(path: Path, sys: Path = SYS) -> bool:
-    """Whether `path` is a program's device, as of v4l2loopback: it may show a scene without noise.
+    """Whether `path` is a software device such as v4l2loopback, whose images may have no noise.
 
     Args:
         path: of the device, may be a link.
-        sys: where the kernel tells what video devices are.
+        sys: the kernel's folder of video devices.
     """
     return (sys / path.resolve().name).resolve().is_relative_to(VIRTUAL)
 
 
 def why_not(path: Path) -> str:
-    """Why this user cannot open `path`, and what to do; empty when nothing speaks against it."""
+    """Why this user cannot open `path`, and what to do; empty if nothing prevents it."""
     if not path.exists():
         there = ", ".join(map(str, sorted(DEV.glob("video[0-9]*")))) or "none"
         return (

@@ -205,7 +205,7 @@ class PeerMonitor:
             self._node.reject(
                 "foreign_camera",
                 f"node {node!r} reports camera {camera!r}, which node {server!r} serves by the "
-                "profile (hosts.HOST.cameras; --name of `vla-zenoh camera`)",
+                "profile (hosts.HOST.cameras; --name of `vla-zenoh node camera`)",
                 node,
             )
             return

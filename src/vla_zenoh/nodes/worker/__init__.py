@@ -1,1 +1,1 @@
-"""The worker node: observations in, action chunks out."""
+"""Node that runs a model: observations in, action chunks out."""

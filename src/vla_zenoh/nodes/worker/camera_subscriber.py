@@ -1,4 +1,4 @@
-"""One camera as a worker hears it: in the form it asked for, else as everybody gets it."""
+"""Subscribes to the image stream of a camera that suits a model best."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from vla_zenoh.types import Event
 from vla_zenoh.types.stream import SingleWriterFilter
 
 STREAM_PATIENCE_S = 0.5
-"""Another camera is believed when the one before it was silent for so long."""
+"""After this silence of a stream's writer another one is accepted."""
 PATIENCE_S, PERIODS = 1.0, 3
-"""Without pictures in the form it asked for, for so long and so many periods of a slow camera, a
-worker takes those that all get."""
+"""Without images on the preferred stream for this long, and for this many periods of a slow camera,
+a worker subscribes to the common one as well."""
 
 
 class ReceivedImage(NamedTuple):
-    """A picture, and who may speak on its key."""
+    """A received image, and the writer filter of its stream."""
 
     arrival: ReceivedSample
-    speaker: SingleWriterFilter
+    writer: SingleWriterFilter
 
 
-class _Ear(NamedTuple):
+class _Stream(NamedTuple):
     key: str
-    slot: LatestSample
-    speaker: SingleWriterFilter
+    buffer: LatestSample
+    writer: SingleWriterFilter
 
 
 class CameraSubscriber:
-    """See the module. While what was asked for comes, nothing else travels.
+    """Subscriber of one camera: its preferred stream, and the common one as long as that is silent.
 
     Args:
-        node: the worker's.
+        node: of the worker.
         camera: its name.
-        key: where pictures are as the worker wants them.
-        plain_key: where they are for all, None where that is the same.
-        patience_s: without pictures on `key` for so long, those on `plain_key` are taken.
-        changed: is notified when a picture arrives.
+        key: of the preferred stream.
+        fallback_key: of the common stream; None if that is the preferred one.
+        patience_s: silence on `key` after which `fallback_key` is subscribed to.
+        changed: notified when an image arrives.
 
     Raises:
-        SessionError: the router does not answer at the port of pictures.
+        SessionError: the router does not answer at the port for images.
     """
 
     def __init__(
@@ -55,74 +55,80 @@ class CameraSubscriber:
         node: Node,
         camera: str,
         key: str,
-        plain_key: str | None,
+        fallback_key: str | None,
         *,
         patience_s: float,
         changed: threading.Condition,
     ) -> None:
         self._node, self._camera, self._changed = node, camera, changed
-        self._plain_key, self._patience_s = plain_key, patience_s
-        self._asked = self._listen(key)
-        self._plain: _Ear | None = None
-        self._heard_s = time.monotonic()
+        self._fallback_key, self._patience_s = fallback_key, patience_s
+        self._preferred = self._subscribe(key)
+        self._fallback: _Stream | None = None
+        self._received_s = time.monotonic()
 
     @property
-    def full(self) -> bool:
-        """Whether a picture is there that was not taken."""
-        return self._asked.slot.has_new or (self._plain is not None and self._plain.slot.has_new)
+    def has_new(self) -> bool:
+        """Whether there is an image that was not taken yet."""
+        return self._preferred.buffer.has_new or (
+            self._fallback is not None and self._fallback.buffer.has_new
+        )
 
-    def take(self) -> ReceivedImage | None:
-        """The newest picture, once."""
-        arrival = self._asked.slot.pop()
+    def pop(self) -> ReceivedImage | None:
+        """The newest image, once."""
+        arrival = self._preferred.buffer.pop()
         if arrival is not None:
-            self._heard_s = time.monotonic()
-            self._ask_no_more()
-            return ReceivedImage(arrival, self._asked.speaker)
-        if self._plain is None:
+            self._received_s = time.monotonic()
+            self._drop_fallback()
+            return ReceivedImage(arrival, self._preferred.writer)
+        if self._fallback is None:
             self._fall_back()
             return None
-        arrival = self._plain.slot.pop()
-        return None if arrival is None else ReceivedImage(arrival, self._plain.speaker)
+        arrival = self._fallback.buffer.pop()
+        return None if arrival is None else ReceivedImage(arrival, self._fallback.writer)
 
     def _fall_back(self) -> None:
-        if self._plain_key is None or time.monotonic() - self._heard_s < self._patience_s:
+        silent_s = time.monotonic() - self._received_s
+        if self._fallback_key is None or silent_s < self._patience_s:
             return
-        self._plain = self._listen(self._plain_key)
-        asked, plain = (self._node.keys.short(one.key) for one in (self._asked, self._plain))
-        why = f"no picture on {asked} for {self._patience_s:g} s; {plain} is listened to as well"
+        self._fallback = self._subscribe(self._fallback_key)
+        preferred, common = (
+            self._node.keys.short(one.key) for one in (self._preferred, self._fallback)
+        )
+        why = f"no image on {preferred} for {self._patience_s:g} s; subscribing to {common} as well"
         self._node.emit(Event("warning", "notice", f"{self._camera}:plain_pictures", why))
 
-    def _ask_no_more(self) -> None:
-        if self._plain is None:
+    def _drop_fallback(self) -> None:
+        if self._fallback is None:
             return
-        self._node.unsubscribe(self._plain.slot)
-        self._plain = None
-        why = f"there are pictures on {self._node.keys.short(self._asked.key)} again"
+        self._node.unsubscribe(self._fallback.buffer)
+        self._fallback = None
+        why = f"there are images on {self._node.keys.short(self._preferred.key)} again"
         self._node.emit(Event("info", "notice", f"{self._camera}:own_pictures", why))
 
-    def _listen(self, key: str) -> _Ear:
-        slot = self._node.subscribe(key, LatestSample(MAX_IMAGE_BYTES, self._changed), Kind.FRAME)
-        return _Ear(key, slot, SingleWriterFilter(STREAM_PATIENCE_S))
+    def _subscribe(self, key: str) -> _Stream:
+        buffer = LatestSample(MAX_IMAGE_BYTES, self._changed)
+        self._node.subscribe(key, buffer, Kind.FRAME)
+        return _Stream(key, buffer, SingleWriterFilter(STREAM_PATIENCE_S))
 
 
 def subscribe_to_camera(
     camera: CameraSpec, node: Node, *, jpeg: bool, host: str | None, changed: threading.Condition
 ) -> CameraSubscriber:
-    """Listen where the pictures are that a model wants.
+    """Subscribe to the stream that suits a model: raw, JPEG, or fitted to model and host.
 
     Args:
-        camera: what the model says of it.
-        node: the worker's.
-        jpeg: take JPEG, not raw pictures.
-        host: of the profile, on which this runs: some have a say in what travels there.
-        changed: is notified when a picture arrives.
+        camera: of the model's spec.
+        node: of the worker.
+        jpeg: JPEG rather than raw images.
+        host: of the profile, on which this runs; it may have streams of its own.
+        changed: notified when an image arrives.
 
     Raises:
-        SessionError: the router does not answer at the port of pictures.
+        SessionError: the router does not answer at the port for images.
     """
     keys, name = node.keys, camera.camera
     settings, part = node.profile.cameras.get(name), node.profile.hosts.get(host or "")
-    key, plain, rates_hz = keys.camera_raw(name), None, [settings.rate_hz if settings else None]
+    key, fallback, rates_hz = keys.camera_raw(name), None, [settings.rate_hz if settings else None]
     if jpeg:
         key = keys.camera_jpeg(name)
         size = size_variant(camera) if settings is not None and settings.fit_for_workers else None
@@ -131,6 +137,6 @@ def subscribe_to_camera(
             key, rates_hz[1] = keys.camera_fitted(name, host_variant(host)), part.pictures.rate_hz
             size = None if size is None else host_variant(host, size)
         if size is not None:
-            key, plain = keys.camera_fitted(name, size), key
+            key, fallback = keys.camera_fitted(name, size), key
     patience_s = max([PATIENCE_S, *(PERIODS / rate for rate in rates_hz if rate)])
-    return CameraSubscriber(node, name, key, plain, patience_s=patience_s, changed=changed)
+    return CameraSubscriber(node, name, key, fallback, patience_s=patience_s, changed=changed)

@@ -1,4 +1,4 @@
-"""What a model saw, on its way out of the worker and into the hands of who asks."""
+"""Publishes the inputs and outputs of inferences for debugging, and subscribes to them."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from vla_zenoh.types.chunk import plain_values
 
 JPEG_QUALITY = 95
 MAX_WAITING, MAX_SAMPLES = 64, 256
-"""Inferences whose pictures wait for their record; samples that wait to be read."""
+"""Inferences whose images wait for their record; samples that wait to be decoded."""
 MAX_WAITING_BYTES = 128 * 1024 * 1024
-"""Of either."""
+"""Of each of the two."""
 
 
 class InferenceDebugPublisher:
-    """Writes what the model saw and said, while somebody listens.
+    """Publishes observation and answer of each inference, while there are subscribers.
 
-    It is called when the chunk is out already, so it never makes one late.
+    It runs after the chunk was published, so it never delays one.
 
     Args:
-        node: the worker's.
+        node: of the worker.
         worker: its name.
         spec: of its model.
     """
@@ -42,14 +42,14 @@ class InferenceDebugPublisher:
     def __init__(self, node: Node, worker: str, spec: ModelSpec) -> None:
         self._node, self._worker, self._spec = node, worker, spec
         keys = node.keys
-        # All with one priority: who has the record has its pictures before.
+        # One priority for all: the images arrive before the record.
         self._record = node.declare_publisher(keys.seen_record(worker), Kind.FRAME)
-        self._pictures = {
+        self._images = {
             camera.camera: node.declare_publisher(keys.seen(worker, camera.camera), Kind.FRAME)
             for camera in spec.observation.cameras
         }
 
-    def show(
+    def publish(
         self,
         observation: Observation,
         answer: ActionSteps,
@@ -57,19 +57,19 @@ class InferenceDebugPublisher:
         chunk: Header,
         inference_ms: float,
     ) -> None:
-        """Write one inference to whoever listens.
+        """Publish one inference.
 
         Args:
-            observation: what the model was given.
-            answer: what it returned.
-            steps: the same, checked.
+            observation: input of the model.
+            answer: its output.
+            steps: (H, D) of the answer, validated.
             chunk: header of the published chunk.
-            inference_ms: time it took.
+            inference_ms: duration.
         """
         stamp_ns, seq = observation.stamp_wall_ns, chunk.seq
         try:
             for camera in self._spec.observation.cameras:
-                stream = self._pictures[camera.camera]
+                stream = self._images[camera.camera]
                 if stream.has_subscribers:
                     rgb = self._rgb(camera.camera, camera.colour, observation, answer)
                     stream.publish(
@@ -93,26 +93,26 @@ class InferenceDebugPublisher:
                 )
                 self._record.publish(seen, stamp_wall_ns=stamp_ns, seq=seq)
         except (RecordError, CodecError) as error:
-            self._node.reject("seen", f"what the model saw cannot be shown: {error}")
+            self._node.reject("seen", f"the inference cannot be published: {error}")
 
     @staticmethod
     def _rgb(
         camera: str, colour: str, observation: Observation, answer: ActionSteps
     ) -> NDArray[np.uint8]:
-        shown = (answer.pictures or {}).get(camera)
-        if shown is not None:
-            return np.asarray(shown)
-        picture = observation.images[camera]
-        return np.ascontiguousarray(picture[..., ::-1]) if colour == "bgr" else picture
+        own = (answer.pictures or {}).get(camera)
+        if own is not None:
+            return np.asarray(own)
+        image = observation.images[camera]
+        return np.ascontiguousarray(image[..., ::-1]) if colour == "bgr" else image
 
 
 @dataclass(frozen=True, slots=True)
 class InferenceView:
-    """One inference with its pictures.
+    """One inference with its images.
 
     Args:
-        record: see `InferenceDebug`.
-        jpegs: camera -> JPEG file of what the model was given.
+        record: prompt, steps, times.
+        jpegs: camera -> JPEG file of the model's input.
     """
 
     record: InferenceDebug
@@ -120,11 +120,11 @@ class InferenceView:
 
 
 class PendingImages:
-    """Pictures that wait for the record of their inference, up to a bound.
+    """Bounded store of images that wait for the record of their inference.
 
     Args:
-        left_out: counts by reason what is not kept.
-        limit: bytes of all of them.
+        left_out: counts dropped images by reason.
+        limit: total bytes.
     """
 
     def __init__(self, left_out: Counter[str], limit: int = MAX_WAITING_BYTES) -> None:
@@ -132,53 +132,55 @@ class PendingImages:
         self._kept: dict[tuple[str, int], dict[str, bytes]] = {}
 
     def add(self, worker: str, seq: int, camera: str, jpeg: bytes) -> None:
-        """Keep one; who has waited longest makes room.
+        """Keep an image, and drop the oldest ones beyond the limits.
 
         Raises:
-            CodecError: no model has so many cameras.
+            CodecError: more cameras than any model has.
         """
         kept = self._kept.setdefault((worker, seq), {})
         if camera not in kept and len(kept) >= MAX_CAMERAS:
-            raise CodecError("cameras", f"{worker} shows more than {MAX_CAMERAS} pictures at once")
+            raise CodecError(
+                "cameras", f"{worker} publishes more than {MAX_CAMERAS} images at once"
+            )
         self._bytes += len(jpeg) - len(kept.get(camera, b""))
         kept[camera] = jpeg
         while len(self._kept) > MAX_WAITING or self._bytes > self._limit:
-            oldest = self.take(*next(iter(self._kept)))
+            oldest = self.pop(*next(iter(self._kept)))
             self._left_out["no_record"] += len(oldest)
 
-    def take(self, worker: str, seq: int) -> dict[str, bytes]:
-        """Those of an inference, camera -> JPEG."""
+    def pop(self, worker: str, seq: int) -> dict[str, bytes]:
+        """Remove the images of an inference, camera -> JPEG."""
         found = self._kept.pop((worker, seq), {})
         self._bytes -= sum(map(len, found.values()))
         return found
 
 
 class InferenceDebugSubscriber:
-    """Collects what workers show; they show it because this listens.
+    """Collects the inferences of one worker or of all; workers publish them while this exists.
 
     Args:
         session: open session.
         keys: of the robot.
-        worker: whose; None: of all.
+        worker: its name; None: all workers.
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys, worker: str | None = None) -> None:
         self.left_out: Counter[str] = Counter()
-        """Samples by the reason why they are not shown; ``late``: `take` was called too seldom."""
+        """Dropped samples by reason; ``late``: `poll` was called too seldom."""
         self._keys = keys
         self._lock = threading.Lock()
         self._samples: deque[zenoh.Sample] = deque()
         self._samples_bytes = 0
-        self._pictures = PendingImages(self.left_out)
+        self._images = PendingImages(self.left_out)
         selectors = (
             (keys.all_seen_records, keys.all_seen)
             if worker is None
             else (keys.seen_record(worker), keys.all_seen_of(worker))
         )
-        handler = zenoh.handlers.Callback(self._hear, indirect=False)
+        handler = zenoh.handlers.Callback(self._receive, indirect=False)
         self._subscribers = [session.declare_subscriber(key, handler) for key in selectors]
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _receive(self, sample: zenoh.Sample) -> None:
         with self._lock:
             try:
                 check_size(sample, MAX_JPEG_BYTES)
@@ -191,38 +193,38 @@ class InferenceDebugSubscriber:
                 self._samples_bytes -= len(self._samples.popleft().payload)
                 self.left_out["late"] += 1
 
-    def take(self) -> list[InferenceView]:
-        """All that came since the last call, oldest first; what cannot be read is left out."""
+    def poll(self) -> list[InferenceView]:
+        """Inferences received since the last call, oldest first."""
         with self._lock:
             samples, self._samples, self._samples_bytes = self._samples, deque(), 0
         out: list[InferenceView] = []
         for sample in samples:
             try:
-                sight = self._read(sample)
+                view = self._decode(sample)
             except CodecError as error:
                 self.left_out[error.reason] += 1
                 continue
-            if sight is not None:
-                out.append(sight)
+            if view is not None:
+                out.append(view)
         return out
 
-    def _read(self, sample: zenoh.Sample) -> InferenceView | None:
+    def _decode(self, sample: zenoh.Sample) -> InferenceView | None:
         header, payload = header_of(sample), bytes_of(sample.payload, MAX_JPEG_BYTES)
         _, worker, *camera = self._keys.short(str(sample.key_expr)).split("/")
-        try:  # folders and files are named by them
+        try:  # folders and files are named after them
             for name in (worker, *camera):
                 key_chunk(name, "name")
         except ProfileError as error:
             raise CodecError("malformed", str(error)) from error
         if camera:
-            self._pictures.add(worker, header.seq, camera[0], payload)
+            self._images.add(worker, header.seq, camera[0], payload)
             return None
         record = records.decode(InferenceDebug, payload)
         if record.worker != worker:
-            raise CodecError("foreign", f"{worker} shows what {record.worker[:60]!r} saw")
-        return InferenceView(record, self._pictures.take(worker, header.seq))
+            raise CodecError("foreign", f"{worker} publishes a record of {record.worker[:60]!r}")
+        return InferenceView(record, self._images.pop(worker, header.seq))
 
     def close(self) -> None:
-        """Stop listening."""
+        """Unsubscribe."""
         for subscriber in self._subscribers:
             subscriber.undeclare()

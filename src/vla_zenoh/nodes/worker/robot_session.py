@@ -1,8 +1,4 @@
-"""One robot's side of a worker: what is heard of it, and what is said to it.
-
-A worker has a seat for every robot it serves. Each has its own node on the robot's keys, and its
-own prompt, episode, activation and rate.
-"""
+"""One robot's subscriptions and publishers of a worker."""
 
 from __future__ import annotations
 
@@ -56,16 +52,16 @@ STATE_KINDS: dict[str, type[Any]] = {
 
 
 class RobotSession:
-    """See the module.
+    """One robot's side of a worker: its own node, prompt, episode, activation and rate.
 
     Args:
-        profile: the robot's: its name, cameras, timing.
+        profile: of the robot: its name, cameras, timing.
         session: open session.
-        policy: the model, not loaded yet; several seats may share it.
+        policy: the model, not loaded yet; several sessions may share it.
         name: of the worker.
-        images: which form of pictures to listen to.
-        host: of the profile, on which this runs: some have a say in what travels there.
-        changed: is notified when a picture arrives.
+        images: image streams to subscribe to.
+        host: of the profile, on which this runs; it may have streams of its own.
+        changed: notified when an image arrives.
     """
 
     def __init__(
@@ -82,32 +78,39 @@ class RobotSession:
         self.robot = profile.robot.name
         node = self.node = Node(worker_node(name), profile, session, host=host)
         self.policy, self.name, self.spec = policy, name, policy.spec
-        self.continuation = ChunkPrefix(policy)
+        self.prefix = ChunkPrefix(policy)
         keys = node.keys
-        self._chunk_out = node.declare_publisher(keys.delta(name), Kind.ORDER)
-        self._spec_out = node.declare_publisher(keys.spec(name), Kind.TELEMETRY)
-        self._seen = InferenceDebugPublisher(node, name, self.spec)
+        self._chunks = node.declare_publisher(keys.delta(name), Kind.ORDER)
+        self._specs = node.declare_publisher(keys.spec(name), Kind.TELEMETRY)
+        self._debug = InferenceDebugPublisher(node, name, self.spec)
         node.serve(
             keys.spec(name),
             lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
         )
-        self._task_slot = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
+        self._tasks = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
         self._jpeg = images == "jpeg"
         self._cameras = {
             one.camera: subscribe_to_camera(one, node, jpeg=self._jpeg, host=host, changed=changed)
             for one in self.spec.observation.cameras
         }
-        self._state_slots = {
-            part: node.subscribe(self._state_key(part), CallbackRing(256, SMALL_BYTES))
+        state_keys = {
+            "joint": keys.state_joint,
+            "pose": keys.state_pose,
+            "gripper": keys.state_gripper,
+        }
+        self._state_buffers = {
+            part: node.subscribe(state_keys[part], CallbackRing(256, SMALL_BYTES))
             for part in self.spec.observation.state
         }
-        self._task_speaker = SingleWriterFilter(TASK_PATIENCE_S)
-        self._speakers = {part: SingleWriterFilter(STREAM_PATIENCE_S) for part in self._state_slots}
+        self._task_writer = SingleWriterFilter(TASK_PATIENCE_S)
+        self._state_writers = {
+            part: SingleWriterFilter(STREAM_PATIENCE_S) for part in self._state_buffers
+        }
         self._images: dict[str, Stamped[Image]] = {}
-        self._pictures_s: dict[str, float] = {}
+        self._images_s: dict[str, float] = {}
         self._states = {part: History() for part in self.spec.observation.state}
         self.task: Task | None = None
-        self._task_heard_s = -1e9
+        self._task_received_s = -1e9
         self._episode = -1
         self._not_before_ns = 0
         self._rate = RateMeter(window_s=10.0)
@@ -115,58 +118,53 @@ class RobotSession:
         self._batch = 0
         self._last_spec_s = -1e9
         self.complaint = "loading"
+        """Why there is no inference; empty if there is."""
         self.due_s = 0.0
-        """When the next inference is wanted, monotonic clock."""
+        """When the next inference is due, monotonic clock."""
 
-    def _state_key(self, part: str) -> str:
-        keys = self.node.keys
-        return {"joint": keys.state_joint, "pose": keys.state_pose, "gripper": keys.state_gripper}[
-            part
-        ]
-
-    # -- in -----------------------------------------------------------------------------------
+    # -- observation --------------------------------------------------------------------------
     @property
-    def news(self) -> bool:
-        """Whether the slowest input has something that was not looked at."""
-        slowest = next(iter(self._cameras.values()), None)
-        return slowest is not None and slowest.full
+    def has_image(self) -> bool:
+        """Whether the first camera has an image that was not polled yet."""
+        first = next(iter(self._cameras.values()), None)
+        return first is not None and first.has_new
 
     @property
-    def sees(self) -> bool:
-        """Whether the model wants pictures."""
+    def needs_images(self) -> bool:
+        """Whether the model observes any camera."""
         return bool(self._cameras)
 
-    def listen(self) -> None:
-        """Take in what came."""
-        arrival = self._task_slot.pop()
+    def poll(self) -> None:
+        """Decode what was received since the last call."""
+        arrival = self._tasks.pop()
         if arrival is not None:
-            task = self.node.decode(Task, arrival, self._task_speaker)
+            task = self.node.decode(Task, arrival, self._task_writer)
             if task is not None:
-                self._take_task(task)
+                self._set_task(task)
         for name, camera in self._cameras.items():
-            heard = camera.take()
-            image = self._read_image(name, heard) if heard is not None else None
-            if heard is not None and image is not None:
+            received = camera.pop()
+            image = self._decode_image(name, received) if received is not None else None
+            if received is not None and image is not None:
                 self._images[name] = image
-                self._pictures_s[name] = heard.arrival.mono_ns / 1e9
-        self.listen_to_states()
+                self._images_s[name] = received.arrival.mono_ns / 1e9
+        self.poll_states()
 
-    def listen_to_states(self) -> None:
-        """Take in states; while nothing else is to do it costs no time afterwards."""
-        for part, inbox in self._state_slots.items():
-            for arrival in inbox.drain():
-                state = self.node.decode(STATE_KINDS[part], arrival, self._speakers[part])
+    def poll_states(self) -> None:
+        """Decode the states received since the last call."""
+        for part, buffer in self._state_buffers.items():
+            for arrival in buffer.drain():
+                state = self.node.decode(STATE_KINDS[part], arrival, self._state_writers[part])
                 if state is not None:
                     self._states[part].add(state)
 
-    def _take_task(self, task: Stamped[Task]) -> None:
-        before, self.task, self._task_heard_s = self.task, task.record, time.monotonic()
+    def _set_task(self, task: Stamped[Task]) -> None:
+        before, self.task, self._task_received_s = self.task, task.record, time.monotonic()
         if before is not None and before.requested_hz != self.task.requested_hz:
-            self.due_s = min(self.due_s, self._task_heard_s)
+            self.due_s = min(self.due_s, self._task_received_s)
         if task.record.episode == self._episode:
             return
         self._episode = task.record.episode
-        # What was seen before the episode began does not belong to it.
+        # An observation from before the episode does not belong to it.
         self._not_before_ns = task.header.stamp_wall_ns
         reset = reset_of(self.policy, self.robot)
         if reset is not None:
@@ -175,12 +173,12 @@ class RobotSession:
             except Exception as error:
                 self.failed(error, "reset_failed")
 
-    def _read_image(self, camera: str, heard: ReceivedImage) -> Stamped[Image] | None:
-        arrival, speaker = heard
+    def _decode_image(self, camera: str, received: ReceivedImage) -> Stamped[Image] | None:
+        arrival, writer = received
         sample = arrival.sample
         try:
             header = self.node.header(arrival)
-            speaker.check(header, arrival.mono_ns)
+            writer.check(header, arrival.mono_ns)
             payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
             if self._jpeg:
                 image = image_codec.decode_jpeg(payload)
@@ -190,23 +188,23 @@ class RobotSession:
         except CodecError as error:
             self.node.reject(error.reason, f"camera {camera}: {error}")
             return None
-        speaker.heard(header, arrival.mono_ns)
+        writer.heard(header, arrival.mono_ns)
         self.node.traffic.received(str(sample.key_expr), header, arrival.nth)
         header, image = self.node.clocks.to_local_clock(header, image)
         return Stamped(header, image, self.node.arrival_wall_ns(arrival))
 
     def observe(self) -> Observation | None:
-        """An observation, None when there is none yet.
+        """Poll and assemble an observation; None if there is none yet.
 
-        A picture that arrives after the request is due is worth a little patience: the one at hand
-        is already half a camera period old on average, and all that time would be latency.
+        Once an inference is due, an image that is about to arrive is worth a short wait: the one at
+        hand is half a camera period old on average, which would all be latency.
         """
-        self.listen()
+        self.poll()
         self.node.clock.adopt_system_time()
         if self.task is not None and self.task.requested_hz <= 0.0:
             return None
-        if self.task is None or time.monotonic() - self._task_heard_s > TASK_PATIENCE_S:
-            self.complaint = "no command node is heard"
+        if self.task is None or time.monotonic() - self._task_received_s > TASK_PATIENCE_S:
+            self.complaint = "no task received: is the command node running?"
             return None
         try:
             observation = assemble(
@@ -226,36 +224,33 @@ class RobotSession:
                 self.complaint = observation.why
             return None
         self.complaint = ""
-        if self._pictures_s and time.monotonic() - self.due_s < FRESH_PATIENCE_S:
+        if self._images_s and time.monotonic() - self.due_s < FRESH_PATIENCE_S:
             tolerance_s = min(FRESH_TOLERANCE_S, 0.25 / observation.rate_hz)
-            if min(self._pictures_s.values()) < self.due_s - tolerance_s:
+            if min(self._images_s.values()) < self.due_s - tolerance_s:
                 return None
         return observation
 
-    # -- out ----------------------------------------------------------------------------------
+    # -- action chunks ------------------------------------------------------------------------
     def publish(
         self,
         observation: Observation,
         answer: ActionSteps,
-        observed_ns: int,
-        start_ns: int,
-        end_ns: int,
+        times_ns: tuple[int, int, int],
         batch: int,
     ) -> bool:
-        """Check an answer and send it.
+        """Validate an answer and publish it as a chunk; False if it was rejected.
 
         Args:
-            observation: what it was made of.
-            answer: the model's.
-            observed_ns: when the observation was at hand, wall clock.
-            start_ns: when inference began.
-            end_ns: when it ended.
-            batch: robots that were answered together.
+            observation: it was inferred from.
+            answer: of the model.
+            times_ns: observation complete, inference started, inference ended; wall clock.
+            batch: number of robots in this inference.
         """
         try:
             steps, done = check_steps(self.spec.action, answer.steps), bool(answer.done)
         except Exception as error:
             return self.failed(error)
+        observed_ns, start_ns, end_ns = times_ns
         self._batch = batch
         self._inference_ms.add((end_ns - start_ns) / 1e6)
         chunk = make_chunk(
@@ -268,20 +263,20 @@ class RobotSession:
             start_ns=start_ns,
             end_ns=end_ns,
         )
-        header = self._chunk_out.publish(chunk)
+        header = self._chunks.publish(chunk)
         self._not_before_ns = header.stamp_wall_ns
         self._rate.tick()
         obeyed = observation.task.active and observation.task.worker == self.name
-        self.continuation.published(observation, steps, header.stamp_wall_ns, obeyed=obeyed)
-        self._seen.show(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
+        self.prefix.published(observation, steps, header.stamp_wall_ns, obeyed=obeyed)
+        self._debug.publish(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
         return True
 
     def failed(self, error: Exception, reason: str = "") -> Literal[False]:
-        """Count and tell that the model gave no answer, and ask it again a little later."""
+        """Count and report an inference that failed; the next one is due a little later."""
         if not reason:
             if isinstance(error, SpecError):
                 reason = "contract"
-            else:  # a PeerError says by itself what it is
+            else:
                 reason = error.reason if isinstance(error, PeerError) else "inference_failed"
         expected = isinstance(error, (SpecError, PeerError))
         why = str(error) if expected else f"{type(error).__name__}: {error}"
@@ -290,11 +285,12 @@ class RobotSession:
         self.due_s = time.monotonic() + AFTER_A_FAILURE_S
         return False
 
+    # -- status -------------------------------------------------------------------------------
     def report(self, *, now: bool = False) -> None:
-        """Tell spec and status when it is time, or `now`."""
+        """Publish spec and status when they are due, or `now`."""
         if now or time.monotonic() - self._last_spec_s > SPEC_PERIOD_S:
             self._last_spec_s = time.monotonic()
-            self._spec_out.publish(self.spec)
+            self._specs.publish(self.spec)
         state = "waiting" if self.complaint else "inferring"
         if not now and not self.node.status_due(state):
             return
@@ -317,6 +313,6 @@ class RobotSession:
         )
 
     def close(self) -> None:
-        """Say goodbye to the robot."""
+        """Report ``stopped`` and close the node."""
         self.node.publish_status("stopped", now=True)
         self.node.close()

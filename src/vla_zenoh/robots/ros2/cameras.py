@@ -75,15 +75,15 @@ class Camera:
     def _take(self, arrival: ReceivedSample) -> bool:
         """Whether it was a picture."""
         outlet, now_s = self.outlet, time.monotonic()
-        due = outlet.in_time(arrival.mono_ns)
-        if not (due and outlet.wanted) and now_s - self._looked_s < LOOK_S:
+        due = outlet.due(arrival.mono_ns)
+        if not (due and outlet.has_subscribers) and now_s - self._looked_s < LOOK_S:
             if outlet.state == OK:
-                outlet.seen(arrival.mono_ns)
+                outlet.captured(arrival.mono_ns)
             return outlet.state == OK
         self._looked_s = now_s
         try:
             picture = self._read(arrival)
-            outlet.look(picture.rgb, arrival.mono_ns, picture.stamp_ns or None)
+            outlet.check(picture.rgb, arrival.mono_ns, picture.stamp_ns or None)
             if picture.stamp_ns:
                 self._newness.check(picture.stamp_ns)
         except CodecError as error:
@@ -91,13 +91,13 @@ class Camera:
             if error.reason in ("encoding", "frame"):  # they will all be like that
                 outlet.lose(str(error))
             return False
-        outlet.seen(arrival.mono_ns)
-        outlet.change(OK)
-        if due and outlet.wanted:
+        outlet.captured(arrival.mono_ns)
+        outlet.set_state(OK)
+        if due and outlet.has_subscribers:
             settings = outlet.profile
             rgb = resize(picture.rgb, settings.width, settings.height)
             stamp_ns = picture.stamp_ns or self._node.clock.wall_at(arrival.mono_ns)
-            outlet.put_rgb(rgb, arrival.mono_ns, stamp_ns)
+            outlet.publish_rgb(rgb, arrival.mono_ns, stamp_ns)
         return True
 
     def _read(self, arrival: ReceivedSample) -> RosImage:

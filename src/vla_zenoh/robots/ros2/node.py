@@ -208,7 +208,7 @@ class Ros2Node:
             self.node.adopt_system_time()
             self._watch_bridges()
         state = "running" if self._arm is None else self._arm.state
-        bad = tuple(camera.outlet.bad is not None for camera in self._cameras)
+        bad = tuple(camera.outlet.fault is not None for camera in self._cameras)
         if bad == self._bad and not self.node.status_due(state):
             return
         now, self._bad = bad != self._bad, bad

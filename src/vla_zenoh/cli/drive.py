@@ -1,0 +1,252 @@
+"""vla-zenoh prompt, activate, deactivate, use, rate, speed, stop, reset: one setting each."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Annotated, NoReturn
+
+import typer
+
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.liveliness import alive_robots
+from vla_zenoh.cli.options import options
+from vla_zenoh.cli.output import complain, console, errors, fail, styled
+from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.codec.settings import decode_percent
+from vla_zenoh.errors import SecurityError
+from vla_zenoh.keys import Keys
+from vla_zenoh.profile import as_robot
+from vla_zenoh.runtime.process import stop_on_signals
+from vla_zenoh.types import Task
+
+PATIENCE_S = 3.0
+DISCOVERY_S, POLL_S = 1.0, 0.05
+"""A router's first answers may lack robots that are alive: `stop --all` asks for this long."""
+ABSENT_PATIENCE_S = 1.5
+"""A command node that is alive may take this long to appear."""
+
+
+@options
+def prompt(
+    text: Annotated[str, typer.Argument(help="What the model shall do.")], target: RobotTarget
+) -> None:
+    """Set the prompt. Any Zenoh client can: put the text on <root>/<robot>/prompt."""
+    with target.operator("prompt", text) as client:
+        task = client.set_prompt(text)
+        _show(
+            target,
+            client,
+            f"prompt: {task.prompt!r} (worker {task.worker}, {task.rate_hz:g} Hz)",
+        )
+
+
+@options
+def activate(
+    target: RobotTarget,
+    held: Annotated[
+        bool,
+        typer.Option("--hold", help="Stay: the arm is active only while this runs (deadman)."),
+    ] = False,
+) -> None:
+    """Let the worker move the arm. Rejected with every reason while something is not ready."""
+    with target.operator("activate") as client:
+        stop = stop_on_signals() if held else None
+        task = client.activate() if stop is None else client.activate_with_deadman("person")
+        _show(
+            target,
+            client,
+            f"active: worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz",
+        )
+        if stop is not None:
+            _hold(target, client, task, stop)
+
+
+def _hold(target: RobotTarget, client: Client, activated: Task, stop: threading.Event) -> None:
+    """Wait until the arm is inactive; Ctrl-C brakes it."""
+    console().print(
+        "The arm stays active while this command runs; Ctrl-C, or losing this process, brakes it."
+    )
+    while not stop.wait(POLL_S):
+        if why := _inactive(client, activated):
+            fail(f"the arm is no longer active: {why}; {target.named(client)}")
+    _deactivate(target, client)
+    raise typer.Exit(130)
+
+
+def _inactive(client: Client, activated: Task) -> str:
+    """Why the arm is no longer active since `activated`; empty while it is."""
+    if "command" not in client.alive:
+        return "its command node is not alive"
+    status = client.status("command")
+    if status is None or status.state in ("active", "holding"):
+        return ""
+    episode = status.detail.get("episode")
+    if not isinstance(episode, int) or episode < activated.episode:  # from before the activation
+        return ""
+    return str(status.detail.get("why", "")) or status.state
+
+
+@options
+def deactivate(target: RobotTarget) -> None:
+    """Brake the arm; then no worker moves it."""
+    with target.client(stop=True) as client:
+        _deactivate(target, client)
+
+
+def _deactivate(target: RobotTarget, client: Client) -> None:
+    if not client.deactivate(PATIENCE_S):
+        _fail(target, client, "deactivate", "confirm that the arm stands")
+    _show(target, client, "inactive, the arm stands", ": ")
+
+
+@options
+def use(
+    worker: Annotated[str, typer.Argument(help="Worker whose chunks move the arm.")],
+    target: RobotTarget,
+) -> None:
+    """Select the worker that moves the arm; the others keep running."""
+    with target.operator("use", worker) as client:
+        _show(target, client, f"worker: {client.set_worker(worker).worker}")
+
+
+@options
+def rate(
+    rate_hz: Annotated[float, typer.Argument(help="Chunks per second.")], target: RobotTarget
+) -> None:
+    """Set how often the workers infer."""
+    with target.operator("rate", f"{rate_hz:g}") as client:
+        _show(target, client, f"rate: {client.set_rate(rate_hz).rate_hz:g} Hz")
+
+
+@options
+def speed(
+    target: RobotTarget,
+    percent: Annotated[
+        str | None,
+        typer.Argument(help="0 to 100; at 0 the arm stands, still active. Default: show it."),
+    ] = None,
+) -> None:
+    """Slow the arm down on the same path. Lowering needs only the right to stop."""
+    wanted = None if percent is None else decode_percent(percent.encode())
+    with target.client(stop=wanted is not None) as client:
+        task = client.wait_for(lambda: client.task, PATIENCE_S)
+        if task is None:
+            _fail(target, client, "speed", "publish its speed")
+        lower = wanted is not None and wanted <= task.speed_percent
+        if lower and (why := target.not_operator(client.profile, "speed", f"{wanted:g}")):
+            raise SecurityError(why)
+        if wanted is None or lower:
+            _show_speed(target, client, task if wanted is None else client.slow_down(wanted))
+            return
+    with target.operator("speed", f"{wanted:g}") as client:
+        _show_speed(target, client, client.set_speed(wanted))
+
+
+def _show_speed(target: RobotTarget, client: Client, task: Task) -> None:
+    _show(target, client, f"speed: {task.speed_percent:g} % of what is planned")
+
+
+@options
+def stop(
+    target: RobotTarget,
+    every: Annotated[
+        bool, typer.Option("--all", help="Every robot that is visible on this router.")
+    ] = False,
+) -> None:
+    """Emergency stop: brake now and stay stopped until `vla-zenoh reset`."""
+    with target.client(stop=True) as client:
+        client.publish(client.keys.stop, "stop")
+        if every:
+            _stop_all(target, client)
+            return
+        if not _stops(client):
+            _fail(target, client, "stop", "confirm that it stopped")
+        _show_stopped(target, client, client.profile.robot.name)
+        if others := target.others(client):
+            more = f"not stopped: {', '.join(others)}; `{target.typed('stop', '--all')}` stops all"
+            errors().print(styled(more, "yellow"), soft_wrap=True)
+
+
+@options
+def reset(target: RobotTarget) -> None:
+    """Clear an emergency stop or a fault. The arm stays inactive."""
+    with target.operator("reset") as client:
+        client.publish(client.keys.reset, "reset")
+        if not _reaches(client, lambda: _state(client) not in ("", "stopped", "fault")):
+            status = client.status("command")
+            if status is None or "command" not in client.alive:
+                _fail(target, client, "reset", "answer")
+            fail(f"not cleared: {status.detail.get('why', '')}: {target.named(client)}")
+        _show(target, client, "reset; inactive", ": ")
+
+
+def _state(client: Client) -> str:
+    status = client.status("command")
+    return status.state if status is not None else ""
+
+
+def _stops(client: Client) -> bool:
+    return _reaches(client, lambda: _state(client) == "stopped")
+
+
+def _reaches(client: Client, done: Callable[[], bool]) -> bool:
+    """Wait until `done`; gives up sooner where there is no command node."""
+    absent_s = time.monotonic() + ABSENT_PATIENCE_S
+
+    def settled() -> bool:
+        return done() or ("command" not in client.alive and time.monotonic() > absent_s)
+
+    client.wait_for(settled, PATIENCE_S)
+    return done()
+
+
+def _fail(target: RobotTarget, client: Client, command: str, what: str) -> NoReturn:
+    """End with the reason why the command node did not do `what`."""
+    if why := target.not_operator(client.profile, command):
+        fail(f"{target.named(client)} does not {what}: {why}")
+    if "command" not in client.alive:
+        fail(target.no_command_node(client, command))
+    fail(
+        f"the command node of {target.named(client)} does not {what}; see "
+        f"`{target.typed('status')}`"
+    )
+
+
+def _stop_all(target: RobotTarget, own: Client) -> None:
+    robots: list[str] = []
+    give_up = time.monotonic() + DISCOVERY_S
+    while time.monotonic() < give_up:
+        for robot in alive_robots(own.session, own.keys):
+            if robot not in robots:
+                own.publish(Keys(robot, own.keys.root).stop, "stop")
+                robots.append(robot)
+        time.sleep(POLL_S)
+    if not robots:
+        why = target.not_operator(own.profile, "stop")
+        fail(f"no robot is visible on this router. {why}".rstrip(". "))
+    clients = [Client(as_robot(own.profile, robot), own.session).subscribe() for robot in robots]
+    done = [_stops(client) for client in clients]
+    for client, stopped in zip(clients, done, strict=True):
+        if stopped:
+            _show_stopped(target, client, own.keys.robot)
+        else:
+            complain(f"{target.named(client)} does not confirm that it stopped")
+    if not all(done):
+        fail(target.not_operator(own.profile, "stop", "--all") or "not every robot has stopped")
+
+
+def _show_stopped(target: RobotTarget, client: Client, own: str) -> None:
+    robot = client.keys.robot
+    how = target.typed("reset", robot=None if robot == own else robot)
+    console().print(
+        styled("stopped", "bold red"),
+        f": {target.named(client)}; `{how}` clears it",
+        sep="",
+        soft_wrap=True,
+    )
+
+
+def _show(target: RobotTarget, client: Client, text: str, separator: str = ", ") -> None:
+    console().print(f"{text}{separator}{target.named(client)}", soft_wrap=True)

@@ -1,0 +1,157 @@
+"""vla-zenoh node: router, sim, ros2, arm, camera, command. Runs one node until Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    AlsoOption,
+    HostOption,
+    ListenOption,
+    NodeOptions,
+    ProfileOption,
+    effective_profile,
+    options,
+)
+from vla_zenoh.runtime.parent_watch import RUN_FOLDER_VARIABLE
+from vla_zenoh.runtime.process import die_with_parent, run_node, stop_on_signals
+
+# Each node is imported in its command: MuJoCo and Pinocchio take long to load.
+
+
+def router(
+    profile: ProfileOption = DEFAULT_PROFILE,
+    listen: ListenOption = None,
+    host: HostOption = None,
+    also: AlsoOption = None,
+    show_config: Annotated[
+        bool, typer.Option("--config", help="Print its Zenoh configuration and exit.")
+    ] = False,
+) -> None:
+    """Run the Zenoh router that connects all nodes of a lab."""
+    from vla_zenoh.runtime.router import router_config, run_router, run_zenohd
+    from vla_zenoh.runtime.scheduling import prefer_this_process, realtime_links
+
+    loaded = effective_profile(profile, listen=listen, host=host)
+    others = [effective_profile(name) for name in also or ()]
+    if show_config:
+        print(json.dumps(router_config(loaded, host=host, also=others), indent=2))
+        return
+    die_with_parent()
+    prefer_this_process()
+    with realtime_links():
+        if loaded.session.router == "zenohd":
+            folder = _run_folder() or Path(tempfile.mkdtemp(prefix="vla-zenoh-"))
+            run_zenohd(loaded, folder, host=host, also=others)
+        stop = stop_on_signals()
+        print(f"routing, {loaded.name}", flush=True)
+        run_router(loaded, stop, host=host, also=others)
+
+
+@options
+def sim(
+    node: NodeOptions,
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="Advance time only on queries of the key sim/step.")
+    ] = False,
+) -> None:
+    """Run the simulated robot: receives commands, publishes its state."""
+    from vla_zenoh.robots.sim.node import SimNode
+
+    profile = node.load()
+    run_node(
+        profile,
+        lambda session, stop: SimNode(profile, session, lockstep=lockstep).run(stop),
+        identity="sim",
+        preferred=True,
+    )
+
+
+@options
+def ros2(node: NodeOptions) -> None:
+    """Drive a ROS 2 robot and serve its cameras, through a bridge or rmw_zenoh."""
+    from vla_zenoh.robots.ros2.node import Ros2Node
+
+    profile = node.load()
+    run_node(
+        profile,
+        lambda session, stop: Ros2Node(profile, session).run(stop),
+        identity="ros2",
+        preferred=True,
+    )
+
+
+@options
+def arm(node: NodeOptions) -> None:
+    """Drive an arm with the Python driver that the profile names in `arm.file`."""
+    from vla_zenoh.robots.python.node import ArmNode
+
+    profile = node.load()
+    run_node(
+        profile,
+        lambda session, stop: ArmNode(profile, session).run(stop),
+        identity="arm",
+        preferred=True,
+    )
+
+
+@options
+def camera(
+    node: NodeOptions,
+    cameras: Annotated[
+        list[str] | None, typer.Argument(help="Cameras of the profile; default: all.")
+    ] = None,
+    name: Annotated[
+        str, typer.Option("--name", help="Node name; a second camera host needs another one.")
+    ] = "camera",
+) -> None:
+    """Publish images of cameras: V4L2 devices, RTSP streams, files and the simulator's."""
+    from vla_zenoh.nodes.camera.node import CameraNode
+
+    profile = node.load()
+    for wanted in cameras or ():
+        if wanted not in profile.cameras:
+            raise typer.BadParameter(
+                f"no camera {wanted!r} in profile {profile.name}; it has: "
+                + ", ".join(profile.cameras)
+            )
+    chosen = tuple(cameras) if cameras else None
+    run_node(
+        profile,
+        lambda session, stop: CameraNode(profile, session, name=name, cameras=chosen).run(stop),
+        identity=name,
+    )
+
+
+@options
+def command(
+    node: NodeOptions,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Compute and check everything, command nothing.")
+    ] = False,
+) -> None:
+    """Run the command node: turns action chunks into a bounded, smooth command stream."""
+    from vla_zenoh.nodes.command.node import CommandNode
+
+    profile = node.load()
+    folder = _run_folder()
+    latch = folder / "stopped" if folder else None
+    run_node(
+        profile,
+        lambda session, stop: CommandNode(profile, session, dry_run=dry_run, latch=latch).run(stop),
+        identity="command",
+        preferred=True,
+    )
+
+
+def _run_folder() -> Path | None:
+    """Folder of the `up` that started this node."""
+    given = os.environ.get(RUN_FOLDER_VARIABLE)
+    return Path(given) if given else None
