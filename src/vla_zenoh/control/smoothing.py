@@ -49,7 +49,7 @@ REST_OFFSET = 1e-6
 
 QUIET = (1e-8, 1e-8, 1e-6)
 """m or rad, per s, per s^2: smaller values are noise and set to zero. The first two are the
-precision of Ruckig's solver; such an acceleration changes a velocity by less than that in a tick."""
+precision of Ruckig's solver; such an acceleration changes a velocity by less in a tick."""
 OVERSHOOT = 1e-6
 """m and rad: rounding by which a plan may leave the range between start, target and stop."""
 
