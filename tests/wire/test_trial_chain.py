@@ -217,7 +217,7 @@ def lay_and_move(chain: Chain, terminal: Terminal, number: int) -> None:
     """Answer the question for the setup of the episode with this number."""
     asked = f"episode {number} of 2: setup 1".encode()
     until("it asks", lambda: asked in terminal.shown, READY_PATIENCE_S)
-    until("for the setup", lambda: terminal.shown.count(b"lay it") == number)
+    until("for the setup", lambda: terminal.shown.count(b"set it up") == number)
     terminal.type(b"\n")
     chain.until("it moves", chain.moves, READY_PATIENCE_S)
     until("it shows how it goes", lambda: b"Enter ends it" in terminal.shown)
