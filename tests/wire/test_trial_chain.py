@@ -132,7 +132,7 @@ def test_ctrl_c_brakes_the_arm_and_the_same_command_goes_on(chain: Chain, tmp_pa
         process.wait(END_S)
         _, told = process.communicate(timeout=END_S)
     assert process.returncode == 130, told
-    assert "0 of 2 done; the same command goes on" in told
+    assert "0 of 2 done; the same command continues" in told
     assert chain.state() == "inactive"
     assert chain.detail("at_rest")
     (broken,) = TrialFolder(out).episodes()
