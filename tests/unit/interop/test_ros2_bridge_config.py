@@ -199,10 +199,10 @@ def test_who_needs_no_bridge_is_told(tmp_path: Path) -> None:
     ("places", "told"),
     [
         ("null", "ros2.connect: is missing: in a secured lab the bridge has a router of its own"),
-        ("[tcp/10.0.0.5:7450]", "ros2.connect.0: lets everybody on the way command the robot"),
+        ("[tcp/10.0.0.5:7450]", "ros2.connect.0: lets anyone on the network command the robot"),
         (
             "[tls/10.0.0.5:7450, tcp/127.0.0.1:7450]",
-            "ros2.connect.1: lets everybody on the way command the robot",
+            "ros2.connect.1: lets anyone on the network command the robot",
         ),
     ],
 )
