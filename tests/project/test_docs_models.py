@@ -23,7 +23,7 @@ from typer.main import get_command
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import PeerError
 from vla_zenoh.interop.action_semantics import ACTION_OPTIONS, read_action_semantics
-from vla_zenoh.interop.options import DEFAULTS, read_map
+from vla_zenoh.interop.field_mapping import DEFAULTS, read_map
 from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, ORIGAMI
 from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.policy import (

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop.adapter import Adapter
-from vla_zenoh.interop.backoff import FIRST_S, LONGEST_S
+from vla_zenoh.interop.adapter import FIRST_S, LONGEST_S, Adapter
 from vla_zenoh.interop.presets import OPENPI
 from vla_zenoh.policy import example_observation
 

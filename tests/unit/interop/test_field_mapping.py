@@ -10,11 +10,10 @@ import pytest
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop import action_semantics as meaning
-from vla_zenoh.interop import groot, openpi, options, origami
-from vla_zenoh.interop.backoff import FIRST_S, LONGEST_S, Backoff
-from vla_zenoh.interop.field_mapping import FieldMapping
-from vla_zenoh.interop.joints import make_forward
-from vla_zenoh.interop.options import DEFAULTS, read_columns, read_field_mapping
+from vla_zenoh.interop import field_mapping, groot, openpi, origami
+from vla_zenoh.interop.action_semantics import make_forward
+from vla_zenoh.interop.adapter import FIRST_S, LONGEST_S, Backoff
+from vla_zenoh.interop.field_mapping import DEFAULTS, FieldMapping, read_columns, read_field_mapping
 from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, ORIGAMI, Presets
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
 from vla_zenoh.policy import Observation, example_observation
@@ -291,7 +290,7 @@ def test_columns() -> None:
 
 
 def test_the_spec_of_every_option_has_its_default_documented() -> None:
-    told = f"{options.__doc__}{meaning.__doc__}"
+    told = f"{field_mapping.__doc__}{meaning.__doc__}"
     assert all(name in told for name in DEFAULTS)
 
 

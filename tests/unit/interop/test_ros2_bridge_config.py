@@ -172,7 +172,7 @@ def test_a_bridge_that_everybody_could_use_is_refused_unless_the_profile_says_so
     tmp_path: Path,
 ) -> None:
     places = "ros2: {connect: [tcp/robot.lan:7447]}\n"
-    with pytest.raises(ProfileError, match=r"at tcp/robot\.lan:7447 lets everybody on that"):
+    with pytest.raises(ProfileError, match=r"at tcp/robot\.lan:7447 lets anyone on that"):
         bridge_config(lab(tmp_path, places))
     profile = lab(tmp_path, f"{places}session: {{insecure: true}}\n")
     # A name often leads to 127.0.1.1 on the computer that bears it.

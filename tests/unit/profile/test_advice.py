@@ -41,7 +41,7 @@ def test_two_hosts_with_real_addresses_need_no_advice() -> None:
         ),
         (
             {"hosts": gpu()},
-            "session.listen: the router on robot is reachable on that computer only",
+            "session.listen: the router on robot is reachable on that",
         ),
         ({"hosts": gpu()}, "hosts.gpu: looks for the router on itself, and it runs on robot"),
         ({"hosts": {"a": {"nodes": ["command"]}}}, "hosts: none runs the router"),
