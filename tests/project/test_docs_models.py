@@ -182,7 +182,7 @@ def test_the_adapter_asks_its_server_and_finds_it_again(tmp_path: Path) -> None:
         with pytest.raises(PeerError, match="no connection to") as raised:
             asked("leave")
         assert raised.value.reason == "peer_gone"
-        with pytest.raises(PeerError, match="tried again in"):
+        with pytest.raises(PeerError, match="retrying in"):
             asked("up")
         until("it answers again", lambda: answers(asked), PATIENCE_S)
         policy.close()

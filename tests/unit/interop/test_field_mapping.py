@@ -245,7 +245,7 @@ def test_a_server_of_ones_own_is_told_with_every_option_and_no_name_of_a_preset(
 
 @pytest.mark.parametrize("name", ["action", "gripper", "gripper_open", "dt_s", "horizon"])
 def test_of_a_server_of_ones_own_no_meaning_is_guessed(name: str) -> None:
-    with pytest.raises(SpecError, match=rf"nobody says what the numbers mean: --set {name}=\("):
+    with pytest.raises(SpecError, match=rf"the meaning of the numbers is missing: --set {name}=\("):
         layout(preset="none", **{k: v for k, v in MINE.items() if k != name})
     with pytest.raises(SpecError, match=r"--set rotation=\(rpy or rotvec"):
         layout(preset="none", **{**MINE, "action": "delta"})
@@ -264,7 +264,7 @@ def test_another_action_than_the_presets_keeps_nothing_of_what_it_says_of_number
     of = layout(action="absolute", rotation="rpy", **told)
     steps = of.steps(np.array([[0.5, 0, 0.3, 0, 0, 2.0]]), seen(of))
     np.testing.assert_allclose(steps, [[0.5, 0, 0.3, 0, 0, 2.0]], atol=ATOL)
-    with pytest.raises(SpecError, match="joint_position is not that of preset droid, so nobody"):
+    with pytest.raises(SpecError, match="joint_position is not that of preset droid, so the meaning"):
         layout(preset="droid", action="joint_position")
 
 
@@ -307,7 +307,7 @@ def test_a_server_that_says_what_is_set_fits() -> None:
     [
         ({"action_dim": 8}, "8 columns, 7 are wanted"),
         ({"action_space": "joint_position"}, "action=delta is set"),
-        ({"image_resolution": [180, 320]}, "pictures of 320x180, size=224x224"),
+        ({"image_resolution": [180, 320]}, "images of 320x180, size=224x224"),
         ({"vla_zenoh_action": {"gripper_open_is_high": True}}, "gripper_open_is_high"),
         ({"vla_zenoh_action": {"dt_s": 0.1}}, "dt_s is 0.1, 0.05 is set"),
     ],
