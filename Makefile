@@ -15,7 +15,7 @@ AGAIN := --reruns 1 -r fEsR
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow fuzz fuzz-motion soak test-ros2 test-models check format bench bench-faults bench-ros2 build ros2-bridge clean
+.PHONY: help setup demo test slow fuzz fuzz-motion soak test-ros2 test-models check format bench bench-faults bench-ros2 build docs ros2-bridge clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -75,9 +75,14 @@ bench-ros2: $(READY) ros2-bridge ## Measure a picture's way to a pose through RO
 build: $(READY) ## Build wheel and sdist into dist/ and try each in an empty environment
 	$(BIN)/python scripts/check_wheel.py $(ARGS)
 
+docs: $(READY) ## Make the reference pages from the code, and the site into site/; ARGS=serve to look at it
+	$(BIN)/uv --quiet pip install --python $(BIN)/python -c constraints.txt -e '.[docs]'
+	$(BIN)/python scripts/reference.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs $(or $(ARGS),build --strict --quiet)
+
 ros2-bridge: ## Build a zenoh-bridge-ros2dds for the tests, once, unless PATH has one
 	@$(PYTHON) scripts/ros2_bridge.py
 
 clean: ## Remove everything these targets made
-	rm -rf .venv .tools dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .tools dist site .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

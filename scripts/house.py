@@ -31,7 +31,7 @@ NODES = (
     ("nodes.camera.node", "nodes.camera"),
     ("nodes.worker.node", "nodes.worker"),
     ("nodes.command.node", "nodes.command"),
-    ("robots.sim.node", "nodes.sim"),
+    ("robots.sim_driver", "nodes.sim"),
 )
 LAB, FRONT = "lab", ("lab", "cli")
 PROGRAMS = ("router", "sim", "camera", "worker", "command")

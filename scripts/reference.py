@@ -7,6 +7,7 @@ python scripts/reference.py --check    # exit status 1 where a page differs from
 from __future__ import annotations
 
 import argparse
+import ast
 import inspect
 import re
 import sys
@@ -161,7 +162,7 @@ def keys_page() -> str:
     out = ["# Keys", MADE.strip()]
     out.append(
         "All keys of a robot begin with `<root>/<robot>/`; the root is `vla` unless the profile "
-        "says otherwise. Roles are those of certificates ([security](../explanation/security.md)); "
+        "says otherwise. Roles are those of certificates ([security](../how-to/security.md)); "
         "without certificates they are not checked."
     )
     rows = ["| key | payload | published by | read by |", "|---|---|---|---|"]
@@ -227,7 +228,156 @@ def cli_page() -> str:
     return "\n\n".join(out) + "\n"
 
 
-PAGE_OF = {"profile.md": profile_page, "keys.md": keys_page, "cli.md": cli_page}
+# -- counters -----------------------------------------------------------------------------------
+REASONS = {
+    "before_activation": "chunk: its observation is older than the activation",
+    "cameras": "`seen`: more cameras than a model may have",
+    "clock_step": "the wall clock was set",
+    "deleted": "a Zenoh `delete` on a key that takes puts",
+    "device_lost": "teleop: the gamepad or SpaceMouse is gone",
+    "encoding": "ROS image: an encoding that is not supported",
+    "expired": "chunk: all of its steps are in the past",
+    "flood": "/tf: more frames than are kept",
+    "foreign": "written by another source than the one that is followed",
+    "foreign_camera": "status of a camera by a node that does not serve it",
+    "foreign_scene": "`sim/scene` of another source",
+    "foreign_spec": "spec by another source than the worker's",
+    "foreign_status": "status by another source than the node's",
+    "frame": "ROS: an unknown frame",
+    "frozen": "ROS joint state: the time stamp does not advance",
+    "future": "chunk: its observation is from the future",
+    "holder": "more deadman tokens than are kept",
+    "invalid": "NaN, or a value that the record does not allow",
+    "malformed": "the payload does not decode",
+    "meaning": "chunk: numbers that its spec does not allow",
+    "more_workers": "more workers than are kept",
+    "no_attachment": "rmw_zenoh: no attachment",
+    "no_gripper": "gripper command for an arm without a gripper",
+    "no_header": "no header in the attachment",
+    "no_spec": "chunk of a worker whose spec is unknown",
+    "no_transform": "ROS: no transform between two frames yet",
+    "out_of_order": "older than the one before",
+    "outlived": "gripper command from before a stop",
+    "oversize": "larger than the limit of its kind",
+    "overtaken": "chunk: a newer one arrived before it was planned",
+    "partial": "ROS joint state: some joints are missing",
+    "peer_error": "the policy server answered with an error",
+    "peer_gone": "the policy server closed the connection",
+    "peer_mismatch": "the policy server is not what the options say",
+    "peer_reply": "the policy server's answer does not decode",
+    "peer_request": "the observation lacks what the policy server asks for",
+    "peer_timeout": "the policy server did not answer in time",
+    "repeated": "ROS topic `active`: `true` again by a program",
+    "replayed": "a sequence number that was received before",
+    "reset_refused": "`sim/reset` that cannot be carried out",
+    "robot_failed": "the robot's Python class raised",
+    "schema": "another version of the wire",
+    "seen": "what the model saw cannot be published",
+    "shape": "wrong number of values",
+    "simulation_fault": "the simulation became unstable",
+    "spec_mismatch": "chunk: another spec than the one agreed at activation",
+    "stale": "older than the limit of its kind",
+    "stalled": "the robot node stood still; the command stream begins again",
+    "stopped": "ROS topic `active`: `true` with an emergency stop behind it",
+    "superseded": "chunk: a newer one is in force",
+    "too_many_models": "camera: more image sizes requested than are made",
+    "truncated": "fewer bytes than the size says",
+    "unencodable": "a record that cannot be encoded",
+    "unknown_worker": "chunk of a worker that is not chosen",
+    "workspace": "chunk: no goal of it is inside the workspace box",
+}
+COUNTERS = {
+    "arm.commands_given": "set-points given to the Python class",
+    "arm.missed_ticks": "ticks of the robot node that were skipped",
+    "arm.stalls": "times the robot node stood still",
+    "arm.stream_silences": "times the command stream fell silent",
+    "command.chunks_dropped": "chunks dropped because more arrived than are kept",
+    "command.gripper_timeouts": "gripper commands that the gripper did not carry out in time",
+    "command.latch_failed": "times the latch file could not be written",
+    "command.missed_ticks": "ticks of the command node that were skipped",
+    "command.smoothing_failures": "times Ruckig found no plan",
+    "dropped": "recorder: samples that were not written",
+    "gripper_bounded": "gripper commands that were bounded",
+    "ros2.commands_sent": "set-points sent to ROS 2",
+    "ros2.efforts_missing": "joint states without efforts",
+    "ros2.gripper_cancelled": "gripper goals cancelled",
+    "ros2.gripper_goals": "gripper goals sent",
+    "ros2.gripper_timeouts": "gripper goals given up",
+    "ros2.missed_ticks": "ticks of the robot node that were skipped",
+    "ros2.stalls": "times the robot node stood still",
+    "ros2.stream_silences": "times the command stream fell silent",
+    "ros2.unstamped": "joint states without a time stamp",
+    "samples": "recorder, replay: samples written or published",
+    "sim.overruns": "simulation steps that took longer than they last",
+    "sim.resets": "resets of the scene",
+    "sim.stream_silences": "times the command stream fell silent",
+    "sim.time_given_up_ms": "simulated time that was skipped to catch up",
+    "sim.torque_saturated": "control periods in which a torque limit acted",
+}
+REJECTING = {
+    "refuse",
+    "_refuse",
+    "reject",
+    "_reject",
+    "CodecError",
+    "PeerError",
+    "Rejection",
+}
+
+
+def counted_in_code() -> tuple[set[str], set[str]]:
+    """Reasons of rejections, and names of other counters, that are written in the code."""
+    reasons, counters = set(), set()
+    for path in SOURCE.rglob("*.py"):
+        if "cli" in path.relative_to(SOURCE).parts:
+            continue
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and node.args:
+                called = node.func
+                name = called.attr if isinstance(called, ast.Attribute) else ast.unparse(called)
+                first = node.args[0]
+                if name in REJECTING and isinstance(first, ast.Constant):
+                    reasons.add(str(first.value))
+            if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
+                held = node.value
+                if isinstance(held, ast.Attribute) and held.attr == "counters":
+                    counters.add(str(node.slice.value))
+    reasons |= {name.removeprefix("refused.") for name in counters if "refused." in name}
+    return reasons, {name for name in counters if "refused." not in name}
+
+
+def counters_page() -> str:
+    """Every counter of a status, and every reason of a rejection."""
+    reasons, counters = counted_in_code()
+    for found, table in ((reasons, REASONS), (counters, COUNTERS)):
+        if found != table.keys():
+            missing, surplus = sorted(found - table.keys()), sorted(table.keys() - found)
+            sys.exit(f"scripts/reference.py: not described: {missing}; not in the code: {surplus}")
+    out = ["# Counters", MADE.strip()]
+    out.append(
+        "`vla-zenoh status` shows the counters of every node; record `NodeStatus`, field "
+        "`counters`. They only grow while a node lives."
+    )
+    rows = ["| counter | counts |", "|---|---|"]
+    rows += [f"| `{name}` | {text} |" for name, text in sorted(COUNTERS.items())]
+    out.append("\n".join(rows))
+    out.append(
+        "## Rejected messages\n\n`refused.<reason>` counts messages that were rejected. On the "
+        "command node chunks are counted as `refused.<reason>` too; on a robot node `pose_`, "
+        "`joint_` or `gripper_` stands before the reason of a command."
+    )
+    rows = ["| reason | why |", "|---|---|"]
+    rows += [f"| `{name}` | {text} |" for name, text in sorted(REASONS.items())]
+    out.append("\n".join(rows))
+    return "\n\n".join(out) + "\n"
+
+
+PAGE_OF = {
+    "profile.md": profile_page,
+    "keys.md": keys_page,
+    "cli.md": cli_page,
+    "counters.md": counters_page,
+}
 
 
 def main() -> None:

@@ -9,8 +9,17 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from ruckig import InputParameter, OutputParameter, Ruckig, Synchronization
+from ruckig import (
+    ControlInterface,
+    InputParameter,
+    OutputParameter,
+    Ruckig,
+    RuckigError,
+    Synchronization,
+    Trajectory,
+)
 
+from vla_zenoh.control.limits import JointMotionLimits
 from vla_zenoh.control.smoothing import Motion, Smoother, motion_limits
 from vla_zenoh.guard.joint_guard import JointGuard, joint_guard_limits, joint_motion_limits
 from vla_zenoh.guard.pose_guard import PoseGuard, guard_limits
@@ -298,3 +307,25 @@ def ratios(mode: Mode, trace: Trace, profile: Profile = PROFILE) -> FloatArray:
             for values, limit in zip(trace.differences(), limits, strict=True)
         ]
     )
+
+
+def stop_from(motion: JointReference, limits: JointMotionLimits) -> Trajectory | None:
+    """The shortest jerk-limited stop from `motion`, each joint by itself.
+
+    None if none can be planned; every finite motion has one.
+    """
+    joints = len(motion.position_rad)
+    ask, path = InputParameter(joints), Trajectory(joints)
+    ask.control_interface = ControlInterface.Velocity
+    ask.synchronization = Synchronization.No
+    ask.current_position = motion.position_rad.tolist()
+    ask.current_velocity = motion.velocity_rad_s.tolist()
+    ask.current_acceleration = motion.acceleration_rad_s2.tolist()
+    ask.target_velocity = ask.target_acceleration = [0.0] * joints
+    ask.max_acceleration = limits.acceleration_rad_s2.tolist()
+    ask.max_jerk = limits.jerk_rad_s3.tolist()
+    try:
+        Ruckig(joints).calculate(ask, path)
+    except (RuckigError, ValueError):
+        return None
+    return path

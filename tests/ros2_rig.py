@@ -19,7 +19,8 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.robots.ros2.node import Ros2Node
+from vla_zenoh.robots.node import RobotNode
+from vla_zenoh.robots.ros2.driver import Ros2Driver
 from vla_zenoh.types import Event, GripperState, Header, JointState, NodeStatus, PoseState
 
 CAMERA = "/camera/realsense2_camera/color/image_raw"
@@ -61,7 +62,7 @@ class Ros2Rig:
     """What a test holds."""
 
     profile: Profile
-    node: Ros2Node
+    node: RobotNode
     session: zenoh.Session
     peer: Ros2Peer
     robot: KinematicPanda
@@ -107,7 +108,7 @@ def ros2_rig(folder: Path, bridge: str = "ros2dds", more: str = "") -> Iterator[
         open_session(profile.session) as watcher,
     ):
         peer = Ros2Peer(theirs, bridge)
-        node = Ros2Node(profile, ours)
+        node = RobotNode(Ros2Driver(profile), ours)
         robot = KinematicPanda(peer)
         rig = Ros2Rig(profile, node, watcher, peer, robot)
         keys = profile.keys

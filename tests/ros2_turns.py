@@ -1,4 +1,4 @@
-"""The node ``ros2``, or its arm alone, turn by turn: in one process, at the time a test says."""
+"""The node ``ros2``, tick by tick: in one process, at the time a test says."""
 
 from __future__ import annotations
 
@@ -19,13 +19,11 @@ from ros2_rig import write_profile
 from vla_zenoh.bus import buffers as slots
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import records
-from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.ros2 import state_subscriber as hearing
-from vla_zenoh.robots.ros2.arm import Arm
-from vla_zenoh.robots.ros2.node import Ros2Node
-from vla_zenoh.robots.ros2.ros_graph import RosGraph
+from vla_zenoh.robots.arm import Arm
+from vla_zenoh.robots.node import RobotNode
+from vla_zenoh.robots.ros2.driver import Ros2Driver
 from vla_zenoh.types import (
     Event,
     FloatArray,
@@ -50,6 +48,7 @@ ALONE = """{
 class Turns:
     """An arm, and what is heard of it: all within one process, at once."""
 
+    robot: RobotNode
     arm: Arm
     node: Node
     peer: Ros2Peer
@@ -63,7 +62,6 @@ class Turns:
     moved_s: float = 0.0
     ramp_s: float = RAMP_S
     """How long the motion takes to its full speed, within the profile's limits."""
-    whole: Ros2Node | None = None
 
     def joint_states(self, velocity: float = 0.0) -> None:
         fields: dict[str, Any] = {
@@ -79,7 +77,11 @@ class Turns:
         self.mono_ns += TICK_NS
         self.wall_ns += TICK_NS + round(clock_s * 1e9)
         self.joint_states()
-        self.arm.turn(self.wall_ns, self.mono_ns, stall_s)
+        self.step(stall_s)
+
+    def step(self, stall_s: float = 0.0) -> None:
+        self.robot.driver.poll(self.mono_ns)
+        self.arm.step(self.wall_ns, self.mono_ns, stall_s)
 
     def sleep(self, duration_s: float) -> None:
         for ns in ("mono_ns", "wall_ns"):
@@ -110,7 +112,7 @@ class Turns:
         for _ in range(round(duration_s / TICK_S)):
             self.up()
             self.turn()
-        assert self.arm.detail()["following"]
+        assert self.arm.follower.following
 
     def transform(self, height_m: float, *, clock_s: float = 0.0) -> None:
         """On /tf: how high the TCP is above the base."""
@@ -144,10 +146,8 @@ class Turns:
 
 
 @contextmanager
-def ros2_turns(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = "", *, whole: bool = False
-) -> Iterator[Turns]:
-    """`more` is YAML that goes on in the profile's section ros2; `whole`: with the node around."""
+def ros2_turns(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = "") -> Iterator[Turns]:
+    """`more` is YAML that goes on in the profile's section ros2."""
     profile = load_profile(str(write_profile(folder, more=more)))
     assert profile.ros2 is not None
     with zenoh.open(zenoh.Config.from_json5(ALONE)) as session:
@@ -155,14 +155,9 @@ def ros2_turns(
         peer = Ros2Peer(session)
         peer.on(TOPIC, GOAL, goals.append)
         peer.on("/goal", "trajectory_msgs/msg/JointTrajectory", goals.append)
-        ros2 = Ros2Node(profile, session) if whole else None
-        if ros2 is not None:
-            node, link, arm = ros2.node, ros2.link, ros2._arm
-            assert arm is not None
-        else:
-            node = Node("ros2", profile, session)
-            link = RosGraph(session, profile.ros2, Messages("jazzy"), "vla_panda")
-            arm = Arm(node, link, Messages("jazzy"), profile.ros2, lambda: (False, None, False))
+        ros2 = RobotNode(Ros2Driver(profile), session)
+        assert ros2.arm is not None
+        node, arm = ros2.node, ros2.arm
         states: dict[type, list[Any]] = {}
         keys, subscribers = node.keys, []
         for key, kind in (
@@ -178,12 +173,11 @@ def ros2_turns(
 
             handler = zenoh.handlers.Callback(keep, indirect=False)
             subscribers.append(session.declare_subscriber(key, handler))
-        robot = Turns(arm, node, peer, session, goals, states, mono_ns=10**12, whole=ros2)
+        robot = Turns(ros2, arm, node, peer, session, goals, states, mono_ns=10**12)
         clock = SimpleNamespace(monotonic_ns=lambda: robot.mono_ns)
-        for module in (slots, hearing):
-            monkeypatch.setattr(module, "time", clock)
+        monkeypatch.setattr(slots, "time", clock)
         robot.turn()
         yield robot
         peer.close()
-        link.close()
+        ros2.driver.close()
         node.close()

@@ -92,7 +92,7 @@ def teleop(chain: Chain, *options: str, profile: Path | None = None) -> Iterator
             READY_PATIENCE_S,
         )
         assert screen.process.poll() is None, screen.shown.decode()
-        until("it shows the state", lambda: b"obeys" in screen.shown, READY_PATIENCE_S)
+        until("it shows the state", lambda: b"follows" in screen.shown, READY_PATIENCE_S)
         yield screen
     finally:
         screen.close()

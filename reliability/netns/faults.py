@@ -18,7 +18,7 @@ CLOCK_STEP_S = 2.0
 SMALL = Shape(mtu=SMALL_MTU)
 TWIN_S = 30.0
 """At least: a twin goes on trying for some 20 s, and its end is part of the fault."""
-REFUSED = "is alive already"
+REFUSED = "is already running"
 
 
 def _nothing(_: Stage) -> None:

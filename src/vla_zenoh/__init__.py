@@ -1,3 +1,114 @@
-"""Vision-language-action models and robots, joined by Zenoh."""
+"""Vision-language-action models and robots, connected by Zenoh.
+
+    import vla_zenoh
+
+    with vla_zenoh.connect("panda_sim") as robot:
+        robot.set_prompt("HARD: go up x20")
+        robot.activate()
+
+The names below are the public ones. Each is imported when it is first used, so that a host needs
+only the libraries of what it runs.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from vla_zenoh.bus.remote_robot import RemoteRobot, connect
+    from vla_zenoh.errors import (
+        CodecError,
+        ProfileError,
+        RecordError,
+        SecurityError,
+        SessionError,
+        SpecError,
+        VlaZenohError,
+    )
+    from vla_zenoh.policy import (
+        ActionSpec,
+        ActionSteps,
+        CameraSpec,
+        ModelSpec,
+        Observation,
+        ObservationSpec,
+        Policy,
+    )
+    from vla_zenoh.profile import Profile, load_profile
+    from vla_zenoh.robot import Command, Reading, Robot
+    from vla_zenoh.types import (
+        ActionChunk,
+        GripperState,
+        Image,
+        JointState,
+        PoseState,
+        Stamped,
+    )
+
+_MODULES = {
+    "bus.remote_robot": ("RemoteRobot", "connect"),
+    "errors": (
+        "CodecError",
+        "ProfileError",
+        "RecordError",
+        "SecurityError",
+        "SessionError",
+        "SpecError",
+        "VlaZenohError",
+    ),
+    "policy": (
+        "ActionSpec",
+        "ActionSteps",
+        "CameraSpec",
+        "ModelSpec",
+        "Observation",
+        "ObservationSpec",
+        "Policy",
+    ),
+    "profile": ("Profile", "load_profile"),
+    "robot": ("Command", "Reading", "Robot"),
+    "types": ("ActionChunk", "GripperState", "Image", "JointState", "PoseState", "Stamped"),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+__all__ = [
+    "ActionChunk",
+    "ActionSpec",
+    "ActionSteps",
+    "CameraSpec",
+    "CodecError",
+    "Command",
+    "GripperState",
+    "Image",
+    "JointState",
+    "ModelSpec",
+    "Observation",
+    "ObservationSpec",
+    "Policy",
+    "PoseState",
+    "Profile",
+    "ProfileError",
+    "Reading",
+    "RecordError",
+    "RemoteRobot",
+    "Robot",
+    "SecurityError",
+    "SessionError",
+    "SpecError",
+    "Stamped",
+    "VlaZenohError",
+    "connect",
+    "load_profile",
+]
+
+
+def __getattr__(name: str) -> Any:
+    module = _MODULE_OF.get(name)
+    if module is None:
+        raise AttributeError(f"module 'vla_zenoh' has no attribute {name!r}")
+    return getattr(import_module(f"vla_zenoh.{module}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

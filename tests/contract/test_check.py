@@ -133,7 +133,7 @@ def test_the_time_to_load_is_not_taken_from_that_to_examine() -> None:
 def test_a_worker_that_hangs_is_given_up() -> None:
     report = examined("hangs", patience_s=0.3)
     assert names(report, "error") == {"hangs"}
-    assert "nothing came back in 0.3 s" in report.findings[0].why
+    assert "no answer within 0.3 s" in report.findings[0].why
 
 
 @pytest.mark.parametrize("fault", WARNINGS)

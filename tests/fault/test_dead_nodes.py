@@ -126,7 +126,7 @@ def test_a_killed_node_brakes_the_arm_and_needs_a_new_activation(
     assert_gentle(chain)
     chain.until("it says why", lambda: chain.detail("why") == death.why)
     if death.own_brake:
-        assert chain.events("following->braking")
+        assert chain.events("running->braking")
     else:
         # A computer that is busy may take longer to bury it than the watchdog waits.
         (event,) = chain.events("active->inactive") or chain.events("holding->inactive")

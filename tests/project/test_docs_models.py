@@ -1,4 +1,4 @@
-"""The model and the adapter of docs/how-to/models.md run."""
+"""The model and the adapter of the pages on models run, and their commands exist."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.world import build_world
 
 ROOT = Path(__file__).parents[2]
-TEXT = (ROOT / "docs" / "how-to" / "models.md").read_text("utf-8")
+PAGES = ("models.md", "policy-servers.md", "evaluate.md")
+TEXT = "\n".join((ROOT / "docs" / "how-to" / page).read_text("utf-8") for page in PAGES)
 LINES = 10
 STEP_M, SECONDS, RATE_HZ = 0.01, 1.0, 10.0
 WAY_M = STEP_M * RATE_HZ * SECONDS
@@ -173,7 +174,7 @@ def test_the_adapter_asks_its_server_and_finds_it_again(tmp_path: Path) -> None:
     with socketserver.TCPServer(("127.0.0.1", 0), Up) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         options = {"port": str(server.server_address[1])}
-        policy: Any = make_policy(find_model(str(written(tmp_path, "lines.py", 2))), options)
+        policy: Any = make_policy(find_model(str(written(tmp_path, "lines.py", 3))), options)
 
         def asked(prompt: str) -> Any:
             return policy.infer(example_observation(policy.spec, prompt=prompt)).steps

@@ -33,7 +33,8 @@ from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.topics import image, joint_state
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.ros2 import Ros2Profile
-from vla_zenoh.robots.ros2.node import Ros2Node
+from vla_zenoh.robots.node import RobotNode
+from vla_zenoh.robots.ros2.driver import Ros2Driver
 from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
 from vla_zenoh.types import PoseState
 
@@ -204,13 +205,13 @@ def test_what_we_write_is_read_by_the_other_side(
     topic = f"/ours/{kind.rsplit('/', 1)[1].lower()}"
     sdk.do("subscribe", name=topic, kind=kind)
     assert sdk.wait("done")
-    writer = link.write(topic, kind)
+    writer = link.publisher(topic, kind)
     payload = JAZZY.encode(message(kind, FIELDS[kind]))
     stop = threading.Event()
 
     def write() -> None:
         while not stop.wait(0.05):
-            writer.put(payload)
+            writer.publish(payload)
 
     thread = threading.Thread(target=write)
     thread.start()
@@ -230,7 +231,7 @@ def test_what_the_other_side_writes_is_read_by_us(
 ) -> None:
     _, sdk = lab
     topic = f"/theirs/{kind.rsplit('/', 1)[1].lower()}"
-    inbox = link.read(topic, kind, CallbackRing(8))
+    inbox = link.subscribe(topic, kind, CallbackRing(8))
     sdk.do("advertise", name=topic, kind=kind)
     announced = sdk.wait("hash")
     assert announced is not None, sdk.errors[-5:]
@@ -278,7 +279,7 @@ def test_the_other_sides_service_answers_us(lab: tuple[Profile, Sdk], link: RosG
     time.sleep(0.3)  # it is declared on its way
     answers: queue.Queue[bytes | None] = queue.Queue()
     request = JAZZY.encode(JAZZY.new(f"{SET_BOOL}_Request", data=True))
-    link.call("/theirs/set_active", SET_BOOL).call(request, answers.put)
+    link.client("/theirs/set_active", SET_BOOL).call(request, answers.put)
     payload = answers.get(timeout=WAIT_S)
     assert payload is not None, sdk.errors[-5:]
     answer = JAZZY.decode(f"{SET_BOOL}_Response", payload)
@@ -297,7 +298,7 @@ def test_the_node_drives_a_robot_of_the_other_side(lab: tuple[Profile, Sdk]) -> 
                 indirect=False,
             ),
         )
-        node, stop = Ros2Node(profile, ours), threading.Event()
+        node, stop = RobotNode(Ros2Driver(profile), ours), threading.Event()
         thread = threading.Thread(target=node.run, args=(stop,))
         thread.start()
         try:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -22,9 +22,9 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.joint_guard import joint_motion_limits
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.python import state_reader as arm_hearing
-from vla_zenoh.robots.python.node import ArmNode
-from vla_zenoh.robots.shutdown_brake import FAILURES, LEAST_S
+from vla_zenoh.robots import python_driver
+from vla_zenoh.robots.node import FAILURES, LEAST_S, RobotNode
+from vla_zenoh.robots.python_driver import PythonDriver
 from vla_zenoh.types import (
     Event,
     FloatArray,
@@ -90,7 +90,7 @@ hosts: {here: {nodes: [router, arm, command, worker]}}
 class Turns:
     """An arm whose time passes as fast as it can; `script` is called before each turn."""
 
-    node: ArmNode
+    node: RobotNode
     session: zenoh.Session
     home_rad: FloatArray
     heard: dict[type, list[Any]]
@@ -104,7 +104,7 @@ class Turns:
 
     @property
     def arm(self) -> Any:
-        return self.node._file._robot
+        return cast("PythonDriver", self.node.driver)._robot
 
     def wait(self) -> Tick:
         self.mono_ns += round(self.period_s * 1e9)
@@ -174,7 +174,7 @@ def turns(
     (tmp_path / "lab.yaml").write_text(PROFILE + getattr(request, "param", ""))
     profile = load_profile(str(tmp_path / "lab.yaml"))
     with zenoh.open(zenoh.Config.from_json5(ALONE)) as session:
-        node = ArmNode(profile, session)
+        node = RobotNode(PythonDriver(profile), session)
         home_rad = np.array(profile.robot.home_rad)
         heard: dict[type, list[Any]] = {}
         keys, subscribers = profile.keys, []
@@ -193,7 +193,7 @@ def turns(
         turns = Turns(node, session, home_rad, heard)
         turns.arm.position_rad = home_rad
         clock = SimpleNamespace(monotonic_ns=lambda: turns.mono_ns)
-        for module in (slots, arm_hearing):
+        for module in (slots, python_driver):
             monkeypatch.setattr(module, "time", clock)
         yield turns
         node._close()

@@ -64,7 +64,7 @@ def set_ahead(node: Node, by_ns: int) -> None:
 
 def asked(node: Node, other: str) -> Any:
     def known() -> Any:
-        node.clocks.tick()
+        node.clocks.poll()
         return node.clocks.offsets().get(other)
 
     node.clocks.track(other)
@@ -94,7 +94,7 @@ def test_stamps_of_another_host_are_read_on_the_own_clock() -> None:
             assert slot.wait(1.0)
             arrival = slot.pop()
             assert arrival is not None
-            near.clocks.tick()
+            near.clocks.poll()
             stamped = near.decode(Task, arrival)
             assert stamped is not None
             late_s = (stamped.received_ns - stamped.header.stamp_wall_ns) / 1e9
@@ -121,7 +121,7 @@ def test_a_source_that_cannot_be_a_node_is_not_asked() -> None:
     with two_nodes() as (near, _):
         for name in ("", "a/b", "**", "x" * 100, "\n", "sim/../..", "command"):
             near.clocks.to_local_clock(Header(0, 0, f"{name}#1"), None)
-        near.clocks.tick()
+        near.clocks.poll()
         assert near.clocks._peers == {}
         for number in range(500):
             near.clocks.to_local_clock(Header(0, 0, f"stranger{number}#1"), None)

@@ -40,7 +40,7 @@ def spoken() -> SingleWriterFilter:
     """Number 7 of ``robot#1`` was heard at time 0."""
     speaker = SingleWriterFilter(SILENCE_NS / 1e9)
     speaker.check(Header(0, 7, "robot#1"), 0)
-    speaker.heard(Header(0, 7, "robot#1"), 0)
+    speaker.accept(Header(0, 7, "robot#1"), 0)
     return speaker
 
 
@@ -134,7 +134,7 @@ def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
         node.publish_status("running", now=True)
         assert node.counters["refused.oversize"] == 2
         told = until("the event", events.drain)
-        words = b"prompt: %d bytes, at most %d are taken" % (limit + 1, limit)
+        words = b"prompt: %d bytes, at most %d are accepted" % (limit + 1, limit)
         assert words in told[-1].sample.payload.to_bytes()
         node.close()
 

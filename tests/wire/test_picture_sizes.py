@@ -190,7 +190,7 @@ def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer(
                 return False
             header = worker.header(heard.arrival)
             heard.writer.check(header, heard.arrival.mono_ns)
-            heard.writer.heard(header, heard.arrival.mono_ns)
+            heard.writer.accept(header, heard.arrival.mono_ns)
             return str(heard.arrival.sample.key_expr) == stream.key
 
         until("a reader", lambda: own.has_subscribers)

@@ -46,7 +46,7 @@ def test_after_a_stall_it_stands_where_it_sent_the_arm_last_and_says_that_it_is_
         turns.up()
     turns.turn(stall_s)
     assert turns.refused("pose_stalled") == 30
-    assert turns.arm.lead.stalls == 1
+    assert turns.arm.follower.stalls == 1
     for _ in range(STALLED_NS // TICK_NS - 1):
         turns.up()
         turns.turn()
@@ -85,7 +85,7 @@ def test_a_late_turn_goes_on_from_what_was_sent_last(turns: Turns, stall_s: floa
         turns.up()
     turns.turn(stall_s)
     turns.rise(0.6)
-    assert turns.arm.lead.stalls == 0
+    assert turns.arm.follower.stalls == 0
     assert turns.steps_m[50:].min() > 0.5 * SPEED_M_S * TICK_S
     assert np.abs(np.diff(turns.steps_m)).max() < STEP_M
     home_m = panda().forward(HOME_RAD).position_m[2]
@@ -145,7 +145,7 @@ def test_joint_states_that_are_finite_and_no_arms_are_refused_and_the_loop_goes_
     heard = len(turns.states[PoseState])
     turns.sleep(0.02)
     turns.joint_states(velocity=1e308)
-    turns.arm.turn(turns.wall_ns, turns.mono_ns)
+    turns.step()
     assert turns.refused("invalid") == 1
     assert len(turns.states[PoseState]) == heard
     turns.sleep(0.02)
@@ -162,7 +162,7 @@ def test_what_was_heard_before_the_arm_was_moved_by_somebody_else_is_not_new_aft
     for _ in range(100):
         turns.turn()
     turns.turn(10.0)
-    assert not turns.arm.detail()["held"]
+    assert not turns.arm.follower.holds
     turns.seq = 0
     turns.up(moves=False)
     turns.turn()
@@ -170,7 +170,7 @@ def test_what_was_heard_before_the_arm_was_moved_by_somebody_else_is_not_new_aft
     turns.seq = 10
     turns.up(moves=False)
     turns.turn()
-    assert turns.arm.detail()["following"]
+    assert turns.arm.follower.following
 
 
 @pytest.mark.parametrize("turns", [JOINT_GOALS], indirect=True)

@@ -11,7 +11,8 @@ from ros2_rig import write_profile
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.interop.ros2.graph import endpoints
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.ros2.node import Ros2Node
+from vla_zenoh.robots.node import RobotNode
+from vla_zenoh.robots.ros2.driver import Ros2Driver
 
 SLASH = "§"
 PLAIN = ""
@@ -38,7 +39,7 @@ def test_the_node_announces_the_ends_that_its_profile_uses_and_no_others(
         open_session(profile.session) as ours,
         open_session(profile.session) as watcher,
     ):
-        node = Ros2Node(profile, ours)
+        node = RobotNode(Ros2Driver(profile), ours)
         expression = f"@/{ours.zid()}/@ros2_lv/*/**"
 
         def announced() -> set[tuple[str, ...]]:
@@ -48,5 +49,5 @@ def test_the_node_announces_the_ends_that_its_profile_uses_and_no_others(
 
         until("every end is announced", lambda: announced() >= wanted)
         assert announced() == wanted
-        node.link.close()
+        node.driver.close()
         node.node.close()

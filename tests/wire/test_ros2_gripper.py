@@ -6,7 +6,8 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from camera_rig import until
@@ -21,6 +22,9 @@ from vla_zenoh.interop.ros2.gripper_actions import SUCCEEDED
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.arm import GripperCommands
+from vla_zenoh.robots.command_follower import CommandFollower
+from vla_zenoh.robots.driver import RobotDriver
 from vla_zenoh.robots.ros2.gripper import Gripper
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.types import GripperCommand
@@ -48,6 +52,8 @@ class Rig:
         self, node: Node, gripper: Gripper, command: Publisher, stranger: Publisher
     ) -> None:
         self.node, self.gripper = node, gripper
+        driver = SimpleNamespace(no_gripper="", lockstep=False, grip=gripper.move)
+        self.commands = GripperCommands(node, cast("RobotDriver", driver))
         self.command, self.stranger = command, stranger
         self.goals: list[Any] = []
         self.actions: list[str] = []
@@ -55,7 +61,12 @@ class Rig:
         self.over = threading.Event()
 
     def turn(self, writer: str = "command#1", *, leads: bool = True) -> None:
-        self.gripper.turn(time.time_ns(), writer, leads=leads)
+        self.turn_at(time.time_ns(), writer, leads=leads)
+
+    def turn_at(self, now_ns: int, writer: str, *, leads: bool) -> None:
+        self.gripper.poll(writer, writer_active=leads)
+        follower = SimpleNamespace(writer=writer, writer_active=leads)
+        self.commands.update(now_ns, cast("CommandFollower", follower))
 
     def turn_until(self, what: str, name: str, count: int, writer: str = "command#1") -> None:
         """Turn until counter `name` stands at `count`."""
@@ -79,8 +90,8 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
     ):
         node = Node("ros2", profile, ours)
         messages = Messages(profile.ros2.distribution)
-        link = RosGraph(ours, profile.ros2, messages, "vla_panda")
-        gripper = Gripper(node, link, messages, profile.ros2.gripper, lambda: rig.width_m)
+        graph = RosGraph(ours, profile.ros2, messages, "vla_panda")
+        gripper = Gripper(node, graph, messages, profile.ros2.gripper, lambda: rig.width_m)
         streams = [
             Publisher(theirs, profile.keys.command_gripper, Kind.ORDER, source, Clock())
             for source in ("command#1", "stranger#1")
@@ -111,7 +122,7 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
         yield rig
         rig.over.set()
         peer.close()
-        link.close()
+        graph.close()
         node.close()
 
 
@@ -136,7 +147,7 @@ def test_a_wall_clock_that_is_set_does_not_give_up_a_goal(rig: Rig) -> None:
     rig.command.publish(ORDER)
     rig.turn_until("the goal", "ros2.gripper_goals", 1)
     for now_ns in (time.time_ns() + HOUR_NS, time.time_ns() - HOUR_NS):
-        rig.gripper.turn(now_ns, "command#1", leads=True)
+        rig.turn_at(now_ns, "command#1", leads=True)
         assert rig.gripper.busy
     assert rig.node.counters["ros2.gripper_timeouts"] == 0
 

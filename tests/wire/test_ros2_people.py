@@ -28,7 +28,7 @@ from vla_zenoh.types import Header, Task
 
 PATIENCE_S = 30.0
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
-TOO_LATE = "an emergency stop came after this was asked"
+TOO_LATE = "an emergency stop came after this request"
 
 
 @dataclass

@@ -5,14 +5,15 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from ros2_turns import SPEED_M_S, TICK_S, Turns, ros2_turns
 
 from vla_zenoh.bus.clock import Tick
-from vla_zenoh.robots.shutdown_brake import FAILURES, LEAST_S
+from vla_zenoh.robots.node import FAILURES, LEAST_S
+from vla_zenoh.robots.ros2.driver import Ros2Driver
 
 MOVING = 60
 """Turns after which the arm is in full motion."""
@@ -47,15 +48,14 @@ class Loop:
         return Tick(1, turns.mono_ns, stall_s, 0.0)
 
     def run(self) -> None:
-        assert self.turns.whole is not None
-        self.turns.whole._loop(self, self.stop)  # pyright: ignore[reportArgumentType]
+        self.turns.robot._loop(self, self.stop)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.fixture
 def turns(
     tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Turns]:
-    with ros2_turns(tmp_path, monkeypatch, getattr(request, "param", ""), whole=True) as turns:
+    with ros2_turns(tmp_path, monkeypatch, getattr(request, "param", "")) as turns:
         yield turns
 
 
@@ -72,11 +72,11 @@ def breaks(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         raise RuntimeError("unforeseen" * 1000)
 
     def break_it(targets: int = 0) -> None:
-        arm, failing = loop.turns.arm, [unforeseen] * targets
-        write = arm._write
-        monkeypatch.setattr(loop.turns.whole, "_watch", unforeseen)
+        driver, failing = cast("Ros2Driver", loop.turns.robot.driver), [unforeseen] * targets
+        write = driver._write
+        monkeypatch.setattr(loop.turns.robot, "_watch", unforeseen)
         monkeypatch.setattr(
-            arm, "_write", lambda *what: failing.pop()() if failing else write(*what)
+            driver, "_write", lambda *what: failing.pop()() if failing else write(*what)
         )
 
     return break_it
@@ -130,7 +130,7 @@ def test_an_arm_that_stood_while_the_loop_did_is_not_moved_again_by_its_brake(
     loop.script[MOVING] = breaks
     loop.script[MOVING + 1] = lambda: setattr(loop, "stall_s", STALL_S)
     assert ends_broken(loop).endswith(": braked, and ends")
-    assert loop.turns.arm.lead.stalls == 1
+    assert loop.turns.arm.follower.stalls == 1
     assert len(loop.turns.goals) == MOVING + 1, "none after that in which it broke"
 
 
@@ -151,6 +151,6 @@ def test_a_loop_that_is_too_slow_to_brake_ends_in_time_and_says_so(loop: Loop) -
 
     loop.script[MOVING] = slow
     loop.run()
-    assert loop.turns.arm.lead.sending
+    assert loop.turns.arm.follower.moving
     (event,) = loop.turns.told("not_braked")
     assert "the loop came too late" in event.why

@@ -20,14 +20,14 @@ from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.ros2.estop_order import EstopOrder
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
-from vla_zenoh.robots.ros2.ros_topics import PATIENCE_NS, RosTopics
+from vla_zenoh.robots.ros2.ros_topics import ACTIVATION_NS, RosTopics
 
 
 class Rig(NamedTuple):
     """Somebody who publishes, what reads it, and what comes of it."""
 
     peer: Ros2Peer
-    wishes: RosTopics
+    topics: RosTopics
     heard: list[tuple[str, str]]
     refused: list[str]
     stop: Callable[[], None]
@@ -40,7 +40,7 @@ class Rig(NamedTuple):
 
     def take_until(self, what: tuple[str, str]) -> None:
         def there() -> bool:
-            self.wishes.take()
+            self.topics.poll()
             return what in self.heard
 
         until(f"{what}", there)
@@ -67,7 +67,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     ):
         messages = Messages(profile.ros2.distribution)
         link = RosGraph(ours, profile.ros2, messages, "vla_panda")
-        wishes = RosTopics(
+        topics = RosTopics(
             Client(profile, ours),
             link,
             messages,
@@ -83,7 +83,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         await_match(theirs, profile.keys.stop)
         for topic in ("/vla/active", "/vla/prompt"):
             await_match(theirs, topic[1:])
-        yield Rig(peer, wishes, heard, refused, lambda: theirs.put(profile.keys.stop, ""))
+        yield Rig(peer, topics, heard, refused, lambda: theirs.put(profile.keys.stop, ""))
         peer.close()
         link.close()
 
@@ -107,18 +107,18 @@ def test_true_is_obeyed_once_and_what_is_repeated_is_told_once(rig: Rig) -> None
     time.sleep(QUIET_S)
     rig.say(True)
     rig.expect(("active", "true"))
-    time.sleep(1.2 * PATIENCE_NS / 1e9)  # nobody agreed: the arm is not active
+    time.sleep(1.2 * ACTIVATION_NS / 1e9)  # nobody agreed: the arm is not active
     rig.say(True, True, True, False)
     rig.expect(("active", "true"), ("active", "false"))
     assert rig.refused == ["repeated"]
 
 
 def test_true_that_was_said_before_a_stop_is_not_obeyed_after_it(rig: Rig) -> None:
-    rig.wishes._switch = ActivationFilter(0)  # it was quiet for long
+    rig.topics._filter = ActivationFilter(0)  # it was quiet for long
     rig.say(True)
-    until("it waits", lambda: rig.wishes._switches._arrivals)
+    until("it waits", lambda: rig.topics._activations._arrivals)
     rig.stop()
-    until("the stop is heard", lambda: rig.wishes._stops.overtook(0))
+    until("the stop is heard", lambda: rig.topics._stops.overtook(0))
     rig.say(False)
     rig.expect(("active", "false"))
     assert rig.refused == ["stopped"]

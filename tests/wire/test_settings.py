@@ -148,8 +148,8 @@ def test_a_stop_is_obeyed_at_once_and_latched_until_reset(chain: Chain) -> None:
 def test_a_second_command_node_refuses_to_start(chain: Chain) -> None:
     done = command_line("node", "command", profile=chain.profile_file)
     assert done.returncode == 1
-    assert "a node 'command' of robot 'panda' is alive already" in done.stderr
-    assert "stop it first" in done.stderr
+    assert "node 'command' of robot 'panda' is already running" in done.stderr
+    assert "Stop it" in done.stderr
     assert "Traceback" not in done.stderr
     chain.activate_when_ready()
 

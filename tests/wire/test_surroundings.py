@@ -39,7 +39,7 @@ class Scene:
         until("both are alive", lambda: {camera.name, thief.name} <= self.look().alive)
 
     def look(self) -> PeerSnapshot:
-        self.command.clocks.tick()
+        self.command.clocks.poll()
         self.peers = self.ears.look(self.command.clock.wall_ns()) or self.peers
         return self.peers
 
@@ -196,7 +196,7 @@ def test_a_reader_who_is_told_of_nobody_measures_who_lives_among_made_up_names(
         number += 1
         reader.clocks.to_local_clock(Header(0, 0, f"ghost{number}#1"), None)
         reader.clocks.to_local_clock(Header(0, 0, scene.camera.source), None)
-        reader.clocks.tick()
+        reader.clocks.poll()
         return "camera" in reader.clocks.offsets()
 
     until("the camera's clock", measured)

@@ -132,7 +132,7 @@ def test_ctrl_c_brakes_the_arm_and_the_same_command_goes_on(chain: Chain, tmp_pa
         process.wait(END_S)
         _, told = process.communicate(timeout=END_S)
     assert process.returncode == 130, told
-    assert "0 of 2 done; the same command goes on" in told
+    assert "0 of 2 done; the same command continues" in told
     assert chain.state() == "inactive"
     assert chain.detail("at_rest")
     (broken,) = TrialFolder(out).episodes()
@@ -217,7 +217,7 @@ def lay_and_move(chain: Chain, terminal: Terminal, number: int) -> None:
     """Answer the question for the setup of the episode with this number."""
     asked = f"episode {number} of 2: setup 1".encode()
     until("it asks", lambda: asked in terminal.shown, READY_PATIENCE_S)
-    until("for the setup", lambda: terminal.shown.count(b"lay it") == number)
+    until("for the setup", lambda: terminal.shown.count(b"set it up") == number)
     terminal.type(b"\n")
     chain.until("it moves", chain.moves, READY_PATIENCE_S)
     until("it shows how it goes", lambda: b"Enter ends it" in terminal.shown)

@@ -130,7 +130,7 @@ def test_a_worker_of_a_name_that_is_taken_refuses_to_start(chain: Chain) -> None
     with worker(chain, "scripted") as process:
         out, _ = process.communicate(timeout=30)
     assert process.returncode == 1
-    assert "a node 'worker-scripted' of robot 'panda' is alive already" in out
+    assert "node 'worker-scripted' of robot 'panda' is already running" in out
 
 
 def test_a_second_up_of_a_host_is_refused_and_leaves_the_arm_to_the_running_one(

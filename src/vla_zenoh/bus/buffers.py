@@ -22,7 +22,7 @@ from vla_zenoh.types import Header
 
 
 def bytes_of(payload: zenoh.ZBytes | None, limit: int = MAX_RECORD_BYTES) -> bytes:
-    """The bytes; none are empty.
+    """The bytes of a payload, empty if there is none.
 
     Raises:
         CodecError: ``oversize``, more than `limit`.
@@ -30,30 +30,29 @@ def bytes_of(payload: zenoh.ZBytes | None, limit: int = MAX_RECORD_BYTES) -> byt
     if payload is None:
         return b""
     if len(payload) > limit:
-        raise CodecError("oversize", f"{len(payload)} bytes, at most {limit} are taken")
+        raise CodecError("oversize", f"{len(payload)} bytes, at most {limit} are accepted")
     return payload.to_bytes()
 
 
 def check_size(sample: zenoh.Sample, limit: int) -> None:
-    """Whether a sample may be taken. A deletion comes without bytes, and would pass for a setting.
+    """Check that a sample is a put of limited size. A deletion would pass for an empty setting.
 
     Raises:
-        CodecError: ``deleted``, it was not put; ``oversize``, payload and attachment together are
-            more than `limit`.
+        CodecError: ``deleted``, or ``oversize``: payload and attachment together exceed `limit`.
     """
     if sample.kind != zenoh.SampleKind.PUT:
-        raise CodecError("deleted", "nothing is deleted here; what is put is taken")
+        raise CodecError("deleted", "a deletion; only puts are accepted")
     attachment = sample.attachment
     size = len(sample.payload) + (len(attachment) if attachment is not None else 0)
     if size > limit:
-        raise CodecError("oversize", f"{size} bytes, at most {limit} are taken")
+        raise CodecError("oversize", f"{size} bytes, at most {limit} are accepted")
 
 
 def payload_and_attachment(sample: zenoh.Sample, limit: int) -> tuple[bytes, bytes | None]:
-    """Payload and attachment.
+    """Payload and attachment of a sample.
 
     Raises:
-        CodecError: as `check` says.
+        CodecError: see `check_size`.
     """
     check_size(sample, limit)
     attachment = sample.attachment
@@ -61,10 +60,10 @@ def payload_and_attachment(sample: zenoh.Sample, limit: int) -> tuple[bytes, byt
 
 
 def header_of(sample: zenoh.Sample) -> Header:
-    """What the sample's writer says of it.
+    """Header of a sample.
 
     Raises:
-        CodecError: it has no header that can be read.
+        CodecError: there is none that can be decoded.
     """
     attachment = sample.attachment
     if attachment is None:
@@ -73,12 +72,12 @@ def header_of(sample: zenoh.Sample) -> Header:
 
 
 class ReceivedSample(NamedTuple):
-    """A sample and when it arrived, on the monotonic clock.
+    """A sample and its time of arrival.
 
     Args:
-        sample: as Zenoh gave it.
-        mono_ns: when.
-        nth: how many had arrived in its slot by then, itself included; 0 where nobody counts.
+        sample: as received from Zenoh.
+        mono_ns: time of arrival, monotonic clock.
+        nth: number of samples its buffer had received by then, this one included; 0: not counted.
     """
 
     sample: zenoh.Sample
@@ -87,13 +86,13 @@ class ReceivedSample(NamedTuple):
 
 
 class RejectedSample(NamedTuple):
-    """Samples that a slot did not take.
+    """Samples that a buffer rejected for one reason.
 
     Args:
         reason: short stable name.
         key: of the newest.
-        why: a sentence on it.
-        times: how many.
+        why: a sentence about the newest.
+        times: number of samples.
     """
 
     reason: str
@@ -103,7 +102,7 @@ class RejectedSample(NamedTuple):
 
 
 class SampleBuffer:
-    """What all have: a bound.
+    """Base of all buffers: rejects samples that are too large.
 
     Args:
         limit: bytes of payload and attachment together.
@@ -111,35 +110,32 @@ class SampleBuffer:
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
-        self._refused: dict[str, RejectedSample] = {}
+        self._rejected: dict[str, RejectedSample] = {}
 
-    def _takes(self, sample: zenoh.Sample) -> bool:
+    def _accepts(self, sample: zenoh.Sample) -> bool:
         try:
             check_size(sample, self._limit)
         except CodecError as error:
-            refused = self._refused
-            known = refused.get(error.reason)
-            times = known.times + 1 if known else 1
-            refused[error.reason] = RejectedSample(
-                error.reason, str(sample.key_expr), str(error), times
-            )
+            rejected, reason = self._rejected, error.reason
+            times = rejected[reason].times + 1 if reason in rejected else 1
+            rejected[reason] = RejectedSample(reason, str(sample.key_expr), str(error), times)
             return False
         return True
 
     def pop_rejected(self) -> list[RejectedSample]:
-        """What was not taken since the last call, by reason."""
-        if not self._refused:
+        """Samples rejected since the last call, by reason."""
+        if not self._rejected:
             return []
-        found, self._refused = self._refused, {}
+        found, self._rejected = self._rejected, {}
         return list(found.values())
 
 
 class LatestSample(SampleBuffer):
-    """Keeps the newest sample, and can be waited on.
+    """Keeps the newest sample; a thread can wait for it.
 
     Args:
         limit: bytes of payload and attachment together.
-        changed: is notified at every sample; several may share one, to be waited on together.
+        changed: notified at every sample; several buffers may share one.
     """
 
     def __init__(
@@ -148,11 +144,10 @@ class LatestSample(SampleBuffer):
         super().__init__(limit)
         self._changed = changed or threading.Condition()
         self._arrival: ReceivedSample | None = None
-        self._count = 0
-        self._taken = 0
+        self._count = self._popped = 0
 
     def __call__(self, sample: zenoh.Sample) -> None:
-        if not self._takes(sample):
+        if not self._accepts(sample):
             return
         with self._changed:
             self._count += 1
@@ -161,26 +156,26 @@ class LatestSample(SampleBuffer):
 
     @property
     def count(self) -> int:
-        """Samples that ever arrived."""
+        """Number of samples received so far."""
         return self._count
 
     @property
     def has_new(self) -> bool:
-        """Whether something untaken is there."""
-        return self._taken != self._count
+        """Whether there is a sample that was not popped."""
+        return self._popped != self._count
 
     def pop(self) -> ReceivedSample | None:
         """The newest sample, once."""
         with self._changed:
-            if self._taken == self._count:
+            if self._popped == self._count:
                 return None
-            self._taken = self._count
+            self._popped = self._count
             return self._arrival
 
     def wait(self, timeout_s: float) -> bool:
-        """Whether something untaken is there, waiting for it at most so long."""
+        """Wait for a sample that was not popped; False after `timeout_s`."""
         with self._changed:
-            return self._changed.wait_for(lambda: self._taken != self._count, timeout_s)
+            return self._changed.wait_for(lambda: self._popped != self._count, timeout_s)
 
 
 class CallbackRing(SampleBuffer):
@@ -194,7 +189,7 @@ class CallbackRing(SampleBuffer):
         self.dropped = 0
 
     def __call__(self, sample: zenoh.Sample) -> None:
-        if not self._takes(sample):
+        if not self._accepts(sample):
             return
         self._count += 1
         if len(self._arrivals) == self._size:
@@ -202,20 +197,20 @@ class CallbackRing(SampleBuffer):
         self._arrivals.append(ReceivedSample(sample, time.monotonic_ns(), self._count))
 
     def drain(self) -> list[ReceivedSample]:
-        """Everything that arrived, oldest first."""
-        taken: list[ReceivedSample] = []
+        """All samples, oldest first."""
+        drained: list[ReceivedSample] = []
         while True:
             try:
-                taken.append(self._arrivals.popleft())
+                drained.append(self._arrivals.popleft())
             except IndexError:
-                return taken
+                return drained
 
 
 class ZenohRing(SampleBuffer):
-    """Like `CallbackRing`, filled by Zenoh itself without a word of Python for each sample.
+    """A `CallbackRing` that Zenoh fills by itself, without running Python for each sample.
 
-    A flood of samples that nobody asked for then takes no time from the loop that reads them. The
-    price: the time of arrival is that of `take_all`, and what is too large is dropped only there.
+    A flood of samples then costs the loop that drains it nothing. The price: the time of arrival is
+    that of `drain`, and samples that are too large are dropped only there.
     """
 
     def __init__(self, size: int, limit: int = MAX_RECORD_BYTES) -> None:
@@ -224,20 +219,20 @@ class ZenohRing(SampleBuffer):
         self._receive: Callable[[], zenoh.Sample | None] = lambda: None
 
     def channel(self) -> zenoh.handlers.RingChannel[zenoh.Sample]:
-        """The handler to declare a subscriber with."""
+        """Handler to declare a subscriber with."""
         return zenoh.handlers.RingChannel(self._size)
 
     def receive_from(self, receive: Callable[[], zenoh.Sample | None]) -> None:
-        """Where the subscriber's samples are had, one at a time, None when there is none."""
+        """Set the function that receives one sample, or None if there is none."""
         self._receive = receive
 
     def drain(self) -> list[ReceivedSample]:
-        """Everything that arrived, oldest first; no more than it holds, however fast they come."""
-        taken: list[ReceivedSample] = []
+        """At most `size` samples, oldest first, however fast they come."""
+        drained: list[ReceivedSample] = []
         for _ in range(self._size):
             sample = self._receive()
             if sample is None:
                 break
-            if self._takes(sample):
-                taken.append(ReceivedSample(sample, time.monotonic_ns()))
-        return taken
+            if self._accepts(sample):
+                drained.append(ReceivedSample(sample, time.monotonic_ns()))
+        return drained

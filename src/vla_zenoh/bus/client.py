@@ -1,4 +1,4 @@
-"""A person's side of the bus: puts settings, reads what nodes say. What the CLI is made of."""
+"""Client of a robot: changes its settings and follows its nodes. The CLI is built on it."""
 
 from __future__ import annotations
 
@@ -29,18 +29,25 @@ POLL_S, HOLD_PATIENCE_S = 0.02, 1.0
 MAX_EVENTS, MAX_REFUSALS = 4096, 256
 MAX_EVENT_BYTES = 64 * 1024
 MAX_WHAT, MAX_WHY = 128, 1000
-"""Characters of an event that are kept; nodes of ours write no more."""
+"""Characters of an event that are kept; our nodes publish no more."""
 DROPPED_HINT = (
-    "statuses or tokens left out, of more names than are kept or too large: somebody who is no "
-    "node of ours writes them"
+    "statuses or liveliness tokens dropped, because they are too many or too large: they come from "
+    "a process that is no node of ours"
 )
 
 
 class Client:
-    """Puts plain text on setting keys and keeps the newest status of every node.
+    """Client of one robot: settings, activation, and the last status of every node.
+
+    ::
+
+        with open_session(profile.session) as session:
+            robot = Client(profile, session).subscribe()
+            robot.set_prompt("pick up the red brick")
+            robot.activate_with_deadman("my script")
 
     Args:
-        profile: for its keys.
+        profile: of the robot.
         session: open session.
     """
 
@@ -56,7 +63,7 @@ class Client:
         self._token: Any = None
 
     def subscribe(self) -> Client:
-        """Begin to listen to status, events, liveliness and the task."""
+        """Subscribe to status, events, liveliness and the task; returns the client."""
         liveliness = self.session.liveliness()
         self._subscriptions += [
             self._subscribe(self.keys.all_status, self._on_status),
@@ -82,7 +89,7 @@ class Client:
         try:
             return header_of(sample), records.decode(kind, bytes_of(sample.payload, limit))
         except CodecError:
-            return None  # a stranger's bytes; the nodes count and tell them
+            return None  # the nodes count and report it
 
     def _on_status(self, sample: zenoh.Sample) -> None:
         found = self._decode(NodeStatus, sample, MAX_STATUS_BYTES)
@@ -113,28 +120,28 @@ class Client:
             self._nodes.token_appeared(name)
             return
         self._nodes.token_gone(name)
-        if name == "command":  # nobody keeps the task any more
+        if name == "command":  # the task is in force no more
             with self._lock:
                 self.task = None
 
-    # -- reading ------------------------------------------------------------------------------
+    # -- state --------------------------------------------------------------------------------
     @property
     def alive(self) -> frozenset[str]:
-        """Names of the nodes that are alive."""
+        """Names of live nodes."""
         return self._nodes.alive
 
     @property
     def dropped(self) -> int:
-        """How often strangers' names, or statuses, were not kept for their number or size."""
+        """Number of statuses and tokens dropped because of their number or size."""
         return self._nodes.dropped
 
     def status(self, node: str) -> NodeStatus | None:
-        """The newest status of a node, None before the first."""
+        """The last status of a node, None before the first."""
         found = self._nodes.status(node)
         return found[0] if found else None
 
     def snapshot(self) -> dict[str, tuple[NodeStatus, float, bool]]:
-        """Node -> (status, seconds since it came, alive)."""
+        """Node -> (status, age in s, alive)."""
         return self._nodes.snapshot()
 
     def pop_events(self) -> list[tuple[str, Header, Event]]:
@@ -145,7 +152,7 @@ class Client:
         return events
 
     def wait_for(self, condition: Callable[[], Value | None], timeout_s: float) -> Value | None:
-        """Poll until `condition` gives something true, at most so long."""
+        """Poll until `condition` returns something true; None after `timeout_s`."""
         give_up = time.monotonic() + timeout_s
         while True:
             found = condition()
@@ -153,16 +160,24 @@ class Client:
                 return found or None
             time.sleep(POLL_S)
 
-    # -- writing ------------------------------------------------------------------------------
+    def stop(self) -> None:
+        """Trigger the emergency stop; it latches until `reset`."""
+        self.publish(self.keys.stop, "stop")
+
+    def reset(self) -> None:
+        """Clear a latched emergency stop or fault; the arm stays inactive."""
+        self.publish(self.keys.reset, "reset")
+
+    # -- settings -----------------------------------------------------------------------------
     def publish(self, key: str, text: str) -> None:
-        """Put plain text, as any Zenoh client would."""
+        """Put plain text on a key, as any Zenoh client could."""
         self.session.put(key, text, encoding=zenoh.Encoding.TEXT_PLAIN, **QOS[Kind.ORDER])
 
     def set_prompt(self, prompt: str, timeout_s: float = 2.0) -> Task:
-        """Put a prompt and wait until the command node has taken it.
+        """Set the prompt, and wait until the command node has accepted it.
 
         Raises:
-            SessionError: it did not; says why where it said so.
+            SessionError: it was rejected, with the reasons, or not accepted in time.
         """
         wanted = prompt.strip()
         return self._set(
@@ -170,7 +185,7 @@ class Client:
         )
 
     def set_rate(self, rate_hz: float, timeout_s: float = 2.0) -> Task:
-        """Likewise for the rate."""
+        """Set the rate of action chunks, as `set_prompt`."""
         return self._set(
             self.keys.rate,
             f"{rate_hz:g}",
@@ -180,11 +195,11 @@ class Client:
         )
 
     def set_speed(self, percent: float, timeout_s: float = 2.0) -> Task:
-        """Likewise for the share of the planned speed that is driven, 0 to 100 percent."""
+        """Set the speed override, 0 to 100 percent of the planned speed, as `set_prompt`."""
         return self._set_speed(self.keys.speed, percent, "speed", timeout_s)
 
     def slow_down(self, percent: float, timeout_s: float = 2.0) -> Task:
-        """Likewise, for whoever may stop the arm: refused where it would go faster."""
+        """Lower the speed override; rejected if that would make the arm faster."""
         return self._set_speed(self.keys.slower, percent, "slower", timeout_s)
 
     def _set_speed(self, key: str, percent: float, what: str, timeout_s: float) -> Task:
@@ -194,31 +209,31 @@ class Client:
         return self._set(key, f"{percent:g}", taken, what, timeout_s)
 
     def set_worker(self, worker: str, timeout_s: float = 2.0) -> Task:
-        """Likewise for the worker."""
+        """Choose the worker whose chunks are carried out, as `set_prompt`."""
         return self._set(
             self.keys.worker, worker, lambda task: task.worker == worker, "worker", timeout_s
         )
 
     def activate(self, timeout_s: float = 3.0) -> Task:
-        """Activate and wait until the arm obeys.
+        """Activate the arm, and wait until it is active.
 
         Raises:
-            SessionError: it was refused, with every reason.
+            SessionError: rejected, with every reason.
         """
         return self._activate("true", timeout_s)
 
     def activate_with_deadman(self, what: str, timeout_s: float = 3.0) -> Task:
-        """Likewise, and only for as long as this process lives and is connected.
+        """Activate the arm for as long as this process is alive and connected: as its deadman.
 
-        Until `deactivate`. Whatever ends it, also kill -9 or a cable that is pulled, brakes the
-        arm: at once where the router sees the connection close, else when it gives up the link
+        If the process ends before `deactivate`, also by kill -9 or a pulled cable, the arm brakes:
+        at once if the router sees the connection close, else when it gives up the link
         (``session.lease_ms``).
 
         Args:
-            what: who this is, for people.
+            what: name of this client, for people.
 
         Raises:
-            SessionError: it was refused, with every reason.
+            SessionError: rejected, with every reason.
         """
         self.release_deadman()
         holder = f"{what}-{secrets.token_hex(4)}"
@@ -231,7 +246,7 @@ class Client:
             try:
                 return self._activate(text, timeout_s)
             except SessionError as error:
-                # The token may be on its way still: it does not go before what is put after it.
+                # The token may still be under way: it may arrive after a later put.
                 if NO_DEADMAN_TOKEN not in str(error) or time.monotonic() > give_up_s:
                     self.release_deadman()
                     raise
@@ -242,14 +257,14 @@ class Client:
         )
 
     def latch_reason(self) -> str:
-        """Why nobody may activate before a person's reset, empty where there is no such reason."""
+        """Latched stop or fault that has to be reset before activation; empty if there is none."""
         status = self.status("command")
         if status is None or status.state not in ("stopped", "fault"):
             return ""
         return f"{status.state}: {status.detail.get('why', '')}"
 
     def deactivate(self, timeout_s: float = 3.0) -> bool:
-        """Deactivate; True when the arm stands within `timeout_s`."""
+        """Deactivate the arm; True if it stands within `timeout_s`."""
         began_s = time.monotonic()
         self.publish(self.keys.active, "false")
         stands = bool(self.wait_for(lambda: self._stands(began_s), timeout_s))
@@ -257,13 +272,13 @@ class Client:
         return stands
 
     def release_deadman(self) -> None:
-        """Hold the arm active no more: if it still is, it brakes."""
+        """End the deadman's presence: the arm brakes if it is still active."""
         token, self._token = self._token, None
         if token is not None:
             token.undeclare()
 
     def _stands(self, since_s: float) -> bool:
-        """By a status that is younger than the order: an older one says nothing about it."""
+        """Whether the arm stands, by a status that is newer than the command."""
         status, heard_s = self._nodes.status("command") or (None, 0.0)
         return (
             status is not None
@@ -282,10 +297,10 @@ class Client:
         *,
         undo: str | None = None,
     ) -> Task:
-        """Put a setting, and wait for a task that says so or a refusal, both younger than it.
+        """Put a setting, and wait for a newer task that has it, or a newer rejection.
 
-        Where neither comes in time, `undo` is put behind it: what somebody was told that it failed
-        must not happen later.
+        If neither comes in time, `undo` is put after it: a setting reported as failed must not
+        take effect later.
         """
         began_s = time.monotonic()
         self.publish(key, text)
@@ -293,19 +308,19 @@ class Client:
             lambda: self._refused(what, began_s) or self._taken(taken, began_s), timeout_s
         )
         if self._refused(what, began_s):
-            time.sleep(0.1)  # the other reasons come right behind the first
+            time.sleep(0.1)  # the other reasons follow the first
             reasons = dict.fromkeys(self._refused(what, began_s))
-            raise SessionError(f"{what} refused:\n  - " + "\n  - ".join(reasons))
+            raise SessionError(f"{what} rejected:\n  - " + "\n  - ".join(reasons))
         task = self._taken(taken, began_s)
         if task is not None:
             return task
         if undo is not None:
             self.publish(key, undo)
         if "command" not in self.alive:
-            raise SessionError(f"{what}: no command node of robot {self.keys.robot!r} is alive")
+            raise SessionError(f"{what}: no command node of robot {self.keys.robot!r} is running")
         status = self.status("command")
-        why = f"; it says: {status.detail.get('why', '')}" if status else ""
-        raise SessionError(f"{what}: the command node did not take it in {timeout_s:g} s{why}")
+        why = f"; its status: {status.detail.get('why', '')}" if status else ""
+        raise SessionError(f"{what}: not accepted by the command node within {timeout_s:g} s{why}")
 
     def _taken(self, taken: Callable[[Task], bool], since_s: float) -> Task | None:
         with self._lock:

@@ -1,4 +1,4 @@
-"""A wall clock that does not jump, and the loop that keeps time by it."""
+"""Wall clock that does not jump, and a timer for fixed-rate loops."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import NamedTuple
 ADOPT_S = 0.005
 """A smaller difference to the system's wall clock is slewing, and is followed silently."""
 NOISE_S = 0.001
-"""A still smaller one is mostly the time between reading two clocks: following it is jitter."""
+"""A still smaller one is mostly the time between reading two clocks; following it would jitter."""
 
 
 class Clock:
-    """Wall time made of the monotonic clock and an offset taken now and then."""
+    """Wall clock: the monotonic clock plus an offset that is updated now and then."""
 
     def __init__(self) -> None:
         self._offset_ns = time.time_ns() - time.monotonic_ns()
@@ -23,15 +23,15 @@ class Clock:
 
     @property
     def offset_ns(self) -> int:
-        """Wall time minus time of the monotonic clock."""
+        """Wall time minus monotonic time."""
         return self._offset_ns
 
     def wall_at(self, mono_ns: int) -> int:
-        """The same for a time of the monotonic clock."""
+        """Wall time of a monotonic time."""
         return mono_ns + self._offset_ns
 
     def adopt_system_time(self) -> float:
-        """Take over the system's wall clock; returns by how much it had been stepped (s), or 0."""
+        """Adopt the system's wall clock; returns its step in s, 0 if there was none."""
         offset_ns = time.time_ns() - time.monotonic_ns()
         step_s = (offset_ns - self._offset_ns) / 1e9
         if abs(step_s) < NOISE_S:
@@ -41,14 +41,14 @@ class Clock:
 
 
 class Tick(NamedTuple):
-    """One turn of a fixed-rate loop.
+    """One cycle of a fixed-rate loop.
 
     Args:
-        periods: how many periods have passed since the last turn, at least 1.
-        nominal_ns: the multiple this turn stands for, on the monotonic clock.
-        stall_s: how late this turn was woken in all, and how long the computer was suspended.
-        computed_s: processor time the turn before took of this thread. Where that is little and the
-            stall is long, the computer was busy with something else.
+        periods: periods since the last cycle, at least 1.
+        nominal_ns: nominal time of this cycle, monotonic clock.
+        stall_s: how late it begins, plus how long the computer was suspended.
+        computed_s: processor time of this thread in the last cycle. If that is short and the stall
+            long, the computer was busy with something else.
     """
 
     periods: int
@@ -58,19 +58,19 @@ class Tick(NamedTuple):
 
 
 def suspended_ns() -> int:
-    """How long this computer was suspended since it was booted; 0 where the system does not say.
+    """How long this computer was suspended since boot; 0 if unknown.
 
-    Never more than that, whatever is done to this thread between the two clocks.
+    Never too long, even if this thread is preempted between reading the two clocks.
     """
     clock = getattr(time, "CLOCK_BOOTTIME", None)
     return 0 if clock is None else time.clock_gettime_ns(clock) - time.monotonic_ns()
 
 
 class FixedRate:
-    """Wakes at multiples of a period; a missed one is reported, not made up for.
+    """Timer of a loop that runs at multiples of a period; missed cycles are reported and skipped.
 
-    Periods are those of the monotonic clock, which stands still while the computer is suspended:
-    nothing was missed then, but whoever goes on has to know of it.
+    The monotonic clock stands still while the computer is suspended. No cycle is missed then, but
+    the suspension is reported as a stall.
     """
 
     def __init__(self, rate_hz: float) -> None:

@@ -1,4 +1,4 @@
-"""Which host this is, and which start of which computer, for status."""
+"""Identity of the host and of its boot, for status."""
 
 from __future__ import annotations
 
@@ -10,51 +10,50 @@ from typing import NamedTuple
 
 from vla_zenoh.keys import key_chunk
 from vla_zenoh.profile import SessionProfile
-from vla_zenoh.security.store import Store
 
 HOST_VARIABLE = "VLA_ZENOH_HOST"
-"""Which host of the profile this computer is, where no option says it."""
+"""Name of this host in the profile, unless an option gives it."""
 BOOT_FILE = Path("/proc/sys/kernel/random/boot_id")
 
 
 class HostId(NamedTuple):
-    """Where a node runs.
+    """Host on which a node runs.
 
     Args:
-        host: of the profile, where it is known; else the computer's own name, which several may
-            have.
-        boot: drawn anew at every start of the computer, so that no other one has it; empty where
-            the system tells none.
+        host: name in the profile if known, else the computer's own name, which need not be unique.
+        boot: unique id of this boot; empty if the system has none.
     """
 
     host: str
     boot: str
 
     def shares_clock(self, other: HostId) -> bool:
-        """Whether both certainly run on the same computer. Unknown is not the same."""
+        """Whether both certainly run on the same computer; False if unknown."""
         return bool(self.boot) and self == other
 
 
 def own_host_id(session: SessionProfile, host: str | None = None) -> HostId:
-    """Where this process runs.
+    """Identity of this host.
 
     Args:
-        session: of the profile; with certificates, whose they are here.
-        host: of the profile, where somebody said so.
+        session: of the profile; a secured host is named by its certificates.
+        host: name in the profile, if given by an option.
 
     Raises:
-        ProfileError: what was said cannot be a host's name.
+        ProfileError: the name cannot be part of a key.
     """
     security = session.security
     named = host or (security.host if security else None) or os.environ.get(HOST_VARIABLE)
     if not named and security is not None:
+        from vla_zenoh.security.store import Store
+
         named = Store(security.folder).known_host()
     return HostId(key_chunk(named, "host") if named else socket.gethostname(), own_boot_id())
 
 
 @cache
 def own_boot_id() -> str:
-    """The start of this computer; empty on systems that tell none."""
+    """Id of this boot; empty if the system has none."""
     try:
         return BOOT_FILE.read_text("ascii").strip()
     except OSError:

@@ -1,4 +1,4 @@
-"""Who is alive, by answers that came in time."""
+"""Nodes and robots that are alive, by their liveliness tokens."""
 
 from __future__ import annotations
 
@@ -7,50 +7,50 @@ import time
 import zenoh
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.keys import Keys
+from vla_zenoh.keys import Keys, last_chunk
 
 PATIENCE_S, ATTEMPTS = 1.0, 5
 ANSWERS = 2
-"""One alone may come in time and lack who is alive: a robot that lived was once not found so."""
+"""A single answer in time may lack a node that is alive; this has been observed."""
 
 
 def alive_nodes(session: zenoh.Session, keys: Keys, name: str | None = None) -> set[str]:
-    """Names of the nodes of a robot that are alive now.
+    """Names of a robot's nodes that are alive.
 
     Args:
         session: an open session.
         keys: of the robot.
-        name: only this one; None: all.
+        name: look for this node only.
 
     Raises:
-        NodeError: the router does not answer in time: who is not named may live all the same.
+        NodeError: the router does not answer in time, so more nodes may be alive.
     """
-    asked = keys.all_alive if name is None else keys.alive(name)
+    expression = keys.all_alive if name is None else keys.alive(name)
     found: set[str] = set()
     answers = 0
     for _ in range(ATTEMPTS):
         began_s = time.monotonic()
-        replies = list(session.liveliness().get(asked, timeout=PATIENCE_S))
-        found |= {str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None}
-        # A query that ran out of time ends like one that has been answered in full.
+        replies = list(session.liveliness().get(expression, timeout=PATIENCE_S))
+        found |= {last_chunk(str(r.ok.key_expr)) for r in replies if r.ok is not None}
+        # A query that timed out ends like one that was answered completely.
         answers += time.monotonic() - began_s < PATIENCE_S and all(r.ok for r in replies)
         if answers == ANSWERS:
             return found
     raise NodeError(
-        f"the router does not say within {PATIENCE_S:g} s which nodes of {keys.robot!r} are alive; "
-        "look whether it is too busy, or its access control does not know us, and try again"
+        f"the router does not report within {PATIENCE_S:g} s which nodes of {keys.robot!r} are "
+        "alive; it may be overloaded, or its access control may not know us. Try again"
     )
 
 
 def alive_robots(session: zenoh.Session, keys: Keys) -> list[str]:
-    """Robots below this root whose command node is alive, of those that one may know of.
+    """Robots below this root whose command node is alive and visible to us, in order.
 
     Args:
         session: an open session.
         keys: of any robot there.
 
     Returns:
-        Their names in order; fewer than there are where the router does not answer in time.
+        Names; incomplete if the router does not answer in time.
     """
     found: set[str] = set()
     for _ in range(ANSWERS):

@@ -14,7 +14,7 @@ from vla_zenoh.types import Header
 
 
 class RateMeter:
-    """How often something happens, over a sliding window."""
+    """Rate of events over a sliding window."""
 
     def __init__(self, window_s: float = 2.0) -> None:
         self._window_s = window_s
@@ -22,13 +22,13 @@ class RateMeter:
         self.total = 0
 
     def tick(self) -> None:
-        """It happened."""
+        """Count one event."""
         self._times.append(time.monotonic())
         self.total += 1
 
     @property
     def rate_hz(self) -> float:
-        """Events per second, 0 when nothing happened within the window."""
+        """Events per second, 0 if none happened within the window."""
         now = time.monotonic()
         while self._times and now - self._times[0] > self._window_s:
             self._times.popleft()
@@ -36,19 +36,19 @@ class RateMeter:
             return 0.0
         span_s = self._times[-1] - self._times[0]
         mean_s = span_s / (len(self._times) - 1)
-        # Between two events the rate does not sink; when the next one is overdue it does.
+        # The rate falls only once the next event is overdue.
         overdue_s = max(now - self._times[-1] - 1.5 * mean_s, 0.0)
         return (len(self._times) - 1) / max(span_s + overdue_s, 1e-6)
 
 
 class Percentiles:
-    """How the last values are spread."""
+    """Percentiles of the last values."""
 
     def __init__(self, size: int) -> None:
         self._values: deque[float] = deque(maxlen=size)
 
     def add(self, value: float) -> None:
-        """Take one value."""
+        """Add a value."""
         self._values.append(value)
 
     def summary(self) -> tuple[float, float] | None:
@@ -71,14 +71,14 @@ class Percentiles:
 
 LINKS_PERIOD_S = 5.0
 MAX_SENDERS = 256
-"""So many are compared with themselves; where more come, who was silent longest is forgotten."""
+"""Sources whose losses are counted; beyond that the one silent for longest is forgotten."""
 OTHERS = "others"
-"""Where losses are counted of more keys than `MAX_SENDERS`."""
+"""Counts the losses of further keys than `MAX_SENDERS`."""
 MAX_LINKS = 8
 
 
 class Sender(Protocol):
-    """Counts what it has written."""
+    """Counts what it has published."""
 
     @property
     def key(self) -> str: ...
@@ -89,8 +89,8 @@ class Sender(Protocol):
 
 
 @dataclass(slots=True)
-class _Heard:
-    """A writer of a key: where its numbers and our arrivals began, and what is missing since."""
+class _Source:
+    """A source on a key: its first sequence number and our count then, and losses since."""
 
     seq: int
     arrivals: int
@@ -98,54 +98,54 @@ class _Heard:
 
 
 class Traffic:
-    """Rates of what is sent, from one report to the next, and records that never arrived.
+    """Rates of published records, from one status to the next, and records that were lost.
 
     Args:
-        session: whose links are shown.
+        session: whose links are listed.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
         self._sessions = [session]
         self._reported_s = time.monotonic()
         self._sent: dict[str, tuple[int, int]] = {}
-        self._heard: dict[tuple[str, str], _Heard] = {}  # in the order of when they spoke last
+        self._received: dict[tuple[str, str], _Source] = {}  # the one received last comes last
         self._lost_before: Counter[str] = Counter()
         self._links: list[str] = []
         self._links_s = -1e9
 
     def add(self, session: zenoh.Session) -> None:
-        """Show the links of this one as well."""
+        """List the links of this session as well."""
         self._sessions.append(session)
 
     def received(self, key: str, header: Header, arrivals: int) -> None:
-        """A record was read.
+        """Count a received record.
 
-        What a slot dropped by itself is not lost: it arrived. Where several writers share a slot
-        this counts too few, never too many.
+        Records that a buffer dropped are not lost: they arrived. If several sources share a buffer
+        too few are counted, never too many.
 
         Args:
-            key: it came on.
-            header: its writer's word.
-            arrivals: samples that had arrived in its slot by then; 0: nobody counts there.
+            key: of the record.
+            header: of the record.
+            arrivals: samples its buffer had received by then; 0: not counted.
         """
         if arrivals == 0:
             return
         who = (key, header.source)
-        known = self._heard.pop(who, None) or _Heard(header.seq, arrivals)
+        known = self._received.pop(who, None) or _Source(header.seq, arrivals)
         missing = (header.seq - known.seq) - (arrivals - known.arrivals)
         known.lost = max(missing, known.lost)
-        self._heard[who] = known
-        if len(self._heard) > MAX_SENDERS:
-            self._forget(next(iter(self._heard)))
+        self._received[who] = known
+        if len(self._received) > MAX_SENDERS:
+            self._forget(next(iter(self._received)))
 
     def _forget(self, who: tuple[str, str]) -> None:
-        key, lost = who[0], self._heard.pop(who).lost
+        key, lost = who[0], self._received.pop(who).lost
         if lost:
             full = key not in self._lost_before and len(self._lost_before) >= MAX_SENDERS
             self._lost_before[OTHERS if full else key] += lost
 
     def sent(self, streams: Iterable[Sender]) -> dict[str, list[float]]:
-        """Key -> records and bytes a second since the last call, of those that carried any."""
+        """Key -> records and bytes per second since the last call, of keys with traffic."""
         now_s = time.monotonic()
         took_s = max(now_s - self._reported_s, 1e-3)
         out: dict[str, list[float]] = {}
@@ -160,14 +160,14 @@ class Traffic:
         return out
 
     def lost(self) -> dict[str, int]:
-        """Key -> records that were written and never arrived here."""
+        """Key -> records that never arrived here."""
         out = Counter(self._lost_before)
-        for (key, _), heard in list(self._heard.items()):  # readers may have threads of their own
+        for (key, _), heard in list(self._received.items()):  # other threads may add to it
             out[key] += heard.lost
         return {key: count for key, count in out.items() if count}
 
     def links(self) -> list[str]:
-        """Where this node is connected to, as Zenoh writes it."""
+        """Endpoints this node is connected to, as Zenoh writes them."""
         if time.monotonic() - self._links_s > LINKS_PERIOD_S:
             self._links_s = time.monotonic()
             found = {str(link.dst) for one in self._sessions for link in one.info.links()}
@@ -175,5 +175,5 @@ class Traffic:
         return self._links
 
     def detail(self, streams: Iterable[Sender]) -> Mapping[str, Any]:
-        """For status."""
+        """Traffic for the status: sent, lost, links."""
         return {"sent": self.sent(streams), "lost": self.lost(), "links": self.links()}

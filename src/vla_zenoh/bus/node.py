@@ -1,4 +1,4 @@
-"""What every node has: a name on the bus, status, events, counters, and checked streams."""
+"""Base of every node: its publishers, subscribers, status, events and counters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from vla_zenoh.bus import clock_sync as offsets
 from vla_zenoh.bus.buffers import (
     CallbackRing,
     LatestSample,
@@ -22,7 +21,7 @@ from vla_zenoh.bus.buffers import (
     header_of,
 )
 from vla_zenoh.bus.clock import Clock
-from vla_zenoh.bus.clock_sync import ClockSync
+from vla_zenoh.bus.clock_sync import ClockSync, reply_with_stamps
 from vla_zenoh.bus.event_throttle import EventThrottle
 from vla_zenoh.bus.host_id import own_host_id
 from vla_zenoh.bus.liveliness import alive_nodes
@@ -30,21 +29,21 @@ from vla_zenoh.bus.metrics import Traffic
 from vla_zenoh.bus.session import QOS, open_session
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
-from vla_zenoh.keys import Kind
+from vla_zenoh.keys import Kind, last_chunk
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Event, Header, NodeStatus, Stamped
 from vla_zenoh.types.stream import SingleWriterFilter
 
 MSGPACK = zenoh.Encoding("application/msgpack")
 STATUS_PERIOD_S = 0.5
-PICTURES_PATIENCE_S = 10.0
+IMAGE_LINK_TIMEOUT_S = 10.0
 
 Record = TypeVar("Record")
 AnyBuffer = TypeVar("AnyBuffer", LatestSample, CallbackRing, ZenohRing)
 
 
 class Publisher:
-    """Writes records on one key, each with its header."""
+    """Publishes records on one key, each with its header."""
 
     def __init__(
         self, session: zenoh.Session, key: str, kind: Kind, source: str, clock: Clock
@@ -57,7 +56,7 @@ class Publisher:
 
     @property
     def has_subscribers(self) -> bool:
-        """Somebody listens."""
+        """Whether any subscriber matches."""
         return self._publisher.matching_status.matching  # pyright: ignore  # stub says bool
 
     def publish(
@@ -68,7 +67,14 @@ class Publisher:
         seq: int | None = None,
         encoding: Any = MSGPACK,
     ) -> Header:
-        """Write a record, or ready-made bytes, stamped now unless told otherwise."""
+        """Publish a record, or encoded bytes.
+
+        Args:
+            record: what to publish.
+            stamp_wall_ns: time of capture; None: now.
+            seq: sequence number; None: one more than the last.
+            encoding: of the payload.
+        """
         header = Header(
             self._clock.wall_ns() if stamp_wall_ns is None else stamp_wall_ns,
             self.seq if seq is None else seq,
@@ -81,7 +87,7 @@ class Publisher:
         return header
 
     def close(self) -> None:
-        """No more is written."""
+        """Undeclare the publisher."""
         self._publisher.undeclare()
 
 
@@ -89,13 +95,13 @@ class Node:
     """A process on the bus.
 
     Args:
-        name: unique for this robot; a second node of the same name is refused.
+        name: unique for this robot.
         profile: the effective profile.
-        session: an open session, closed by whoever opened it.
-        host: of the profile, on which this runs, where somebody said so.
+        session: an open session; the caller closes it.
+        host: name of this host in the profile, if known.
 
     Raises:
-        NodeError: a node of this name is alive already, or the router does not say.
+        NodeError: a node of this name is already running, or the router does not answer.
     """
 
     def __init__(
@@ -109,73 +115,68 @@ class Node:
         self.counters: Counter[str] = Counter()
         self.started_wall_ns = time.time_ns()
         self._declared: list[Any] = []
-        self._streams: list[Publisher] = []
-        self._slots: list[SampleBuffer] = []
+        self._publishers: list[Publisher] = []
+        self._buffers: list[SampleBuffer] = []
         self._subscribers: list[tuple[SampleBuffer, Any]] = []
-        self._pictures: zenoh.Session | None = None
+        self._image_session: zenoh.Session | None = None
         self.traffic = Traffic(session)
-        self._last_status = 0.0
-        self._last_state = ""
-        self._refuse_a_second_one()
+        self._status_s, self._last_state = 0.0, ""
+        if alive_nodes(session, self.keys, name):
+            raise NodeError(
+                f"node {name!r} of robot {profile.robot.name!r} is already running. Stop it, or "
+                "start this one with a different --name where the command has it"
+            )
         self.clocks = ClockSync(
             session, self.keys, self.clock, name, profile.timing.max_clock_offset_s
         )
         own_clock = self.keys.clock(name)
-        self.serve(own_clock, lambda query: offsets.reply_with_stamps(self.clock, own_clock, query))
+        self.serve(own_clock, lambda query: reply_with_stamps(self.clock, own_clock, query))
         self._token = session.liveliness().declare_token(self.keys.alive(name))
         self._status = self.declare_publisher(self.keys.status(name), Kind.TELEMETRY)
-        self._news = EventThrottle(
-            self.declare_publisher(self.keys.event(name), Kind.TELEMETRY).publish
-        )
+        events = self.declare_publisher(self.keys.event(name), Kind.TELEMETRY)
+        self._events = EventThrottle(events.publish)
 
-    def _refuse_a_second_one(self) -> None:
-        if alive_nodes(self.session, self.keys, self.name):
-            raise NodeError(
-                f"a node {self.name!r} of robot {self.profile.robot.name!r} is alive already; "
-                "stop it first, or give this one another --name where the command has it"
-            )
-
-    # -- writing ------------------------------------------------------------------------------
+    # -- publishing ---------------------------------------------------------------------------
     def declare_publisher(self, key: str, kind: Kind) -> Publisher:
-        """A writer for `key`.
+        """A publisher on `key`.
 
         Raises:
-            SessionError: it is for pictures, and the router does not answer at their port.
+            SessionError: the router does not answer at the port for images.
         """
-        made = Publisher(self._session_for(kind), key, kind, self.source, self.clock)
-        self._streams.append(made)
-        return made
+        publisher = Publisher(self._session_for(kind), key, kind, self.source, self.clock)
+        self._publishers.append(publisher)
+        return publisher
 
-    def undeclare(self, stream: Publisher) -> None:
-        """Nothing is written there any more."""
-        self._streams.remove(stream)
-        stream.close()
+    def undeclare(self, publisher: Publisher) -> None:
+        """Close a publisher."""
+        self._publishers.remove(publisher)
+        publisher.close()
 
     def _session_for(self, kind: Kind) -> zenoh.Session:
-        """Pictures have a connection of their own where the profile says so."""
+        """Images have a connection of their own if the profile says so."""
         if kind is not Kind.FRAME or not self.profile.session.separate_links:
             return self.session
-        if self._pictures is None:
-            self._pictures = open_session(
-                self.profile.session, identity=self.name, images=True, wait_s=PICTURES_PATIENCE_S
+        if self._image_session is None:
+            self._image_session = open_session(
+                self.profile.session, identity=self.name, images=True, wait_s=IMAGE_LINK_TIMEOUT_S
             )
-            self.traffic.add(self._pictures)
-        return self._pictures
+            self.traffic.add(self._image_session)
+        return self._image_session
 
     def emit(self, event: Event) -> None:
-        """Write an event; a flood of the same is thinned out and counted, see `EventThrottle`."""
-        self._news.emit(event)
+        """Publish an event; repetitions are throttled and counted, see `EventThrottle`."""
+        self._events.emit(event)
 
     def reject(self, reason: str, why: str, about: str = "") -> None:
-        """Count a refusal by reason, and say why.
+        """Count a rejection and emit an event.
 
         Args:
             reason: short stable name.
             why: a sentence.
-            about: what is refused; a flood of refusals of one thing does not silence another's.
+            about: what is rejected; each is throttled by itself.
         """
         self.counters[f"refused.{reason}"] += 1
-        self._news.emit(Event("warning", "refusal", reason, why[:1000]), about)
+        self._events.emit(Event("warning", "refusal", reason, why[:1000]), about)
 
     def publish_status(
         self,
@@ -187,12 +188,10 @@ class Node:
         latency_ms: Mapping[str, tuple[float, float]] | None = None,
         now: bool = False,
     ) -> None:
-        """Write status when it is time, when `state` changed, or `now`."""
-        self._tick()
-        clock = time.monotonic()
-        if not now and state == self._last_state and clock - self._last_status < STATUS_PERIOD_S:
+        """Publish the status if it is due: periodically, when `state` changes, or `now`."""
+        if not self.status_due(state) and not now:
             return
-        self._last_status, self._last_state = clock, state
+        self._status_s, self._last_state = time.monotonic(), state
         self._status.publish(
             NodeStatus(
                 self.name,
@@ -204,27 +203,28 @@ class Node:
                 rates_hz or {},
                 latency_ms or {},
                 dict(self.counters),
-                {**(detail or {}), "clocks": self._clocks_in_words(), "net": self._net()},
+                {**(detail or {}), "clocks": self._clock_detail(), "net": self._traffic_detail()},
                 self.host_id.boot,
             )
         )
 
-    def _tick(self) -> None:
-        self.clocks.tick()
-        self._tell_of_refused()
-        self._news.tick()
+    def status_due(self, state: str) -> bool:
+        """Whether `publish_status` would publish now; lets a fast loop skip collecting details."""
+        self.clocks.poll()
+        self._report_rejected()
+        self._events.poll()
+        due = time.monotonic() - self._status_s >= STATUS_PERIOD_S
+        return due or state != self._last_state
 
-    def _net(self) -> dict[str, Any]:
-        found = self.traffic.detail(self._streams)
-        short = self.keys.short
+    def _traffic_detail(self) -> dict[str, Any]:
         return {
-            what: {short(key): value for key, value in said.items()}
-            if isinstance(said, Mapping)
-            else said
-            for what, said in found.items()
+            name: {self.keys.short(key): value for key, value in part.items()}
+            if isinstance(part, Mapping)
+            else part
+            for name, part in self.traffic.detail(self._publishers).items()
         }
 
-    def _clocks_in_words(self) -> dict[str, dict[str, float]]:
+    def _clock_detail(self) -> dict[str, dict[str, float]]:
         return {
             node: {
                 "offset_ms": round(found.offset_s * 1e3, 3),
@@ -234,61 +234,60 @@ class Node:
             for node, found in self.clocks.offsets().items()
         }
 
-    def status_due(self, state: str) -> bool:
-        """Whether `report` would write now: lets a fast loop skip collecting what to report."""
-        self._tick()
-        due = time.monotonic() - self._last_status >= STATUS_PERIOD_S
-        return due or state != self._last_state
-
-    # -- reading ------------------------------------------------------------------------------
+    # -- subscribing --------------------------------------------------------------------------
     def subscribe(self, key: str, buffer: AnyBuffer, kind: Kind = Kind.STATE) -> AnyBuffer:
-        """Let samples on `key` fall into `slot`; of `kind` it matters whether they are pictures.
+        """Subscribe to `key`; samples go to `buffer`, which is returned.
 
-        Those that it does not take are counted and told with the next report.
+        Samples that the buffer rejects are counted and reported with the next status.
+
+        Args:
+            key: key expression.
+            buffer: where samples go.
+            kind: of the key; it matters for images only, which may have their own connection.
 
         Raises:
-            SessionError: the router does not answer at the port of pictures.
+            SessionError: the router does not answer at the port for images.
         """
         session = self._session_for(kind)
         self.watch_buffer(buffer)
         if isinstance(buffer, ZenohRing):
             subscriber = session.declare_subscriber(key, buffer.channel())
             buffer.receive_from(subscriber.try_recv)
-            self._subscribers.append((buffer, subscriber))
-            return buffer
-        handler = zenoh.handlers.Callback(buffer, indirect=False)
-        self._subscribers.append((buffer, session.declare_subscriber(key, handler)))
+        else:
+            handler = zenoh.handlers.Callback(buffer, indirect=False)
+            subscriber = session.declare_subscriber(key, handler)
+        self._subscribers.append((buffer, subscriber))
         return buffer
 
     def unsubscribe(self, buffer: SampleBuffer) -> None:
-        """Let no more samples fall into `slot`."""
+        """Undeclare the subscribers of `buffer`."""
         for found, subscriber in self._subscribers:
             if found is buffer:
                 subscriber.undeclare()
         self._subscribers = [pair for pair in self._subscribers if pair[0] is not buffer]
-        self._tell_of_refused()
-        self._slots.remove(buffer)
+        self._report_rejected()
+        self._buffers.remove(buffer)
 
     def watch_buffer(self, buffer: SampleBuffer) -> None:
-        """Count and tell what `slot` does not take."""
-        self._slots.append(buffer)
+        """Count and report the samples that `buffer` rejects."""
+        self._buffers.append(buffer)
 
-    def _tell_of_refused(self) -> None:
-        for slot in self._slots:
-            for found in slot.pop_rejected():
+    def _report_rejected(self) -> None:
+        for buffer in self._buffers:
+            for found in buffer.pop_rejected():
                 key = self.keys.short(found.key)
                 self.counters[f"refused.{found.reason}"] += found.times - 1
                 self.reject(found.reason, f"{key}: {found.why}", key)
 
     def on_alive(self, callback: Callable[[str, bool], None]) -> None:
-        """Call back with (node name, alive) now and at every change, on Zenoh's thread."""
+        """Call back with (node, alive) now and at every change, on Zenoh's thread."""
         self.on_tokens(self.keys.all_alive, callback)
 
     def on_tokens(self, expression: str, callback: Callable[[str, bool], None]) -> None:
-        """Likewise with the last part of the key of every liveliness token."""
+        """Call back with (last part of the key, alive) for every liveliness token."""
 
         def change(sample: zenoh.Sample) -> None:
-            callback(str(sample.key_expr).rsplit("/", 1)[-1], sample.kind == zenoh.SampleKind.PUT)
+            callback(last_chunk(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
 
         handler = zenoh.handlers.Callback(change, indirect=False)
         self._declared.append(
@@ -296,7 +295,7 @@ class Node:
         )
 
     def serve(self, key: str, reply: Callable[[zenoh.Query], None]) -> None:
-        """Answer `get` on `key`; `reply` runs on Zenoh's thread."""
+        """Answer queries on `key`; `reply` runs on Zenoh's thread."""
 
         def handle(query: zenoh.Query) -> None:
             with query:
@@ -306,13 +305,13 @@ class Node:
         self._declared.append(self.session.declare_queryable(key, handler, complete=True))
 
     def adopt_system_time(self) -> None:
-        """Take over the system's wall clock; that it was set is counted and told."""
+        """Adopt the system's wall clock; a step of it is counted and reported."""
         step_s = self.clock.adopt_system_time()
         if step_s:
             self.reject("clock_step", f"the wall clock was set by {step_s:+.3f} s")
 
     def arrival_wall_ns(self, arrival: ReceivedSample) -> int:
-        """Arrival time on this node's wall clock."""
+        """Arrival time of a sample on this node's wall clock."""
         return self.clock.wall_ns() - (time.monotonic_ns() - arrival.mono_ns)
 
     def decode(
@@ -321,58 +320,61 @@ class Node:
         arrival: ReceivedSample,
         writer_filter: SingleWriterFilter | None = None,
     ) -> Stamped[Record] | None:
-        """Decode a stream sample; a refusal is counted and told, and None is returned.
-
-        Its stamps are put on this node's clock, see `vla_zenoh.bus.clock_sync`.
+        """Decode a sample, with its stamps on this node's clock, see `ClockSync`.
 
         Args:
-            kind: the record.
+            kind: type of the record.
             arrival: the sample.
-            speaker: of its key: only he is heard, and each of his records once.
+            writer_filter: of its key.
+
+        Returns:
+            None if the sample was rejected, which is counted and reported.
         """
-        sample = arrival.sample
+        key = str(arrival.sample.key_expr)
         try:
             header = self.header(arrival)
-            if writer_filter is not None:  # before the payload: who shouts nonsense costs least
+            if writer_filter is not None:  # first: a flood by another source must cost little
                 writer_filter.check(header, arrival.mono_ns)
-            record = records.decode(kind, bytes_of(sample.payload))
+            record = records.decode(kind, bytes_of(arrival.sample.payload))
             here, record = self.clocks.to_local_clock(header, record)
         except CodecError as error:
-            key = self.keys.short(str(sample.key_expr))
-            self.reject(error.reason, f"{key}: {error}", key)
+            self._reject_sample(key, error)
             return None
         if writer_filter is not None:
-            writer_filter.heard(header, arrival.mono_ns)
-        self.traffic.received(str(sample.key_expr), header, arrival.nth)
+            writer_filter.accept(header, arrival.mono_ns)
+        self.traffic.received(key, header, arrival.nth)
         return Stamped(here, record, self.arrival_wall_ns(arrival))
 
     @staticmethod
     def header(arrival: ReceivedSample) -> Header:
-        """What the sample's writer says of it.
+        """Header of a sample.
 
         Raises:
-            CodecError: it has no header that can be read.
+            CodecError: there is none that can be decoded.
         """
         return header_of(arrival.sample)
 
     def decode_text(
         self, decode: Callable[[bytes], Record], arrival: ReceivedSample
     ) -> Record | None:
-        """Decode a plain setting likewise."""
+        """Decode a setting in plain text; None if it was rejected."""
         try:
             return decode(bytes_of(arrival.sample.payload))
         except CodecError as error:
-            key = self.keys.short(str(arrival.sample.key_expr))
-            self.reject(error.reason, f"{key}: {error}", key)
+            self._reject_sample(str(arrival.sample.key_expr), error)
             return None
 
+    def _reject_sample(self, key: str, error: CodecError) -> None:
+        short = self.keys.short(key)
+        self.reject(error.reason, f"{short}: {error}", short)
+
     def close(self) -> None:
-        """Say goodbye: the liveliness token goes first, so that others notice at once."""
+        """Leave the bus. The liveliness token goes first, so that others notice at once."""
         self._token.undeclare()
         for declared in (*self._declared, *(subscriber for _, subscriber in self._subscribers)):
             declared.undeclare()
         self._declared.clear()
         self._subscribers.clear()
-        if self._pictures is not None:
-            self._pictures.close()
-            self._pictures = None
+        if self._image_session is not None:
+            self._image_session.close()
+            self._image_session = None

@@ -1,4 +1,4 @@
-"""Zenoh sessions: the one place that opens them, and how each kind of key is carried."""
+"""Opens Zenoh sessions, and says with which quality of service each kind of key is sent."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import SessionProfile
 from vla_zenoh.profile.session import SecurityProfile, second_link
-from vla_zenoh.security.store import Store
 
 Mode = Literal["client", "router"]
-"""Peers are none of ours: a router does not forward them to each other."""
+"""No peers: a router does not forward between them."""
 RETRY_S = 0.1
 CLIENT, LINKED, FIRST = 1, 2, 3
-"""Leases that a client, a router that connects to others, and one that does not announce: so long
-the other side waits. Who connects has to wait longer than who is connected to. For who comes back
-while the other still holds its old transport is taken for a second link of that, and its keys are
-mixed up (Zenoh 1.10; eclipse-zenoh/zenoh#2806)."""
+"""Leases announced by a client, by a router that connects to others, and by one that does not: how
+long the other side waits. The connecting side must wait longer than the listening one. A client
+that reconnects while its old transport is still held is taken for a second link of it, and its keys
+get mixed up (Zenoh 1.10; eclipse-zenoh/zenoh#2806)."""
 ROUTER_BLOCKS_US = 200_000
-"""A router waits so long for a link that does not take what must arrive, then closes it."""
+"""A router blocks this long on a link for samples that must not be dropped, then closes it."""
 MAX_MESSAGE_BYTES = 160 * 1024 * 1024
-"""Zenoh itself takes no larger sample from a link; the largest picture we read has 96 MiB."""
+"""Zenoh accepts no larger message from a link; the largest image we decode has 96 MiB."""
 
 _DROP = zenoh.CongestionControl.DROP
 _BLOCK = zenoh.CongestionControl.BLOCK
@@ -57,18 +56,18 @@ def session_config(
     access: Mapping[str, Any] | None = None,
     images: bool = False,
 ) -> dict[str, Any]:
-    """Zenoh's configuration as plain data, before it is handed to its strict parser.
+    """Configuration of a Zenoh session, as plain data for its strict parser.
 
     Args:
         profile: the session section.
         mode: of the session.
         connect: overrides the profile's endpoints; of a router: other routers.
-        identity: which node's certificate is shown; None: that of the people at this computer.
-        access: section ``access_control``, of a router.
-        pictures: of a client: the link that pictures have to themselves.
+        identity: node whose certificate is used; None: the operator at this computer.
+        access: section ``access_control`` of a router.
+        images: a client's separate link for images.
 
     Raises:
-        SecurityError: the certificate is not there.
+        SecurityError: the certificate is missing.
     """
     routes = mode == "router"
     targets = (connect or ()) if routes else (connect or profile.connect)
@@ -79,7 +78,7 @@ def session_config(
         "listen": {"endpoints": _listening(profile) if routes else []},
         "connect": {
             "endpoints": [second_link(e) if images else e for e in targets],
-            # A router waits for nobody, and goes on looking for the others.
+            # A router starts at once, and keeps trying to reach the others.
             "timeout_ms": -1 if routes else 0,
             "exit_on_failure": not routes,
             "retry": {
@@ -117,6 +116,8 @@ def _listening(profile: SessionProfile) -> list[str]:
 
 
 def _tls(security: SecurityProfile, identity: str | None, routes: bool) -> dict[str, Any]:
+    from vla_zenoh.security.store import Store
+
     files = Store(security.folder).identity_files(security.host, identity, security.people)
     own = {"private_key": str(files.key), "certificate": str(files.certificate)}
     sides = ("connect", "listen") if routes else ("connect",)
@@ -140,21 +141,21 @@ def open_session(
     wait_s: float = 0.0,
     stop: threading.Event | None = None,
 ) -> zenoh.Session:
-    """A session as the profile says.
+    """Open a session of a profile.
 
     Args:
         profile: the session section.
         mode: of the session.
         connect: overrides the profile's endpoints; of a router: other routers.
-        identity: which node this is, for its certificate; None: the people at this computer.
-        access: who may do what, of a router.
-        pictures: the link that pictures have to themselves, where ``separate_links``.
-        wait_s: keep trying for this long.
-        stop: give up at once when it is set.
+        identity: node whose certificate is used; None: the operator at this computer.
+        access: section ``access_control`` of a router.
+        images: use the separate link for images, see ``separate_links``.
+        wait_s: retry for this long.
+        stop: gives up as soon as it is set.
 
     Raises:
-        SecurityError: the certificate is not there.
-        SessionError: nobody answers there, or the address is taken; says what to do.
+        SecurityError: the certificate is missing.
+        SessionError: no router answers, or the address is in use; says what to do.
     """
     settings = session_config(
         profile,
@@ -179,20 +180,20 @@ def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
     if settings["mode"] == "router":
         where = ", ".join(settings["listen"]["endpoints"])
         if "access_control" in settings and "Access control" in str(error):
-            return SessionError(f"the router does not take its rules of access: {error}")
+            return SessionError(f"the router rejects its access control rules: {error}")
         return SessionError(
-            f"the router cannot listen on {where}: {error}. Is another router or program there? "
-            "`vla-zenoh doctor` tells; choose another address with --listen or session.listen"
+            f"the router cannot listen on {where}: {error}. Is another program using that address? "
+            "Run `vla-zenoh doctor`, or choose another address with --listen or session.listen"
         )
     where = ", ".join(settings["connect"]["endpoints"])
     tls = settings["transport"]["link"].get("tls")
     if tls is not None:
         return SessionError(
-            f"no Zenoh router answers at {where}, or it refuses the certificate "
-            f"{tls['connect_certificate']}. `vla-zenoh secure show` says whether that is good; "
+            f"no Zenoh router answers at {where}, or it rejects the certificate "
+            f"{tls['connect_certificate']}. Check that with `vla-zenoh secure show`; "
             "start a router with `vla-zenoh node router` or `vla-zenoh up`"
         )
     return SessionError(
         f"no Zenoh router answers at {where}. Start one with `vla-zenoh node router`, or all "
-        "nodes with `vla-zenoh up`; another address is given with --connect or session.connect"
+        "nodes with `vla-zenoh up`; set another address with --connect or session.connect"
     )

@@ -1,4 +1,4 @@
-"""Lets the kernel end connections of this process whose other side has gone without a word."""
+"""Sets TCP_USER_TIMEOUT on this process's connections, so that the kernel closes dead ones."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ _FAMILIES = (socket.AF_INET, socket.AF_INET6)
 
 
 class TcpUserTimeout:
-    """Ends TCP connections whose data nobody acknowledges for a while.
+    """Closes TCP connections whose data is not acknowledged in time; Linux only.
 
-    Zenoh closes a link that fell silent, but where the kernel still holds data for it, the end of a
-    TLS session waits until that is sent: as long as the network is down. Whoever comes back before
-    is taken for a second link of the one that is about to end, and is lost with it
-    (eclipse-zenoh/zenoh#2806). So the kernel is told to give such data up.
+    Zenoh closes a link that fell silent. But if the kernel still holds data for it, the end of a
+    TLS session waits until that is sent, i.e. while the network is down. A client that reconnects
+    before then is taken for a second link of the old session, and is lost with it
+    (eclipse-zenoh/zenoh#2806). So the kernel has to give such data up.
 
-    Sockets belong to Zenoh; they are found among the open files of the process. Does nothing but on
-    Linux.
+    The sockets belong to Zenoh; they are found among the open files of the process.
 
     Args:
         timeout_s: see `socket.TCP_USER_TIMEOUT`.
@@ -31,21 +30,21 @@ class TcpUserTimeout:
         self._known: set[str] = set()
 
     def apply(self) -> int:
-        """Tell the kernel so of every connection that is new; how many there are in all."""
+        """Set the timeout on every new connection; returns the number of all connections."""
         if sys.platform != "linux":
             return 0
         found: set[str] = set()
         for name in os.listdir(OPEN_FILES):
-            with suppress(OSError):  # closed meanwhile
+            with suppress(OSError):  # closed in the meantime
                 target = os.readlink(f"{OPEN_FILES}/{name}")
                 if not target.startswith("socket:"):
                     continue
-                if target in self._known or self._tell(int(name)):
+                if target in self._known or self._set_timeout(int(name)):
                     found.add(target)
         self._known = found
         return len(found)
 
-    def _tell(self, descriptor: int) -> bool:
+    def _set_timeout(self, descriptor: int) -> bool:
         with socket.socket(fileno=os.dup(descriptor)) as known:
             tcp = known.family in _FAMILIES and known.type == socket.SOCK_STREAM
             if tcp:

@@ -157,7 +157,7 @@ def stop(
 ) -> None:
     """Emergency stop: brake now and stay stopped until `vla-zenoh reset`."""
     with target.client(stop=True) as client:
-        client.publish(client.keys.stop, "stop")
+        client.stop()
         if every:
             _stop_all(target, client)
             return
@@ -173,7 +173,7 @@ def stop(
 def reset(target: RobotTarget) -> None:
     """Clear an emergency stop or a fault. The arm stays inactive."""
     with target.operator("reset") as client:
-        client.publish(client.keys.reset, "reset")
+        client.reset()
         if not _reaches(client, lambda: _state(client) not in ("", "stopped", "fault")):
             status = client.status("command")
             if status is None or "command" not in client.alive:

@@ -20,7 +20,7 @@ from vla_zenoh.bus.buffers import CallbackRing, bytes_of, header_of
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, fail, print_json, styled
+from vla_zenoh.cli.output import console, fail, new_table, print_json, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec import message
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
@@ -78,9 +78,7 @@ def keys(
 
 def table(found: Iterable[KeyTraffic]) -> Table:
     """A table of keys."""
-    out = Table(header_style="bold")
-    for column in ("key", "type", "writer", "rate", "bytes/s"):
-        out.add_column(column, overflow="fold")
+    out = new_table("key", "type", "writer", "rate", "bytes/s")
     for traffic in found:
         out.add_row(
             one_line(traffic.key),

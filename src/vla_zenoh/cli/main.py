@@ -100,9 +100,9 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
             {
                 "trial": "lab.cli.trial:trial",
                 "compare": "lab.cli.compare:compare",
-                "inspect": "cli.inspect:inspect",
-                "net": "cli.net:net",
-                "serve-openpi": "cli.serve:serve_openpi",
+                "inspect": "lab.cli.inspect:inspect",
+                "net": "lab.cli.net:net",
+                "serve-openpi": "lab.cli.serve_openpi:serve_openpi",
             },
         ),
     },

@@ -63,12 +63,13 @@ def sim(
     ] = False,
 ) -> None:
     """Run the simulated robot: receives commands, publishes its state."""
-    from vla_zenoh.robots.sim.node import SimNode
+    from vla_zenoh.robots.node import RobotNode
+    from vla_zenoh.robots.sim_driver import SimDriver
 
     profile = node.load()
     run_node(
         profile,
-        lambda session, stop: SimNode(profile, session, lockstep=lockstep).run(stop),
+        lambda session, stop: RobotNode(SimDriver(profile, lockstep=lockstep), session).run(stop),
         identity="sim",
         preferred=True,
     )
@@ -77,12 +78,13 @@ def sim(
 @options
 def ros2(node: NodeOptions) -> None:
     """Drive a ROS 2 robot and serve its cameras, through a bridge or rmw_zenoh."""
-    from vla_zenoh.robots.ros2.node import Ros2Node
+    from vla_zenoh.robots.node import RobotNode
+    from vla_zenoh.robots.ros2.driver import Ros2Driver
 
     profile = node.load()
     run_node(
         profile,
-        lambda session, stop: Ros2Node(profile, session).run(stop),
+        lambda session, stop: RobotNode(Ros2Driver(profile), session).run(stop),
         identity="ros2",
         preferred=True,
     )
@@ -91,12 +93,13 @@ def ros2(node: NodeOptions) -> None:
 @options
 def arm(node: NodeOptions) -> None:
     """Drive an arm with the Python driver that the profile names in `arm.file`."""
-    from vla_zenoh.robots.python.node import ArmNode
+    from vla_zenoh.robots.node import RobotNode
+    from vla_zenoh.robots.python_driver import PythonDriver
 
     profile = node.load()
     run_node(
         profile,
-        lambda session, stop: ArmNode(profile, session).run(stop),
+        lambda session, stop: RobotNode(PythonDriver(profile), session).run(stop),
         identity="arm",
         preferred=True,
     )

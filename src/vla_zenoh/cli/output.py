@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,7 +18,9 @@ import numpy as np
 import typer
 from pydantic import BaseModel
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.segment import Segment
+from rich.table import Table
 from rich.text import Text
 
 from vla_zenoh.sanitize import printable
@@ -64,6 +66,41 @@ def errors() -> Screen:
 def styled(text: object, style: str) -> Text:
     """Untrusted `text` in a colour."""
     return Text(printable(str(text)), style=style)
+
+
+def new_table(
+    *columns: str, title: str | None = None, left: Collection[str] | None = None
+) -> Table:
+    """An empty table.
+
+    Args:
+        columns: their names.
+        title: of the table.
+        left: columns that are aligned left, the others right; None: all left, in which long text
+            wraps.
+    """
+    table = Table(header_style="bold", title=title, title_justify="left")
+    for column in columns:
+        aligned = "left" if left is None or column in left else "right"
+        table.add_column(column, justify=aligned, overflow="fold" if left is None else "ellipsis")
+    return table
+
+
+def progress_bars(width: int, screen: Screen | None = None, *, counted: bool = True) -> Progress:
+    """Progress bars on stderr.
+
+    Args:
+        width: of the descriptions, in characters.
+        screen: another console.
+        counted: show how many of how many are done.
+    """
+    return Progress(
+        TextColumn(f"{{task.description:<{width}}}", markup=False),
+        BarColumn(),
+        *([MofNCompleteColumn()] if counted else []),
+        TimeElapsedColumn(),
+        console=screen or errors(),
+    )
 
 
 def print_json(value: Any) -> None:

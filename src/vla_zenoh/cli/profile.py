@@ -6,11 +6,10 @@ from typing import Annotated, Any
 
 import typer
 from rich.syntax import Syntax
-from rich.table import Table
 
 from vla_zenoh.cli.bridge_config import bridge_config
 from vla_zenoh.cli.options import HostOption, JsonOption
-from vla_zenoh.cli.output import console, errors, fail, print_json, styled
+from vla_zenoh.cli.output import console, errors, fail, new_table, print_json, styled
 from vla_zenoh.errors import MissingExtraError, ProfileError, RecordError, ResourceError
 from vla_zenoh.profile import Profile, load_profile, profile_file, profile_names, to_yaml
 from vla_zenoh.profile.advice import advice
@@ -30,9 +29,8 @@ def list_profiles(as_json: JsonOption = False) -> None:
     if as_json:
         print_json(rows)
         return
-    table = Table(header_style="bold")
-    for column in ("name", "about", "robot", "driver", "hosts", "file"):
-        table.add_column(column, no_wrap=column == "name", overflow="fold")
+    table = new_table("name", "about", "robot", "driver", "hosts", "file")
+    table.columns[0].no_wrap = True
     for row in rows:
         if "fault" in row:
             wrong = styled(row["fault"], "red")

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
-from rich.table import Table
 
 from vla_zenoh.cli.addresses import is_own
 from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, ProfileOption
-from vla_zenoh.cli.output import console, errors, fail, print_json, styled
+from vla_zenoh.cli.output import console, errors, fail, new_table, print_json, styled
 from vla_zenoh.cli.secure_copying import copy_commands
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
@@ -287,9 +286,7 @@ def _warn_of_loopback(profile: Profile) -> None:
 
 
 def _print(entries: list[Entry], now: dt.datetime) -> None:
-    table = Table(header_style="bold")
-    for column in ("host", "node", "valid until", "days", "serves as", "what is wrong"):
-        table.add_column(column, overflow="fold")
+    table = new_table("host", "node", "valid until", "days", "serves as", "what is wrong")
     for entry in entries:
         found, colour = entry.certificate, "green"
         if entry.faults:

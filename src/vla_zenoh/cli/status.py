@@ -10,12 +10,11 @@ from typing import Annotated
 import typer
 from rich.console import Group
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from vla_zenoh.bus.client import DROPPED_HINT, Client
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, fail, print_json, styled
+from vla_zenoh.cli.output import console, fail, new_table, print_json, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, Header, NodeStatus
@@ -112,9 +111,8 @@ def render(
         insecure: the profile lets anyone command the robot.
         left_out: statuses of unknown nodes that were not kept.
     """
-    table = Table(header_style="bold", title=f"robot {robot}", title_justify="left")
-    for column in ("node", "state", "age", "rate", "rejected", "message"):
-        table.add_column(column, overflow="fold")
+    columns = ("node", "state", "age", "rate", "rejected", "message")
+    table = new_table(*columns, title=f"robot {robot}")
     for name, (found, age_s, alive) in nodes.items():
         state = found.state if alive else "dead"
         table.add_row(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -19,20 +19,25 @@ from vla_zenoh.types import FloatArray, JointCommand, PoseCommand, Stamped
 from vla_zenoh.types.commands import JointReference, PoseReference
 
 STANDING_RAD_S = 0.02
-"""An arm of which no joint is faster stands: its law may be exchanged."""
+"""An arm whose joints are all slower than this stands: its control law may be exchanged."""
 
 UNHEEDED = frozenset({"jump", "too_fast", "out_of_range", "names", "moving", "other_mode"})
-"""Why a stream is not followed although nobody else's is: who writes it has to hear of it."""
+"""Reasons for which a stream is rejected although no other is followed: its writer must know."""
 UNHEEDED_NS = 200_000_000
-"""For so long it is said after the last such refusal."""
-LEADING = frozenset(state.value for state in OBEYING)
-"""Who commands in another state brakes or stands already, and waits for nothing."""
+"""The arm reports this for so long after the last such rejection."""
+ACTIVE_STATES = frozenset(state.value for state in OBEYING)
+"""States in which a command node drives the arm; in any other it brakes or stands."""
+SETTLE_NS = 500_000_000
+"""After the last command the arm comes to rest within this time."""
+MOVED_M, MOVED_RAD = 0.005, 0.02
+"""An arm at rest that moves further than this, TCP or any joint, is moved by something else; its
+elbow may move while the TCP stays."""
 
 Mode = Literal["pose", "joint"]
 
 
 class Measured(NamedTuple):
-    """Where the arm is.
+    """Measured state of the arm.
 
     Args:
         pose: of the TCP.
@@ -44,18 +49,22 @@ class Measured(NamedTuple):
     position_rad: FloatArray
     velocity_rad_s: FloatArray
 
+    def at(self, mode: Mode) -> Any:
+        """The pose or the joint positions."""
+        return self.pose if mode == "pose" else self.position_rad
+
 
 class ArmGuard:
-    """Follows one stream; the other may begin when nobody is followed and the arm stands.
+    """Follows one of two streams; the other may begin once none is followed and the arm stands.
 
-    It begins where the arm was measured, not where the last reference was: the change itself moves
-    nothing.
+    The new stream begins where the arm is measured, not at the last reference, so the change itself
+    moves nothing.
 
     Args:
         poses: guard of the pose stream.
         joints: guard of the joint stream.
-        measure: where the arm is now.
-        mode: which of them holds the arm at first.
+        measure: reads the state of the arm.
+        mode: the stream that holds the arm at first.
     """
 
     def __init__(
@@ -68,44 +77,46 @@ class ArmGuard:
         self._poses, self._joints = poses, joints
         self._measure = measure
         self._writer = self._state = ""
-        self._unheeded_until_ns = 0
-        self._now_ns = 0
+        self._unheeded_until_ns = self._now_ns = 0
         self.mode: Mode = mode
 
+    def _of(self, mode: Mode) -> PoseGuard | JointGuard:
+        return self._poses if mode == "pose" else self._joints
+
     @property
-    def _in_charge(self) -> PoseGuard | JointGuard:
-        return self._poses if self.mode == "pose" else self._joints
+    def _active(self) -> PoseGuard | JointGuard:
+        return self._of(self.mode)
 
     @property
     def following(self) -> bool:
         """A command stream is being followed."""
-        return self._in_charge.following
+        return self._active.following
 
     @property
     def moving(self) -> bool:
-        """A stream is being followed, or what was followed last is still brought to rest."""
-        return self._in_charge.moving
+        """A stream is being followed, or the last one is still being brought to rest."""
+        return self._active.moving
 
     @property
     def writer(self) -> str:
-        """Source of the stream that is being followed, empty where none is."""
+        """Source of the stream that is being followed, empty if none is."""
         return self._writer if self.following else ""
 
     @property
     def writer_active(self) -> bool:
-        """Who is followed carries out what it is told; after a stop, for one, it only brakes."""
-        return self.following and self._state in LEADING
+        """The followed source is active; after a stop, for example, it only brakes."""
+        return self.following and self._state in ACTIVE_STATES
 
     @property
     def braking(self) -> bool:
         """The stream fell silent in motion."""
-        return self._in_charge.braking
+        return self._active.braking
 
     @property
     def unheeded(self) -> bool:
-        """Somebody leads an arm that follows nobody, and is not obeyed.
+        """No stream is followed, and that of an active source is rejected.
 
-        Who writes that stream cannot see it by the arm, which may stand when a motion begins.
+        Its writer cannot see that from the arm, which may well stand when a motion begins.
         """
         if self.following or self.braking:
             return False
@@ -113,12 +124,12 @@ class ArmGuard:
 
     @property
     def silences(self) -> int:
-        """How often a stream fell silent in motion."""
+        """Number of times a stream fell silent in motion."""
         return self._poses.silences + self._joints.silences
 
     @property
     def reference(self) -> PoseReference | JointReference:
-        """What the arm holds now."""
+        """The set-point now."""
         if self.mode == "joint":
             return self._joints.motion
         motion = self._poses.motion
@@ -127,77 +138,60 @@ class ArmGuard:
         )
 
     def offer_pose(self, command: Stamped[PoseCommand], now_ns: int) -> str | None:
-        """Take a pose, or say in one word why not.
+        """Accept a pose, or return the reason why it is rejected.
 
         Returns:
-            None, ``other_mode`` (joints are followed), ``moving`` (the arm does, so that its law
-            cannot be exchanged), or what `PoseGuard.offer` says.
+            None, ``other_mode`` (joints are followed), ``moving`` (the arm moves, so its control
+            law cannot be exchanged), or what `PoseGuard.offer` returns.
         """
-        reason = self._offer_pose(command, now_ns)
-        self._note(reason, command.record.state, now_ns)
-        return reason
-
-    def _offer_pose(self, command: Stamped[PoseCommand], now_ns: int) -> str | None:
-        if self.mode != "pose":
-            if self.following or self.braking:
-                return "other_mode"
-            measured = self._measure()
-            if _moves(measured):
-                return "moving"
-            self._poses.anchor(measured.pose)
-        reason = self._poses.offer(command, now_ns)
-        if reason is None:
-            self.mode, self._writer = "pose", command.header.source
-            self._state = command.record.state
-        return reason
+        return self._offer("pose", command, now_ns)
 
     def offer_joint(self, command: Stamped[JointCommand], now_ns: int) -> str | None:
-        """Take joint positions, or say in one word why not.
+        """Accept joint positions, or return the reason why they are rejected, as `offer_pose`."""
+        return self._offer("joint", command, now_ns)
 
-        Returns:
-            None, ``other_mode`` (poses are followed), ``moving``, or what `JointGuard.offer` says.
-        """
-        reason = self._offer_joint(command, now_ns)
-        self._note(reason, command.record.state, now_ns)
-        return reason
-
-    def _offer_joint(self, command: Stamped[JointCommand], now_ns: int) -> str | None:
-        if self.mode != "joint":
-            if self.following or self.braking:
-                return "other_mode"
-            measured = self._measure()
-            if _moves(measured):
-                return "moving"
-            self._joints.anchor(measured.position_rad)
-        reason = self._joints.offer(command, now_ns)
+    def _offer(self, mode: Mode, command: Stamped[Any], now_ns: int) -> str | None:
+        reason = self._change(mode) or self._of(mode).offer(command, now_ns)
+        state = command.record.state
         if reason is None:
-            self.mode, self._writer = "joint", command.header.source
-            self._state = command.record.state
+            self.mode, self._writer, self._state = mode, command.header.source, state
+        elif reason in UNHEEDED and state in ACTIVE_STATES and not (self.following or self.braking):
+            self._unheeded_until_ns = now_ns + UNHEEDED_NS
         return reason
 
-    def _note(self, reason: str | None, state: str, now_ns: int) -> None:
-        # While somebody is followed a stranger's word changes nothing.
-        if reason in UNHEEDED and state in LEADING and not (self.following or self.braking):
-            self._unheeded_until_ns = now_ns + UNHEEDED_NS
+    def _change(self, mode: Mode) -> str | None:
+        """Prepare the guard of `mode` for a stream, or the reason against a change."""
+        if mode == self.mode:
+            return None
+        if self.following or self.braking:
+            return "other_mode"
+        measured = self._measure()
+        if float(np.abs(measured.velocity_rad_s).max()) > STANDING_RAD_S:
+            return "moving"
+        self._of(mode).anchor(measured.at(mode))
+        return None
 
     def tick(self, now_ns: int) -> PoseReference | JointReference:
-        """What the arm has to hold at `now_ns`."""
+        """The set-point at `now_ns`."""
         self._now_ns = now_ns
-        self._in_charge.tick(now_ns)
+        self._active.tick(now_ns)
         return self.reference
 
     def anchor(self) -> None:
-        """Somebody else moved the arm; follow nobody and stand. Commands heard stay heard."""
+        """Follow no stream and hold the measured place: the arm was moved by other means.
+
+        Commands received before are still replays.
+        """
         measured = self._measure()
         self._poses.anchor(measured.pose)
         self._joints.anchor(measured.position_rad)
 
     def hold(self) -> None:
-        """Follow nobody and stand where the reference is: the arm stopped there by itself."""
-        self._in_charge.hold()
+        """Follow no stream and hold the reference: the arm stopped there by itself."""
+        self._active.hold()
 
     def reset(self) -> None:
-        """The robot was put elsewhere; follow nobody and stand there."""
+        """Follow no stream, forget the last, and hold the measured place: the robot was reset."""
         measured = self._measure()
         self._poses.reset(measured.pose)
         self._joints.reset(measured.position_rad)
@@ -209,45 +203,30 @@ def make_arm_guard(
     joint_range_rad: tuple[FloatArray, FloatArray],
     dt_s: float,
 ) -> ArmGuard:
-    """The guard of a profile's robot, standing where the arm stands.
+    """Make the guard of a profile's robot; it holds the arm where it stands.
 
     Args:
-        profile: limits, timing, and which stream holds the arm at first.
-        measure: where the arm is now.
-        joint_range_rad: lower and upper ends of the joints, (n,) each.
-        dt_s: time between two ticks.
+        profile: limits, timing, and the stream that holds the arm at first.
+        measure: reads the state of the arm.
+        joint_range_rad: lower and upper ends of the joint ranges, (n,) each.
+        dt_s: period of the controller.
     """
     here = measure()
+    joint_limits = joint_guard_limits(profile, *joint_range_rad)
     return ArmGuard(
         PoseGuard(here.pose, dt_s, guard_limits(profile)),
-        JointGuard(
-            profile.robot.arm_joints,
-            here.position_rad,
-            dt_s,
-            joint_guard_limits(profile, *joint_range_rad),
-        ),
+        JointGuard(profile.robot.arm_joints, here.position_rad, dt_s, joint_limits),
         measure,
         profile.robot.command,
     )
 
 
-def _moves(measured: Measured) -> bool:
-    return float(np.abs(measured.velocity_rad_s).max()) > STANDING_RAD_S
-
-
-SETTLE_NS = 500_000_000
-"""After the last command the arm comes to rest within this time."""
-MOVED_M, MOVED_RAD = 0.005, 0.02
-"""An arm at rest that is moved by more than this, TCP or any joint, is moved by somebody else: its
-elbow may be, while the TCP stays."""
-
-
 class HeldReference:
-    """Remembers whether the last command sent still counts.
+    """Whether the robot's own controller still holds the last command it was sent.
 
-    A controller goes on holding what it was sent last, some way from where the arm is measured; the
-    next stream has to begin there. When somebody else moves the arm that is no longer so. Times are
-    of the monotonic clock.
+    A controller goes on holding that, some way from where the arm is measured, and the next stream
+    has to begin there. It no longer counts once something else moves the arm. Times are of the
+    monotonic clock.
     """
 
     def __init__(self) -> None:
@@ -256,19 +235,19 @@ class HeldReference:
 
     @property
     def held(self) -> bool:
-        """What was sent last is what the controller holds."""
+        """The controller holds the last command."""
         return self._sent_ns is not None
 
     def on_sent(self, now_ns: int) -> None:
-        """A command was sent."""
+        """Note that a command was sent."""
         self._sent_ns, self._settled = now_ns, None
 
     def invalidate(self) -> None:
-        """Nobody knows what became of the last commands: the robot is not heard."""
+        """Note that the fate of the last commands is unknown: no states are received."""
         self._sent_ns = self._settled = None
 
     def update(self, measured: Measured, now_ns: int) -> bool:
-        """Whether `held` still; call it while nothing is sent."""
+        """Whether `held` is still true; call it while nothing is sent."""
         if self._sent_ns is None or now_ns - self._sent_ns < SETTLE_NS:
             return self.held
         if self._settled is None:
@@ -281,9 +260,10 @@ class HeldReference:
 
 
 def max_braking_time_s(profile: Profile) -> float:
-    """From the last command until the arm stands, whatever motion the robot's side followed.
+    """Longest time from the last command until the arm stands.
 
-    That may be faster than the profile's limits, by `BRAKE_MARGIN`, and still be gaining speed.
+    The robot's side may follow a stream that is `BRAKE_MARGIN` times faster than the profile's
+    limits, and still accelerating.
     """
     if profile.robot.command == "joint":
         limits = joint_motion_limits(profile, BRAKE_MARGIN)
@@ -298,10 +278,10 @@ def max_braking_time_s(profile: Profile) -> float:
 
 
 def _stop_s(velocity: float, acceleration: float, jerk: float, share: float) -> float:
-    """Of one axis that moves at both limits, by this share of acceleration and jerk.
+    """Stopping time of one axis at both limits, with this share of acceleration and jerk.
 
-    The acceleration fades first, and is believed for a while before; then the axis slows down: by a
-    trapezoid of acceleration, than which the triangle of a short stop is shorter.
+    First the acceleration is extrapolated and fades; then the axis slows down by a trapezoid of
+    acceleration, which takes longer than the triangle of a short stop.
     """
     most, change = share * acceleration, share * jerk
     fades_s = acceleration / change

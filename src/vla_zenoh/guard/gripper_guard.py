@@ -1,73 +1,67 @@
-"""The robot's side of gripper orders: whose are obeyed, how old, each once, within the profile."""
+"""Guard of gripper commands on the robot's side: source, age, order, limits of the profile."""
 
 from __future__ import annotations
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.types import GripperCommand, Stamped
+from vla_zenoh.types.stream import SingleWriterFilter
 
 OLDEST_NS = 1_000_000_000
-"""An order older than this is not carried out: who gave it may be gone, or have stopped the arm,
-while it waited on a link that hung or in a process that stood still."""
+"""An older command is rejected: its source may have died or stopped the arm while the command
+waited on a stuck link or in a suspended process."""
 MAX_SOURCES = 64
-"""So many sources are remembered, the newest; each start of a command node is one."""
+"""Sources whose last sequence number is remembered; each start of a command node is one."""
 
 
 class GripperGuard:
-    """Between the bus and a gripper.
+    """Checks commands between the bus and a gripper.
 
-    Orders are rare, so silence says nothing: what came once is never new again, however much later.
+    Gripper commands are rare, so silence of their writer means nothing: a replay is rejected
+    however much later it comes.
 
     Args:
-        profile: of the gripper; no order goes beyond it.
+        profile: of the gripper; accepted commands are clamped to its limits.
 
     Attributes:
-        bounded: orders that asked for more than the profile allows.
+        bounded: number of commands that were clamped.
     """
 
     def __init__(self, profile: GripperProfile) -> None:
         self._profile = profile
-        self._newest: dict[str, int] = {}
+        self._filter = SingleWriterFilter(sources=MAX_SOURCES)
         self.bounded = 0
 
     def accept(
         self, order: Stamped[GripperCommand], writer: str, now_ns: int, *, writer_active: bool
     ) -> GripperCommand:
-        """The order as it may be carried out.
+        """The command to carry out, within the limits of the profile.
 
         Args:
-            order: what came.
-            writer: source whose commands the arm follows, empty while it follows nobody's.
-            now_ns: wall clock, on which the order is stamped.
-            leads: that source carries out what it is told, see `ArmGuard.leads`.
+            order: as received.
+            writer: source of the command stream that the arm follows, empty if it follows none.
+            now_ns: wall clock, as in the header.
+            writer_active: that source is active, see `ArmGuard.writer_active`.
 
         Raises:
-            CodecError: ``foreign`` (somebody else moves the arm), ``replayed``, ``stale``, or
-                ``outlived`` (who gave it was stopped meanwhile).
+            CodecError: ``foreign`` (another source moves the arm), ``replayed``, ``stale``, or
+                ``outlived`` (its source was stopped in the meantime).
         """
-        source, seq = order.header.source, order.header.seq
-        if writer and source != writer:
-            raise CodecError("foreign", f"by {source[:60]!r}, while {writer[:60]!r} moves the arm")
-        known = self._newest.get(source, -1)
-        if seq <= known:
-            raise CodecError("replayed", f"number {seq} came again or late")
-        self._newest.pop(source, None)
-        self._newest[source] = seq
-        if len(self._newest) > MAX_SOURCES:
-            del self._newest[next(iter(self._newest))]
+        self._filter.check(order.header, writer=writer)
+        self._filter.accept(order.header)
         age_ns = now_ns - order.header.stamp_wall_ns
         if age_ns > OLDEST_NS:
             raise CodecError("stale", f"is {age_ns / 1e9:.1f} s old")
         if writer and not writer_active:
-            raise CodecError("outlived", "came when who gave it had stopped")
-        return self._within(order.record)
+            raise CodecError("outlived", "its source has been stopped")
+        return self._clamped(order.record)
 
-    def _within(self, asked: GripperCommand) -> GripperCommand:
-        most = self._profile
-        given = GripperCommand(
-            min(asked.width_m, most.max_width_m),
-            min(asked.speed_m_s, most.speed_m_s),
-            min(asked.force_n, most.force_n),
+    def _clamped(self, command: GripperCommand) -> GripperCommand:
+        limits = self._profile
+        clamped = GripperCommand(
+            min(command.width_m, limits.max_width_m),
+            min(command.speed_m_s, limits.speed_m_s),
+            min(command.force_n, limits.force_n),
         )
-        self.bounded += given != asked
-        return given
+        self.bounded += clamped != command
+        return clamped

@@ -1,7 +1,4 @@
-"""The robot's side of the joint stream: what a controller may follow, and what it does in silence.
-
-The same as `vla_zenoh.guard.pose_guard` for an arm that is commanded by joint positions.
-"""
+"""Guard of a stream of joint positions on the robot's side; see `vla_zenoh.guard.pose_guard`."""
 
 from __future__ import annotations
 
@@ -9,34 +6,26 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from ruckig import (
-    ControlInterface,
-    InputParameter,
-    Ruckig,
-    RuckigError,
-    Synchronization,
-    Trajectory,
-)
 
 from vla_zenoh.control.limits import JointMotionLimits
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN, GovernedPath, GovernorLimits
 from vla_zenoh.guard.stream_guard import StreamGuard
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray, JointCommand, Stamped
+from vla_zenoh.types import FloatArray, JointCommand
 from vla_zenoh.types.commands import JointReference
 
 
 class JointGuardLimits(NamedTuple):
-    """What the robot's side allows.
+    """Limits of a joint stream on the robot's side.
 
     Args:
-        timeout_s: silence after which it brakes.
-        brake: of its own stop; a command that is faster is refused.
-        lower_rad: (n,) least position of every joint.
-        upper_rad: (n,) greatest.
-        jump_rad: no joint may be commanded further than this from the reference in force.
-        begin_rad: nor this far by the first command of a stream, which begins where the arm stands.
-        begin_rad_s: and no joint may move faster than this in it: a stream of ours begins at rest.
+        timeout_s: silence after which the guard brakes.
+        brake: of its own stop; faster commands are rejected.
+        lower_rad: (n,) lower ends of the joint ranges.
+        upper_rad: (n,) upper ends.
+        jump_rad: a command may be this far from the reference in force, each joint.
+        begin_rad: the first command of a stream may be this far from where the arm stands.
+        begin_rad_s: and it may move this fast: our streams begin at rest.
     """
 
     timeout_s: float
@@ -49,10 +38,10 @@ class JointGuardLimits(NamedTuple):
 
 
 class JointSpace:
-    """Joint positions (n,); a way beside one is their difference."""
+    """Space of joint positions (n,). A way beside one is their difference."""
 
     def rest(self, motion: JointReference) -> JointReference:
-        """Standing where `motion` is."""
+        """At rest at the position of `motion`."""
         return JointReference.at_rest(motion.position_rad)
 
     def speed(self, motion: JointReference) -> GovernedPath:
@@ -61,26 +50,26 @@ class JointSpace:
         return GovernedPath(np.zeros(len(velocity_rad_s)), velocity_rad_s, acceleration_rad_s2)
 
     def beside(self, base: JointReference, way: GovernedPath) -> JointReference:
-        """See `vla_zenoh.guard.reference_governor.Space`."""
+        """The motion that is `way` beside `base`."""
         return JointReference(base[0] + way[0], base[1] + way[1], base[2] + way[2])
 
     def apart(self, motion: JointReference, base: JointReference) -> GovernedPath:
-        """See `vla_zenoh.guard.reference_governor.Space`."""
+        """The way `motion` is beside `base`."""
         return GovernedPath(motion[0] - base[0], motion[1] - base[1], motion[2] - base[2])
 
     def sizes(self, shares: FloatArray) -> FloatArray:
-        """Every joint counts."""
+        """Every joint counts by itself."""
         return np.abs(shares)
 
 
 class JointGuard(StreamGuard[JointReference]):
-    """See the module.
+    """Guard of a stream of joint positions.
 
     Args:
         names: of the arm's joints, in the order of every (n,) here.
-        position_rad: reference at first: where the arm stands.
-        dt_s: tick of the controller.
-        limits: see `JointGuardLimits`.
+        position_rad: where the arm stands.
+        dt_s: period of the controller.
+        limits: of the stream.
     """
 
     def __init__(
@@ -90,33 +79,17 @@ class JointGuard(StreamGuard[JointReference]):
         dt_s: float,
         limits: JointGuardLimits,
     ) -> None:
-        self._names = tuple(names)
-        self._limits = limits
-        still = JointReference.at_rest(position_rad)
+        self._names, self._limits = tuple(names), limits
         whole = np.ones(len(position_rad))
         brake = GovernorLimits(*limits.brake, axis=whole, beside=whole)
-        super().__init__(JointSpace(), still, dt_s, limits.timeout_s, brake)
+        super().__init__(JointSpace(), position_rad, dt_s, limits.timeout_s, brake)
 
-    def reset(self, position_rad: FloatArray) -> None:
-        """The robot was put elsewhere; follow nobody and stand."""
-        self.anchor(position_rad)
-        self._stream.forget()
+    def _standing(self, here: FloatArray) -> JointReference:
+        return JointReference.at_rest(here)
 
-    def anchor(self, position_rad: FloatArray) -> None:
-        """Somebody else moved the robot; follow nobody and stand. Commands heard stay heard."""
-        self._put(JointReference.at_rest(position_rad))
-
-    def offer(self, command: Stamped[JointCommand], now_ns: int) -> str | None:
-        """Take a command, or say in one word why not.
-
-        Returns:
-            None, or ``foreign``, ``replayed``, ``late``, ``braking``, ``names`` (not exactly the
-            arm's joints), ``jump``, ``too_fast``, ``out_of_range``.
-        """
-        objection = self._objection(command.header, command.received_ns)
-        if objection is not None:
-            return objection
-        wanted = self._ordered(command.record)
+    def _admit(self, record: JointCommand) -> JointReference | str:
+        """The command in the arm's own order; ``names``, ``out_of_range`` are reasons as well."""
+        wanted = self._ordered(record)
         if wanted is None:
             return "names"
         here, limits = self.motion.position_rad, self._limits
@@ -129,16 +102,15 @@ class JointGuard(StreamGuard[JointReference]):
             return "too_fast"
         if not self.following and (np.abs(wanted.velocity_rad_s) > limits.begin_rad_s).any():
             return "too_fast"
-        # An arm that stands outside its range may come back, and goes no further out.
+        # An arm outside its range may come back, but go no further out.
         if (wanted.position_rad < np.minimum(limits.lower_rad, here)).any() or (
             wanted.position_rad > np.maximum(limits.upper_rad, here)
         ).any():
             return "out_of_range"
-        self._take(Stamped(command.header, wanted, command.received_ns))
-        return None
+        return wanted
 
     def _ordered(self, record: JointCommand) -> JointReference | None:
-        """The command in the arm's own order of joints, None where it is for other joints."""
+        """The command in the arm's order of joints, None if it names other joints."""
         columns = (record.position_rad, record.velocity_rad_s, record.acceleration_rad_s2)
         if record.names == self._names:
             return JointReference(*columns)
@@ -146,28 +118,6 @@ class JointGuard(StreamGuard[JointReference]):
             return None
         order = [record.names.index(name) for name in self._names]
         return JointReference(*(column[order] for column in columns))
-
-
-def stop_from(motion: JointReference, limits: JointMotionLimits) -> Trajectory | None:
-    """The shortest jerk-limited stop from `motion`, each joint by itself.
-
-    None where none can be planned, which leaves standing at once: finite motions all have one.
-    """
-    joints = len(motion.position_rad)
-    ask, path = InputParameter(joints), Trajectory(joints)
-    ask.control_interface = ControlInterface.Velocity
-    ask.synchronization = Synchronization.No
-    ask.current_position = motion.position_rad.tolist()
-    ask.current_velocity = motion.velocity_rad_s.tolist()
-    ask.current_acceleration = motion.acceleration_rad_s2.tolist()
-    ask.target_velocity = ask.target_acceleration = [0.0] * joints
-    ask.max_acceleration = limits.acceleration_rad_s2.tolist()
-    ask.max_jerk = limits.jerk_rad_s3.tolist()
-    try:
-        Ruckig(joints).calculate(ask, path)
-    except (RuckigError, ValueError):
-        return None
-    return path
 
 
 def joint_motion_limits(profile: Profile, margin: float = 1.0) -> JointMotionLimits:
@@ -180,7 +130,7 @@ def joint_motion_limits(profile: Profile, margin: float = 1.0) -> JointMotionLim
 def joint_guard_limits(
     profile: Profile, lower_rad: FloatArray, upper_rad: FloatArray
 ) -> JointGuardLimits:
-    """What the robot's side of `profile` allows an arm with joints of this range, (n,) each."""
+    """Limits of a profile's joint stream for an arm with joints of this range, (n,) each."""
     return JointGuardLimits(
         profile.timing.command_timeout_s,
         joint_motion_limits(profile, BRAKE_MARGIN),

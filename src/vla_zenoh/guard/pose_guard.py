@@ -1,9 +1,7 @@
-"""The robot's side of the pose stream: what a controller may follow, and what it does in silence.
+"""Guard of a stream of TCP poses on the robot's side.
 
-A stream of poses is only as good as its writer. Between it and the controller stands
-`PoseGuard`: it refuses what is not finite, not new, from somebody else, or a jump; between two
-commands it extrapolates with the command's own velocity and acceleration; and when the stream falls
-silent in motion it brakes by itself, jerk-limited, and says so.
+It rejects poses that are not new, come from a second source, or jump; between two commands it
+extrapolates; when the stream falls silent in motion it brakes, jerk-limited.
 """
 
 from __future__ import annotations
@@ -27,26 +25,26 @@ from vla_zenoh.kinematics.so3 import (
     spatial_rates,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray, PoseCommand, Stamped
+from vla_zenoh.types import FloatArray, PoseCommand
 
 TURN_STOP, TURN_BESIDE = 0.55, 0.5
-"""Parts of a limit of rotation that each axis may have, so that the norm of three keeps it: in a
-stop, and beside a motion that turns as well."""
+"""Share of a rotation limit for each axis, so that the norm of three stays within it: in a stop,
+and beside a motion that rotates as well."""
 
 
 class GuardLimits(NamedTuple):
-    """What the robot's side allows.
+    """Limits of a pose stream on the robot's side.
 
     Args:
-        timeout_s: silence after which it brakes.
-        jump_m: a command may differ from the reference in force by this much.
-        jump_rad: likewise.
-        begin_m: the first command of a stream may differ by this much. A stream begins where the
-            reference is; one that goes on after the robot has braked by itself would jerk it.
-        begin_rad: likewise.
-        begin_m_s: and it may move this fast: a stream of ours begins at rest.
-        begin_rad_s: likewise.
-        brake: velocity, acceleration and jerk of its own stop.
+        timeout_s: silence after which the guard brakes.
+        brake: velocity, acceleration and jerk of its own stop; faster commands are rejected.
+        jump_m: a command may be this far from the reference in force.
+        jump_rad: the same for rotation.
+        begin_m: the first command of a stream may be this far from the reference. A stream that
+            goes on after the robot has braked by itself would make it jerk.
+        begin_rad: the same for rotation.
+        begin_m_s: and it may move this fast: our streams begin at rest.
+        begin_rad_s: the same for rotation.
     """
 
     timeout_s: float
@@ -60,14 +58,13 @@ class GuardLimits(NamedTuple):
 
 
 class PoseSpace:
-    """Poses; a way beside one is of the position, and of the rotation vector r of ``exp3(r) R``.
+    """Space of TCP poses. A way beside one is a translation and the vector r of ``exp3(r) R``.
 
-    Its rates are exact however large r is, so that the twist of what lies beside a motion is that
-    of its poses.
+    Rates are exact however large r is: the twist of a motion beside another is that of its poses.
     """
 
     def rest(self, motion: Motion) -> Motion:
-        """Standing where `motion` is."""
+        """At rest at the pose of `motion`."""
         return Motion(motion.pose, _STILL, _STILL)
 
     def speed(self, motion: Motion) -> GovernedPath:
@@ -75,7 +72,7 @@ class PoseSpace:
         return GovernedPath(_STILL, motion.twist, motion.acceleration)
 
     def beside(self, base: Motion, way: GovernedPath) -> Motion:
-        """See `vla_zenoh.guard.reference_governor.Space`."""
+        """The motion that is `way` beside `base`."""
         turn = exp3(way.value[3:])
         spin, spin_change = spatial_rates(way.value[3:], way.rate[3:], way.change[3:])
         twist, acceleration = base.twist + way.rate, base.acceleration + way.change
@@ -88,7 +85,7 @@ class PoseSpace:
         return Motion(pose, twist, acceleration)
 
     def apart(self, motion: Motion, base: Motion) -> GovernedPath:
-        """See `vla_zenoh.guard.reference_governor.Space`."""
+        """The way `motion` is beside `base`."""
         turn = motion.pose.rotation @ base.pose.rotation.T
         rotvec = log3(turn)
         carried = turn @ base.twist[3:]
@@ -100,7 +97,7 @@ class PoseSpace:
         return GovernedPath(value, rate, change)
 
     def sizes(self, shares: FloatArray) -> FloatArray:
-        """Of translation an axis counts, of rotation the norm."""
+        """Translation counts per axis, rotation by its norm."""
         sizes = np.abs(shares)
         sizes[..., 3:] = np.sqrt((shares[..., 3:] ** 2).sum(axis=-1, keepdims=True))
         return sizes
@@ -110,49 +107,33 @@ _STILL = np.zeros(6)
 
 
 class PoseGuard(StreamGuard[Motion]):
-    """See the module.
+    """Guard of a stream of TCP poses.
 
     Args:
-        pose: reference at first: where the robot stands.
-        dt_s: tick of the controller.
-        limits: see `GuardLimits`.
+        pose: where the robot stands.
+        dt_s: period of the controller.
+        limits: of the stream.
     """
 
     def __init__(self, pose: Pose, dt_s: float, limits: GuardLimits) -> None:
         self._limits = limits
-        super().__init__(
-            PoseSpace(), _standing(pose), dt_s, limits.timeout_s, _governed(limits.brake)
-        )
+        super().__init__(PoseSpace(), pose, dt_s, limits.timeout_s, _governed(limits.brake))
 
-    def reset(self, pose: Pose) -> None:
-        """The robot was put elsewhere; follow nobody and stand."""
-        self.anchor(pose)
-        self._stream.forget()
+    def _standing(self, here: Pose) -> Motion:
+        position_m = np.array(here.position_m, dtype=np.float64)
+        return Motion(Pose(position_m, np.array(here.rotation)), _STILL, _STILL)
 
-    def anchor(self, pose: Pose) -> None:
-        """Somebody else moved the robot; follow nobody and stand. Commands heard stay heard."""
-        self._put(_standing(pose))
-
-    def offer(self, command: Stamped[PoseCommand], now_ns: int) -> str | None:
-        """Take a command, or say in one word why not.
-
-        Returns:
-            None, or ``foreign``, ``replayed``, ``late``, ``braking``, ``jump``, ``too_fast``.
-        """
-        record = command.record
-        objection = self._objection(command.header, command.received_ns)
-        if objection is not None:
-            return objection
+    def _admit(self, record: PoseCommand) -> Motion | str:
         rotation = rotation_from_quat(record.quat_xyzw)
-        here, limits = self._expected.pose, self._limits
+        expected, limits = self._expected.pose, self._limits
         jump_m, jump_rad = (
             (limits.jump_m, limits.jump_rad)
             if self.following
             else (limits.begin_m, limits.begin_rad)
         )
         if (
-            norm3(record.position_m - here.position_m) > jump_m
-            or angle_between(here.rotation, rotation) > jump_rad
+            norm3(record.position_m - expected.position_m) > jump_m
+            or angle_between(expected.rotation, rotation) > jump_rad
         ):
             return "jump"
         for values, order in ((record.twist, 0), (record.acceleration, 1)):
@@ -165,14 +146,7 @@ class PoseGuard(StreamGuard[Motion]):
             or norm3(record.twist[3:]) > limits.begin_rad_s
         ):
             return "too_fast"
-        motion = Motion(Pose(record.position_m, rotation), record.twist, record.acceleration)
-        self._take(Stamped(command.header, motion, command.received_ns))
-        return None
-
-
-def _standing(pose: Pose) -> Motion:
-    position_m = np.array(pose.position_m, dtype=np.float64)
-    return Motion(Pose(position_m, np.array(pose.rotation)), _STILL, _STILL)
+        return Motion(Pose(record.position_m, rotation), record.twist, record.acceleration)
 
 
 def _governed(limits: MotionLimits) -> GovernorLimits:
@@ -185,7 +159,7 @@ def _governed(limits: MotionLimits) -> GovernorLimits:
 
 
 def guard_limits(profile: Profile) -> GuardLimits:
-    """What the robot's side of `profile` allows: its own stop may be harder than the stream."""
+    """Limits of a profile's pose stream; the robot's own stop may be harder than the stream."""
     translation, rotation = motion_limits(profile.limits)
     velocity, acceleration, jerk = translation
     spin, spin_change, spin_jerk = rotation

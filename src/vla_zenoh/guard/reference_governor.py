@@ -1,15 +1,14 @@
-"""A reference governor: what is told may step, what the controller is given does not.
+"""Reference governor: commanded set-points may step, the reference for the controller does not.
 
-The reference is what is told plus a difference. Where what is told goes on as a motion within the
-profile's limits of jerk could have, the difference stays as it is: a healthy stream has none, and
-passes unchanged. Any other step of what is told, however small (a command was late or lost, a
-stream begins a little aside, this side itself was woken late), is put into the difference in
-position, velocity and acceleration at once, so that the reference goes on as it was. From there the
-difference goes to zero, jerk-limited and as gently as `SETTLE_S` allows.
+The reference is the commanded path plus a difference. As long as the commanded path goes on as a
+motion within the profile's jerk limits could, the difference stays as it is: a healthy stream has
+none and passes unchanged. Any other step, however small (a command was late or lost, a stream
+begins a little aside, this loop was late), goes into the position, velocity and acceleration of the
+difference at once, so that the reference continues. The difference then goes to zero,
+jerk-limited and as gently as `SETTLE_S` allows.
 
-Both are sampled from motions whose jerk is bounded. A difference of third order over ticks of any
-length is a mean of that jerk, and so is bounded by the same number; likewise the acceleration and
-the velocity.
+Both are sampled from motions of bounded jerk. A third-order difference over ticks of any length is
+a mean of that jerk and has the same bound; so have acceleration and velocity.
 
 Ruckig: Berscheid and Kroeger, "Jerk-limited real-time trajectory generation with arbitrary target
 states", RSS 2021.
@@ -37,30 +36,30 @@ from vla_zenoh.types import FloatArray
 BRAKE_MARGIN = 2.0
 """The robot's own stop may use this multiple of the stream's limits."""
 ORDINARY = 1.15
-"""Part of the stream's limits of jerk within which what is told is taken as it is. The difference
-has what is left of `BRAKE_MARGIN`."""
+"""Multiple of the stream's jerk limits within which the commanded path passes unchanged. The
+difference has the rest of `BRAKE_MARGIN`."""
 SETTLE_S = 0.02
-"""A small difference is gone after about this time, with less jerk than it might have; a large one
-takes as long as its limits make it."""
+"""A small difference is gone after about this time, with less jerk than allowed; a large one takes
+as long as its limits require."""
 LONG_S = 0.6
-"""A difference that would take longer beside a stream that has all of its own jerk is large: what
-is told then moves on without jerk, all of that goes into the difference, and that has it all."""
+"""A difference is large if it would take longer beside a stream that uses all of its own jerk. The
+commanded path then goes on without jerk, and the difference gets all of it."""
 UNIT_S = 0.1
-"""Of the numbers that Ruckig is given: it calls everything below 1e-8 zero, whatever it is."""
+"""Unit of the numbers given to Ruckig, which takes everything below 1e-8 for zero."""
 NOTHING = 1e-7
-"""In these units. Ruckig answers noise with all the jerk there is."""
+"""In these units. Ruckig would answer noise with full jerk."""
 LEAST_JERK = 1e-3
-"""Part of the jerk that is planned with at least."""
+"""Least share of the jerk for planning."""
 SLACK, LEAST = 0.1, 0.25
-"""Parts of the stream's limits: when what is told has taken so much more of them since, the
-difference is planned anew; and so much the difference has at least."""
+"""Shares of the stream's limits. The difference is replanned when the commanded path takes `SLACK`
+more of them; it always has `LEAST`."""
 GRID = 8
 
 Reference = TypeVar("Reference")
 
 
 class GovernedPath(NamedTuple):
-    """A motion beside another one, (n,) each: value, its rate and that one's rate."""
+    """Motion beside another one: value, its first and second derivative, (n,) each."""
 
     value: FloatArray
     rate: FloatArray
@@ -68,10 +67,10 @@ class GovernedPath(NamedTuple):
 
 
 class Space(Protocol[Reference]):
-    """Where references lie, and how one is a way (n,) beside another."""
+    """Space of references, in which one is a way (n,) beside another."""
 
     def rest(self, motion: Reference) -> Reference:
-        """Standing where `motion` is."""
+        """At rest at the place of `motion`."""
         ...
 
     def speed(self, motion: Reference) -> GovernedPath:
@@ -87,19 +86,19 @@ class Space(Protocol[Reference]):
         ...
 
     def sizes(self, shares: FloatArray) -> FloatArray:
-        """Of numbers (..., n), in parts of their limits, what counts for each axis."""
+        """Of shares (..., n) of the limits, what counts for each axis."""
         ...
 
 
 class GovernorLimits(NamedTuple):
-    """(n,) each: of velocity, acceleration, jerk.
+    """Limits of the reference, (n,) each.
 
     Args:
         velocity: per axis.
-        acceleration: likewise.
-        jerk: likewise.
-        axis: part of each that one axis may have by itself in a stop, where they bound a norm.
-        beside: likewise in a difference, which also turns with what it is beside.
+        acceleration: per axis.
+        jerk: per axis.
+        axis: share that one axis may use in a stop, where the limits bound a norm.
+        beside: share in a difference, which also rotates with the path it is beside.
     """
 
     velocity: FloatArray
@@ -113,9 +112,9 @@ def _tests() -> FloatArray:
     """(m, 3) rows q with ``|q . (m0, m1, m2)| <= 1`` for the moments of every jerk within +-1.
 
     ``m_i`` is the integral of ``j(s) (1 - s)^i`` over the unit interval: the change of acceleration
-    and velocity, and twice that of position. What a bounded jerk can do is convex, and its bounds
-    are touched by jerks that change their sign at most twice: by polynomials of degree 2 with their
-    roots there. `GRID` of them a side bound it from outside within two hundredths.
+    and velocity, and twice that of position. The set a bounded jerk can reach is convex; its bounds
+    are touched by jerks that change sign at most twice, i.e. by polynomials of degree 2 with these
+    roots. `GRID` roots a side bound the set from outside within 2 %.
     """
     u = (np.arange(2000) + 0.5) / 2000
     places = np.arange(GRID + 1) / GRID
@@ -131,17 +130,17 @@ _EVEN = np.array([1.0, 1 / 2, 1 / 3])
 
 
 class ReferenceGovernor(Generic[Reference]):
-    """See the module.
+    """Turns a commanded path that may step into a jerk-limited reference.
 
     Args:
-        space: where the references lie.
+        space: of the references.
         motion: the reference at first.
-        dt_s: of a tick.
+        dt_s: period of a tick.
         brake: limits of its own stop, `BRAKE_MARGIN` times those of the stream.
 
     Attributes:
         motion: the reference now.
-        told: what it goes to: what was told last, or where it stands.
+        target: where it goes: the last commanded set-point, or where it stands.
     """
 
     def __init__(
@@ -151,7 +150,7 @@ class ReferenceGovernor(Generic[Reference]):
         limits = np.array(brake[:3])
         self._brake = limits * brake.axis
         self._own = limits / BRAKE_MARGIN
-        jerk = self._told_jerk = ORDINARY * self._own[2]
+        jerk = self._target_jerk = ORDINARY * self._own[2]
         self._reach = np.stack([jerk * dt_s, jerk * dt_s**2, jerk * (dt_s**3 / 2)])
         self._axis = brake.beside
         velocity, acceleration, jerk = self._own
@@ -167,110 +166,114 @@ class ReferenceGovernor(Generic[Reference]):
         self.put(motion)
 
     def put(self, motion: Reference) -> None:
-        """Stand where `motion` is, whatever was before."""
-        self.told = self.motion = self._space.rest(motion)
+        """Hold the place of `motion` at once."""
+        self.target = self.motion = self._space.rest(motion)
         self._way: GovernedPath | None = None
         self._cramped: NDArray[np.bool_] | None = None
         self._planned = self._stopping = False
 
     @property
     def moving(self) -> bool:
-        """The reference is not at rest at what it goes to, or that moves."""
-        return self._way is not None or bool(self._space.speed(self.told).rate.any())
+        """The reference is not yet where it goes, or that moves."""
+        return self._way is not None or bool(self._space.speed(self.target).rate.any())
 
-    def follow(self, told: Reference, *, steady: bool) -> None:
-        """Go on as told.
+    def follow(self, target: Reference, *, steady: bool) -> None:
+        """Advance by a tick along the commanded path.
 
         Args:
-            told: where to be now.
-            steady: it is known to go on from what was told a tick ago.
+            target: commanded set-point of this tick.
+            steady: it is known to continue the one of the last tick.
         """
-        space, goes_on, on = self._space, steady, told
+        space, goes_on, on = self._space, steady, target
         if self._stopping:
             self._advance()
-            goes_on, on = False, self.told
+            goes_on, on = False, self.target
         elif not steady or self._cramped is not None:
-            on, share = self._went_on(told)
-            goes_on = self._cramped is None and self._could(space.apart(told, on), share)
-            self._advance(told, share)
+            on, share = self._went_on(target)
+            goes_on = self._cramped is None and self._could(space.apart(target, on), share)
+            self._advance(target, share)
         elif self._way is not None:
-            change = space.speed(told).change
-            changed = np.array([change, (change - space.speed(self.told).change) / self._dt_s])
+            change = space.speed(target).change
+            changed = np.array([change, (change - space.speed(self.target).change) / self._dt_s])
             if self._planned and (np.abs(changed) <= self._known).all():
                 self._advance()
             else:
-                self._advance(told, self._share_of(told))
+                self._advance(target, self._share_of(target))
         if not goes_on:
             at = on if self._way is None else space.beside(on, self._way)
-            self._way, self._planned, self._stopping = space.apart(at, told), False, False
-        self.told = told
-        self.motion = told if self._way is None else space.beside(told, self._way)
+            self._way, self._planned, self._stopping = space.apart(at, target), False, False
+        self.target = target
+        self.motion = target if self._way is None else space.beside(target, self._way)
 
     def rest(self) -> None:
-        """Go on where nobody tells anything: to where was told last, or to the end of a stop."""
+        """Advance by a tick without a command: to the last set-point, or to the end of a stop."""
         if not self._stopping:
-            moved = self._space.speed(self.told).rate.any()
-            self.follow(self._space.rest(self.told), steady=not moved)
+            moved = self._space.speed(self.target).rate.any()
+            self.follow(self._space.rest(self.target), steady=not moved)
             return
         self._advance()
-        self.motion = self.told if self._way is None else self._space.beside(self.told, self._way)
+        self.motion = (
+            self.target if self._way is None else self._space.beside(self.target, self._way)
+        )
 
     def stop(self) -> None:
-        """Come to rest from now on as fast as the limits allow, each axis by itself."""
+        """Brake to rest as fast as the limits allow, each axis by itself."""
         self._way, self._cramped = self._space.speed(self.motion), None
-        self.told = self._space.rest(self.motion)
+        self.target = self._space.rest(self.motion)
         self._stopping = True
         self._plan(self._way, self._brake, ControlInterface.Velocity)
-        if not self._planned:  # there is nothing to stop, or nothing was found: stand at once
+        if not self._planned:  # nothing to stop, or no plan: stand at once
             self.put(self.motion)
 
-    # -- what is told -------------------------------------------------------------------------
-    def _share_of(self, told: Reference) -> FloatArray:
-        """The jerk (n,) that leads to `told`, in parts of its limit and not above it."""
-        change = self._space.speed(told).change - self._space.speed(self.told).change
+    # -- commanded path -----------------------------------------------------------------------
+    def _share_of(self, target: Reference) -> FloatArray:
+        """The jerk (n,) that leads to `target`, as shares of its limit, at most 1."""
+        change = self._space.speed(target).change - self._space.speed(self.target).change
         share = change / self._reach[0]
         share = share / np.maximum(self._space.sizes(share), 1.0)
         return share if self._cramped is None else np.where(self._cramped, 0.0, share)
 
-    def _went_on(self, told: Reference) -> tuple[Reference, FloatArray]:
-        """What was told a tick ago, gone on with the jerk that brings it nearest to `told`.
+    def _went_on(self, target: Reference) -> tuple[Reference, FloatArray]:
+        """The set-point of the last tick, continued with the jerk that leads nearest to `target`.
 
         Returns:
-            that, and the jerk (n,) in parts of its limit.
+            The continued set-point, and the jerk (n,) as shares of its limit.
         """
-        space, dt_s, share = self._space, self._dt_s, self._share_of(told)
-        _, rate, change = space.speed(self.told)
-        jerk = self._told_jerk * share
+        space, dt_s, share = self._space, self._dt_s, self._share_of(target)
+        _, rate, change = space.speed(self.target)
+        jerk = self._target_jerk * share
         gone = GovernedPath(
             (rate + (change + jerk * (dt_s / 3)) * (dt_s / 2)) * dt_s,
             rate + (change + jerk * (dt_s / 2)) * dt_s,
             change + jerk * dt_s,
         )
-        return space.beside(space.rest(self.told), gone), share
+        return space.beside(space.rest(self.target), gone), share
 
     def _could(self, away: GovernedPath, share: FloatArray) -> bool:
-        """Whether some jerk within its limit leads so far from where this share of it does."""
+        """Whether a jerk within its limit leads this far away from where this share of it leads."""
         moments = np.array(away[::-1]) / self._reach + np.multiply.outer(_EVEN, share)
         return float(self._space.sizes(_TESTS @ moments).max()) <= 1.0
 
     # -- the difference -----------------------------------------------------------------------
-    def _advance(self, told: Reference | None = None, share: FloatArray | None = None) -> None:
-        """Let a tick pass for the difference.
+    def _advance(self, target: Reference | None = None, share: FloatArray | None = None) -> None:
+        """Advance the difference by a tick.
 
         Args:
-            told: what is told at its end; None: nothing is.
-            share: (n,) of its jerk that it has meanwhile.
+            target: commanded set-point at its end; None: there is none.
+            share: (n,) of the jerk that the commanded path uses meanwhile.
         """
         if self._way is None:
             return
-        if told is not None and share is not None:
-            _, rate, change = self._space.speed(told)
-            taken = self._space.sizes(np.array([rate, change, self._told_jerk * share]) / self._own)
+        if target is not None and share is not None:
+            _, rate, change = self._space.speed(target)
+            taken = self._space.sizes(
+                np.array([rate, change, self._target_jerk * share]) / self._own
+            )
             if not self._planned or (taken > self._taken).any():
                 self._settle(self._way, taken)
         if self._way is None:
             return
-        if not self._planned:  # none was found: it goes on for a tick, and another is looked for
+        if not self._planned:  # no plan: coast for a tick and try again
             value, rate, change = self._way
             self._way = GovernedPath(value + self._dt_s * rate, rate, np.zeros(len(rate)))
             return
@@ -282,11 +285,11 @@ class ReferenceGovernor(Generic[Reference]):
         )
         if self._time_s >= self._trajectory.duration * UNIT_S:
             if self._stopping:
-                self.put(self._space.beside(self.told, self._way))
+                self.put(self._space.beside(self.target, self._way))
             self._way, self._planned, self._cramped = None, False, None
 
     def _settle(self, way: GovernedPath, taken: FloatArray) -> None:
-        """Plan the difference to zero, within what is left beside what is told (3, n)."""
+        """Plan the difference to zero, beside a path that takes these shares (3, n)."""
         needed = _jerk(way, SETTLE_S)
         self._taken = taken + self._slack
         self._known = self._taken[1:] * self._own[1:]
@@ -300,7 +303,7 @@ class ReferenceGovernor(Generic[Reference]):
     def _plan(
         self, way: GovernedPath, limits: Iterable[FloatArray], interface: ControlInterface
     ) -> None:
-        """Plan the way to rest, in numbers near 1: each axis has units of its own."""
+        """Plan the way to rest; each axis has units of its own, so that numbers are near 1."""
         velocity, acceleration, jerk = limits
         length = self._length = jerk * UNIT_S**3
         units = np.array([length, length / UNIT_S, length / UNIT_S**2])
@@ -321,6 +324,6 @@ class ReferenceGovernor(Generic[Reference]):
 
 
 def _jerk(way: GovernedPath, time_s: float) -> FloatArray:
-    """About the jerk (n,) with which a way comes to rest at zero within this time."""
+    """Approximate jerk (n,) with which a way comes to rest at zero within this time."""
     value, rate, change = np.abs(way)
     return (32 * value / time_s + 16 * rate) / time_s**2 + 6 * change / time_s

@@ -1,9 +1,14 @@
-"""Guard of a stream of set-points: one writer, newest first, extrapolated between commands."""
+"""Guard of a command stream on the robot's side, whatever its set-points are.
+
+`vla_zenoh.guard.pose_guard` and `vla_zenoh.guard.joint_guard` say how poses and joint positions
+are checked. Everything else is the same for both and stands here: which samples are accepted, what
+the arm does between two of them, and how it brakes when the stream falls silent in motion.
+"""
 
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -16,17 +21,23 @@ from vla_zenoh.guard.reference_governor import (
     Space,
 )
 from vla_zenoh.types import FloatArray, Header, Stamped
+from vla_zenoh.types.stream import SingleWriterFilter
 
 CLOCK_DRIFT = 1e-3
-"""Share by which two clocks may drift apart; a real one does by a tenth of that."""
+"""Share by which two clocks may drift apart; real ones drift by a tenth of that."""
 ACCELERATE_S = 0.02
-"""For how long a command's acceleration is believed; its velocity is until the stream times out."""
+"""A command's acceleration is extrapolated this long; its velocity until the stream times out."""
+FADING_S = 0.07
+"""The acceleration then fades to zero within this time where there is room for it: motion in vain
+has to be undone."""
+STILL = 1e-4
+"""m/s and rad/s: a stream that ends slower than this has ended on purpose."""
 
 Command = TypeVar("Command")
 
 
 class CommandStream(Generic[Command]):
-    """The commands of one writer at a time.
+    """Commands of one writer at a time, on the clock of the receiver.
 
     Args:
         timeout_s: silence after which the stream has ended.
@@ -35,27 +46,21 @@ class CommandStream(Generic[Command]):
     def __init__(self, timeout_s: float) -> None:
         self.newest: Stamped[Command] | None = None
         self._timeout_s = timeout_s
-        self._source: str | None = None
-        self._last_seq = -1
-        self._base_ns = 0
-        self._delay_ns = 0
-        self._ticked_ns = 0
-        self._anew = False
+        self._filter = SingleWriterFilter()
+        self._base_ns = self._delay_ns = self._ticked_ns = 0
+        self._has_new = False
 
     def objection(self, header: Header, received_ns: int) -> str | None:
-        """Why a command is not taken: ``foreign``, ``replayed``, ``late``, or nothing.
+        """Why a command is rejected: ``foreign``, ``replayed``, ``late``, or None.
 
-        Late is what was longer on its way than the stream may be silent: who followed a link that
-        gets slower and slower would go on long after its writer has braked.
+        A late command was under way for longer than the stream may be silent: on a link that gets
+        slower and slower the arm would go on long after the writer has braked.
         """
-        if self.newest is not None and header.source != self._source:
-            return "foreign"
-        if header.source == self._source and header.seq <= self._last_seq:
-            return "replayed"
-        if self.newest is not None and self._late(header, received_ns):
+        reason = self._filter.objection(header)
+        if reason is None and self.newest is not None and self._late(header, received_ns):
             went_back = header.stamp_wall_ns < self.newest.header.stamp_wall_ns
-            return None if went_back else "late"  # stamps of a stream go back when a clock was set
-        return None
+            return None if went_back else "late"  # stamps of a stream go back if a clock was set
+        return reason
 
     def _shortest_ns(self, received_ns: int) -> int:
         passed_ns = 0 if self.newest is None else received_ns - self.newest.received_ns
@@ -66,36 +71,33 @@ class CommandStream(Generic[Command]):
         return late_ns >= self._timeout_s * 1e9
 
     def take(self, command: Stamped[Command]) -> None:
-        """Follow `command`: it is put on our clock by its stamp, because arrival times jitter.
+        """Follow `command`, which is put on our clock by its stamp, because arrival times jitter.
 
-        The difference of both clocks is the shortest delay seen: a command that was held up on its
-        way is not taken for one that is meant later.
+        The offset of both clocks is the shortest delay seen: a command that was held up on its way
+        is not mistaken for one that is meant later.
         """
         stamp_ns = command.header.stamp_wall_ns
         delay_ns = command.received_ns - stamp_ns
-        # Later than a stream may be silent: not a hold-up, one of the clocks was set.
+        # Later than a stream may be silent: not a delay, one of the clocks was set.
         if self.newest is not None and not self._late(command.header, command.received_ns):
             delay_ns = min(delay_ns, self._shortest_ns(command.received_ns))
         self._delay_ns = delay_ns
         self._base_ns = stamp_ns + delay_ns
-        self._anew = True
-        self.newest, self._source, self._last_seq = (
-            command,
-            command.header.source,
-            command.header.seq,
-        )
+        self._has_new = True
+        self.newest = command
+        self._filter.accept(command.header)
 
     def may_step(self, now_ns: int, dt_s: float) -> bool:
-        """Whether this tick may be told something else than the one before foretold.
+        """Whether the set-point of this tick may differ from what the last tick predicted.
 
-        That is after a new command, or where this tick is not `dt_s` later.
+        That is after a new command, or if this tick is not `dt_s` later.
         """
         late_s = (now_ns - self._ticked_ns) / 1e9 - dt_s
-        anew, self._anew, self._ticked_ns = self._anew, False, now_ns
-        return anew or abs(late_s) > 0.5 * dt_s
+        has_new, self._has_new, self._ticked_ns = self._has_new, False, now_ns
+        return has_new or abs(late_s) > 0.5 * dt_s
 
     def live(self, now_ns: int) -> Command | None:
-        """The newest command, None where there is none or the stream has fallen silent."""
+        """The newest command, None if there is none or the stream has timed out."""
         if self.newest is None or now_ns - self.newest.received_ns > self._timeout_s * 1e9:
             return None
         return self.newest.record
@@ -103,39 +105,35 @@ class CommandStream(Generic[Command]):
     def ahead_s(self, now_ns: int) -> float:
         """How far `now_ns` is past the time the newest command is meant for.
 
-        The stream is a function of time, so a late command meets the path its predecessors
-        foretold. Nothing bounds it but the end of the stream, which comes a time-out after the
-        command did: a bound that is met before that, as by the last command where it was held up
-        on its way, would stop the reference in one tick.
+        The stream is a function of time, so a late command meets the path that its predecessors
+        predicted. The only bound is the end of the stream, a timeout after the command arrived: a
+        bound met before that would stop the reference in one tick.
         """
         return max((now_ns - self._base_ns) / 1e9, 0.0)
 
     def end(self) -> None:
-        """Follow nobody; what was heard already is not new when it comes again."""
+        """Follow no source; commands received before are still replays."""
         self.newest = None
+        self._filter.release()
 
     def forget(self) -> None:
-        """Follow nobody, and know nobody."""
-        self.newest, self._source, self._last_seq = None, None, -1
-
-
-FADING_S = 0.07
-"""For so long a command's acceleration then fades, where there is room for it: what is done in vain
-has to be undone."""
+        """Follow no source, and forget what was received."""
+        self.newest = None
+        self._filter.reset()
 
 
 class Extrapolation(Generic[Reference]):
-    """A motion from one command on, within the limits of the stream.
+    """Motion from one command on, within the limits of the stream: the next may be late or lost.
 
-    For as long as there were between this command and the one before it the acceleration goes on
-    changing as it did; then it stays until the command is `ACCELERATE_S` old, or less where the
-    motion would get too fast or turn round; then it fades to zero, jerk-limited.
+    For as long as the time between the last two commands the acceleration keeps changing as it did.
+    Then it stays until the command is `ACCELERATE_S` old, or less if the motion would get too fast
+    or reverse. Then it fades to zero, jerk-limited.
 
     Args:
-        space: where motions lie.
-        command: from which it begins.
-        before: the command before that one, where it belongs to the same stream.
-        gap_s: between these two.
+        space: of the references.
+        command: where it begins.
+        before: the command before that one, if it belongs to the same stream.
+        gap_s: time between these two.
         brake: limits of the robot's own stop, `BRAKE_MARGIN` times those of the stream.
     """
 
@@ -153,7 +151,7 @@ class Extrapolation(Generic[Reference]):
         jerk = np.zeros(len(rate))
         if before is not None and 0.0 < gap_s <= ACCELERATE_S:
             was = space.apart(before, self._base).change
-            # Who accelerates as much as it may will not do so more and more.
+            # At its limit the acceleration does not grow any further.
             later = _cut(space, 2 * change - was, acceleration_limit)
             jerk = _cut(space, (later - change) / gap_s, jerk_limit)
         else:
@@ -164,20 +162,20 @@ class Extrapolation(Generic[Reference]):
 
     @cached_property
     def _later(self) -> tuple[GovernedPath, FloatArray, FloatArray, FloatArray]:
-        """What comes when the next command does not: from where, how long steady, fading, how."""
+        """Motion if the next command does not come: start, steady time, fading time, jerk."""
         velocity_limit, jerk_limit = self._limits
         then = _on(self._first, self._jerk, self._gap_s)
         change, speed = np.maximum(np.abs(then.change), 1e-9), np.abs(then.rate)
-        turning = then.rate * then.change < 0
-        # Twice the time for which the acceleration may last before the motion is too fast or turns.
-        room_s = 2 * np.where(turning, speed, velocity_limit - speed) / change
+        reversing = then.rate * then.change < 0
+        # Twice the time the acceleration may last before the motion is too fast or reverses.
+        room_s = 2 * np.where(reversing, speed, velocity_limit - speed) / change
         fading_s = np.maximum(np.minimum(room_s, FADING_S), change / jerk_limit)
         steady_s = np.clip((room_s - fading_s) / 2, 0.0, ACCELERATE_S - self._gap_s)
         steady_s[self._jerk * then.change < 0] = 0.0
         return then, steady_s, fading_s, -then.change / fading_s
 
     def at(self, ahead_s: float) -> Reference:
-        """The motion `ahead_s` after the command."""
+        """The reference `ahead_s` after the command."""
         if ahead_s <= self._gap_s:
             return self._space.beside(self._base, _on(self._first, self._jerk, ahead_s))
         way, steady_s, fading_s, fade = self._later
@@ -203,36 +201,45 @@ def _on(way: GovernedPath, jerk: FloatArray | float, time_s: FloatArray | float)
     )
 
 
-STILL = 1e-4
-"""m/s and rad/s: a stream that ends slower than this has ended on purpose."""
-
-
 class StreamGuard(Generic[Reference]):
-    """Follows a stream of commands, and stops by itself when that falls silent in motion.
+    """Follows a command stream, and brakes by itself when that falls silent in motion.
+
+    A subclass says how a measured place becomes a reference at rest, and which commands it admits.
 
     Args:
-        space: where its references lie.
-        motion: reference at first: where the robot stands.
-        dt_s: tick of the controller.
+        space: of the references.
+        here: where the robot stands.
+        dt_s: period of the controller.
         timeout_s: silence after which the stream has ended.
-        brake: of its own stop, twice the stream's.
+        brake: limits of its own stop, `BRAKE_MARGIN` times those of the stream.
+
+    Attributes:
+        braking: the stream fell silent in motion, and the reference still moves.
+        silences: number of times a stream fell silent in motion.
     """
 
     def __init__(
         self,
         space: Space[Reference],
-        motion: Reference,
+        here: Any,
         dt_s: float,
         timeout_s: float,
         brake: GovernorLimits,
     ) -> None:
         self._space, self._dt_s, self._brake = space, dt_s, brake
         self._stream: CommandStream[Reference] = CommandStream(timeout_s)
-        self._governor = ReferenceGovernor(space, motion, dt_s, brake)
+        self._governor = ReferenceGovernor(space, self._standing(here), dt_s, brake)
         self._extrapolation: Extrapolation[Reference] | None = None
         self.braking = False
-        """The stream fell silent in motion, and the reference still moves."""
         self.silences = 0
+
+    def _standing(self, here: Any) -> Reference:
+        """The reference of a robot that stands at a measured place."""
+        raise NotImplementedError
+
+    def _admit(self, record: Any) -> Reference | str:
+        """The reference of a command, or the reason against it."""
+        raise NotImplementedError
 
     @property
     def motion(self) -> Reference:
@@ -246,36 +253,58 @@ class StreamGuard(Generic[Reference]):
 
     @property
     def moving(self) -> bool:
-        """A stream is being followed, or what was followed last is still brought to rest."""
+        """A stream is being followed, or the last one is still being brought to rest."""
         return self.following or self._governor.moving
 
-    def hold(self) -> None:
-        """Follow nobody and stand where the reference is: the arm stopped there by itself."""
-        self._put(self.motion)
+    @property
+    def _expected(self) -> Reference:
+        """Where the next command should be: on the stream's path, or where the robot stands."""
+        return self._governor.target if self.following else self.motion
 
-    def _put(self, motion: Reference) -> None:
+    def hold(self) -> None:
+        """Follow no stream and hold the reference: the arm stopped there by itself."""
+        self._rest_at(self.motion)
+
+    def anchor(self, here: Any) -> None:
+        """Follow no stream and hold this measured place: the robot was moved by other means.
+
+        Commands received before are still replays.
+        """
+        self._rest_at(self._standing(here))
+
+    def reset(self, here: Any) -> None:
+        """Follow no stream, forget the last one, and hold this place: the robot was reset."""
+        self.anchor(here)
+        self._stream.forget()
+
+    def _rest_at(self, motion: Reference) -> None:
         self._stream.end()
         self.braking = False
         self._governor.put(motion)
 
-    def _objection(self, header: Header, received_ns: int) -> str | None:
-        objection = self._stream.objection(header, received_ns)
-        return "braking" if objection is None and self.braking else objection
+    def offer(self, command: Stamped[Any], now_ns: int) -> str | None:
+        """Accept a command, or return the reason why it is rejected.
 
-    @property
-    def _expected(self) -> Reference:
-        """Where a command is expected: where what was told leads, or where the robot stands."""
-        return self._governor.told if self.following else self.motion
-
-    def _take(self, command: Stamped[Reference]) -> None:
-        before = self._stream.newest
-        self._stream.take(command)
-        gap_s = 0.0
+        Returns:
+            None, ``foreign``, ``replayed``, ``late``, ``braking``, ``jump``, ``too_fast``, or what
+            else the subclass objects to.
+        """
+        objection = self._stream.objection(command.header, command.received_ns)
+        if objection is None and self.braking:
+            return "braking"
+        if objection is not None:
+            return objection
+        motion = self._admit(command.record)
+        if isinstance(motion, str):
+            return motion
+        before, gap_s = self._stream.newest, 0.0
+        self._stream.take(Stamped(command.header, motion, command.received_ns))
         if before is not None:
             gap_s = (command.header.stamp_wall_ns - before.header.stamp_wall_ns) / 1e9
         self._extrapolation = Extrapolation(
-            self._space, command.record, before and before.record, gap_s, self._brake
+            self._space, motion, before and before.record, gap_s, self._brake
         )
+        return None
 
     def tick(self, now_ns: int) -> Reference:
         """The reference to follow at `now_ns`."""
@@ -286,7 +315,7 @@ class StreamGuard(Generic[Reference]):
             return governor.motion
         if self._stream.newest is not None:
             self._stream.end()
-            if float(np.abs(self._space.speed(governor.told).rate).max()) >= STILL:
+            if float(np.abs(self._space.speed(governor.target).rate).max()) >= STILL:
                 self.silences += 1
                 self.braking = True
                 governor.stop()

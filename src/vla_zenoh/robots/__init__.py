@@ -1,1 +1,1 @@
-"""Robot nodes: the simulator, ROS 2, and arms driven by a Python file."""
+"""The robot node, and its drivers: the simulator, ROS 2, and a Python file."""

@@ -1,175 +1,190 @@
-"""Leads an arm that holds by itself what it was told last: a command stream in, targets out.
+"""Follows a command stream: subscribes to it, guards it, and leads the driver along it.
 
-Between the two stands the same guard as in the simulator. When the stream falls silent in motion it
-brakes here; then nothing more is sent, and the robot's own controller holds what it was sent last.
+When the stream falls silent in motion, the guard brakes the arm. Then a real robot is sent nothing
+more: its controller holds the last set-point.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Protocol
 
 from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.guard.arm_guard import SETTLE_NS, ArmGuard, HeldReference, Measured, make_arm_guard
-from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
+from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
 from vla_zenoh.types.commands import JointReference, PoseReference
 
-INBOX = 64
-STREAMING = "streaming"
+BUFFER = 64
 STALLED_NS = 500_000_000
-"""After a stall nobody is obeyed for so long, and the robot is not ready: what was sent meanwhile
-is still arriving, and who sent it has to hear of it and brake."""
+"""After a stall commands are rejected and the robot is not ready for this long: what was sent
+during the stall is still arriving, and its writer has to notice and brake."""
 
-UNHEEDED_WHY = (
-    "the command stream is refused and nobody is followed: it does not begin where the arm stands, "
-    "or its beginning was lost"
-)
+
+class FollowingRobot(Protocol):
+    """The part of a `vla_zenoh.robots.driver.RobotDriver` that a follower uses."""
+
+    modes: tuple[str, ...]
+    period_s: float
+    simulated: bool
+    lockstep: bool
+
+    @property
+    def joint_range_rad(self) -> tuple[FloatArray, FloatArray]: ...
+    def state_now(self) -> Measured | None: ...
+    def forward(self, position_rad: FloatArray) -> Pose: ...
+    def move(self, reference: PoseReference | JointReference, now_ns: int) -> None: ...
 
 
 class CommandFollower:
-    """See the module.
+    """Leads a robot along the command streams of its profile.
 
     Args:
-        node: on whose behalf; its profile says which stream leads the arm.
-        kinematics: of the arm.
-        send: takes each target, and the wall clock it is for.
+        node: on the bus; its counters get the rejections.
+        driver: of the robot.
 
     Attributes:
-        stall_s: how long the last stall was.
-        stalls: how often the arm was led when this side stood still.
+        stall_s: duration of the last stall.
+        stalls: how often the loop stood still while it moved the arm.
+        accepting: False after `stop_accepting`.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        kinematics: Kinematics,
-        send: Callable[[PoseCommand | JointCommand, int], None],
-    ) -> None:
-        self._node, self._kinematics, self._send = node, kinematics, send
-        self._mode = node.profile.robot.command
+    def __init__(self, node: Node, driver: FollowingRobot) -> None:
+        self._node, self._driver = node, driver
         keys = node.keys
-        key = keys.command_joint if self._mode == "joint" else keys.command_pose
-        self._orders = node.subscribe(key, CallbackRing(INBOX, SMALL_BYTES))
+        subscribed = {"pose": keys.command_pose, "joint": keys.command_joint}
+        self._streams = [
+            (mode, node.subscribe(subscribed[mode], CallbackRing(BUFFER, SMALL_BYTES)))
+            for mode in driver.modes
+        ]
         self._guard: ArmGuard | None = None
         self._measured: Measured | None = None
         self._hold = HeldReference()
-        self._deaf = False
+        self._timeout_s = node.profile.timing.command_timeout_s
         self._stalled_until_ns = 0
         self.stall_s, self.stalls = 0.0, 0
+        self.accepting = True
+        if (state := driver.state_now()) is not None:
+            self.on_measured(state)
 
-    # -- one turn -----------------------------------------------------------------------------
-    def measured(self, measured: Measured) -> None:
-        """Where the arm is; with the first of these it can be led."""
+    # -- one tick -----------------------------------------------------------------------------
+    def on_measured(self, measured: Measured) -> None:
+        """Update the state of the arm; the first one makes it possible to follow."""
         self._measured = measured
         if self._guard is None:
-            self._guard = self._make_guard()
+            profile, driver = self._node.profile, self._driver
+            self._guard = make_arm_guard(
+                profile, self._state_now, driver.joint_range_rad, driver.period_s
+            )
 
-    def woken(self, mono_ns: int, stall_s: float) -> None:
-        """A turn begins.
+    def _state_now(self) -> Measured:
+        state = self._driver.state_now() or self._measured
+        assert state is not None
+        return state
+
+    def begin(self, mono_ns: int, stall_s: float) -> None:
+        """Begin a tick.
 
         Args:
-            mono_ns: on the monotonic clock: wall clocks are set now and then.
-            stall_s: how late it is. The robot stopped at what it was sent last: after a long stall
-                it is led on from there, and from rest, whatever moved before.
+            mono_ns: on the monotonic clock, which nobody sets.
+            stall_s: how late the tick is. The robot stopped at its last set-point: after a long
+                stall motion resumes from there, at rest.
         """
-        if stall_s <= self._node.profile.timing.command_timeout_s:
+        if stall_s <= self._timeout_s:
             if mono_ns >= self._stalled_until_ns:
                 self._stalled_until_ns = 0
             return
         if stall_s * 1e9 > SETTLE_NS:
-            self._hold.invalidate()  # somebody else may have moved the arm meanwhile
-        if self._guard is not None and self.sending:
+            self._hold.invalidate()  # the arm may have been moved by other means meanwhile
+        if self._guard is not None and self.moving:
             self._guard.hold()
             self._stalled_until_ns, self.stall_s = mono_ns + STALLED_NS, stall_s
             self.stalls += 1
-        for _ in self._orders.drain():
-            self._refuse("stalled")
+        for mode, buffer in self._streams:
+            for _ in buffer.drain():
+                self._reject(mode, "stalled")
 
-    def turn(self, now_ns: int, mono_ns: int, *, away: str = "", silent: bool = False) -> None:
-        """Take what arrived, and send what the arm has to follow.
+    def update(self, now_ns: int, mono_ns: int, *, away: str = "", silent: bool = False) -> None:
+        """Accept or reject the commands that arrived, and move the robot.
 
         Args:
             now_ns: wall clock.
-            mono_ns: the same moment on the monotonic clock.
-            away: why the robot follows nothing, in one word, where it does not.
-            silent: it is not known where the arm is.
+            mono_ns: the same time on the monotonic clock.
+            away: reason to reject commands, one word, while the robot cannot be moved.
+            silent: the robot's state is not known.
         """
         guard = self._guard
-        for arrival in self._orders.drain():
-            if guard is None or self._deaf:
-                continue
-            reason = away or ("stalled" if self.stalled else self._offer(guard, arrival, mono_ns))
-            if reason:
-                self._refuse(reason)
+        reason = away or ("stalled" if self.stalled else "")
+        for mode, buffer in self._streams:
+            for arrival in buffer.drain():
+                if guard is None or not self.accepting:
+                    continue
+                if reason:
+                    self._reject(mode, reason)
+                elif mode == "joint":
+                    self._offer(mode, JointCommand, guard.offer_joint, arrival, mono_ns)
+                else:
+                    self._offer(mode, PoseCommand, guard.offer_pose, arrival, mono_ns)
         if guard is not None and self._measured is not None:
-            self._follow(guard, self._measured, now_ns, mono_ns, away)
+            self._lead(guard, self._measured, now_ns, mono_ns, away)
         if silent or away:
             self._hold.invalidate()
 
-    def _offer(self, guard: ArmGuard, arrival: ReceivedSample, mono_ns: int) -> str | None:
-        if not (guard.following or guard.braking or self._hold.held):
-            guard.anchor()  # nobody holds the arm at what was sent last: it is where it is
-        # Silence is counted by a clock that nobody sets.
-        if self._mode == "joint":
-            joints = self._node.decode(JointCommand, arrival)
-            if joints is None:
-                return None
-            return guard.offer_joint(replace(joints, received_ns=arrival.mono_ns), mono_ns)
-        pose = self._node.decode(PoseCommand, arrival)
-        if pose is None:
-            return None
-        return guard.offer_pose(replace(pose, received_ns=arrival.mono_ns), mono_ns)
+    def _offer(
+        self,
+        mode: str,
+        kind: type,
+        offer: Callable[..., str | None],
+        arrival: ReceivedSample,
+        mono_ns: int,
+    ) -> None:
+        guard = self._guard
+        assert guard is not None
+        if not (guard.following or guard.braking or self.holds):
+            guard.anchor()  # no controller holds a set-point of ours: begin where the arm is
+        command = self._node.decode(kind, arrival)
+        if command is None:
+            return
+        # Silence is measured on the clock of the ticks.
+        received_ns = mono_ns if self._driver.lockstep else arrival.mono_ns
+        rejected = offer(replace(command, received_ns=received_ns), mono_ns)
+        if rejected:
+            self._reject(mode, rejected, f" by {command.header.source[:60]!r}")
 
-    def _refuse(self, reason: str) -> None:
-        self._node.reject(f"{self._mode}_{reason}", f"command/{self._mode}: {reason}")
+    def _reject(self, mode: str, reason: str, by: str = "") -> None:
+        self._node.reject(f"{mode}_{reason}", f"command/{mode}{by}: {reason}")
 
-    def _follow(
+    def _lead(
         self, guard: ArmGuard, measured: Measured, now_ns: int, mono_ns: int, away: str
     ) -> None:
-        if away and self.sending:
-            guard.anchor()  # who follows later must not be led on from where nobody went
+        if self._driver.simulated:
+            self._driver.move(guard.tick(mono_ns), now_ns)
+            return
         was_moving = guard.moving
+        if away and was_moving:
+            guard.anchor()  # the next stream must not begin where the arm never went
+            was_moving = guard.moving
         reference = guard.tick(mono_ns)
-        if guard.moving or was_moving:
+        if was_moving or guard.moving:
             self._hold.on_sent(mono_ns)
-            self._send(self._target(reference), now_ns)
+            self._driver.move(reference, now_ns)
         else:
             self._hold.update(measured, mono_ns)
 
-    def _target(self, reference: PoseReference | JointReference) -> PoseCommand | JointCommand:
-        if isinstance(reference, JointReference):
-            return JointCommand(self._node.profile.robot.arm_joints, *reference, STREAMING)
-        position_m, rotation, twist, acceleration = reference
-        quat_xyzw = quat_from_rotation(rotation)
-        return PoseCommand(
-            position_m, quat_xyzw, twist, acceleration, position_m, quat_xyzw, STREAMING
-        )
+    # -- control ------------------------------------------------------------------------------
+    def stop_accepting(self) -> None:
+        """Ignore all further commands: the guard brakes a motion when its stream times out."""
+        self.accepting = False
 
-    def _make_guard(self) -> ArmGuard:
-        profile, kinematics = self._node.profile, self._kinematics
-        order = [kinematics.arm_joints.index(name) for name in profile.robot.arm_joints]
-        ends = (kinematics.lower_rad[order], kinematics.upper_rad[order])
-        dt_s = 1.0 / profile.timing.command_hz
-        return make_arm_guard(profile, self._measure, ends, dt_s)
+    def restart(self) -> None:
+        """The simulated robot was put elsewhere: follow no stream and stand there."""
+        if self._guard is not None:
+            self._guard.reset()
 
-    def _measure(self) -> Measured:
-        assert self._measured is not None
-        return self._measured
-
-    # -- looking ------------------------------------------------------------------------------
-    def deafen(self) -> None:
-        """Take no more commands: what moves is braked."""
-        self._deaf = True
-
-    @property
-    def deaf(self) -> bool:
-        """It was deafened: what else belongs to the arm takes no more commands either."""
-        return self._deaf
-
+    # -- state --------------------------------------------------------------------------------
     @property
     def following(self) -> bool:
         """A command stream is being followed."""
@@ -182,27 +197,32 @@ class CommandFollower:
 
     @property
     def stalled(self) -> bool:
-        """This side stood still a moment ago, while the arm was led."""
+        """The loop stood still a moment ago, while it moved the arm."""
         return self._stalled_until_ns > 0
 
     @property
     def unheeded(self) -> bool:
-        """Somebody commands the arm and is not obeyed; see `ArmGuard.unheeded`."""
+        """Commands arrive and are rejected while no stream is followed; see `ArmGuard.unheeded`."""
         return self._guard is not None and self._guard.unheeded
 
     @property
-    def sending(self) -> bool:
-        """The robot is being sent targets."""
+    def moving(self) -> bool:
+        """A stream is followed, or the last one is being brought to rest."""
         return self._guard is not None and self._guard.moving
 
     @property
+    def mode(self) -> str:
+        """Stream that is or was followed last: ``pose`` or ``joint``."""
+        return self._node.profile.robot.command if self._guard is None else self._guard.mode
+
+    @property
     def writer(self) -> str:
-        """Source of the command stream that is followed, empty where none is."""
+        """Source of the command stream that is followed; empty: none."""
         return "" if self._guard is None else self._guard.writer
 
     @property
-    def leads(self) -> bool:
-        """See `ArmGuard.leads`."""
+    def writer_active(self) -> bool:
+        """See `ArmGuard.writer_active`."""
         return self._guard is not None and self._guard.writer_active
 
     @property
@@ -212,19 +232,22 @@ class CommandFollower:
 
     @property
     def holds(self) -> bool:
-        """What was sent last is what the robot's controller holds."""
-        return self._hold.held
+        """The robot's controller holds the last set-point."""
+        return self._hold.held or self._driver.simulated
+
+    @property
+    def reference(self) -> PoseReference | JointReference | None:
+        """Set-point of the guard, None before the first measurement."""
+        return None if self._guard is None else self._guard.reference
 
     def held(self) -> tuple[Pose | None, FloatArray | None]:
-        """Where the robot's controller holds the TCP, and (n,) its joints where it is led by them.
+        """Set-point that a real robot's controller holds: TCP pose, (n,) joints in joint mode.
 
-        None: nobody knows, since nothing was sent, or somebody else moved the arm.
+        None where it is unknown: nothing was sent, or the arm was moved by other means.
         """
-        if self._guard is None or not self._hold.held:
+        reference = self.reference
+        if reference is None or not self._hold.held or self._driver.simulated:
             return None, None
-        reference = self._guard.reference
         if isinstance(reference, JointReference):
-            names = self._node.profile.robot.arm_joints
-            joints_rad = self._kinematics.ordered(names, reference.position_rad)
-            return self._kinematics.forward(joints_rad), reference.position_rad
+            return self._driver.forward(reference.position_rad), reference.position_rad
         return Pose(reference.position_m, reference.rotation), None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, Literal, TypeVar
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.types.checks import integer, set_field, text
@@ -11,12 +11,12 @@ from vla_zenoh.types.checks import integer, set_field, text
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What stands beside every streamed record.
+    """Header of a streamed sample; it travels as the sample's attachment.
 
     Args:
         stamp_wall_ns: time of capture, nanoseconds since the Unix epoch on the writer's clock.
-        seq: counts up by one for every record this source writes on this key.
-        source: who wrote it: node name and a number that differs after every restart.
+        seq: sequence number, one more for every sample of this source on this key.
+        source: node name and a number that differs after every restart.
     """
 
     stamp_wall_ns: int
@@ -34,12 +34,12 @@ Record = TypeVar("Record")
 
 @dataclass(frozen=True, slots=True)
 class Stamped(Generic[Record]):
-    """A record as it arrived.
+    """A record as received.
 
     Args:
-        header: what its writer said of it.
+        header: of the sample.
         record: the record.
-        received_ns: when it arrived here, same clock as the caller's ``now_ns``.
+        received_ns: time of arrival here, same clock as the caller's ``now_ns``.
     """
 
     header: Header
@@ -48,41 +48,79 @@ class Stamped(Generic[Record]):
 
 
 class SingleWriterFilter:
-    """Remembers who speaks on a key.
+    """Passes the samples of one source at a time, and each of them once.
 
-    Another source is heard only when the known one has been silent for a while: it was started
-    anew, or it is gone. Until then a stranger cannot put his word in, and what comes again or late
-    is not taken for new.
+    The first source becomes the writer. Samples of any other source are rejected until the writer
+    is released or has been silent, so nobody else can interfere with a live stream. Times are of
+    any clock that never goes back.
 
     Args:
-        silence_s: after this nobody speaks any more.
+        silence_s: a writer that is silent for this long is forgotten; None: never.
+        sources: sources whose last sequence number is remembered, at least 1. With more than one
+            no source becomes the writer: they may take turns.
+
+    Attributes:
+        writer: source whose samples pass, empty if any may begin.
     """
 
-    def __init__(self, silence_s: float) -> None:
-        self._silence_ns = int(silence_s * 1e9)
-        self._source: str | None = None
-        self._seq = -1
-        self._heard_ns = 0
+    def __init__(self, silence_s: float | None = None, sources: int = 1) -> None:
+        self._silence_ns = None if silence_s is None else int(silence_s * 1e9)
+        self._sources = sources
+        self._last_seq: dict[str, int] = {}  # the source that wrote last comes last
+        self._accepted_ns = 0
+        self.writer = ""
 
-    def check(self, header: Header, mono_ns: int) -> None:
-        """Whether a record of this header may be taken.
+    def objection(
+        self, header: Header, now_ns: int = 0, writer: str = ""
+    ) -> Literal["foreign", "replayed"] | None:
+        """Why a sample is to be rejected, None if it may be accepted.
 
         Args:
-            header: the record's.
-            mono_ns: when it arrived, on the monotonic clock.
+            header: of the sample.
+            now_ns: when it arrived.
+            writer: the only source that may write, if the caller knows it.
+        """
+        if self._silent(now_ns):
+            return None
+        writer = writer or self.writer
+        if writer and header.source != writer:
+            return "foreign"
+        return "replayed" if header.seq <= self._last_seq.get(header.source, -1) else None
+
+    def check(self, header: Header, now_ns: int = 0, writer: str = "") -> None:
+        """Raise an error for a sample that is to be rejected, see `objection`.
 
         Raises:
             CodecError: ``foreign`` or ``replayed``.
         """
-        if self._source is None or mono_ns - self._heard_ns >= self._silence_ns:
-            return
-        if header.source != self._source:
+        reason = self.objection(header, now_ns, writer)
+        if reason == "foreign":
+            writer = writer or self.writer
             raise CodecError(
-                "foreign", f"by {header.source[:60]!r}, while {self._source[:60]!r} speaks"
+                reason, f"from {header.source[:60]!r}, but {writer[:60]!r} is writing this stream"
             )
-        if header.seq <= self._seq:
-            raise CodecError("replayed", f"number {header.seq} came again or late")
+        if reason == "replayed":
+            raise CodecError(reason, f"sample {header.seq} is a repetition or out of order")
 
-    def heard(self, header: Header, mono_ns: int) -> None:
-        """A record of this header was taken."""
-        self._source, self._seq, self._heard_ns = header.source, header.seq, mono_ns
+    def accept(self, header: Header, now_ns: int = 0) -> None:
+        """Note that a sample was accepted."""
+        if self._silent(now_ns):
+            self._last_seq.clear()
+        self._last_seq.pop(header.source, None)
+        self._last_seq[header.source] = header.seq
+        if len(self._last_seq) > self._sources:
+            del self._last_seq[next(iter(self._last_seq))]
+        self._accepted_ns = now_ns
+        self.writer = header.source if self._sources == 1 else ""
+
+    def release(self) -> None:
+        """Let any source begin; samples accepted before are still replays."""
+        self.writer = ""
+
+    def reset(self) -> None:
+        """Forget every source."""
+        self.writer = ""
+        self._last_seq.clear()
+
+    def _silent(self, now_ns: int) -> bool:
+        return self._silence_ns is not None and now_ns - self._accepted_ns >= self._silence_ns

@@ -58,14 +58,14 @@ def test_who_asks_again_at_once_is_answered_a_little_later() -> None:
     desk = Desk()
     for _ in range(3):
         desk.news.emit(REFUSED)
-        desk.news.tick()
+        desk.news.poll()
     assert desk.counts == [1]
     desk.now_s += PERIOD_S
-    desk.news.tick()
+    desk.news.poll()
     assert desk.counts == [1, 2]
     assert desk.read[-1].why == REFUSED.why
     desk.now_s += PERIOD_S
-    desk.news.tick()
+    desk.news.poll()
     assert len(desk.read) == 2
 
 
@@ -76,7 +76,7 @@ def test_in_the_end_every_refusal_of_a_setting_is_counted_once(acts: list[str]) 
         if act == "ask":
             desk.news.emit(REFUSED)
         elif act == "tick":
-            desk.news.tick()
+            desk.news.poll()
         else:
             desk.now_s += PERIOD_S
     assert sum(desk.counts) == acts.count("ask")
@@ -88,8 +88,8 @@ def test_whoever_makes_up_kinds_fills_no_memory_and_breaks_no_count() -> None:
         made_up = Event("warning", "refusal", "rate_refused", f"not {number}")
         for _ in range(2):
             desk.news.emit(made_up)
-        desk.news.tick()
+        desk.news.poll()
     desk.now_s += PERIOD_S
-    desk.news.tick()
+    desk.news.poll()
     assert min(desk.counts) == 1
     assert len(desk.read) <= 6 * KINDS

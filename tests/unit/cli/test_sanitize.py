@@ -18,8 +18,9 @@ from rich.table import Table
 from rich.text import Text
 
 import vla_zenoh
-from vla_zenoh.cli import net, status
+from vla_zenoh.cli import status
 from vla_zenoh.cli.output import Screen, styled
+from vla_zenoh.lab.cli import net
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, Header, NodeStatus
 

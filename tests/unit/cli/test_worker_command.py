@@ -10,9 +10,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.serve import serve_openpi
 from vla_zenoh.cli.worker import worker
 from vla_zenoh.lab.cli.check import check
+from vla_zenoh.lab.cli.serve_openpi import serve_openpi
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.launch import node_commands
 from vla_zenoh.security.identity import identities

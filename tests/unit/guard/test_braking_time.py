@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from guard_rig import stop_from
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.guard.arm_guard import max_braking_time_s
-from vla_zenoh.guard.joint_guard import joint_motion_limits, stop_from
+from vla_zenoh.guard.joint_guard import joint_motion_limits
 from vla_zenoh.guard.pose_guard import guard_limits
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.kinematics.so3 import Pose

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from guard_rig import stop_from
 
 from vla_zenoh.control.limits import JointMotionLimits
 from vla_zenoh.guard.joint_guard import (
@@ -14,7 +15,6 @@ from vla_zenoh.guard.joint_guard import (
     JointGuardLimits,
     joint_guard_limits,
     joint_motion_limits,
-    stop_from,
 )
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import FloatArray, Header, JointCommand, Stamped

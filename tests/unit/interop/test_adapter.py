@@ -126,7 +126,9 @@ def test_a_server_that_answers_is_asked_again_soon_and_a_silent_one_ever_less_of
 def test_what_does_not_fit_is_named_and_nothing_is_asked() -> None:
     adapter = Wired(lambda: STEP)
     adapter.wrong = ["it gives 8 columns", "its gripper is another"]
-    with pytest.raises(PeerError, match="does not match: it gives 8 columns; its gripper") as raised:
+    with pytest.raises(
+        PeerError, match="does not match: it gives 8 columns; its gripper"
+    ) as raised:
         adapter.ask()
     assert raised.value.reason == "peer_mismatch"
     assert adapter.begun == []

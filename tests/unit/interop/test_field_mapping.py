@@ -264,7 +264,9 @@ def test_another_action_than_the_presets_keeps_nothing_of_what_it_says_of_number
     of = layout(action="absolute", rotation="rpy", **told)
     steps = of.steps(np.array([[0.5, 0, 0.3, 0, 0, 2.0]]), seen(of))
     np.testing.assert_allclose(steps, [[0.5, 0, 0.3, 0, 0, 2.0]], atol=ATOL)
-    with pytest.raises(SpecError, match="joint_position is not that of preset droid, so the meaning"):
+    with pytest.raises(
+        SpecError, match="joint_position is not that of preset droid, so the meaning"
+    ):
         layout(preset="droid", action="joint_position")
 
 

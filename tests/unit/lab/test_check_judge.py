@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vla_zenoh.lab.check import judge
-from vla_zenoh.lab.check.examples import ImageStyle, chart
+from vla_zenoh.lab.check.examples import ExampleStyle, chart
 from vla_zenoh.policy import ActionSpec, Rotation
 
 STEP = 0.02
@@ -14,7 +14,7 @@ STEP = 0.02
 
 def found(rotation: Rotation, step: list[float]) -> set[str]:
     action = ActionSpec(horizon=1, dt_s=0.1, rotation=rotation, gripper="none")
-    example_styles = [(ImageStyle("chart", picture=chart), np.array([step], np.float32))]
+    example_styles = [(ExampleStyle("chart", picture=chart), np.array([step], np.float32))]
     return {finding.name for finding in judge.behaviour(action, example_styles, {})}
 
 

@@ -23,9 +23,9 @@ from vla_zenoh.lab.doctor.access import router
 from vla_zenoh.lab.doctor.computer import (
     SHARED_MEMORY,
     TIME_ERROR,
+    clock_finding,
     disk,
     governor,
-    judge,
     kernel_state,
     left_segments,
     niceness,
@@ -45,7 +45,7 @@ from vla_zenoh.lab.doctor.software import (
     robot,
     version_fault,
 )
-from vla_zenoh.lab.doctor.software import judge as judge_backend
+from vla_zenoh.lab.doctor.software import renderer_finding as judge_backend
 from vla_zenoh.profile import SessionProfile, load_profile
 from vla_zenoh.simulation.render import Backend
 
@@ -187,9 +187,9 @@ def test_only_the_performance_governor_is_well(
 
 
 def test_an_unsynchronised_clock_is_a_warning() -> None:
-    assert judge(TIME_ERROR).level == "warn"
-    assert "chrony" in judge(TIME_ERROR).advice
-    assert judge(0).level == "ok"
+    assert clock_finding(TIME_ERROR).level == "warn"
+    assert "chrony" in clock_finding(TIME_ERROR).advice
+    assert clock_finding(0).level == "ok"
 
 
 def test_the_kernel_says_how_the_clock_is() -> None:
@@ -325,7 +325,7 @@ def test_a_camera_the_profile_names_has_to_be_there(tmp_path: Path) -> None:
     assert video_devices(["0"], tmp_path).level == "ok"
     finding = video_devices([str(tmp_path / "video4")], tmp_path)
     assert finding.level == "fail"
-    assert "video4 not there" in finding.found
+    assert "video4 not found" in finding.found
     assert "video0" in finding.found
 
 

@@ -94,7 +94,7 @@ def test_the_escape_key_does_not_swallow_the_stop_after_it() -> None:
 def typed(
     keyboard: Keyboard, keys: str, now_s: float, how: KeyEvent = KeyEvent.TYPED
 ) -> list[str | None]:
-    return [keyboard.take(Keystroke(key, how), now_s) for key in keys]
+    return [keyboard.update(Keystroke(key, how), now_s) for key in keys]
 
 
 def test_a_repeating_key_moves_until_the_repeats_end() -> None:
@@ -123,7 +123,7 @@ def test_a_released_key_stops_at_once() -> None:
 def test_keys_are_let_go_with_the_window() -> None:
     keyboard = Keyboard()
     typed(keyboard, "wi.", 0.0, KeyEvent.PRESSED)
-    keyboard.take(Keystroke("unfocused", KeyEvent.TYPED), 0.1)
+    keyboard.update(Keystroke("unfocused", KeyEvent.TYPED), 0.1)
     assert keyboard.read(0.1) == OperatorInput()
 
 
@@ -140,13 +140,13 @@ def test_every_axis_has_both_directions() -> None:
 def test_orders_levels_and_toggles() -> None:
     keyboard = Keyboard()
     given = [
-        keyboard.take(Keystroke(key, KeyEvent.TYPED), 0.0)
+        keyboard.update(Keystroke(key, KeyEvent.TYPED), 0.0)
         for key in ("q", "x", "enter", "tab", "5")
     ]
     assert given == [QUIT, STOP, ACTIVATE, TAKE_OVER, None]
     assert keyboard.level == 4
     for how in (KeyEvent.PRESSED, KeyEvent.HELD, KeyEvent.RELEASED):
-        keyboard.take(Keystroke("space", how), 0.0)
+        keyboard.update(Keystroke("space", how), 0.0)
     assert keyboard.read(0.0).toggles == 1
 
 

@@ -82,7 +82,7 @@ def test_while_an_episode_runs_a_script_ends_it_by_an_empty_line_alone(
     os.close(write)
     with pytest.raises(NodeError, match="has ended while an episode runs"):
         someone.poll_line()
-    with pytest.raises(NodeError, match="the same command goes on"):
+    with pytest.raises(NodeError, match="the same command continues"):
         someone.ask(laid())
 
 
@@ -92,7 +92,7 @@ def test_a_script_whose_lines_are_not_where_they_belong_is_stopped(pipe: tuple[i
     os.write(write, b"y\n")
     line = someone.ask(episode)
     assert not episode.enter(line)
-    with pytest.raises(NodeError, match="'y' means nothing here: an empty line when it is laid"):
+    with pytest.raises(NodeError, match="'y' is not valid here: an empty line when it is set up"):
         someone.reject_line(line, episode.phase)
     os.close(write)
 
@@ -113,7 +113,7 @@ def test_after_an_episode_that_was_taken_away_a_person_is_asked_whatever_was_sai
     read, write = pipe
     os.write(write, b"\n")
     assert person(read, lays=True).ask(EpisodeFsm(DueEpisode(1, 2, "bob"), 20.0, end)) == ""
-    assert "the arm was taken away" in capsys.readouterr().err
+    assert "the arm was deactivated" in capsys.readouterr().err
     os.close(write)
     with pytest.raises(NodeError, match="has ended before the trial"):
         person(read, lays=True).ask(EpisodeFsm(DueEpisode(1, 2, "bob"), 20.0, end))

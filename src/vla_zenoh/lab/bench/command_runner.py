@@ -1,4 +1,4 @@
-"""What a tick of the command node costs, in the real chain, at several rates."""
+"""Measures duration and lateness of the command node's ticks in the real chain."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ def measure_command(
     log: Callable[[str, str], None],
     busy: int = 0,
 ) -> dict[str, Any]:
-    """Cost and lateness of ticks while the arm goes up and down, at one rate.
+    """Measure ticks at one rate while the arm moves up and down.
 
     Args:
-        profile: of a simulated robot, at an address of its own.
-        command_hz: ticks a second.
-        seconds: how long to measure.
+        profile: of a simulated robot, at a free endpoint.
+        command_hz: ticks per second.
+        seconds: duration.
         stop: set by Ctrl-C.
-        log: (node, line) for what nodes write.
-        busy: programs that do nothing but compute meanwhile.
+        log: called with (node, line) of the nodes' output.
+        busy: number of programs that load the processors.
 
     Raises:
-        NodeError: the chain does not come up, or the arm is not obeyed to the end.
+        NodeError: the chain does not come up, or the arm does not stay active.
         Interrupted: Ctrl-C.
     """
     profile = override(profile, {"timing": {"command_hz": command_hz}})
@@ -54,19 +54,19 @@ def measure_command(
 
         def watch() -> None:
             if not host.supervisor.poll():
-                raise NodeError("a node dies again and again")
+                raise NodeError("a node crashes again and again")
 
         listener = StreamListener(host.session, profile.keys, profile.task.worker)
         run = DemoRunner(client, listener, stop, watch, lambda *_: None)
         run.wait_until_ready()
         run.start("hold", RATE_HZ)
-        listener.close()  # what it hears costs time that is not the command node's
+        listener.close()  # its decoding costs time of this process
         client.set_prompt(PROMPT)
         if stop.wait(STATUS_S):
             raise Interrupted
         pid = host.supervisor.pids()["command"]
         missed, spent_s, began_s = _missed(host), cpu_s(pid), time.monotonic()
-        with others_compute(busy):
+        with _load(busy):
             if stop.wait(max(seconds, SPREAD_S)):
                 raise Interrupted
             status = client.status("command")
@@ -89,8 +89,8 @@ def measure_command(
 
 
 @contextmanager
-def others_compute(count: int) -> Iterator[None]:
-    """So many programs that do nothing but compute, at this one's own niceness."""
+def _load(count: int) -> Iterator[None]:
+    """Load the processors with `count` programs of this one's niceness."""
     programs = [subprocess.Popen([sys.executable, "-c", COMPUTES]) for _ in range(count)]
     try:
         yield

@@ -10,7 +10,7 @@ from vla_zenoh.errors import NodeError
 
 
 def cpu_s(pid: int) -> float:
-    """CPU time a process has taken so far, of threads that have ended too, s."""
+    """CPU time of a process so far, ended threads included, s."""
     clock = ctypes.c_int()
     error = ctypes.CDLL(None).clock_getcpuclockid(pid, ctypes.byref(clock))
     if error:

@@ -1,7 +1,7 @@
-"""The thesis's protocol: ten prompts, 50 steps each, at several rates; and how a row is made.
+"""Motion protocol: ten prompts, 50 steps each, at several rates, and the row of each. Pure.
 
-Where 50 steps would leave the arm's reach, the asked path turns back rather than being cut, so that
-all of it can be carried out. A prompt begins where the one named as preparation has put the arm.
+Where 50 steps would leave the arm's reach, the path turns back instead of being cut. A prompt
+starts where its preparation has left the arm.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ STEPS = 50
 RATES_HZ = (1.0, 2.0, 5.0, 10.0)
 PREPARATION_HZ = 10.0
 WAY_HZ = 20.0
-"""A path's length is taken between measured poses at this rate: what trembles faster is no way."""
+"""Rate of the measured poses that a path length is summed over, so that tremor does not count."""
 TOLERANCE_M, TOLERANCE_RAD = 0.001, 0.002
 OFF_AXIS_MM, OFF_AXIS_RAD = 1.0, 0.002
 VELOCITY_STEP_SLACK = 1.02
-"""Velocity may change by acceleration limit times period; this much for rounding."""
+"""Share by which a velocity step may exceed acceleration limit times period, for rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class MotionCase:
 
     Args:
         prompt: HARD prompt, with where to turn back.
-        preparation: prompt that brings the arm to where this one can be carried out, or "".
+        preparation: prompt that moves the arm to the start, or "".
     """
 
     prompt: str
@@ -49,7 +49,7 @@ class MotionCase:
 
     @property
     def segment(self) -> DemoSegment:
-        """What is asked and measured."""
+        """The segment to run."""
         return make_segment(self.prompt, STEPS)
 
 
@@ -69,13 +69,13 @@ PROTOCOL: tuple[MotionCase, ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """How the prompts are carried out.
+    """Conditions of a run.
 
     Args:
-        rate_hz: requests a second.
-        horizon: steps in one chunk.
-        delay_ms: time an inference takes.
-        jitter: share by which that varies, either way.
+        rate_hz: requests per second.
+        horizon: steps of a chunk.
+        delay_ms: duration of an inference.
+        jitter: share by which that varies.
     """
 
     rate_hz: float
@@ -85,7 +85,7 @@ class Conditions:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """As shown in progress."""
         chunk = f", chunks of {self.horizon}" if self.horizon > 1 else ""
         delay = f", {self.delay_ms:g} ms +-{self.jitter:.0%}" if self.delay_ms else ""
         return f"{self.rate_hz:g} Hz{chunk}{delay}"
@@ -93,15 +93,15 @@ class Conditions:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredStream:
-    """The commanded motion of a trial.
+    """The commanded motion of a case.
 
     Args:
         time_s: (n,) stamps.
         twist: (n, 6).
         acceleration: (n, 6).
-        chunk_seq: (n,) the chunk each command carries out; -1: none.
-        path_m: way of the measured TCP, in translation.
-        path_rad: likewise in rotation.
+        chunk_seq: (n,) chunk that each command is caused by; -1: none.
+        path_m: path length of the measured TCP in translation.
+        path_rad: path length in rotation.
         tracking_m: largest distance between measured and reference pose.
         e2e_ms: camera stamp to pose command, one per chunk.
         outbound_ms: camera stamp to chunk received, one per chunk.
@@ -119,7 +119,7 @@ class MeasuredStream:
 
 
 def failed_row(trial: MotionCase, conditions: Conditions, why: str) -> dict[str, Any]:
-    """The row of a prompt that was not carried out to its end; it has no figures."""
+    """The row of a case that did not end; it has no figures."""
     return {"prompt": trial.name, **asdict(conditions), "faults": [why], "ok": False}
 
 
@@ -131,9 +131,9 @@ def make_row(
     stream: MeasuredStream,
     refused: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
-    """One row of the result; `refused`: what nodes refused meanwhile, by ``node.reason``."""
+    """One row of the result; `refused`: rejections of the nodes meanwhile, by ``node.reason``."""
     translation, rotation = profile.limits.translation, profile.limits.rotation
-    # Commands are whole periods apart; what their stamps say beyond that is the clock being read.
+    # Commands are whole periods apart; their stamps add the jitter of reading the clock.
     period_s = 1.0 / profile.timing.command_hz
     step_s = np.round(np.diff(stream.time_s) / period_s) * period_s
     inside = step_s > 0
@@ -174,7 +174,7 @@ def make_row(
         "peak_acceleration_m_s2": _peak(stream.acceleration[:, :3]),
         "peak_acceleration_rad_s2": _peak_norm(stream.acceleration[:, 3:]),
         "peak_jerk_over_limit": _jerk_over_limit(jerk, profile),
-        # What a chunk's seam does to the acceleration, beside what happens anywhere else.
+        # Jerk at the seams between chunks, and elsewhere.
         "seams": int(at_seam.sum()),
         "seam_jerk_over_limit": _jerk_over_limit(jerk[at_seam], profile),
         "elsewhere_jerk_over_limit": _jerk_over_limit(jerk[~at_seam], profile),
@@ -190,7 +190,7 @@ def make_row(
 
 
 def faults_of(row: dict[str, Any], outcome: SegmentOutcome) -> list[str]:
-    """What of the protocol's promises a row breaks."""
+    """Violations of the protocol's tolerances in a row."""
     checks = (
         ("translation", abs(row["reached_m"] - row["asked_m"]), TOLERANCE_M, "m"),
         ("rotation", abs(row["reached_rad"] - row["asked_rad"]), TOLERANCE_RAD, "rad"),
@@ -208,7 +208,7 @@ def faults_of(row: dict[str, Any], outcome: SegmentOutcome) -> list[str]:
     out = [
         f"{name} {value:.4g} {unit}" for name, value, limit, unit in checks if not value <= limit
     ]
-    # Steps of chunks that overlap are asked for more than once and carried out once.
+    # Steps of overlapping chunks are requested more than once and executed once.
     wanted = outcome.segment.steps
     if outcome.steps_done < wanted or (row["horizon"] == 1 and outcome.steps_done > wanted):
         why = ", ".join(f"{name} {count}" for name, count in row["refused"].items())
@@ -218,7 +218,7 @@ def faults_of(row: dict[str, Any], outcome: SegmentOutcome) -> list[str]:
 
 
 def path_length(poses: Sequence[Pose]) -> tuple[float, float]:
-    """Length of the way through `poses`: metres, and radians of the angles between them."""
+    """Path length through `poses`: m, and rad of the angles between them."""
     pairs = list(pairwise(poses))
     return (
         sum(norm3(b.position_m - a.position_m) for a, b in pairs),

@@ -1,7 +1,7 @@
-"""The motion protocol on a virtual clock: the same code, faster than real time, one row a process.
+"""Runs the motion protocol in lockstep, one row per process.
 
-What a computer's load does is not in it, so its latencies are those of `Delays` and of waiting for
-the next picture and tick; motion, limits and seams are what the nodes would do.
+Latencies are those of `Delays` and of waiting for the next image and tick; motion, limits and seams
+are those of the nodes.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import PoseCommand
 
 CAMERA_S, WIRE_S = 0.015, 0.0005
-"""Camera stamp to worker, and every other way, about as measured in real time."""
+"""Camera stamp to worker, and every other link, about as measured in real time."""
 WARM_UP_S, SETTLE_S, SLACK_S = 1.2, 1.0, 5.0
 LOOK_S = 0.25
-"""How often a waiting parent looks whether it shall stop."""
+"""How often the parent checks for Ctrl-C."""
 
 Row = dict[str, Any]
 
@@ -61,13 +61,13 @@ def run_in_lockstep(
     Args:
         profile: of a robot that is commanded by poses.
         trials: prompts.
-        conditions: each prompt under each of these.
-        stop: set by Ctrl-C; rows not ended are left out.
-        done: called with every row as it ends, in whatever order.
-        processes: at once; None: one a core.
+        conditions: of each prompt.
+        stop: set by Ctrl-C; unfinished rows are dropped.
+        done: called with every row as it ends, in any order.
+        processes: at once; None: one per core.
 
     Raises:
-        NodeError: one of them was killed.
+        NodeError: a process was killed.
     """
     jobs = [(profile, trial, each) for each in conditions for trial in trials]
     context = multiprocessing.get_context("spawn")
@@ -79,7 +79,7 @@ def run_in_lockstep(
             ended, left = wait(left, LOOK_S, FIRST_COMPLETED)
             for future in ended:
                 done(_result(future))
-        if left:  # not to the end of their rows
+        if left:  # in the middle of a row
             for process in multiprocessing.active_children():
                 process.terminate()
         yield from (_result(future) for future in futures if future not in left)
@@ -96,11 +96,11 @@ def _result(future: Future[Row]) -> Row:
 
 def _begin() -> None:
     die_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends us
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
 
 
 def lockstep_row(profile: Profile, trial: MotionCase, conditions: Conditions) -> Row:
-    """Carry one prompt out; one that does not end is a row that says so."""
+    """Run one case; one that does not end gives a failed row."""
     try:
         return _row(profile, trial, conditions)
     except NodeError as error:
@@ -122,15 +122,15 @@ def _row(profile: Profile, trial: MotionCase, conditions: Conditions) -> Row:
     loop.put("active", True)
     loop.run(LOOK_S)
     if trial.preparation:
-        _carry_out(loop, make_segment(trial.preparation, 1), PREPARATION_HZ)
+        _run_segment(loop, make_segment(trial.preparation, 1), PREPARATION_HZ)
     loop.put("rate", conditions.rate_hz)
     loop.run(1.0 / PREPARATION_HZ)
-    before, since = _standing(loop), len(loop.trace.time_ns)
-    steps_done = _carry_out(loop, trial.segment, conditions.rate_hz)
+    before, since = _rest_pose(loop), len(loop.trace.time_ns)
+    steps_done = _run_segment(loop, trial.segment, conditions.rate_hz)
     outcome = judge_segment(
         trial.segment,
         before,
-        _standing(loop),
+        _rest_pose(loop),
         max_width_m=profile.robot.gripper.max_width_m,
         steps_done=steps_done,
         duration_s=(loop.now_ns - loop.trace.time_ns[since]) / 1e9 - SETTLE_S,
@@ -138,8 +138,8 @@ def _row(profile: Profile, trial: MotionCase, conditions: Conditions) -> Row:
     return make_row(trial, conditions, profile, outcome, _stream(loop, since))
 
 
-def _carry_out(loop: Lockstep, segment: DemoSegment, rate_hz: float) -> int:
-    """Put the prompt, wait until the arm stands after its last step; steps carried out."""
+def _run_segment(loop: Lockstep, segment: DemoSegment, rate_hz: float) -> int:
+    """Publish the prompt and run until rest after its last step; the accepted steps."""
     commander, limit_s = loop.commander, segment.steps / rate_hz * 2 + SLACK_S
     episode = commander.task.episode
     loop.put("prompt", segment.prompt_with_count)
@@ -150,14 +150,14 @@ def _carry_out(loop: Lockstep, segment: DemoSegment, rate_hz: float) -> int:
     if not ended or commander.state.value not in ("active", "holding"):
         raise NodeError(
             f"{segment.prompt_with_count!r} at {rate_hz:g} Hz did not end in {limit_s:.0f} s: the "
-            f"command node is {commander.state.value} ({commander.why}), refused: "
+            f"command node is {commander.state.value} ({commander.why}), rejected: "
             f"{dict(loop.refused) or 'nothing'}"
         )
     loop.run(SETTLE_S)
     return commander.progress.steps
 
 
-def _standing(loop: Lockstep) -> RestPose:
+def _rest_pose(loop: Lockstep) -> RestPose:
     return RestPose(Pose(*loop.world.tcp()), loop.world.gripper_state().width_m)
 
 

@@ -1,4 +1,4 @@
-"""The motion protocol's rows as tables for people."""
+"""Tables of the motion protocol, also beside the figures published in the thesis."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Row = dict[str, Any]
 
 
 def motion_table(rows: Sequence[Row]) -> Table:
-    """What was asked and reached, and what the motion was like."""
+    """Asked and reached motion, with peaks, tracking and jerk."""
     chunked = any(row["horizon"] > 1 for row in rows)
     delayed = any(row["delay_ms"] for row in rows)
     table = _table(

@@ -38,14 +38,14 @@ def run_in_real_time(
     stop: threading.Event,
     progress: Callable[[MotionCase, Conditions, int], None],
 ) -> Iterator[tuple[dict[str, Any], Streams]]:
-    """One row after the other, with what was recorded for it.
+    """One row after the other, with its recorded streams.
 
     Args:
         host: up, with a simulator.
         trials: prompts.
-        conditions: each prompt under each of these; only the rate may differ, the worker is up.
+        conditions: of each prompt; only the rate may differ, as the worker is running.
         stop: set by Ctrl-C.
-        progress: called with trial, conditions and steps carried out.
+        progress: called with case, conditions and accepted steps.
 
     Raises:
         NodeError: the chain does not come up.
@@ -80,7 +80,7 @@ def run_in_real_time(
                 since_ns = time.time_ns()
                 outcome = run.run_segment(0, trial.segment, each.rate_hz)
             except NodeError as error:
-                # The arm stands, as it should; the other prompts can still be measured.
+                # The arm is at rest; the other prompts can still be measured.
                 yield failed_row(trial, each, str(error)), listener.close()
                 continue
             finally:
@@ -93,7 +93,7 @@ def run_in_real_time(
 
 
 def _refusals(host: Host) -> Counter[str]:
-    """What every node has refused so far, by ``node.reason``."""
+    """Rejections of every node so far, by ``node.reason``."""
     assert host.client is not None
     return Counter(
         {

@@ -1,8 +1,7 @@
-"""Two runs of `bench task` over the same layouts, pair by pair.
+"""Paired comparison of two runs of `bench task` over the same layouts.
 
-Which layouts a policy met is most of the noise in its success rate. Where both runs asked the same
-task of the same layout the layout cancels, so that far fewer episodes tell two policies apart than
-two rates beside each other would.
+Most of the noise in a success rate comes from the layouts. Pairing episodes with the same task in
+the same layout cancels it, so that far fewer episodes tell two policies apart.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from vla_zenoh.errors import RecordError, describe_fault
 from vla_zenoh.lab.statistics import Paired, paired
 
 ALPHA = 0.05
-"""A p below this counts as a difference, as in the intervals at 95 %."""
+"""Significance level, as in the intervals at 95 %."""
 CONDITIONS = (
     "mode",
     "profile",
@@ -29,10 +28,10 @@ CONDITIONS = (
     "rate_hz",
     "limit_s",
 )
-"""Beside the model and its options, what changes how well it does."""
+"""What influences the success rate beside the model and its options."""
 
 Task = tuple[int, str, str, str, str, int]
-"""Seed, family, target, onto, direction, and how often that was asked before."""
+"""Seed, family, target, onto, direction, and number of earlier occurrences."""
 
 
 class _Read(BaseModel):
@@ -40,7 +39,7 @@ class _Read(BaseModel):
 
 
 class PairedOutcome(_Read):
-    """How one episode of a run ended; as in its file."""
+    """Outcome of one episode in a result file."""
 
     seed: int
     family: str
@@ -52,13 +51,13 @@ class PairedOutcome(_Read):
 
     @property
     def task(self) -> str:
-        """What was asked, without the layout."""
+        """The task, without the layout."""
         onto = f"on {self.onto}" if self.onto else ""
         return " ".join(part for part in (self.family, self.target, onto, self.direction) if part)
 
 
 class TaskResultFile(_Read):
-    """What `vla-zenoh bench task` wrote; as in its file."""
+    """Result file of `vla-zenoh bench task`."""
 
     model: str
     options: dict[str, str]
@@ -74,7 +73,7 @@ class TaskResultFile(_Read):
     all: tuple[PairedOutcome, ...]
 
     def by_task(self) -> dict[Task, PairedOutcome]:
-        """Every episode, by what was asked in which layout."""
+        """Every episode by task and layout."""
         asked: Counter[Any] = Counter()
         out: dict[Task, PairedOutcome] = {}
         for each in self.all:
@@ -85,14 +84,14 @@ class TaskResultFile(_Read):
 
 
 def read_run(content: bytes, where: str) -> TaskResultFile:
-    """A file of `bench task`.
+    """Parse a result file of `bench task`.
 
     Args:
         content: of the file.
-        where: it is, for messages.
+        where: its path, for messages.
 
     Raises:
-        RecordError: it is something else.
+        RecordError: it is no such file.
     """
     try:
         return TaskResultFile.model_validate_json(content)
@@ -105,12 +104,12 @@ def read_run(content: bytes, where: str) -> TaskResultFile:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Made by `compare`.
+    """Paired comparison of two runs.
 
     Args:
         a: the first run.
-        b: the second one; differences are B's less A's.
-        pairs: what both were asked in the same layout, in A's order.
+        b: the second run; differences are B minus A.
+        pairs: episodes with the same task and layout, in A's order.
     """
 
     a: TaskResultFile
@@ -119,28 +118,28 @@ class Comparison:
 
     @property
     def counts(self) -> Paired:
-        """Of all pairs; its first is B."""
+        """Counts over all pairs; B is first."""
         return _counts(self.pairs)
 
     @property
     def b_is_worse(self) -> bool:
-        """B did fewer of the same tasks, and chance alone explains that with less than `ALPHA`."""
+        """B has significantly fewer successes in the same tasks."""
         return self.counts.difference < 0 and self.counts.p < ALPHA
 
     @property
     def unpaired(self) -> tuple[int, int]:
-        """Episodes of A, and of B, that have no partner."""
+        """Episodes of A and of B without a partner."""
         return len(self.a.all) - len(self.pairs), len(self.b.all) - len(self.pairs)
 
     def by(self, of: Callable[[PairedOutcome], str]) -> dict[str, Paired]:
-        """Counts of the pairs that are alike in something of their task."""
+        """Counts by a property of the task."""
         return {
             name: _counts(pair for pair in self.pairs if of(pair[0]) == name)
             for name in sorted({of(one) for one, _ in self.pairs})
         }
 
     def disagreements(self) -> Iterator[dict[str, Any]]:
-        """Every pair that one alone did: who, and how the other failed."""
+        """Pairs with one success: whose, and how the other failed."""
         for one, other in self.pairs:
             if one.success != other.success:
                 failed = other if one.success else one
@@ -168,15 +167,15 @@ class Comparison:
 
 
 def compare(a: TaskResultFile, b: TaskResultFile, differ: Collection[str] = ()) -> Comparison:
-    """Pair what both runs asked in the same layouts.
+    """Pair the episodes of two runs.
 
     Args:
-        a: one run.
-        b: another one.
-        differ: which of `CONDITIONS` may differ, because they are what is compared.
+        a: the first run.
+        b: the second run.
+        differ: those of `CONDITIONS` that may differ.
 
     Raises:
-        RecordError: they were made under other conditions than these, or share no task.
+        RecordError: other conditions differ, or the runs share no task.
     """
     if a.scene != b.scene:
         raise RecordError(
@@ -185,14 +184,14 @@ def compare(a: TaskResultFile, b: TaskResultFile, differ: Collection[str] = ()) 
         )
     others = {name: pair for name, pair in differing(a, b).items() if name not in differ}
     if others:
-        told = ", ".join(
-            f"{name} is {_said(one)} in A and {_said(two)} in B"
+        listed = ", ".join(
+            f"{name} is {_shown_value(one)} in A and {_shown_value(two)} in B"
             for name, (one, two) in others.items()
         )
         named = " ".join(f"--differ {name}" for name in others)
         raise RecordError(
-            f"the runs were not made alike: {told}. That would be taken for the models' doing; "
-            f"run one of them again, or, where it is what you want to compare: {named}"
+            f"the runs were not made alike: {listed}. That would be attributed to the models; "
+            f"repeat one of them, or, to compare just that: {named}"
         )
     first, second = a.by_task(), b.by_task()
     pairs = tuple((one, second[task]) for task, one in first.items() if task in second)
@@ -202,13 +201,13 @@ def compare(a: TaskResultFile, b: TaskResultFile, differ: Collection[str] = ()) 
 
 
 def differing(a: TaskResultFile, b: TaskResultFile) -> dict[str, tuple[Any, Any]]:
-    """Those of `CONDITIONS` that are not the same -> what they are in A and in B."""
+    """Those of `CONDITIONS` that differ -> their values in A and B."""
     values = {name: (getattr(a, name), getattr(b, name)) for name in CONDITIONS}
     return {name: pair for name, pair in values.items() if pair[0] != pair[1]}
 
 
 def figures(counts: Paired) -> dict[str, Any]:
-    """Plain types of some pairs, whose first is B."""
+    """Plain types of paired counts; B is first."""
     n = counts.setups
     return {
         "pairs": n,
@@ -240,7 +239,7 @@ def _shown(run: TaskResultFile) -> Mapping[str, Any]:
     }
 
 
-def _said(value: Any) -> str:
+def _shown_value(value: Any) -> str:
     if value is None or value == ():
         return "not set"
     if isinstance(value, tuple):

@@ -1,4 +1,4 @@
-"""What the task benchmark asks, and what its outcomes add up to."""
+"""Plan and score of the task benchmark. Pure."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from vla_zenoh.policy.model_options import shown
 from vla_zenoh.types import ObjectPoses
 
 SCENE = "bricks"
-"""The scene that has what tasks are about."""
+"""The scene of the tasks."""
 STAY = "stay"
 NOT_OBEYED, ARM_LOST, NO_STATE = "not_obeyed", "arm_lost", "no_state"
 CHAIN_FAILURES: Mapping[str, str] = {
-    NOT_OBEYED: "the arm was not given to the worker: activation was refused to the end",
-    ARM_LOST: "the arm was taken from the worker while it was at work",
-    NO_STATE: "the simulator's objects were not heard",
+    NOT_OBEYED: "activation was rejected to the end",
+    ARM_LOST: "the arm was deactivated during the episode",
+    NO_STATE: "the simulator's objects were silent",
 }
 """Kinds of failure of the chain, beside those of the task (`vla_zenoh.lab.tasks.FAILURES`)."""
 
@@ -39,24 +39,23 @@ BASELINES: Mapping[str, tuple[str, str]] = {
     "hold": ("scripted", "hold"),
     "scripted": ("scripted", "HARD: go down x12"),
 }
-"""Names that stand for a worker and a prompt of its own. Neither knows any task: what they reach is
-what the measure gives away."""
+"""Baseline -> worker and prompt. Neither does any task: their successes are false positives."""
 
 
 @dataclass(frozen=True, slots=True)
 class TaskPlan:
-    """What is to be run.
+    """Episodes to run.
 
     Args:
         model: name of the worker, or of one of `BASELINES`.
-        episodes: how many.
-        seed: of the first layout; the next ones follow it.
-        family: one of `FAMILIES` or ``stay``; None: all three by turns.
-        held_out: prompts in words that no model was trained with.
-        pairs: each layout is used twice, with another brick the second time.
-        prompt: put in place of the episode's own.
-        limit_s: for one episode.
-        rate_hz: chunks per second; None: as the profile says.
+        episodes: number of them.
+        seed: of the first layout; the others follow.
+        family: one of `FAMILIES` or ``stay``; None: all three in turn.
+        held_out: prompts in held-out wordings.
+        pairs: every layout twice, the second time with another brick.
+        prompt: in place of the episode's own.
+        limit_s: time limit of an episode.
+        rate_hz: chunks per second; None: of the profile.
         delay_ms: added to every inference.
     """
 
@@ -73,11 +72,11 @@ class TaskPlan:
 
     @property
     def worker(self) -> str:
-        """The worker that runs."""
+        """Name of the worker."""
         return BASELINES.get(self.model, (self.model, ""))[0]
 
     def requests(self) -> Iterator[TaskRequest]:
-        """Every episode, before its layout is known."""
+        """Every episode."""
         families = (self.family,) if self.family else FAMILIES
         for index in range(self.episodes):
             layout = index // 2 if self.pairs else index
@@ -88,13 +87,13 @@ class TaskPlan:
             )
 
     def prompt_for(self, episode: TaskEpisode) -> str:
-        """The prompt that is put for `episode`."""
+        """The prompt to publish for `episode`."""
         return self.prompt or BASELINES.get(self.model, ("", episode.prompt))[1]
 
 
 @dataclass(frozen=True, slots=True)
 class TaskRequest:
-    """One episode to run.
+    """One episode of a plan, before its layout is known.
 
     Args:
         seed: of the layout.
@@ -107,10 +106,10 @@ class TaskRequest:
     target: str | None = None
 
     def draw(self, objects: ObjectPoses, *, held_out: bool) -> TaskEpisode:
-        """The task in this layout.
+        """Draw the task in this layout.
 
-        A push that has no free way with the brick asked for is drawn with any other; where no brick
-        has one, another family is asked instead of leaving the layout out.
+        Where the target cannot be pushed, another brick is; where none can, another family is drawn
+        instead of skipping the layout.
         """
         if self.family == STAY:
             return draw_stay(self.seed)
@@ -127,16 +126,16 @@ class TaskRequest:
 
 @dataclass(frozen=True, slots=True)
 class TaskOutcome:
-    """How one episode ended.
+    """Outcome of one episode.
 
     Args:
-        episode: what was asked.
-        prompt: what was put.
-        success: it was done.
+        episode: its task.
+        prompt: as published.
+        success: the task was done.
         failure: kind, empty after a success.
         time_s: from activation to the verdict.
-        why: a sentence, where the chain failed.
-        pictures: (beginning, end) as JPEG, where there are any.
+        why: reason, where the chain failed.
+        pictures: (start, end) as JPEG, None: no camera.
     """
 
     episode: TaskEpisode
@@ -163,16 +162,16 @@ class TaskOutcome:
 
 @dataclass(slots=True)
 class TaskScore:
-    """All outcomes of a plan, and what they add up to.
+    """Outcomes of a plan, and their figures.
 
     Args:
-        plan: what was run.
+        plan: that was run.
         mode: ``real_time`` or ``lockstep``.
         profile: its name.
-        vary: what was varied beside the places.
+        vary: what was varied beside the layout.
         ended: the outcomes.
         latency_ms: stage -> ``[p50, p95]``.
-        wall_s: how long it all took.
+        wall_s: duration of the run.
         options: of the model, in force.
     """
 
@@ -239,30 +238,30 @@ def _figures(ended: Sequence[TaskOutcome]) -> dict[str, Any]:
 
 STAY = "stay"
 FIRST_SEED = 1
-"""The layout where nobody asks for another."""
+"""The default layout."""
 
 
 @dataclass(frozen=True, slots=True)
 class PromptedTask(TaskRequest):
-    """An episode with a prompt that somebody thought of.
+    """An episode with a prompt of the user.
 
     Args:
-        prompt: as put.
+        prompt: as published.
     """
 
     prompt: str = ""
 
     def draw(self, objects: ObjectPoses, *, held_out: bool) -> TaskEpisode:
-        """What the prompt asks for; the arm is to stay where it asks for nothing."""
+        """The task of the prompt; an unknown prompt is judged as ``stay``."""
         return TaskEpisode(self.seed, parse_prompt(self.prompt) or Order(STAY), self.prompt)
 
 
 @dataclass(frozen=True, slots=True)
 class DemoPlan(TaskPlan):
-    """Some prompts, or one task of every family, each in the same layout.
+    """Prompts of the user, or one task of every family, all in the same layout.
 
     Args:
-        prompts: to be put one after the other; empty: one of every family, drawn.
+        prompts: one after the other; empty: one task of every family.
     """
 
     prompts: tuple[str, ...] = ()
@@ -277,5 +276,5 @@ class DemoPlan(TaskPlan):
 
 
 def is_judged(prompt: str) -> bool:
-    """Whether it is known here what `prompt` asks for."""
+    """The goal of `prompt` is known, so that it can be judged."""
     return parse_prompt(prompt) is not None or is_nonsense(prompt)

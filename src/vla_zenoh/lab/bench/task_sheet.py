@@ -1,4 +1,4 @@
-"""One picture of all failures: how each began, how it ended, and what was asked."""
+"""Contact sheet of outcomes: start and end of each episode, with its prompt."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ Picture = NDArray[np.uint8]
 
 
 def failure_sheet(ended: Sequence[TaskOutcome]) -> bytes | None:
-    """A JPEG file with the first failures that have pictures; None where there is none."""
+    """A JPEG of the first failures with pictures; None: there are none."""
     return sheet([each for each in ended if not each.success])
 
 
 def sheet(ended: Sequence[TaskOutcome]) -> bytes | None:
-    """A JPEG file with the first outcomes that have pictures; None where there is none."""
+    """A JPEG of the first outcomes with pictures; None: there are none."""
     shown = [each for each in ended if each.pictures is not None][:MAX_TILES]
     if not shown:
         return None
@@ -46,10 +46,10 @@ def _tile(ended: TaskOutcome) -> Picture:
                 decode_jpeg(jpeg).rgb, (TILE_WIDTH, TILE_HEIGHT), interpolation=cv2.INTER_AREA
             )
             tile[:TILE_HEIGHT, index * TILE_WIDTH : (index + 1) * TILE_WIDTH] = small
-    said = f"{ended.episode.seed}: {ended.failure or 'done'}, {ended.time_s:.1f} s"
-    # OpenCV's letters are ASCII.
+    title = f"{ended.episode.seed}: {ended.failure or 'done'}, {ended.time_s:.1f} s"
+    # OpenCV draws only ASCII.
     prompt = ended.prompt.encode("ascii", "replace").decode()
-    for row, line in enumerate([said, *textwrap.wrap(prompt, LETTERS)[:2]]):
+    for row, line in enumerate([title, *textwrap.wrap(prompt, LETTERS)[:2]]):
         cv2.putText(
             tile,
             line,

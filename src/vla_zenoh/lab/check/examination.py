@@ -1,4 +1,4 @@
-"""Runs a model on examples and says everything that is wrong with it, each fault by its name."""
+"""Examination of a model: runs it on example observations and collects findings."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from vla_zenoh.lab.check.examples import (
     MAX_WIDTH_M,
     PROMPTS,
     ExampleMaker,
-    ImageStyle,
+    ExampleStyle,
     example_styles,
     noise,
 )
 from vla_zenoh.lab.check.judge import Steps
-from vla_zenoh.lab.check.model_runner import Bench, ModelFailed, ModelHung
+from vla_zenoh.lab.check.model_runner import ModelFailed, ModelHung, ModelRunner
 from vla_zenoh.lab.check.report import CheckReport, distinct
 from vla_zenoh.policy import Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
@@ -27,28 +27,28 @@ from vla_zenoh.profile import Limits, Profile, Timing
 
 DEFAULT_RUNS = 100
 ENOUGH_RUNS = 12
-"""With fewer timed runs nothing is said of memory."""
+"""Timed runs needed for a finding on memory."""
 
 
 class Examination:
-    """See the module.
+    """Examination of one model.
 
     Args:
         policy: made, not loaded.
         worker: its name.
-        bench: where it runs.
-        profile: what it is held against; None: only against its own spec and default limits.
-        rate_hz: chunks per second that will be asked of it; None: as the profile says.
-        prompts: to try, the first one most; None: the model's `example_prompts`, or `PROMPTS`.
+        runner: of its calls.
+        profile: to check it against; None: its own spec and default limits.
+        rate_hz: requested chunks per second; None: of the profile.
+        prompts: the first one most often; None: the model's `example_prompts`, or `PROMPTS`.
         runs: timed inferences.
-        budget_s: no new example after this time; loading does not count.
+        budget_s: time limit for new examples; loading does not count.
     """
 
     def __init__(
         self,
         policy: Policy,
         worker: str,
-        bench: Bench,
+        runner: ModelRunner,
         *,
         profile: Profile | None = None,
         rate_hz: float | None = None,
@@ -56,28 +56,28 @@ class Examination:
         runs: int = DEFAULT_RUNS,
         budget_s: float = 30.0,
     ) -> None:
-        self._policy, self._bench, self._profile = policy, bench, profile
+        self._policy, self._runner, self._profile = policy, runner, profile
         self._rate_hz = rate_hz or (profile.task.rate_hz if profile else None)
         self._limits = profile.limits if profile else Limits()
         self._timing = profile.timing if profile else Timing()
         self._width_m = profile.robot.gripper.max_width_m if profile else MAX_WIDTH_M
         named = prompts or getattr(policy, "example_prompts", None)
-        self._looks = example_styles(tuple(named) if named else PROMPTS)
+        self._styles = example_styles(tuple(named) if named else PROMPTS)
         self._runs, self._budget_s = runs, budget_s
         self._loaded_s = 0.0
         self._maker, self._continuation = ExampleMaker(policy.spec, profile), ChunkPrefix(policy)
-        self._answers: list[tuple[ImageStyle, Steps]] = []
+        self._answers: list[tuple[ExampleStyle, Steps]] = []
         self._took_ms: list[float] = []
         self.report = CheckReport(worker, policy.spec)
 
     def run(self) -> CheckReport:
-        """Examine; never raises for what the model does."""
+        """Examine; errors of the model become findings."""
         report = self.report
         try:
             self._run()
             close = getattr(self._policy, "close", None)
             if callable(close):
-                self._bench.call(close)
+                self._runner.call(close)
         except ModelFailed as failed:
             report.findings.append(error("close_failed", str(failed)))
         except ModelHung as hung:
@@ -91,22 +91,22 @@ class Examination:
             report.findings += policy_check.check_spec(
                 self._profile, self._policy.spec, worker=report.worker, rate_hz=self._rate_hz
             )
-        before_kib = self._bench.memory_kib()
-        if not (self._load() and self._first()):
+        before_kib = self._runner.memory_kib()
+        if not (self._load() and self._infer_first()):
             return
-        loaded_kib = self._bench.memory_kib()
+        loaded_kib = self._runner.memory_kib()
         self._compare()
-        self._together()
-        for look in self._looks[1:]:
+        self._compare_batch()
+        for style in self._styles[1:]:
             if not self._in_budget():
                 break
             self._reset()
-            self._infer(look)
-        self._time_it()
+            self._infer(style)
+        self._measure()
         report.memory_mib = (
             before_kib / 1024,
             loaded_kib / 1024,
-            self._bench.memory_kib() / 1024,
+            self._runner.memory_kib() / 1024,
         )
         self._judge()
 
@@ -117,11 +117,11 @@ class Examination:
         load = getattr(policy, "load", None)
         if callable(load):
             try:
-                _, report.load_s = self._bench.call(load)
+                _, report.load_s = self._runner.call(load)
             except ModelFailed as failed:
                 report.findings.append(error("load_failed", str(failed)))
                 return False
-        self._loaded_s = self._bench.spent_s()
+        self._loaded_s = self._runner.spent_s()
         if policy.spec.hash != declared:
             report.findings.append(
                 error(
@@ -141,10 +141,10 @@ class Examination:
             )
         return True
 
-    def _first(self) -> bool:
-        """The first answer: what is wrong there is wrong everywhere."""
+    def _infer_first(self) -> bool:
+        """First inference; without an answer there is no point in others."""
         self._reset()
-        steps = self._infer(self._looks[0], again=True)
+        steps = self._infer(self._styles[0], again=True)
         if steps is None:
             return False
         self.report.first_ms = self._took_ms.pop()
@@ -152,10 +152,10 @@ class Examination:
         return True
 
     def _compare(self) -> None:
-        """Whether the answer is the same again, and whether it depends on what is seen."""
-        report, chart = self.report, self._looks[0]
+        """Repeat an observation, and change one thing at a time."""
+        report, chart = self.report, self._styles[0]
         cameras = bool(self._policy.spec.observation.cameras)
-        first, again = self._anew(chart), self._anew(chart)
+        first, again = self._infer_again(chart), self._infer_again(chart)
         if first is None or again is None:
             return
         report.deterministic = judge.alike(first, again)
@@ -168,55 +168,55 @@ class Examination:
                 )
             )
         trials = {
-            "pictures": ImageStyle(chart.name, picture=noise, prompt=chart.prompt)
+            "pictures": ExampleStyle(chart.name, picture=noise, prompt=chart.prompt)
             if cameras
             else None,
-            "colour order": ImageStyle(chart.name, prompt=chart.prompt, swapped=True)
+            "colour order": ExampleStyle(chart.name, prompt=chart.prompt, swapped=True)
             if cameras
             else None,
-            "prompt": ImageStyle(chart.name, prompt=self._another_prompt())
+            "prompt": ExampleStyle(chart.name, prompt=self._another_prompt())
             if self._policy.spec.observation.prompt
             else None,
         }
-        for name, look in trials.items():
-            if look is None or not report.deterministic or not self._in_budget():
+        for name, style in trials.items():
+            if style is None or not report.deterministic or not self._in_budget():
                 continue
             if name == "colour order" and report.depends_on.get("pictures") is False:
                 continue
-            other = self._anew(look)
+            other = self._infer_again(style)
             report.depends_on[name] = None if other is None else not judge.alike(first, other)
 
-    def _together(self) -> None:
-        """Whether two observations that are asked about at once are answered as each alone."""
+    def _compare_batch(self) -> None:
+        """Compare ``infer_batch`` on two observations with ``infer`` on each."""
         if not judge.takes_batches(self._policy) or not self.report.deterministic:
             return
-        chart = self._looks[0]
-        pair = (chart, ImageStyle(chart.name, picture=noise, prompt=self._another_prompt()))
-        alone = [self._anew(look) for look in pair]
+        chart = self._styles[0]
+        pair = (chart, ExampleStyle(chart.name, picture=noise, prompt=self._another_prompt()))
+        alone = [self._infer_again(style) for style in pair]
         if any(steps is None for steps in alone):
             return
         self._reset()
-        seen = [self._maker.make(look, again=True) for look in pair]
+        seen = [self._maker.make(style, again=True) for style in pair]
         try:
-            found, _ = self._bench.call(lambda: judge.ask_batch(self._policy, seen))
+            found, _ = self._runner.call(lambda: judge.ask_batch(self._policy, seen))
         except ModelFailed as failed:
             self.report.findings.append(error("batch", f"infer_batch: {failed}"))
             return
         self.report.findings += judge.batch_findings(self._policy.spec.action, found, alone)
 
     def _another_prompt(self) -> str:
-        prompts = [look.prompt for look in self._looks if not look.strange]
+        prompts = [style.prompt for style in self._styles if not style.strange]
         return next((text for text in prompts if text != prompts[0]), PROMPTS[1])
 
-    def _time_it(self) -> None:
+    def _measure(self) -> None:
         kib: list[float] = []
         self._reset()
         for index in range(self._runs):
             if not self._in_budget():
                 break
-            if self._infer(self._looks[index % 2]) is None:
+            if self._infer(self._styles[index % 2]) is None:
                 return
-            kib.append(self._bench.memory_kib())
+            kib.append(self._runner.memory_kib())
         report = self.report
         if len(kib) < ENOUGH_RUNS:
             return
@@ -224,9 +224,9 @@ class Examination:
         report.findings += leaks
 
     # -- one inference ------------------------------------------------------------------------
-    def _anew(self, look: ImageStyle) -> Steps | None:
+    def _infer_again(self, style: ExampleStyle) -> Steps | None:
         self._reset()
-        return self._infer(look, again=True)
+        return self._infer(style, again=True)
 
     def _reset(self) -> None:
         self._continuation = ChunkPrefix(self._policy)
@@ -234,40 +234,40 @@ class Examination:
         if reset is None:
             return
         try:
-            self._bench.call(reset)
+            self._runner.call(reset)
         except ModelFailed as failed:
             self.report.findings.append(error("reset_failed", str(failed)))
 
-    def _infer(self, look: ImageStyle, *, again: bool = False) -> Steps | None:
-        """A checked answer, None where there is none; what is wrong goes into the report."""
+    def _infer(self, style: ExampleStyle, *, again: bool = False) -> Steps | None:
+        """A checked answer, None: there is none, and the report has the finding."""
         findings, action = self.report.findings, self._policy.spec.action
         try:
-            observation = self._maker.make(look, again=again)
+            observation = self._maker.make(style, again=again)
         except SpecError as fault:
             findings.append(error("picture_size", str(fault)))
             return None
         try:
-            answer, took_s = self._bench.call(lambda: self._continuation.infer(observation))
+            answer, took_s = self._runner.call(lambda: self._continuation.infer(observation))
         except ModelFailed as failed:
-            refused = look.strange and isinstance(failed.error, SpecError)
+            refused = style.strange and isinstance(failed.error, SpecError)
             if not refused:
-                findings.append(error("inference_failed", f"{look.name}: {failed}"))
+                findings.append(error("inference_failed", f"{style.name}: {failed}"))
             return None
         self._took_ms.append(took_s * 1e3)
         try:
             steps = check_steps(action, answer.steps)
         except SpecError as fault:
-            findings.append(error(fault.reason, f"{look.name}: {fault}"))
+            findings.append(error(fault.reason, f"{style.name}: {fault}"))
             return None
         findings += policy_check.check_chunk(action, steps, self._limits, self._width_m)
-        self._answers.append((look, steps))
-        # So that one that takes what is under way is given some at the next look.
+        self._answers.append((style, steps))
+        # A model with real-time chunking gets committed steps at the next inference.
         arrival_ns = observation.stamp_wall_ns + round(took_s * 1e9)
-        self._continuation.published(observation, steps, arrival_ns, obeyed=look.active)
+        self._continuation.published(observation, steps, arrival_ns, obeyed=style.active)
         return steps
 
     def _in_budget(self) -> bool:
-        if self._bench.spent_s() - self._loaded_s < self._budget_s:
+        if self._runner.spent_s() - self._loaded_s < self._budget_s:
             return True
         if not any(finding.name == "cut_short" for finding in self.report.findings):
             self.report.findings.append(
@@ -278,7 +278,7 @@ class Examination:
             )
         return False
 
-    # -- what it all means --------------------------------------------------------------------
+    # -- findings ------------------------------------------------------------------------------
     def _judge(self) -> None:
         report, action = self.report, self._policy.spec.action
         report.runs = len(self._took_ms)

@@ -1,4 +1,4 @@
-"""Observations made from a spec: a colour chart, other pictures, an arm in several states."""
+"""Example observations made from a spec: test images, prompts, states of the arm."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ PROMPTS = (
     "push the blue brick to the left",
     "hold",
 )
-"""Tried where a model does not name others. Two ask for different motions, one for none."""
+"""Default prompts: two ask for different motions, one for none."""
 STRANGE_PROMPT = "legt den grünen Klotz in die Kiste \N{PACKAGE}, bitte! " * 8
-"""Long, in another language and beyond ASCII: a model may refuse it, and must not break."""
+"""Long, in another language, not ASCII: a model may reject it, and must not break."""
 DEFAULT_SIZE = (480, 640)
 PERIOD_NS = 200_000_000
 START_NS = 1_700_000_000_000_000_000
@@ -50,31 +50,31 @@ def chart(height: int, width: int) -> Picture:
 
 
 def noise(height: int, width: int) -> Picture:
-    """The same noise every time, coarse enough to outlive a resize."""
+    """Noise of a fixed seed, coarse enough to survive a resize."""
     small = np.random.default_rng(7).integers(0, 256, (12, 16, 3), dtype=np.uint8)
     scaled = cv2.resize(small, (width, height), interpolation=cv2.INTER_NEAREST)
     return np.asarray(scaled, np.uint8)
 
 
 def plain(value: int) -> Callable[[int, int], Picture]:
-    """Nothing but one gray."""
+    """A uniform gray."""
     return lambda height, width: np.full((height, width, 3), value, np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
-class ImageStyle:
-    """What one example shows.
+class ExampleStyle:
+    """Style of one example observation.
 
     Args:
-        name: for people.
+        name: in findings.
         picture: of every camera, from height and width, RGB.
-        prompt: plain text.
+        prompt: of the task.
         position_m: of the TCP.
         width_m: of the gripper.
-        holding: an object is held.
-        swapped: red and blue are exchanged.
-        active: the arm is obeyed.
-        strange: the model may refuse it with a `SpecError`.
+        holding: the gripper holds an object.
+        swapped: red and blue exchanged.
+        active: the arm is active.
+        strange: the model may reject it with a `SpecError`.
     """
 
     name: str
@@ -88,30 +88,30 @@ class ImageStyle:
     strange: bool = False
 
 
-def example_styles(prompts: Sequence[str] = PROMPTS) -> list[ImageStyle]:
-    """Everything that is tried, the most telling first."""
+def example_styles(prompts: Sequence[str] = PROMPTS) -> list[ExampleStyle]:
+    """All examples, the most informative first."""
     first = prompts[0]
     return [
-        ImageStyle("colour chart", prompt=first),
-        ImageStyle("noise", picture=noise, prompt=first),
-        ImageStyle("black pictures", picture=plain(0), prompt=first),
-        *(ImageStyle(f"prompt {prompt[:24]!r}", prompt=prompt) for prompt in prompts[1:]),
-        ImageStyle("a strange prompt", prompt=STRANGE_PROMPT, strange=True),
-        ImageStyle("something held", prompt=first, width_m=0.03, holding=True),
-        ImageStyle("gripper shut", prompt=first, width_m=0.0, position_m=(0.5, 0.2, 0.02)),
-        ImageStyle("far corner", prompt=first, position_m=(0.75, -0.45, 0.6)),
-        ImageStyle("white pictures", picture=plain(255), prompt=first),
-        ImageStyle("not obeyed", prompt=first, active=False),
+        ExampleStyle("colour chart", prompt=first),
+        ExampleStyle("noise", picture=noise, prompt=first),
+        ExampleStyle("black pictures", picture=plain(0), prompt=first),
+        *(ExampleStyle(f"prompt {prompt[:24]!r}", prompt=prompt) for prompt in prompts[1:]),
+        ExampleStyle("a strange prompt", prompt=STRANGE_PROMPT, strange=True),
+        ExampleStyle("something held", prompt=first, width_m=0.03, holding=True),
+        ExampleStyle("gripper shut", prompt=first, width_m=0.0, position_m=(0.5, 0.2, 0.02)),
+        ExampleStyle("far corner", prompt=first, position_m=(0.75, -0.45, 0.6)),
+        ExampleStyle("white pictures", picture=plain(255), prompt=first),
+        ExampleStyle("not obeyed", prompt=first, active=False),
     ]
 
 
 @dataclass(slots=True)
 class ExampleMaker:
-    """Makes observations one after the other, each a period later than the last.
+    """Makes observations, each a period later than the last.
 
     Args:
-        spec: what the model asks for.
-        profile: where the cameras' sizes and the joints are from; None: usual ones.
+        spec: of the model.
+        profile: for image sizes and joints; None: defaults.
         seq: of the next one.
     """
 
@@ -119,41 +119,39 @@ class ExampleMaker:
     profile: Profile | None = None
     seq: int = 0
 
-    def make(self, look: ImageStyle, *, again: bool = False) -> Observation:
-        """An observation with this look.
-
-        Its arrays cannot be written to, as those a worker gives cannot.
+    def make(self, style: ExampleStyle, *, again: bool = False) -> Observation:
+        """An observation of this style, with read-only arrays as in a worker.
 
         Args:
-            look: what it shows.
-            again: with the time and number of the first one, as if everything began anew.
+            style: of the example.
+            again: use the stamp and number of the first observation.
 
         Raises:
-            SpecError: a picture of the profile's size does not fit the spec.
+            SpecError: an image of the profile's size does not fit the spec.
         """
         seq = 0 if again else self.seq
         self.seq = max(self.seq, seq + 1)
-        seen = example_observation(self.spec, prompt=look.prompt)
+        seen = example_observation(self.spec, prompt=style.prompt)
         return replace(
             seen,
             stamp_wall_ns=START_NS + seq * PERIOD_NS,
             seq=seq,
-            task=replace(seen.task, active=look.active, episode=1),
-            images=self._images(look),
+            task=replace(seen.task, active=style.active, episode=1),
+            images=self._images(style),
             joint=self._joint() if seen.joint is not None else None,
-            pose=PoseState(np.array(look.position_m), np.array(DOWN_XYZW), np.zeros(6))
+            pose=PoseState(np.array(style.position_m), np.array(DOWN_XYZW), np.zeros(6))
             if seen.pose is not None
             else None,
-            gripper=GripperState(look.width_m, moving=False, holding=look.holding)
+            gripper=GripperState(style.width_m, moving=False, holding=style.holding)
             if seen.gripper is not None
             else None,
         )
 
-    def _images(self, look: ImageStyle) -> Mapping[str, Picture]:
+    def _images(self, style: ExampleStyle) -> Mapping[str, Picture]:
         out: dict[str, Picture] = {}
         for camera in self.spec.observation.cameras:
-            picture = look.picture(*self._size(camera))
-            if look.swapped:
+            picture = style.picture(*self._size(camera))
+            if style.swapped:
                 picture = np.ascontiguousarray(picture[..., ::-1])
             prepared = np.array(prepare_image(Image(picture), camera))
             prepared.setflags(write=False)
@@ -161,7 +159,7 @@ class ExampleMaker:
         return out
 
     def _size(self, camera: CameraSpec) -> tuple[int, int]:
-        """Height and width of what the camera sends."""
+        """Height and width of the camera's images."""
         source = self.profile.cameras.get(camera.camera) if self.profile else None
         if source is not None:
             return source.height, source.width

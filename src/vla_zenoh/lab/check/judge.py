@@ -1,4 +1,4 @@
-"""What the answers of an examination, and the time and memory they took, say of a model."""
+"""Findings on the answers of a model, and on the time and memory they took. Pure."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from numpy.typing import NDArray
 from vla_zenoh.control import policy_check
 from vla_zenoh.control.policy_check import Finding, error, note, warning
 from vla_zenoh.errors import SpecError
-from vla_zenoh.lab.check.examples import MAX_WIDTH_M, ImageStyle
+from vla_zenoh.lab.check.examples import MAX_WIDTH_M, ExampleStyle
 from vla_zenoh.policy import ActionSpec, ActionSteps, Observation, Policy, check_steps
 
 GROWTH_KIB, GROWTH_TOTAL_KIB = 32.0, 4096.0
-"""Memory that every inference keeps, and in all, before it is taken for a leak."""
+"""Growth per inference, and in all, above which it is a leak."""
 ALIKE = 1e-7
 
 Steps = NDArray[np.float32]
-Answers = Sequence[tuple[ImageStyle, Steps]]
+Answers = Sequence[tuple[ExampleStyle, Steps]]
 
 
 def alike(a: Steps, b: Steps) -> bool:
-    """Whether two answers are the same."""
+    """Two answers are equal."""
     return a.shape == b.shape and bool(np.abs(a - b).max() <= ALIKE)
 
 
 def growth(kib: Sequence[float]) -> tuple[float, list[Finding]]:
-    """KiB that every inference adds, and whether that is a leak.
+    """Growth of memory per inference in KiB, and a finding if it is a leak.
 
     Args:
         kib: resident memory after each.
     """
     third = len(kib) // 3
-    # The first third may still fill caches; from then on nothing should be kept.
+    # The first third may still fill caches.
     rest = np.array(kib[third:])
     each_kib = float(np.polyfit(np.arange(len(rest)), rest, 1)[0])
     steady = rest[-third:].min() > rest[:third].max()
@@ -46,21 +46,21 @@ def growth(kib: Sequence[float]) -> tuple[float, list[Finding]]:
 def slowness(
     action: ActionSpec, p50_s: float, p95_s: float, *, oldest_s: float, rate_hz: float | None
 ) -> list[Finding]:
-    """What an inference that takes so long is too slow for.
+    """Findings on the duration of an inference.
 
     Args:
         action: of the spec.
-        p50_s: of one inference.
-        p95_s: likewise.
-        oldest_s: an observation may be at most so old.
-        rate_hz: chunks per second that are asked of it; None: not known.
+        p50_s: median.
+        p95_s: 95th percentile.
+        oldest_s: limit on the age of an observation.
+        rate_hz: requested chunks per second; None: unknown.
     """
     found: list[Finding] = []
     if p50_s > oldest_s:
         found.append(
             error(
                 "too_slow",
-                f"an inference takes {p50_s:.3g} s; the command node refuses chunks whose "
+                f"an inference takes {p50_s:.3g} s; the command node rejects chunks whose "
                 f"observation is older than {oldest_s:g} s (timing.max_observation_age_s)",
             )
         )
@@ -88,12 +88,12 @@ def slowness(
 def behaviour(
     action: ActionSpec, answers: Answers, depends_on: Mapping[str, bool | None]
 ) -> list[Finding]:
-    """What all answers have in common that they should not.
+    """Findings on what all answers have in common.
 
     Args:
         action: of the spec.
         answers: at least one.
-        depends_on: pictures, colour order, prompt: whether they matter; None: not known.
+        depends_on: pictures, colour order, prompt -> the answer depends on it; None: unknown.
     """
     found = _polarity(action, answers)
     # The first three numbers of every rotation, x, y, z of a quaternion too, are zero for none.
@@ -110,11 +110,11 @@ def behaviour(
 
 
 def _polarity(action: ActionSpec, answers: Answers) -> list[Finding]:
-    """An open, empty gripper that every answer shuts is a sign of the wrong polarity."""
+    """Every answer closes an open, empty gripper: probably the wrong polarity."""
     shares = [
         opening
-        for look, steps in answers
-        if look.width_m == MAX_WIDTH_M
+        for style, steps in answers
+        if style.width_m == MAX_WIDTH_M
         and (opening := policy_check.gripper_opening(action, steps)) is not None
     ]
     if not shares or float(np.concatenate(shares).max()) > 0.5:
@@ -129,7 +129,7 @@ def _polarity(action: ActionSpec, answers: Answers) -> list[Finding]:
 
 
 NEAR = 1e-3
-"""Of the largest number of an answer: a batch is summed up in another order."""
+"""Tolerance as a share of the largest number: a batch is summed in another order."""
 
 
 def takes_batches(policy: Policy) -> bool:
@@ -138,7 +138,7 @@ def takes_batches(policy: Policy) -> bool:
 
 
 def ask_batch(policy: Policy, observations: Sequence[Observation]) -> list[Any]:
-    """What it answers, nothing of it being under way."""
+    """Answers of ``infer_batch``, without committed steps."""
     infer_batch: Any = getattr(policy, "infer_batch", None)
     committed = getattr(policy, "takes_committed", False)
     extra = {"committed": [None] * len(observations)} if committed else {}
@@ -146,7 +146,7 @@ def ask_batch(policy: Policy, observations: Sequence[Observation]) -> list[Any]:
 
 
 def batch_findings(action: ActionSpec, found: Sequence[Any], alone: Sequence[Any]) -> list[Finding]:
-    """What differs.
+    """Findings on answers that differ between ``infer_batch`` and ``infer``.
 
     Args:
         action: of the spec.
@@ -154,8 +154,8 @@ def batch_findings(action: ActionSpec, found: Sequence[Any], alone: Sequence[Any
         alone: (H, D) of ``infer`` for the same observations, in their order.
     """
     if len(found) != len(alone):
-        said = f"infer_batch gave {len(found)} answers to {len(alone)} observations"
-        return [error("batch", said)]
+        why = f"infer_batch gave {len(found)} answers to {len(alone)} observations"
+        return [error("batch", why)]
     out: list[Finding] = []
     for number, (answer, wanted) in enumerate(zip(found, alone, strict=True), 1):
         steps = answer.steps if isinstance(answer, ActionSteps) else answer

@@ -1,4 +1,4 @@
-"""What was found out about a model."""
+"""Report of a model check."""
 
 from __future__ import annotations
 
@@ -55,22 +55,22 @@ MEANINGS: Mapping[str, str] = {
 
 @dataclass(slots=True)
 class CheckReport:
-    """See the module.
+    """Report of a model check.
 
     Args:
         worker: its name.
-        spec: what it declares; None where it could not be made.
-        findings: all that is wrong or worth knowing.
+        spec: of the model; None: the model could not be made.
+        findings: errors, warnings and notes.
         shape: (H, D) of the first answer.
-        load_s: time of ``load()``.
-        first_ms: time of the first inference.
+        load_s: duration of ``load()``.
+        first_ms: duration of the first inference.
         latency_ms: ``[p50, p95, max]`` of the later ones.
-        runs: how many those were.
+        runs: number of later inferences.
         memory_mib: resident: before load, after it, after all runs.
-        growth_kib_per_run: resident memory that every inference adds, None: too few runs.
+        growth_kib_per_run: growth of resident memory per inference, None: too few runs.
         deterministic: the same answer to the same observation after ``reset()``.
-        depends_on: pictures, colour order, prompt: whether the answer does; None: cannot be told.
-        step_range: per number of a step ``[smallest, largest]`` over all answers.
+        depends_on: pictures, colour order, prompt -> the answer depends on it; None: unknown.
+        step_range: per component of a step ``[smallest, largest]`` over all answers.
     """
 
     worker: str
@@ -89,7 +89,7 @@ class CheckReport:
 
     @property
     def ok(self) -> bool:
-        """Nothing found that forbids giving it the arm."""
+        """No finding is an error."""
         return not any(finding.level == "error" for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""vla-zenoh bench compare."""
+"""vla-zenoh bench compare: whether one model does more tasks than another."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ import typer
 from rich.table import Table
 
 from vla_zenoh.cli.options import JsonOption
-from vla_zenoh.cli.output import console, print_json
+from vla_zenoh.cli.output import console, new_table, print_json
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.lab.bench.paired_tasks import ALPHA, CONDITIONS, Comparison, figures, read_run
 from vla_zenoh.lab.bench.paired_tasks import compare as compare_runs
 
 B_IS_WORSE = 3
-"""Exit code; 1 and 2 are those of every command for what it refuses."""
+"""Exit code; 1 and 2 are those of every command for errors."""
 LEAST_WIDTH = 120
 DISAGREEMENTS = 10
 
 
 def compare(
-    a: Annotated[Path, typer.Argument(help="Result of a run of `bench task`.", metavar="A.json")],
-    b: Annotated[Path, typer.Argument(help="Result of another one.", metavar="B.json")],
+    a: Annotated[Path, typer.Argument(help="Result of `bench task`.", metavar="A.json")],
+    b: Annotated[Path, typer.Argument(help="Another one.", metavar="B.json")],
     differ: Annotated[
         list[str] | None,
         typer.Option(
             "--differ",
-            help=f"What is compared, where it is not the model; may be repeated: "
+            help=f"Condition that may differ, besides the model; repeatable: "
             f"{', '.join(CONDITIONS)}.",
         ),
     ] = None,
-    tasks: Annotated[bool, typer.Option("--tasks", help="A row for every task, too.")] = False,
+    tasks: Annotated[bool, typer.Option("--tasks", help="A row per task, too.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare two runs of `bench task` on the layouts that are in both.
+    """Compare two runs of `bench task` on the layouts that both have.
 
-    Exits with 0 when B was not shown to be worse than A, 3 when it was (p below 0.05), 1 when the
-    runs cannot be compared.
+    Exits with 3 if B is worse than A (p below 0.05), with 1 if the runs cannot be compared, else
+    with 0.
     """
     unknown = [name for name in differ or () if name not in CONDITIONS]
     if unknown:
@@ -64,30 +64,29 @@ def _print(found: Comparison, *, tasks: bool) -> None:
     out = console(LEAST_WIDTH)
     for name, run in (("A", result["a"]), ("B", result["b"])):
         options = ", ".join(f"{k}={v}" for k, v in run["options"].items())
-        told = f" ({options})" if options else ""
-        out.print(f"{name}: {run['model']}{told}, {run['episodes']} episodes", soft_wrap=True)
+        given = f" ({options})" if options else ""
+        out.print(f"{name}: {run['model']}{given}, {run['episodes']} episodes", soft_wrap=True)
     for name, (one, other) in result["differ"].items():
         out.print(f"{name}: {one} in A, {other} in B", soft_wrap=True)
-    table = Table(header_style="bold")
-    for column in ("", "pairs", "A", "B", "both", "only A", "only B", "neither", "B - A"):
-        table.add_column(column, justify="right" if column else "left", no_wrap=True)
-    table.add_column("95 %", justify="right", no_wrap=True)
-    table.add_column("p", justify="right", no_wrap=True)
+    columns = ("pairs", "A", "B", "both", "only A", "only B", "neither", "B - A", "95 %", "p")
+    table = new_table("", *columns, left=("",))
+    for column in table.columns:
+        column.no_wrap = True
     _row(table, "all", figures(found.counts))
     for part in ("by_family", *(["by_task"] if tasks else [])):
         table.add_section()
         for name, row in result[part].items():
             _row(table, name, row)
     out.print(table)
-    said = list(found.disagreements())
-    for each in said[:DISAGREEMENTS]:
+    differing = list(found.disagreements())
+    for each in differing[:DISAGREEMENTS]:
         who, why = each["done_by"].upper(), each["failure_of_the_other"]
         out.print(f"- {each['seed']}, {each['task']}: done by {who} alone, the other: {why}")
-    if len(said) > DISAGREEMENTS:
-        out.print(f"- and {len(said) - DISAGREEMENTS} more, with --json")
+    if len(differing) > DISAGREEMENTS:
+        out.print(f"- and {len(differing) - DISAGREEMENTS} more, with --json")
     only_a, only_b = found.unpaired
     if only_a or only_b:
-        out.print(f"left out, because only one of them did it: {only_a} of A, {only_b} of B")
+        out.print(f"left out, in only one of the runs: {only_a} of A, {only_b} of B")
     out.print(_verdict(found), soft_wrap=True)
 
 
@@ -110,7 +109,7 @@ def _verdict(found: Comparison) -> str:
     low, high = counts.difference_95
     if counts.p >= ALPHA:
         return (
-            f"No difference is shown: p = {counts.p:.2g}, and B's rate less A's is between "
+            f"No significant difference: p = {counts.p:.2g}, B's rate minus A's is between "
             f"{low:+.1%} and {high:+.1%}."
         )
     word = "fewer" if found.b_is_worse else "more"

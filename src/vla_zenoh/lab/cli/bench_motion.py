@@ -9,14 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-)
+from rich.progress import TaskID
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
@@ -25,7 +18,7 @@ from vla_zenoh.cli.options import (
     number_list,
     options,
 )
-from vla_zenoh.cli.output import console, errors
+from vla_zenoh.cli.output import console, progress_bars
 from vla_zenoh.lab.bench.motion import PROTOCOL, STEPS, Conditions, MotionCase
 from vla_zenoh.lab.cli.bench_file import JsonFileOption, up_with_last_lines, write_json
 from vla_zenoh.profile import Profile
@@ -91,13 +84,7 @@ class _Run:
         self._profile, self._out, self._stop = profile, out, stop
         self._cases, self._conditions = measured.cases(), measured.conditions()
         self.rows: list[dict[str, Any]] = []
-        self.bars = Progress(
-            TextColumn("{task.description:<44}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=errors(),
-        )
+        self.bars = progress_bars(44)
         total = len(self._cases) * len(self._conditions)
         self._everything = self.bars.add_task("all rows", total=total)
 

@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
@@ -23,7 +21,7 @@ from vla_zenoh.cli.options import (
     effective_profile,
     options,
 )
-from vla_zenoh.cli.output import console, errors
+from vla_zenoh.cli.output import console, new_table, progress_bars
 from vla_zenoh.lab.bench.task import BASELINES, SCENE, TaskPlan, TaskScore
 from vla_zenoh.lab.cli.bench_file import (
     LAST_LINES,
@@ -213,13 +211,7 @@ def _with_bricks(profile: Profile, worker: str, vary: list[str], path: str = "")
 
 @contextmanager
 def _bar(episodes: int) -> Iterator[Callable[[TaskScore], None]]:
-    with Progress(
-        TextColumn("{task.description:<44}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=errors(),
-    ) as bars:
+    with progress_bars(44) as bars:
         bar = bars.add_task("starting", total=episodes)
 
         def advance(score: TaskScore) -> None:
@@ -308,9 +300,8 @@ def _real_time(
 
 
 def _print(result: dict[str, Any]) -> None:
-    table = Table(header_style="bold", title=_title(result), title_justify="left")
-    for column in ("", "done", "of", "rate", "95 %", "time p50", "p95", "failures"):
-        table.add_column(column, justify="left" if column in ("", "failures") else "right")
+    columns = ("", "done", "of", "rate", "95 %", "time p50", "p95", "failures")
+    table = new_table(*columns, title=_title(result), left=("", "failures"))
     rows = [("all", result), *result["by_family"].items(), *result.get("pairs", {}).items()]
     for name, row in rows:
         low, high = row["wilson_95"]

@@ -1,4 +1,4 @@
-"""vla-zenoh lab compare."""
+"""vla-zenoh lab compare: how far the chunks of two workers differ."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.table import Table
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, fail, print_json
+from vla_zenoh.cli.output import console, fail, new_table, print_json
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import VlaZenohError
 from vla_zenoh.lab.compare.agreement import (
@@ -40,18 +40,18 @@ def compare(
         float, typer.Option("--seconds", "-s", help="How long to listen.", min=0.1)
     ] = 10.0,
     recording: Annotated[
-        Path | None, typer.Option("--recording", "-r", help="Of this file in place of a live run.")
+        Path | None, typer.Option("--recording", "-r", help="Compare in this recording.")
     ] = None,
     tolerance_s: Annotated[
         float,
-        typer.Option("--tolerance", help="Seconds that two observations may lie apart.", min=0),
+        typer.Option("--tolerance", help="Seconds between two observations of a pair.", min=0),
     ] = DEFAULT_TOLERANCE_S,
     as_json: JsonOption = False,
 ) -> None:
-    """Show how far two workers are apart, of a live run or a recording.
+    """Show how far the chunks of two workers differ, live or in a recording.
 
-    Both may run in the shadow; one of them may be obeyed. Chunks are paired by the time of their
-    observation and carried out in thought from where the arm then was.
+    One of them may move the arm. Chunks are paired by the time of their observation, and their
+    motions compared from the arm's pose at that time.
     """
     loaded = target.load()
     if recording is not None:
@@ -64,8 +64,8 @@ def compare(
         console().print(_table(a, b, found))
     if not found.pairs:
         fail(
-            f"no chunks of {a} and {b} belong together: {found.only_a} of {a}, {found.only_b} of "
-            f"{b}; do both infer? (`vla-zenoh status`)"
+            f"no chunks of {a} and {b} form a pair: {found.only_a} of {a}, {found.only_b} of "
+            f"{b}; do both run? (`vla-zenoh status`)"
         )
 
 
@@ -147,14 +147,11 @@ def _of(
 
 
 def _table(a: str, b: str, found: Disagreement) -> Table:
-    table = Table(
-        header_style="bold",
-        title=f"{b} against {a}: {found.pairs} pairs, observations {found.apart_s * 1e3:.0f} ms "
-        f"apart, ways compared after {found.after_s:.2f} s",
-        title_justify="left",
+    title = (
+        f"{b} against {a}: {found.pairs} pairs, observations {found.apart_s * 1e3:.0f} ms apart, "
+        f"motions compared after {found.after_s:.2f} s"
     )
-    for column in ("", "mean", "p95", "bias"):
-        table.add_column(column, justify="left" if not column else "right")
+    table = new_table("", "mean", "p95", "bias", title=title, left=("",))
     if found.mean is not None and found.p95 is not None and found.bias is not None:
         for axis, name in enumerate(AXES):
             unit, scale = ("mm", 1e3) if axis < 3 else ("mrad", 1e3)
@@ -168,7 +165,7 @@ def _table(a: str, b: str, found: Disagreement) -> Table:
     ):
         table.add_row(name, "" if value is None else form(value), "", "")
     alone = f"{found.only_a} of {a}, {found.only_b} of {b}"
-    table.add_row("without a partner", alone, "", "")
+    table.add_row("unpaired", alone, "", "")
     if found.unreadable:
-        table.add_row("without meaning", str(found.unreadable), "", "")
+        table.add_row("unreadable", str(found.unreadable), "", "")
     return table

@@ -1,4 +1,4 @@
-"""vla-zenoh dataset export, dataset stats."""
+"""vla-zenoh dataset: recorded runs as training data."""
 
 from __future__ import annotations
 
@@ -8,38 +8,39 @@ from typing import Annotated, Literal
 
 import typer
 
+from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.evaluation.files import MCAP
 
 dataset_app = typer.Typer(
-    name="dataset", help="Recorded runs as data to train on.", no_args_is_help=True
+    name="dataset", help="Turn recorded runs into training data.", no_args_is_help=True
 )
 
 
 @dataset_app.command("export")
 def export(
-    runs: Annotated[list[Path], typer.Argument(help="Recordings (.mcap), or folders with such.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the dataset; a new one.")],
+    runs: Annotated[list[Path], typer.Argument(help="Recordings (.mcap), or folders of them.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="New folder for the dataset.")],
     form: Annotated[
         Literal["lerobot"], typer.Option("--format", help="LeRobotDataset v3.0.")
     ] = "lerobot",
     worker: Annotated[
-        str | None, typer.Option("--worker", help="Only what this worker did.")
+        str | None, typer.Option("--worker", help="Only episodes of this worker.")
     ] = None,
     cameras: Annotated[
         list[str] | None,
-        typer.Option("--camera", help="Only this one; may be repeated. Else all recorded ones."),
+        typer.Option("--camera", help="Only this camera; repeatable. Default: all recorded ones."),
     ] = None,
     state: Annotated[
-        str, typer.Option("--state", help="Parts of the state, as the worker lerobot has them.")
+        str, typer.Option("--state", help="Parts of the state, as in the worker lerobot.")
     ] = "position+rpy+gripper_m",
     successful: Annotated[
-        bool, typer.Option("--successful", help="Only episodes known to have done their task.")
+        bool, typer.Option("--successful", help="Only episodes known to be successful.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a script.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Make a dataset of recorded runs: an episode for each time a worker was obeyed."""
+    """Export a dataset with one episode per activation of a worker."""
     from vla_zenoh.lab.dataset.episodes import episodes_of
     from vla_zenoh.lab.dataset.lerobot import export as write
     from vla_zenoh.lab.dataset.success import succeeded
@@ -74,14 +75,15 @@ def export(
 def stats(
     folder: Annotated[Path, typer.Argument(help="A LeRobot dataset v3.0.")],
     name: Annotated[
-        str | None, typer.Option("--name", help="Key of the statistics; the folder's name else.")
+        str | None,
+        typer.Option("--name", help="Key of the statistics; default: the folder's name."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="File; dataset_statistics.json in the folder without it."),
+        typer.Option("--out", "-o", help="File; default: dataset_statistics.json in the folder."),
     ] = None,
 ) -> None:
-    """Write OpenVLA's dataset_statistics.json of a dataset."""
+    """Write OpenVLA's dataset_statistics.json for a dataset."""
     from vla_zenoh.lab.dataset.openvla import openvla_statistics
 
     content = openvla_statistics(folder, name or folder.resolve().name)

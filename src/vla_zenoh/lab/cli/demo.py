@@ -1,4 +1,4 @@
-"""vla-zenoh demo."""
+"""vla-zenoh demo: a simulated robot does tasks by prompt."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ import typer
 from vla_zenoh.cli.options import DEFAULT_PROFILE
 
 DEFAULT_STEPS = 50
-
-
 TASK_PROFILE = "panda_bricks"
 
 
@@ -20,12 +18,12 @@ def demo(
         str | None,
         typer.Option(
             "--prompt",
-            help="One prompt: a task such as 'put the red brick in the box', or a fixed motion "
-            "such as 'HARD: go up'. Without it: one task of every kind.",
+            help="A task such as 'put the red brick in the box', or a fixed motion such as "
+            "'HARD: go up'. Default: one task of every kind.",
         ),
     ] = None,
     tour: Annotated[
-        bool, typer.Option("--tour", help="A tour of all fixed motions in place of tasks.")
+        bool, typer.Option("--tour", help="All fixed motions in place of tasks.")
     ] = False,
     rate: Annotated[
         float, typer.Option("--rate", help="Chunks per second.", min=0.2, max=50)
@@ -37,7 +35,7 @@ def demo(
         float | None,
         typer.Option(
             "--seconds",
-            help="Let a fixed motion run this long; the most a task may take.",
+            help="Duration of a fixed motion; time limit of a task.",
             min=0.5,
             max=3600,
         ),
@@ -52,16 +50,16 @@ def demo(
         Path | None, typer.Option("--json", help="Write the summary to this file.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Run folder; runs/demo-<time> without it.")
+        Path | None, typer.Option("--out", help="Run folder; default: runs/demo-<time>.")
     ] = None,
 ) -> None:
-    """Bring a simulated robot up, let prompts move it, and show what was asked and done.
+    """Start a simulated robot, let prompts move it, and show what it did.
 
     Exits with 0 only when the arm did what was asked.
     """
-    # Simulation, kinematics and plots take a while to load, and a camera host has none of them.
+    # Imported here: simulation, kinematics and plots take long to load.
     if tour and prompt is not None:
-        raise typer.BadParameter("--tour is instead of a --prompt")
+        raise typer.BadParameter("give either --tour or --prompt")
     if tour or (prompt is not None and _is_fixed_motion(prompt)):
         from vla_zenoh.lab.cli.demo_run import run_demo
         from vla_zenoh.lab.demo.segments import make_segment

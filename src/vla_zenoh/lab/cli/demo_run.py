@@ -1,4 +1,4 @@
-"""What ``vla-zenoh demo --tour`` does: fixed motions, held against what was asked."""
+"""``vla-zenoh demo --tour``: fixed motions, compared with what their prompts ask."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
-from vla_zenoh.cli.output import console, styled
+from vla_zenoh.cli.output import console, new_table, progress_bars, styled
 from vla_zenoh.lab.cli.demo_stage import Stage, prepare, refusals
 from vla_zenoh.lab.demo.plot import plot_run
 from vla_zenoh.lab.demo.runner import DemoResult, DemoRunner
@@ -22,7 +20,7 @@ from vla_zenoh.profile import Profile
 
 HOLD = "hold"
 KEPT = 400
-"""States that the demo itself looks back on."""
+"""States that the demo keeps."""
 
 
 def run_demo(
@@ -33,7 +31,7 @@ def run_demo(
     json_file: Path | None,
     out: Path | None,
 ) -> None:
-    """See ``vla-zenoh demo``."""
+    """Run fixed motions and show how far each came."""
     stage = prepare(profile, out)
     result = _run(stage, segments, rate, seconds)
     run = stage.recorded()
@@ -49,7 +47,7 @@ def _run(
     stage: Stage, segments: list[DemoSegment], rate_hz: float, seconds: float | None
 ) -> DemoResult:
     profile, stop = stage.profile, stage.stop
-    with stage.nodes("{task.description:<24}") as (running, bars):
+    with stage.nodes(24) as (running, bars):
         assert running.session is not None and running.client is not None
         tasks: list[Any] = []
 
@@ -127,8 +125,7 @@ def _write_tables(stage: Stage, run: Run) -> None:
     ]
     write_chunks(folder / "chunks.npz", spec, chunks)
     marks = [(at_ns, prompt) for at_ns, prompt in run.prompts() if prompt != HOLD]
-    columns = (TextColumn("{task.description:<24}", markup=False), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=stage.screen) as bars:
+    with progress_bars(24, stage.screen, counted=False) as bars:
         plotting = bars.add_task("drawing plot.png", total=1)
         plot_run(folder / "plot.png", profile, run.poses, run.commands, marks, first)
         bars.update(plotting, completed=1)
@@ -136,9 +133,9 @@ def _write_tables(stage: Stage, run: Run) -> None:
 
 
 def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
-    table = Table(title="asked and reached, measured at rest", title_justify="left")
-    for column in ("prompt", "steps", "asked", "reached", "drift", "rotation drift", ""):
-        table.add_column(column, justify="left" if column in ("prompt", "") else "right")
+    columns = ("prompt", "steps", "asked", "reached", "drift", "rotation drift", "")
+    title = "asked and reached, measured at rest"
+    table = new_table(*columns, title=title, left=("prompt", ""))
     for outcome in result.outcomes:
         asked, reached = _amounts(outcome)
         faults = outcome.faults()
@@ -171,7 +168,7 @@ def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
         "plot.png, front.mp4)"
     )
     if result.interrupted:
-        screen.print("interrupted; the arm was braked", style="yellow")
+        screen.print("interrupted; the arm braked", style="yellow")
     elif summary["ok"]:
         screen.print("the arm did what was asked", style="bold green")
     else:

@@ -1,4 +1,4 @@
-"""What every demo has: an address of its own, a run folder, nodes, a recording and a film."""
+"""Stage of a demo: its address, run folder, nodes, recording and video."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress
 
 from vla_zenoh.cli.addresses import own_address
 from vla_zenoh.cli.options import effective_profile
-from vla_zenoh.cli.output import Screen, errors
+from vla_zenoh.cli.output import Screen, errors, progress_bars
 from vla_zenoh.lab.demo.video import write_video
 from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.recording.run import Run, load_run, pictures
@@ -26,19 +26,19 @@ from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
 from vla_zenoh.types import NodeStatus
 
 MAX_LOG_LINES = 20
-PICTURE_NS = 60_000_000
-"""Pictures of the film lie at least this far apart: twice as many as it shows."""
+IMAGE_NS = 60_000_000
+"""Least time between images of the video: twice its frame rate."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """See the module. Made by `prepare`.
+    """A profile at an address of its own, and the run folder. Made by `prepare`.
 
     Args:
-        profile: in force, at an address of its own.
+        profile: effective.
         folder: of the run.
         stop: set by Ctrl-C.
-        screen: for progress, which is no result: stdout stays for the summary.
+        screen: for progress; stdout is for the summary.
     """
 
     profile: Profile
@@ -48,32 +48,26 @@ class Stage:
 
     @property
     def camera(self) -> str | None:
-        """Whose pictures are recorded and filmed; None: there is no camera."""
+        """The camera that is recorded; None: there is none."""
         cameras = self.profile.cameras
         return "front" if "front" in cameras else next(iter(cameras), None)
 
     @property
     def recording(self) -> Path:
-        """The file everything else is made of."""
+        """The recording, from which all other files are made."""
         return self.folder / "run.mcap"
 
     @contextmanager
-    def nodes(self, described: str) -> Iterator[tuple[Host, Progress]]:
-        """All nodes at work and recorded, beside bars; where it fails, the end of their log.
+    def nodes(self, width: int) -> Iterator[tuple[Host, Progress]]:
+        """Run and record all nodes, with progress bars; a failure shows the end of their log.
 
         Args:
-            described: format of the bars' first column.
+            width: of the descriptions of the bars, in characters.
         """
         profile, lines = self.profile, []
-        columns = (
-            TextColumn(described, markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-        )
         with (
             (self.folder / "nodes.log").open("w", encoding="utf-8") as log_file,
-            Progress(*columns, console=self.screen) as bars,
+            progress_bars(width, self.screen) as bars,
         ):
             coming_up = bars.add_task("starting the nodes", total=None)
 
@@ -81,8 +75,8 @@ class Stage:
                 log_file.write(f"{node:>16} | {line}\n")
                 lines.append(f"{node}: {line}")
 
-            # Pictures of one camera alone: each more takes its share of the processor.
-            pictures_of = [profile.keys.camera_jpeg(self.camera)] if self.camera else []
+            # Images of one camera only: each more costs processor time.
+            images = [profile.keys.camera_jpeg(self.camera)] if self.camera else []
             try:
                 with Host(profile, None, log=log, tell=log, own_router=True) as running:
                     assert running.session is not None
@@ -91,7 +85,7 @@ class Stage:
                         profile,
                         running.session,
                         self.recording,
-                        expressions=(*profile.keys.without_images, *pictures_of),
+                        expressions=(*profile.keys.without_images, *images),
                     ).start()
                     try:
                         yield running, bars
@@ -103,11 +97,11 @@ class Stage:
                 raise
 
     def recorded(self) -> Run:
-        """What was recorded."""
+        """Load the recording."""
         return load_run(self.recording)
 
     def write(self, summary: Mapping[str, Any], json_file: Path | None) -> None:
-        """profile.yaml and summary.json, the latter also where a person wants it."""
+        """Write profile.yaml and summary.json, the latter also to `json_file`."""
         (self.folder / "profile.yaml").write_text(to_yaml(self.profile), "utf-8")
         text = json.dumps(summary, indent=2) + "\n"
         for path in (self.folder / "summary.json", json_file):
@@ -116,14 +110,9 @@ class Stage:
                 path.write_text(text, "utf-8")
 
     def film(self, run: Run, marks: list[tuple[int, str]]) -> None:
-        """front.mp4, with `marks` (ns, text) in it."""
+        """Write front.mp4 with `marks` (ns, text) in it."""
         frames = self._frames(run)
-        columns = (
-            TextColumn("{task.description:<24}", markup=False),
-            BarColumn(),
-            TimeElapsedColumn(),
-        )
-        with Progress(*columns, console=self.screen) as bars:
+        with progress_bars(24, self.screen, counted=False) as bars:
             filming = bars.add_task("writing front.mp4", total=max(1, len(frames)))
             written = write_video(
                 self.folder / "front.mp4",
@@ -132,18 +121,18 @@ class Stage:
                 lambda done, total: bars.update(filming, completed=done, total=total),
             )
             if not written:
-                bars.update(filming, description="no pictures, no video", completed=1, total=1)
+                bars.update(filming, description="no images, no video", completed=1, total=1)
 
     def _frames(self, run: Run) -> list[tuple[int, bytes]]:
         frames: list[tuple[int, bytes]] = []
         for picture in pictures(run.file, self.camera) if self.camera is not None else ():
-            if not frames or picture.received_ns - frames[-1][0] >= PICTURE_NS:
+            if not frames or picture.received_ns - frames[-1][0] >= IMAGE_NS:
                 frames.append((picture.received_ns, picture.jpeg))
         return frames
 
 
 def prepare(profile: str, out: Path | None) -> Stage:
-    """A stage for the profile, in the folder `out` or one named by the time of day."""
+    """Make a stage for a profile, in the folder `out` or one named by the time."""
     stop = stop_on_signals()
     die_with_parent()
     loaded = own_address(effective_profile(profile))
@@ -156,7 +145,7 @@ def prepare(profile: str, out: Path | None) -> Stage:
 
 
 def refusals(statuses: Mapping[str, NodeStatus]) -> dict[str, int]:
-    """What all nodes refused, by reason."""
+    """Rejections of all nodes, by reason."""
     out: Counter[str] = Counter()
     for status in statuses.values():
         for name, count in status.counters.items():

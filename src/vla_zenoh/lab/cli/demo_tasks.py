@@ -1,4 +1,4 @@
-"""What ``vla-zenoh demo`` does with a policy that does tasks: nodes, run folder, verdicts."""
+"""``vla-zenoh demo`` with a policy that does tasks: nodes, run folder, verdicts."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from rich.table import Table
 from rich.text import Text
 
-from vla_zenoh.cli.output import console, styled
+from vla_zenoh.cli.output import console, new_table, styled
 from vla_zenoh.lab.bench.task import DemoPlan, TaskOutcome, is_judged
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
@@ -21,7 +20,7 @@ from vla_zenoh.lab.tasks import FAILURES, LIMIT_S
 from vla_zenoh.sanitize import one_line, printable
 
 ROUNDS = 3
-"""Tasks without a prompt given: one of every family."""
+"""Tasks without a prompt: one of every family."""
 
 
 def run_task_demo(
@@ -33,7 +32,7 @@ def run_task_demo(
     json_file: Path | None,
     out: Path | None,
 ) -> None:
-    """See ``vla-zenoh demo``."""
+    """Run tasks and show the verdict on each."""
     stage = prepare(profile, out)
     loaded, folder = stage.profile, stage.folder
     plan = DemoPlan(
@@ -72,7 +71,7 @@ def run_task_demo(
 
 def _run(stage: Stage, plan: DemoPlan) -> tuple[list[TaskOutcome], dict[str, int]]:
     ended: list[TaskOutcome] = []
-    with stage.nodes("{task.description:<52}") as (running, bars):
+    with stage.nodes(52) as (running, bars):
         assert running.client is not None
         client = running.client
         bar = bars.add_task("waiting for the first task", total=plan.episodes)
@@ -90,7 +89,7 @@ def _run(stage: Stage, plan: DemoPlan) -> tuple[list[TaskOutcome], dict[str, int
 
 
 def _well(ended: TaskOutcome) -> bool | None:
-    """Whether it was done; None: nobody here knows what was asked, and the chain was well."""
+    """Whether it was done; None: the prompt cannot be judged, and no node failed."""
     if is_judged(ended.prompt):
         return ended.success
     return None if ended.success or ended.failure in FAILURES else False
@@ -99,14 +98,12 @@ def _well(ended: TaskOutcome) -> bool | None:
 def _word(ended: TaskOutcome) -> str:
     done = _well(ended)
     if done is None:
-        return "not judged: a wording that only the policy may know"
+        return "not judged: unknown wording"
     return f"done in {ended.time_s:.1f} s" if done else ended.failure
 
 
 def _show(ended: list[TaskOutcome], summary: dict[str, Any], folder: Path) -> None:
-    table = Table(title="asked by prompt, judged by the true poses", title_justify="left")
-    table.add_column("prompt")
-    table.add_column("")
+    table = new_table("prompt", "", title="prompts, judged by the true poses")
     for each in ended:
         colour = {True: "green", False: "red", None: "yellow"}[_well(each)]
         known = is_judged(each.prompt) and each.failure in FAILURES

@@ -1,4 +1,4 @@
-"""vla-zenoh doctor: what is missing on this host."""
+"""vla-zenoh doctor: what is missing on this computer."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import (
     PROFILE_VARIABLE,
     AlsoOption,
+    JsonOption,
     effective_profile,
 )
 from vla_zenoh.cli.output import console, errors, print_json, styled
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
-from vla_zenoh.lab.doctor.access import access
-from vla_zenoh.lab.doctor.access_check import AccessVerdict, check_access, read_access, try_identity
+from vla_zenoh.lab.doctor.access import AccessVerdict, access
+from vla_zenoh.lab.doctor.access_check import check_access, read_access, try_identity
 from vla_zenoh.lab.doctor.software import robot
 from vla_zenoh.profile import Profile, SessionProfile
 
@@ -32,7 +33,7 @@ COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
 
 
 def try_zenoh(profile: SessionProfile, endpoint: str) -> str:
-    """Opens a Zenoh session at `endpoint` and closes it; returns the reason if it cannot."""
+    """Open and close a Zenoh session at `endpoint`; the reason why it fails, or empty."""
     try:
         open_session(profile, connect=(endpoint,)).close()
     except SessionError as error:
@@ -46,38 +47,34 @@ def doctor(
     profile: Annotated[
         str | None,
         typer.Option(
-            "--profile", "-p", envvar=PROFILE_VARIABLE, help="Look for what this profile needs."
+            "--profile", "-p", envvar=PROFILE_VARIABLE, help="Check what this profile needs."
         ),
     ] = None,
     host: Annotated[
         str | None, typer.Option("--host", help="Only what this host of the profile needs.")
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print a list of objects instead of a table.")
-    ] = False,
+    as_json: JsonOption = False,
     rules: Annotated[
         Path | None,
-        typer.Option(
-            "--rules", help="Try the rules of access in this configuration of Zenoh instead."
-        ),
+        typer.Option("--rules", help="Test the access rules in this Zenoh configuration instead."),
     ] = None,
     also: AlsoOption = None,
 ) -> None:
-    """Look at this computer: what is missing, and the package or setting that helps.
+    """Check this computer: what is missing, and the package or setting that helps.
 
-    Exits with 1 when something will not work, with 0 when all works or works only less well.
+    Exits with 1 if something will not work, with 0 if there are only warnings.
     """
     if host is not None and profile is None:
-        raise typer.BadParameter("it is the name of a host in a profile: give --profile too")
+        raise typer.BadParameter("--host names a host of a profile: give --profile too")
     if also and profile is None:
         raise typer.BadParameter("--also names robots beside that of a profile: give --profile too")
     zenoh.init_log_from_env_or("off")
     needs, session, loaded = Needs(), SessionProfile(), None
     if profile is not None:
-        # Whose certificates are looked at; a computer of people alone is no host of the profile.
+        # The host of the certificates; a computer without nodes is no host of the profile.
         loaded = effective_profile(profile, host=host or os.environ.get(HOST_VARIABLE))
         needs, session = needs_of(loaded, host), loaded.session
-    with errors().status("Looking at this computer"):
+    with errors().status("Checking this computer"):
         findings = list(examine(needs, functools.partial(try_zenoh, session)))
         if loaded is not None:
             findings += robot(loaded, host)
@@ -101,8 +98,8 @@ def _rehearse(profile: Profile, rules: Path | None, also: Sequence[str]) -> list
 
 
 def show(findings: list[HostFinding]) -> None:
-    """Prints a table and how many findings want something done."""
-    table = Table(show_lines=False, header_style="bold")
+    """Print a table of findings and their counts."""
+    table = Table(header_style="bold")
     table.add_column("what", no_wrap=True)
     table.add_column("", no_wrap=True)
     table.add_column("found and what to do", overflow="fold")

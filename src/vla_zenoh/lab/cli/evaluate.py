@@ -1,4 +1,4 @@
-"""vla-zenoh eval."""
+"""vla-zenoh eval: figures and plots of recorded runs."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ import typer
 from rich import box
 from rich.table import Table
 
-from vla_zenoh.cli.output import console, errors, fail, plain_types
+from vla_zenoh.cli.output import console, errors, fail, new_table, plain_types
 from vla_zenoh.lab.evaluation import tables
 from vla_zenoh.lab.evaluation.combined import overall, to_mapping
 from vla_zenoh.lab.evaluation.files import evaluate
 from vla_zenoh.lab.evaluation.result import STAGES, Evaluation
 
-PICTURES = 8
+IMAGES = 8
 WIDE = 110
-"""Columns of a terminal in which every column has room."""
+"""Width of a terminal with room for every column, in characters."""
 STDOUT = Path("-")
 
 
 def evaluation(
     paths: Annotated[
         list[Path],
-        typer.Argument(help="Recordings (.mcap), the thesis's CSV, or folders that hold such."),
+        typer.Argument(help="Recordings (.mcap), CSV of the thesis, or folders of them."),
     ],
     first: Annotated[
-        int | None, typer.Option("--first", help="Only so many requests of each run.", min=1)
+        int | None, typer.Option("--first", help="Only this many requests of each run.", min=1)
     ] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write everything to this file; - is stdout.")
@@ -43,15 +43,15 @@ def evaluation(
     html_file: Annotated[
         Path | None, typer.Option("--html", help="Write a page with plots to this file.")
     ] = None,
-    pictures: Annotated[
-        int, typer.Option("--pictures", help="Moments shown of each camera.", min=0, max=50)
-    ] = PICTURES,
+    images: Annotated[
+        int, typer.Option("--images", help="Images of each camera on the page.", min=0, max=50)
+    ] = IMAGES,
 ) -> None:
-    """Evaluate recorded runs: latency, motion, drift, smoothness, refusals.
+    """Evaluate recorded runs: latency, motion, drift, smoothness, rejections.
 
-    Exits with 0 when at least one file could be evaluated; what could not is said on stderr.
+    Exits with 0 if at least one file could be evaluated; stderr says which could not.
     """
-    runs, faults = evaluate(paths, first, pictures=pictures if html_file else 0)
+    runs, faults = evaluate(paths, first, pictures=images if html_file else 0)
     if STDOUT not in (json_file, csv_file):
         _show(runs)
     for run in runs:
@@ -117,17 +117,11 @@ def _show(runs: Sequence[Evaluation]) -> None:
 
 
 def _show_latency(runs: Sequence[Evaluation]) -> None:
-    table = Table(title="latency in ms", title_justify="left", header_style="bold")
+    several, wide = len(runs) > 1, console().width >= WIDE
+    columns = (*(["run"] if several else []), "stage", *tables.LATENCY_COLUMNS)
+    columns += ("",) if wide else ()
+    table = new_table(*columns, title="latency in ms", left=("run", "stage", ""))
     table.box, table.padding = box.SIMPLE_HEAD, (0, 1, 0, 0)
-    several = len(runs) > 1
-    if several:
-        table.add_column("run", overflow="fold")
-    table.add_column("stage")
-    for column in tables.LATENCY_COLUMNS:
-        table.add_column(column, justify="right")
-    wide = console().width >= WIDE
-    if wide:
-        table.add_column("")
     for run in runs:
         name = run.name
         for index, row in enumerate(tables.latency_rows(run)):
@@ -139,10 +133,8 @@ def _show_latency(runs: Sequence[Evaluation]) -> None:
 
 
 def _show_segments(run: Evaluation) -> None:
-    table = Table(title="asked and reached", title_justify="left", header_style="bold")
+    table = new_table(*tables.SEGMENT_COLUMNS, title="asked and reached", left=("prompt",))
     table.box, table.padding = box.SIMPLE_HEAD, (0, 1, 0, 0)
-    for column in tables.SEGMENT_COLUMNS:
-        table.add_column(column, justify="left" if column == "prompt" else "right")
     for row in tables.segment_rows(run):
         table.add_row(*row)
     console().print(table)

@@ -50,7 +50,7 @@ def teleop(
         def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
             settings = _settings_session(loaded, stack)
             node = Teleop(
-                loaded, session, settings, name, stick=stick, frame=frame, level=speed - 1
+                loaded, session, settings, name, device=stick, frame=frame, level=speed - 1
             )
             node.run(stop)
 

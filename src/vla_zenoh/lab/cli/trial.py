@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
-from rich.text import Text
 
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, errors, fail, print_json, printable
+from vla_zenoh.cli.output import console, errors, fail, new_table, print_json
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.plan import TrialPlan
@@ -206,15 +204,13 @@ def _mapping(plan: TrialPlan, result: TrialScore, found: list[EpisodeVerdict]) -
 
 def _show(plan: TrialPlan, result: TrialScore) -> None:
     title = f"{plan.prompt!r}: {result.done} of {result.of} episodes"
-    table = Table(header_style="bold", title=Text(printable(title)), title_justify="left")
     columns = ("worker", "done", "of", "rate", "95 %", "time p50", "brakes", "taken", "void")
-    for column in columns:
-        table.add_column(column, justify="left" if column == "worker" else "right")
+    table = new_table(*columns, title=title, left=("worker",))
     for each in result.workers:
         low, high = each.wilson_95
         time_s = each.time_to_success_s
         table.add_row(
-            Text(printable(each.worker)),
+            each.worker,
             str(each.successes),
             str(each.episodes),
             "" if each.rate is None else f"{each.rate:.1%}",

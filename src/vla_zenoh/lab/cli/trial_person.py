@@ -1,8 +1,8 @@
-"""The person at a trial: somebody at a terminal, or a script that writes lines.
+"""The operator of a trial: a person at a terminal, or a script that writes lines.
 
-To a terminal questions are put on stderr, and what is typed while the arm moves ends the episode.
-A script's lines may all be there from the beginning: while the arm moves an empty line alone is
-taken, and one that means nothing where it stands ends the trial, because all behind it would.
+Questions go to stderr; a line typed while the arm moves ends the episode. A script may write all
+lines in advance: while the arm moves only an empty line is read, and an invalid line ends the
+trial, because the lines after it would be out of step.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from vla_zenoh.lab.trial.verdict import END_WORDS
 WAIT_S = 0.1
 REFRESH_S = 0.2
 MAX_LINE_BYTES = 64 * 1024
-VERDICTS = "y / n / x (void, done again), and a note"
+VERDICTS = "y / n / x (void, repeated), and a note"
 EXPECTED = {
-    Phase.SETUP: "an empty line when it is laid",
+    Phase.SETUP: "an empty line when it is set up",
     Phase.BLOCKED: "an empty line to try again, or x and a note",
     Phase.JUDGE: VERDICTS,
 }
 
 
 class Lines:
-    """Lines of a file descriptor, without waiting for one longer than asked.
+    """Lines of a file descriptor, with a timeout.
 
     Args:
         fd: a terminal, a pipe or a file.
@@ -47,11 +47,11 @@ class Lines:
 
     @property
     def over(self) -> bool:
-        """There is no line, and none will come."""
+        """End of file, and no line is left."""
         return self._eof and not self._buffer
 
     def peek(self, timeout_s: float) -> str | None:
-        """The next line, which stays; None: it is not there within that time."""
+        """The next line without consuming it; None after the timeout."""
         if not self._whole() and select.select([self._fd], [], [], timeout_s)[0]:
             data = b""
             with suppress(OSError):  # a terminal that is gone
@@ -63,32 +63,31 @@ class Lines:
         return self._buffer.partition(b"\n")[0].decode("utf-8", "replace").rstrip("\r")
 
     def take(self, timeout_s: float) -> str | None:
-        """Likewise, and it is gone then."""
+        """Consume the next line; None after the timeout."""
         line = self.peek(timeout_s)
         if line is not None:
             self._buffer = self._buffer.partition(b"\n")[2]
         return line
 
     def forget(self) -> None:
-        """What a person typed before now was not meant for what is asked now."""
+        """Discard what was typed before the next question."""
         termios.tcflush(self._fd, termios.TCIFLUSH)
         self._buffer = b""
 
     def _whole(self) -> bool:
-        # At the end of all what has no line feed is a line; more than this is none any more.
+        # Text without a line feed is a line at end of file, or when it is too long.
         too_long = len(self._buffer) >= MAX_LINE_BYTES
         return b"\n" in self._buffer or too_long or (self._eof and bool(self._buffer))
 
 
 class TrialPerson:
-    """See the module.
+    """The operator at a terminal or behind a pipe; implements `Operator`.
 
     Args:
         plan: of the trial.
-        fd: where lines come from.
+        fd: source of the lines.
         stop: set by Ctrl-C.
-        lays: setups are laid by somebody else: nobody is asked whether they are, but after an
-            episode that somebody or something else has ended.
+        lays: setups are prepared: ask only after an episode that something else ended.
     """
 
     def __init__(self, plan: TrialPlan, fd: int, stop: threading.Event, *, lays: bool) -> None:
@@ -106,18 +105,16 @@ class TrialPerson:
             self._say(self._setup(episode), style="bold")
             if self._lays and not episode.needs_confirmation:
                 return ""
-            question = "lay it, then press Enter:"
+            question = "set it up, then press Enter:"
             if episode.needs_confirmation:
-                question = (
-                    "the arm was taken away before: lay it, see that it may move, then Enter:"
-                )
+                question = "the arm was deactivated: set it up, check that it may move, then Enter:"
         elif phase is Phase.BLOCKED:
             self._say(self._plan.hide(episode.reasons), style="yellow")
-            question = "repair it, then press Enter; or x (void, done again), and a note:"
+            question = "fix it, then press Enter; or x (void, repeated), and a note:"
         else:
             question = f"did it succeed? {VERDICTS}:"
         if self._terminal and phase is not Phase.JUDGE:
-            self._lines.forget()  # an Enter too many is not to move an arm
+            self._lines.forget()  # a surplus Enter must not move the arm
         self._say(question, end=" " if self._terminal else "\n")
         return self._wait()
 
@@ -135,7 +132,7 @@ class TrialPerson:
                 raise Interrupted
             if self._lines.over:
                 raise NodeError(
-                    "standard input has ended before the trial; the same command goes on with it"
+                    "standard input has ended before the trial; the same command continues it"
                 )
         return line
 
@@ -145,9 +142,9 @@ class TrialPerson:
         Raises:
             NodeError: it is a line of a script.
         """
-        said = f"{line[:80]!r} means nothing here: {EXPECTED[phase]}"
+        said = f"{line[:80]!r} is not valid here: {EXPECTED[phase]}"
         if not self._terminal:
-            raise NodeError(f"{said}; the same command goes on with the trial")
+            raise NodeError(f"{said}; the same command continues the trial")
         self._say(said, style="yellow")
 
     # -- while the arm moves ------------------------------------------------------------------
@@ -155,7 +152,7 @@ class TrialPerson:
         """See `Operator`.
 
         Raises:
-            NodeError: a script has ended, so nobody would judge.
+            NodeError: a script has ended, so there is no judge.
         """
         if self._terminal:
             line = self._lines.take(0.0)
@@ -164,8 +161,8 @@ class TrialPerson:
             return self._lines.take(0.0)
         if self._lines.over:
             raise NodeError(
-                "standard input has ended while an episode runs; the same command goes on with "
-                "the trial"
+                "standard input has ended while an episode runs; the same command continues the "
+                "trial"
             )
         return None
 

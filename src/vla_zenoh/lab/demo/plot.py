@@ -1,4 +1,4 @@
-"""One picture of a run: path, orientation, speed against its limit, latency."""
+"""Plot of a run: path, orientation, speed against its limit, latency."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def plot_run(
     """Draw a run into a PNG.
 
     Args:
-        path: of the picture.
+        path: of the file.
         profile: for limits and names.
         poses: measured, as heard.
         commands: as heard.

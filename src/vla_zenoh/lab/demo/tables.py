@@ -1,4 +1,4 @@
-"""A run as files that any tool reads: CSV of commands and measured poses, and the chunks."""
+"""Run folder: commands and measured poses as CSV, and the chunks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COMMAND_COLUMNS = (*POSE_COLUMNS, "goal_x_m", "goal_y_m", "goal_z_m", "state", "
 
 
 def write_commands(path: Path, commands: Iterable[Any]) -> None:
-    """One row per pose command."""
+    """Write one row per pose command."""
     rows = (
         [
             entry.received_ns,
@@ -39,7 +39,7 @@ def write_commands(path: Path, commands: Iterable[Any]) -> None:
 
 
 def write_poses(path: Path, poses: Iterable[Any]) -> None:
-    """One row per measured pose."""
+    """Write one row per measured pose."""
     rows = (
         [
             entry.received_ns,
@@ -55,7 +55,7 @@ def write_poses(path: Path, poses: Iterable[Any]) -> None:
 
 
 def write_chunks(path: Path, spec: ModelSpec, chunks: Sequence[np.ndarray]) -> None:
-    """A chunk file for ``vla-zenoh worker replay``: spec, steps (N, H, D), length (N,)."""
+    """Write a chunk file for ``vla-zenoh worker replay``: spec, steps (N, H, D), length (N,)."""
     horizon, dimension = spec.action.horizon, spec.action.dimension
     steps = np.zeros((len(chunks), horizon, dimension), np.float32)
     for index, chunk in enumerate(chunks):

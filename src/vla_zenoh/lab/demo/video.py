@@ -1,4 +1,4 @@
-"""The front camera's pictures as an MP4 that every browser plays, with the prompt written in."""
+"""Images of a camera as MP4, with the prompt drawn in."""
 
 from __future__ import annotations
 

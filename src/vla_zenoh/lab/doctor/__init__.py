@@ -1,4 +1,4 @@
-"""Looks at a host: what is there, what is missing, and the package or setting that helps."""
+"""Diagnosis of a host: what is missing, and the package or setting that helps."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ ROLES: tuple[Role, ...] = ("base", "control", "sim", "ros2")
 
 
 def examine(needs: Needs, try_zenoh: Callable[[str], str]) -> Iterator[HostFinding]:
-    """All checks, one after the other, each as soon as it is done; some take seconds.
+    """Run all checks; yields each finding as soon as it is made. Some take seconds.
 
     Args:
-        needs: what this host is for.
-        try_zenoh: opens a session at an endpoint and closes it; returns the reason if it cannot.
+        needs: of this host.
+        try_zenoh: opens a session at an endpoint and closes it; returns why that failed, or "".
     """
     yield python_version()
     results = {role: libraries(role, required=role in needs.roles) for role in ROLES}

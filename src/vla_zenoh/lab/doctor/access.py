@@ -1,4 +1,4 @@
-"""Whether strangers are kept out, and whether everybody else can do their part."""
+"""Checks of access: the router, the certificates of this host, and the rules of the profile."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import datetime as dt
 import re
 import socket
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol
+from dataclasses import dataclass
 
 from vla_zenoh.errors import MissingExtraError, SecurityError, VlaZenohError
 from vla_zenoh.lab.doctor.finding import HostFinding
@@ -19,35 +19,39 @@ from vla_zenoh.security.unused_certificates import unused_certificates
 
 SHOWN_FAULTS = 6
 SERVERS = ("router", BRIDGE)
-"""Whose certificates are not shown to the router."""
+"""Nodes whose certificates are not presented to the router."""
 
 
-class Tried(Protocol):
-    """What came of trying everything in the name of one identity."""
+@dataclass(frozen=True, slots=True)
+class AccessVerdict:
+    """Result of the access test for one identity.
 
-    @property
-    def identity(self) -> Identity: ...
-    @property
-    def must(self) -> int: ...
-    @property
-    def must_not(self) -> int: ...
-    @property
-    def faults(self) -> tuple[str, ...]: ...
+    Args:
+        identity: that verdict.
+        must: number of acts that it must be able to do.
+        must_not: number of acts that it must not be able to do.
+        faults: each a sentence with the rule that is missing or too much.
+    """
+
+    identity: Identity
+    must: int
+    must_not: int
+    faults: tuple[str, ...]
 
 
 def access(
     profile: Profile,
     now: dt.datetime,
-    check_access: Callable[[], Sequence[Tried]],
+    check_access: Callable[[], Sequence[AccessVerdict]],
     try_identity: Callable[[str], str],
 ) -> Iterator[HostFinding]:
-    """The certificates of this computer, the rules of the profile, and what the router makes of it.
+    """Certificates of this computer, rules of the profile, and the running router.
 
     Args:
         profile: the lab.
         now: UTC.
-        rehearse: tries the rules with real sessions.
-        try_identity: shows the certificate of a node of this computer to the running router;
+        check_access: the access test.
+        try_identity: presents the certificate of a node of this computer to the running router;
             returns what is wrong.
     """
     security = profile.session.security
@@ -67,23 +71,23 @@ def access(
     try:
         yield from map(rules, check_access())
     except VlaZenohError as error:
-        yield HostFinding("access", "fail", f"the rules could not be tried: {error}")
+        yield HostFinding("access", "fail", f"the access test failed: {error}")
     for entry in entries:
         if entry.node not in SERVERS and not entry.faults:
             yield _accepted(entry, try_identity)
 
 
 def certificates(host: str, entries: Sequence[Entry]) -> HostFinding:
-    """Whether those of this host are good, and for how long."""
+    """Validity of the certificates of this host."""
     name = f"certificates of {host}"
     if not entries:
-        return HostFinding(name, "fail", "there are none", f"vla-zenoh secure add {host}")
+        return HostFinding(name, "fail", "none", f"vla-zenoh secure add {host}")
     faults = [f"{entry.path.name} {fault}" for entry in entries for fault in entry.faults]
     soon = [f"{entry.path.name} {entry.warning}" for entry in entries if entry.warning]
     if faults:
-        said = "; ".join((*faults, *soon))
+        found = "; ".join((*faults, *soon))
         return HostFinding(
-            name, "fail", said, f"vla-zenoh secure add {host} --renew, and copy them"
+            name, "fail", found, f"vla-zenoh secure add {host} --renew, and copy them"
         )
     if soon:
         return HostFinding(name, "warn", "; ".join(soon), f"vla-zenoh secure add {host} --renew")
@@ -91,20 +95,20 @@ def certificates(host: str, entries: Sequence[Entry]) -> HostFinding:
     return HostFinding(name, "ok", f"{len(entries)}, all valid until {end:%Y-%m-%d}")
 
 
-def rules(tried: Tried) -> HostFinding:
-    """What one identity could and could not do."""
-    name = f"access {tried.identity.common_name}"
-    if not tried.faults:
-        said = f"can do all {tried.must} things of its role, none of {tried.must_not} others"
-        return HostFinding(name, "ok", said)
-    shown = list(tried.faults[:SHOWN_FAULTS])
-    if len(tried.faults) > SHOWN_FAULTS:
-        shown.append(f"and {len(tried.faults) - SHOWN_FAULTS} more")
+def rules(verdict: AccessVerdict) -> HostFinding:
+    """Finding on the access of one identity."""
+    name = f"access {verdict.identity.common_name}"
+    if not verdict.faults:
+        found = f"can do all {verdict.must} acts of its role, none of {verdict.must_not} others"
+        return HostFinding(name, "ok", found)
+    shown = list(verdict.faults[:SHOWN_FAULTS])
+    if len(verdict.faults) > SHOWN_FAULTS:
+        shown.append(f"and {len(verdict.faults) - SHOWN_FAULTS} more")
     return HostFinding(
         name,
         "fail",
         "\n".join(shown),
-        "write the router's rules anew: vla-zenoh node router --config > FILE",
+        "regenerate the router's rules: vla-zenoh node router --config > FILE",
     )
 
 
@@ -114,17 +118,17 @@ def _accepted(entry: Entry, try_identity: Callable[[str], str]) -> HostFinding:
         why = try_identity(entry.node)
     except VlaZenohError as error:
         return HostFinding(name, "warn", str(error))
-    return HostFinding(name, "fail" if why else "ok", why or "and knows it")
+    return HostFinding(name, "fail" if why else "ok", why or "and grants it access")
 
 
 def _without(profile: Profile) -> HostFinding:
     if all(map(is_loopback, profile.session.listen)):
-        said = "no certificates; the router listens on this computer only"
-        return HostFinding("access", "ok", said)
+        found = "no certificates; the router listens on this computer only"
+        return HostFinding("access", "ok", found)
     return HostFinding(
         "access",
         "warn",
-        "everybody on the network can command this robot",
+        "anyone on the network can command this robot",
         "vla-zenoh secure init makes certificates and rules",
     )
 
@@ -139,8 +143,8 @@ def router(endpoint: str, *, is_router: bool, try_zenoh: Callable[[str], str]) -
 
     Args:
         endpoint: as Zenoh writes it, ``tcp/127.0.0.1:7447``.
-        is_router: the router is to run on this host.
-        try_zenoh: opens a session there and closes it; returns the reason when it cannot.
+        is_router: the router runs on this host.
+        try_zenoh: opens a session there and closes it; returns why that failed, or "".
     """
     name = f"router {endpoint}"
     match = _TCP.match(endpoint)
@@ -152,22 +156,20 @@ def router(endpoint: str, *, is_router: bool, try_zenoh: Callable[[str], str]) -
         socket.create_connection((host, port), timeout=CONNECT_LIMIT_S).close()
     except socket.gaierror:
         return HostFinding(
-            name, "fail", f"no host is called {host!r}", "correct session.connect in the profile"
+            name, "fail", f"no host has the name {host!r}", "correct session.connect in the profile"
         )
     except OSError as error:
         return _silent(name, error.strerror or "no answer", is_router)
     if endpoint.startswith("tls/"):
-        return HostFinding(
-            name, "ok", "something listens; its certificate is looked at by the nodes"
-        )
+        return HostFinding(name, "ok", "a server listens; nodes check its certificate")
     error = try_zenoh(endpoint)
     if not error:
         return HostFinding(name, "ok", "answers")
     return HostFinding(
         name,
         "fail",
-        f"the port is taken by something that does not speak Zenoh ({error})",
-        f"see what it is: sudo ss -ltnp 'sport = :{port}'; stop it, or take another port in "
+        f"the port is in use by another program than Zenoh ({error})",
+        f"find it: sudo ss -ltnp 'sport = :{port}'; stop it, or set another port in "
         "session.listen and session.connect of the profile",
     )
 

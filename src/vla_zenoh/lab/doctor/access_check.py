@@ -1,8 +1,8 @@
-"""Tries with real sessions whether every role can do what it must, and nothing else.
+"""Access test: tries with real sessions that every role can do what it must, and nothing else.
 
-Zenoh drops without a word what a rule forbids, so a rule that is missing looks like a node that
-hangs. Here a router with the very rules of the profile is opened on this computer, with
-certificates made for the occasion, and everybody in the lab tries everything on every key.
+Zenoh drops silently what a rule forbids, so that a missing rule looks like a node that hangs. This
+test opens a router on this computer, with the rules of the profile and certificates of its own, and
+lets every identity of the lab try every act on every key.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ import zenoh
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import Keys, covers
+from vla_zenoh.lab.doctor.access import AccessVerdict
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import SecurityProfile
 from vla_zenoh.security.identity import Identity, Role, identities
@@ -31,27 +31,18 @@ from vla_zenoh.security.roles import TABLE, Act, Right, expressions, rights
 from vla_zenoh.security.rules import EVERY_MESSAGE, access_control, allowing, missing, passages
 from vla_zenoh.security.store import Store
 
-Tried = frozenset[tuple[str, Act, str]]
+Done = set[tuple[str, Act, str]]
 """(common name, act, key) of what went through."""
+Sessions = Mapping[str, zenoh.Session]
+"""Common name -> session."""
 Part = tuple[Keys, Identity]
-"""At which robot somebody is what."""
+"""An identity at one robot."""
 
-
-@dataclass(frozen=True, slots=True)
-class AccessVerdict:
-    """What came of it for one identity.
-
-    Args:
-        identity: whose.
-        must: how many things it must be able to do.
-        must_not: how many it must not.
-        faults: sentences, each with the rule that is missing or too much.
-    """
-
-    identity: Identity
-    must: int
-    must_not: int
-    faults: tuple[str, ...]
+SETTLE_S = 0.4
+"""From a declaration until all sessions on one computer know of it."""
+REPLY_S = 2.0
+WITNESS = Identity(Role.ROUTER, "witness", "rehearsal")
+"""Peer of every act; it may do everything, as routers may."""
 
 
 def check_access(
@@ -59,41 +50,41 @@ def check_access(
     access: Mapping[str, Any] | None = None,
     also: Sequence[Profile] = (),
 ) -> list[AccessVerdict]:
-    """Try everything; takes some seconds.
+    """Run the access test; takes some seconds.
 
     Args:
         profile: the lab.
-        access: another section ``access_control`` than that which is made of the profiles.
-        also: other robots that the router serves. Everybody of each tries the keys of all.
+        access: section ``access_control`` to test; None: the one made of the profiles.
+        also: other robots of the router; every identity of each tries the keys of all.
 
     Raises:
         MissingExtraError: the library ``cryptography`` is not installed.
         SecurityError: certificates cannot be made.
-        SessionError: no sessions could be opened here, or a certificate was not accepted.
+        SessionError: no session can be opened, or a certificate is not accepted.
     """
     profiles = (profile, *also)
     parts = _parts(profiles)
     lab = [played[0][1] for played in parts.values()]
     rules = dict(access_control(profiles) if access is None else access)
-    cast = probes(profiles)
-    keys = [each.keys for each in profiles]
+    keys_of = probes(profiles)
+    robots = [each.keys for each in profiles]
     with _stage(profile, lab, _with_witness(rules)) as (witness, sessions):
-        went: Tried = frozenset().union(
-            # First: a session that has had a publisher knows where nobody listens to it, and sends
-            # nothing there, whatever the router would let through.
-            deletions(witness, sessions, cast[Act.DELETE]),
-            puts(witness, sessions, cast[Act.PUT]),
-            subscriptions(witness, sessions, cast[Act.SUBSCRIBE]),
-            questions(witness, sessions, cast[Act.ASK]),
-            answers(witness, sessions, cast[Act.ANSWER]),
-            tokens(witness, sessions, cast[Act.ANNOUNCE], keys),
-            watching(witness, sessions, keys),
+        done: Done = set().union(
+            # First: a session that has had a publisher on a key without a subscriber sends nothing
+            # there, whatever the router would let through.
+            _deletions(witness, sessions, keys_of[Act.DELETE]),
+            _puts(witness, sessions, keys_of[Act.PUT]),
+            _subscriptions(witness, sessions, keys_of[Act.SUBSCRIBE]),
+            _queries(witness, sessions, keys_of[Act.ASK]),
+            _replies(witness, sessions, keys_of[Act.ANSWER]),
+            _tokens(witness, sessions, keys_of[Act.ANNOUNCE], robots),
+            _watched_tokens(witness, sessions, robots),
         )
-    return [_judge(played, cast, rules, went) for played in parts.values()]
+    return [_judge(played, keys_of, rules, done) for played in parts.values()]
 
 
 def _parts(profiles: Sequence[Profile]) -> dict[str, list[Part]]:
-    """Common name -> what it is at each robot where it is somebody; without routers."""
+    """Common name -> its identity at every robot where it has one; without routers."""
     out: dict[str, list[Part]] = {}
     for profile in profiles:
         for one in identities(profile):
@@ -103,35 +94,37 @@ def _parts(profiles: Sequence[Profile]) -> dict[str, list[Part]]:
 
 
 def probes(profiles: Sequence[Profile]) -> dict[Act, list[str]]:
-    """Act -> every key of the lab on which somebody may do it or its counterpart.
+    """Act -> every key of the lab on which some identity may do it or its counterpart.
 
-    What is put may be tried to be deleted; tokens are watched all at once.
+    Every key of PUT is also tried with DELETE; tokens are watched all at once.
     """
     made: dict[str, set[Act]] = {}
     for profile in profiles:
-        somewhere = next(iter(profile.cameras), "front")
+        camera = next(iter(profile.cameras), "front")
         for row, identity in product(TABLE, identities(profile)):
             acts = {act for act in Act if row.roles(act)}
             for act in acts & {Act.PUT, Act.ANSWER, Act.ANNOUNCE}:
                 for key in expressions(profile.keys, row.member, identity, act):
-                    made.setdefault(key.replace("*", somewhere), set()).update(acts)
-    cast = {act: sorted(key for key, acts in made.items() if act in acts) for act in Act}
-    watched = [one for profile in profiles for one in tokens_of(profile.keys)]
-    return {**cast, Act.DELETE: cast[Act.PUT], Act.WATCH: watched}
+                    made.setdefault(key.replace("*", camera), set()).update(acts)
+    keys_of = {act: sorted(key for key, acts in made.items() if act in acts) for act in Act}
+    watched = [one for profile in profiles for one in _token_selectors(profile.keys)]
+    return {**keys_of, Act.DELETE: keys_of[Act.PUT], Act.WATCH: watched}
 
 
-# -- the stage ------------------------------------------------------------------------------------
+# -- router and sessions --------------------------------------------------------------------------
 @contextmanager
 def _stage(
     profile: Profile, lab: Sequence[Identity], rules: Mapping[str, Any]
-) -> Iterator[tuple[zenoh.Session, dict[str, zenoh.Session]]]:
-    """A router with `rules`, a witness, and a session for everybody."""
+) -> Iterator[tuple[zenoh.Session, Sessions]]:
+    """A router with `rules`, a witness, and a session for every identity."""
     with tempfile.TemporaryDirectory(prefix="vla-zenoh-rehearsal-") as folder, ExitStack() as stack:
         store, now = Store(folder), dt.datetime.now(dt.UTC)
         store.make_authority("rehearsal", now)
         router = Identity(Role.ROUTER, "router", WITNESS.host)
         store.add([router, WITNESS, *lab], now, days=1, addresses=["127.0.0.1"])
-        endpoint = f"tls/127.0.0.1:{_free_port()}"
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            endpoint = f"tls/127.0.0.1:{probe.getsockname()[1]}"
         session = profile.session.model_copy(
             update={
                 "connect": (endpoint,),
@@ -143,8 +136,8 @@ def _stage(
 
         def enter(one: Identity, **more: Any) -> zenoh.Session:
             security = SecurityProfile(folder=folder, host=one.host)
-            mine = session.model_copy(update={"security": security})
-            return stack.enter_context(open_session(mine, identity=one.node, **more))
+            own = session.model_copy(update={"security": security})
+            return stack.enter_context(open_session(own, identity=one.node, **more))
 
         enter(router, mode="router", access=rules)
         witness = enter(WITNESS)
@@ -152,7 +145,6 @@ def _stage(
 
 
 def _with_witness(rules: Mapping[str, Any]) -> dict[str, Any]:
-    more = access_control([])
     everything = {
         "id": "witness",
         "messages": list(EVERY_MESSAGE),
@@ -161,183 +153,92 @@ def _with_witness(rules: Mapping[str, Any]) -> dict[str, Any]:
         "key_exprs": ["**"],
     }
     subject = {"id": "witness", "cert_common_names": [WITNESS.common_name]}
+    policy = {"rules": ["witness"], "subjects": ["witness"]}
     return {
-        **more,
+        **access_control([]),
         **rules,
         "rules": [*(rules.get("rules") or ()), everything],
         "subjects": [*(rules.get("subjects") or ()), subject],
-        "policies": [
-            *(rules.get("policies") or ()),
-            {"rules": ["witness"], "subjects": ["witness"]},
-        ],
+        "policies": [*(rules.get("policies") or ()), policy],
     }
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-# -- the verdict ----------------------------------------------------------------------------------
-def _judge(
-    played: Sequence[Part],
-    cast: Mapping[Act, Sequence[str]],
-    rules: Mapping[str, Any],
-    went: Tried,
-) -> AccessVerdict:
-    one = played[0][1]
-    granted = [right for keys, part in played for right in rights(keys, part)]
-    faults: list[str] = []
-    count = {True: 0, False: 0}
-    for act in Act:
-        for key in cast[act]:
-            must = _must(played, granted, act, key)
-            count[must] += 1
-            done = (one.common_name, act, key) in went
-            if done != must:
-                faults.append(_fault(rules, one, act, key, must=must))
-    return AccessVerdict(one, count[True], count[False], tuple(faults))
-
-
-def _must(played: Sequence[Part], granted: Sequence[Right], act: Act, key: str) -> bool:
-    if act is Act.SUBSCRIBE and any(
-        Role.OPERATOR in one.roles and covers(keys.all_keys, key) for keys, one in played
-    ):
-        return True
-    return any(right.act is act and covers(right.key, key) for right in granted)
-
-
-def _fault(rules: Mapping[str, Any], one: Identity, act: Act, key: str, *, must: bool) -> str:
-    what = f"{one.common_name} {'cannot' if must else 'can'} {act.value} {key}"
-    if must:
-        lacking = ", ".join(map(str, missing(rules, one, act, key)))
-        return (
-            f"{what}: {f'no rule allows {lacking}' if lacking else 'Zenoh drops it all the same'}"
-        )
-    first = passages(act, key)[0]
-    named = ", ".join(allowing(rules, one.common_name, first))
-    return f"{what} and must not: {f'rule {named!r} allows it' if named else 'nothing denies it'}"
-
-
-# -- the running router ---------------------------------------------------------------------------
-def try_identity(profile: Profile, node: str | None) -> str:
-    """Why the running router does not serve this computer's certificate for `node`; empty: it does.
-
-    Args:
-        profile: the lab.
-        node: whose certificate; None: that of the people here.
-
-    Raises:
-        SessionError: no router answers, or it refuses the certificate.
-        SecurityError: the certificate is not there.
-    """
-    with open_session(profile.session, identity=node) as session:
-        if alive(session, profile.keys):
-            return ""
-    return (
-        "the router takes the certificate and gives it nothing: it does not know this name. "
-        "Start the router again with this profile, or see whether any node is up"
-    )
-
-
-def read_access(file: Path) -> dict[str, Any]:
-    """The section ``access_control`` of a Zenoh configuration file.
-
-    Raises:
-        SecurityError: it cannot be read.
-    """
-    try:
-        text = zenoh.Config.from_file(str(file)).get_json("access_control")
-    except (zenoh.ZError, OSError) as error:
-        raise SecurityError(f"{file} is no configuration of Zenoh: {error}") from error
-    return dict(json.loads(text) or {})
-
-
-SETTLE_S = 0.4
-"""From a declaration until everybody who is concerned knows of it, on one computer."""
-ANSWER_S = 2.0
-WITNESS = Identity(Role.ROUTER, "witness", "rehearsal")
-"""Hears and says everything, as routers do."""
-
-
-def _listen(session: zenoh.Session, keys: Sequence[str], take: Callable[[Any], None]) -> list[Any]:
-    handler = zenoh.handlers.Callback(take, indirect=False)
+# -- acts: each returns what went through between a session and the witness -----------------------
+def _subscribe(
+    session: zenoh.Session, keys: Sequence[str], callback: Callable[[zenoh.Sample], None]
+) -> list[Any]:
+    handler = zenoh.handlers.Callback(callback, indirect=False)
     return [session.declare_subscriber(key, handler) for key in keys]
 
 
-def _end(declared: Sequence[Any]) -> None:
+def _undeclare(declared: Sequence[Any]) -> None:
     for one in declared:
         one.undeclare()
 
 
-def puts(
-    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
-) -> set[tuple[str, Act, str]]:
-    """What of each session's puts arrived at the witness, as (common name, act, key)."""
-    heard: set[tuple[str, Act, str]] = set()
-    listening = _listen(
+def _puts(witness: zenoh.Session, sessions: Sessions, keys: Sequence[str]) -> Done:
+    """Publications that the witness receives."""
+    received: Done = set()
+    subscribers = _subscribe(
         witness,
         keys,
-        lambda sample: heard.add((sample.payload.to_string(), Act.PUT, str(sample.key_expr))),
+        lambda sample: received.add((sample.payload.to_string(), Act.PUT, str(sample.key_expr))),
     )
-    # As nodes write: a publisher that is never told of a listener sends nothing.
-    writing = [
+    # Publishers, as in the nodes: one that learns of no subscriber sends nothing.
+    publishers = [
         (name, session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK))
         for name, session in sessions.items()
         for key in keys
     ]
     time.sleep(SETTLE_S)
-    for name, publisher in writing:
+    for name, publisher in publishers:
         publisher.put(name)
     time.sleep(SETTLE_S)
     matching = {
         (name, Act.PUT, str(publisher.key_expr))
-        for name, publisher in writing
+        for name, publisher in publishers
         if publisher.matching_status.matching  # pyright: ignore  # stub says bool
     }
-    _end([*listening, *(publisher for _, publisher in writing)])
-    return heard & matching
+    _undeclare([*subscribers, *(publisher for _, publisher in publishers)])
+    return received & matching
 
 
-def deletions(
-    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
-) -> set[tuple[str, Act, str]]:
-    """Which of each session's deletions arrived at the witness. Nobody needs to be told of him."""
-    heard: set[tuple[str, Act, str]] = set()
+def _deletions(witness: zenoh.Session, sessions: Sessions, keys: Sequence[str]) -> Done:
+    """Deletions that the witness receives."""
+    received: Done = set()
 
-    def hear(sample: zenoh.Sample) -> None:
+    def on_sample(sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.DELETE and sample.attachment is not None:
-            heard.add((sample.attachment.to_string(), Act.DELETE, str(sample.key_expr)))
+            received.add((sample.attachment.to_string(), Act.DELETE, str(sample.key_expr)))
 
-    listening = _listen(witness, keys, hear)
+    subscribers = _subscribe(witness, keys, on_sample)
     time.sleep(SETTLE_S)
     for name, session in sessions.items():
         for key in keys:
             session.delete(key, attachment=name, congestion_control=zenoh.CongestionControl.BLOCK)
     time.sleep(SETTLE_S)
-    _end(listening)
-    return set(heard)
+    _undeclare(subscribers)
+    return set(received)
 
 
-def subscriptions(
-    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
-) -> set[tuple[str, Act, str]]:
-    """Which keys each session hears the witness on."""
-    heard: set[tuple[str, Act, str]] = set()
+def _subscriptions(witness: zenoh.Session, sessions: Sessions, keys: Sequence[str]) -> Done:
+    """Keys on which each session receives the witness."""
+    received: Done = set()
 
-    def hear(name: str) -> Callable[[zenoh.Sample], None]:
-        return lambda sample: heard.add((name, Act.SUBSCRIBE, str(sample.key_expr)))
+    def callback(name: str) -> Callable[[zenoh.Sample], None]:
+        return lambda sample: received.add((name, Act.SUBSCRIBE, str(sample.key_expr)))
 
-    listening = [
-        one for name, session in sessions.items() for one in _listen(session, keys, hear(name))
+    subscribers = [
+        one
+        for name, session in sessions.items()
+        for one in _subscribe(session, keys, callback(name))
     ]
     time.sleep(SETTLE_S)
     for key in keys:
         witness.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
     time.sleep(SETTLE_S)
-    _end(listening)
-    return set(heard)
+    _undeclare(subscribers)
+    return set(received)
 
 
 def _serve(session: zenoh.Session, keys: Sequence[str], name: str) -> list[Any]:
@@ -356,90 +257,151 @@ def _serve(session: zenoh.Session, keys: Sequence[str], name: str) -> list[Any]:
     ]
 
 
-def questions(
-    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
-) -> set[tuple[str, Act, str]]:
-    """Which keys each session is answered on by the witness."""
-    serving = _serve(witness, keys, "witness")
+def _queries(witness: zenoh.Session, sessions: Sessions, keys: Sequence[str]) -> Done:
+    """Queries that the witness replies to."""
+    queryables = _serve(witness, keys, "witness")
     time.sleep(SETTLE_S)
-    found = {
+    done = {
         (name, Act.ASK, key)
         for name, session in sessions.items()
         for key in keys
-        if any(reply.ok is not None for reply in session.get(key, timeout=ANSWER_S))
+        if any(reply.ok is not None for reply in session.get(key, timeout=REPLY_S))
     }
-    _end(serving)
-    return found
+    _undeclare(queryables)
+    return done
 
 
-def answers(
-    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], keys: Sequence[str]
-) -> set[tuple[str, Act, str]]:
-    """Which keys each session answers the witness on."""
-    serving = [one for name, session in sessions.items() for one in _serve(session, keys, name)]
+def _replies(witness: zenoh.Session, sessions: Sessions, keys: Sequence[str]) -> Done:
+    """Replies to queries of the witness."""
+    queryables = [one for name, session in sessions.items() for one in _serve(session, keys, name)]
     time.sleep(SETTLE_S)
-    found: set[tuple[str, Act, str]] = set()
+    done: Done = set()
     for key in keys:
         replies = witness.get(
             key,
-            timeout=ANSWER_S,
+            timeout=REPLY_S,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
         )
-        heard = [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
-        found |= {(name, Act.ANSWER, key) for name in heard}
-    _end(serving)
-    return found
+        names = [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
+        done |= {(name, Act.ANSWER, key) for name in names}
+    _undeclare(queryables)
+    return done
 
 
-def tokens(
-    witness: zenoh.Session,
-    sessions: Mapping[str, zenoh.Session],
-    keys: Sequence[str],
-    robots: Sequence[Keys],
-) -> set[tuple[str, Act, str]]:
-    """Which liveliness tokens of each session the witness sees."""
-    found: set[tuple[str, Act, str]] = set()
+def _tokens(
+    witness: zenoh.Session, sessions: Sessions, keys: Sequence[str], robots: Sequence[Keys]
+) -> Done:
+    """Liveliness tokens that the witness sees."""
+    done: Done = set()
     for name, session in sessions.items():
         tokens = [session.liveliness().declare_token(key) for key in keys]
         time.sleep(SETTLE_S)
-        found |= {(name, Act.ANNOUNCE, key) for of in robots for key in alive(witness, of)}
-        _end(tokens)
+        done |= {(name, Act.ANNOUNCE, key) for of in robots for key in _live_tokens(witness, of)}
+        _undeclare(tokens)
         time.sleep(SETTLE_S)
-    return found
+    return done
 
 
-def watching(
-    witness: zenoh.Session, sessions: Mapping[str, zenoh.Session], robots: Sequence[Keys]
-) -> set[tuple[str, Act, str]]:
-    """Whether each session sees the witness's liveliness tokens."""
+def _watched_tokens(witness: zenoh.Session, sessions: Sessions, robots: Sequence[Keys]) -> Done:
+    """Liveliness tokens of the witness that each session sees."""
     own = {
-        expression: expression.replace("*", WITNESS.node)
+        selector: selector.replace("*", WITNESS.node)
         for of in robots
-        for expression in tokens_of(of)
+        for selector in _token_selectors(of)
     }
     tokens = [witness.liveliness().declare_token(key) for key in own.values()]
     time.sleep(SETTLE_S)
-    found = {
-        (name, Act.WATCH, expression)
+    done = {
+        (name, Act.WATCH, selector)
         for name, session in sessions.items()
-        for expression, key in own.items()
-        if key in _tokens(session, expression)
+        for selector, key in own.items()
+        if key in _tokens_of(session, selector)
     }
-    _end(tokens)
-    return found
+    _undeclare(tokens)
+    return done
 
 
-def tokens_of(keys: Keys) -> tuple[str, ...]:
-    """Every selector of liveliness tokens of a robot."""
+def _token_selectors(keys: Keys) -> tuple[str, ...]:
     return keys.all_alive, keys.all_holding
 
 
-def alive(session: zenoh.Session, keys: Keys) -> set[str]:
-    """Keys of all liveliness tokens of a robot that this session sees."""
-    return {key for expression in tokens_of(keys) for key in _tokens(session, expression)}
+def _live_tokens(session: zenoh.Session, keys: Keys) -> set[str]:
+    return {key for selector in _token_selectors(keys) for key in _tokens_of(session, selector)}
 
 
-def _tokens(session: zenoh.Session, expression: str) -> set[str]:
-    replies = session.liveliness().get(expression, timeout=ANSWER_S)
+def _tokens_of(session: zenoh.Session, selector: str) -> set[str]:
+    replies = session.liveliness().get(selector, timeout=REPLY_S)
     return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+
+
+# -- verdict --------------------------------------------------------------------------------------
+def _judge(
+    played: Sequence[Part],
+    keys_of: Mapping[Act, Sequence[str]],
+    rules: Mapping[str, Any],
+    done: Done,
+) -> AccessVerdict:
+    one = played[0][1]
+    granted = [right for keys, part in played for right in rights(keys, part)]
+    faults: list[str] = []
+    count = {True: 0, False: 0}
+    for act in Act:
+        for key in keys_of[act]:
+            must = _must(played, granted, act, key)
+            count[must] += 1
+            if ((one.common_name, act, key) in done) != must:
+                faults.append(_fault(rules, one, act, key, must=must))
+    return AccessVerdict(one, count[True], count[False], tuple(faults))
+
+
+def _must(played: Sequence[Part], granted: Sequence[Right], act: Act, key: str) -> bool:
+    if act is Act.SUBSCRIBE and any(
+        Role.OPERATOR in one.roles and covers(keys.all_keys, key) for keys, one in played
+    ):
+        return True
+    return any(right.act is act and covers(right.key, key) for right in granted)
+
+
+def _fault(rules: Mapping[str, Any], one: Identity, act: Act, key: str, *, must: bool) -> str:
+    what = f"{one.common_name} {'cannot' if must else 'can'} {act.value} {key}"
+    if must:
+        lacking = ", ".join(map(str, missing(rules, one, act, key)))
+        why = f"no rule allows {lacking}" if lacking else "Zenoh drops it although rules allow it"
+        return f"{what}: {why}"
+    names = ", ".join(allowing(rules, one.common_name, passages(act, key)[0]))
+    return f"{what} and must not: {f'rule {names!r} allows it' if names else 'nothing denies it'}"
+
+
+# -- the running router ---------------------------------------------------------------------------
+def try_identity(profile: Profile, node: str | None) -> str:
+    """Why the running router does not serve this computer's certificate for `node`; empty: it does.
+
+    Args:
+        profile: the lab.
+        node: of the certificate; None: the operator's.
+
+    Raises:
+        SessionError: no router answers, or it rejects the certificate.
+        SecurityError: no such certificate.
+    """
+    with open_session(profile.session, identity=node) as session:
+        if _live_tokens(session, profile.keys):
+            return ""
+    return (
+        "the router accepts the certificate but grants it no access: its rules lack this name. "
+        "Restart the router with this profile, or check that any node is up"
+    )
+
+
+def read_access(file: Path) -> dict[str, Any]:
+    """The section ``access_control`` of a Zenoh configuration file.
+
+    Raises:
+        SecurityError: it cannot be read.
+    """
+    try:
+        text = zenoh.Config.from_file(str(file)).get_json("access_control")
+    except (zenoh.ZError, OSError) as error:
+        raise SecurityError(f"{file} is no Zenoh configuration: {error}") from error
+    return dict(json.loads(text) or {})

@@ -1,4 +1,4 @@
-"""Whether nodes can keep time on this host: priority, processors, clock frequency."""
+"""Checks of the computer: scheduling, processors, memory, disk, cameras, clock, terminal."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CPU = Path("/sys/devices/system/cpu")
 
 
 def real_time_priority() -> HostFinding:
-    """This user may run threads at a real-time priority: found out by doing it, and undone."""
+    """This user may use a real-time priority (tried, and undone)."""
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
@@ -42,7 +42,7 @@ def real_time_priority() -> HostFinding:
 
 
 def niceness() -> HostFinding:
-    """This user may put nodes before other programs: found out by doing it, and undone."""
+    """This user may lower the niceness (tried, and undone)."""
     before = os.getpriority(os.PRIO_PROCESS, 0)
     try:
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
@@ -50,7 +50,7 @@ def niceness() -> HostFinding:
         return HostFinding(
             "niceness",
             "warn",
-            f"{NICENESS} is not permitted; other programs may hold up nodes that move an arm",
+            f"{NICENESS} is not permitted; other programs may delay nodes that move an arm",
             f"add the line '{_user()} - nice {NICENESS}' to {LIMITS_FILE} and log in again; "
             "in a container: --cap-add=SYS_NICE",
         )
@@ -59,7 +59,7 @@ def niceness() -> HostFinding:
 
 
 def processors() -> HostFinding:
-    """There is a processor for the controller besides the one for everything else."""
+    """At least two processors: one for the controller, one for everything else."""
     usable = len(os.sched_getaffinity(0))
     found = f"{usable} usable of {os.cpu_count()}"
     if usable < FEWEST_PROCESSORS:
@@ -73,7 +73,7 @@ def processors() -> HostFinding:
 
 
 def governor(cpu: Path = CPU) -> HostFinding:
-    """The processors do not fall asleep between two ticks of a controller."""
+    """The frequency governor keeps processors awake between two ticks of a controller."""
     kinds = sorted({_text(path) for path in cpu.glob("cpu*/cpufreq/scaling_governor")})
     if not kinds:
         return HostFinding(
@@ -103,7 +103,7 @@ def _user() -> str:
 
 MIB = 1024 * 1024
 SHARED_MEMORY_WANTED_MIB = 256
-"""Each Zenoh session that sends pictures takes a pool of 16 MiB; a lab has up to ten of them."""
+"""Each Zenoh session that sends images takes a pool of 16 MiB; a lab has up to ten of them."""
 DISK_WANTED_MIB = 2048
 DISK_NEEDED_MIB = 200
 
@@ -113,7 +113,7 @@ SHARED_MEMORY = Path("/dev/shm")
 def shared_memory(
     folder: Path = SHARED_MEMORY, wanted_mib: int = SHARED_MEMORY_WANTED_MIB
 ) -> HostFinding:
-    """Pictures find room in shared memory; else they go through sockets, five times slower."""
+    """Room in shared memory for images; without it they go through sockets, five times slower."""
     advice = (
         f"sudo mount -o remount,size={wanted_mib}M {folder}; "
         f"in a container: --shm-size={wanted_mib}m"
@@ -128,11 +128,11 @@ def shared_memory(
 
 
 def left_segments(folder: Path = SHARED_MEMORY) -> HostFinding:
-    """No killed process of this user has left its Zenoh shared memory behind."""
+    """No Zenoh shared memory left behind by killed processes of this user."""
     segments = sorted(folder.glob("*.zenoh"))
     left = [path for path in segments if _is_left(path)]
     if not left:
-        in_use = f"{len(segments)} segments in use" if segments else "no segments at all"
+        in_use = f"{len(segments)} segments in use" if segments else "no segments"
         return HostFinding("left shared memory", "ok", f"none; {in_use}")
     size_mib = sum(_size(path) for path in left) // MIB
     return HostFinding(
@@ -145,14 +145,14 @@ def left_segments(folder: Path = SHARED_MEMORY) -> HostFinding:
 
 
 def disk(folder: Path | None = None, wanted_mib: int = DISK_WANTED_MIB) -> HostFinding:
-    """Recordings and pictures of runs find room."""
+    """Room on the disk for recordings and videos."""
     folder = folder or Path.cwd()
     free_mib = shutil.disk_usage(folder).free // MIB
     found = f"{free_mib / 1024:.1f} GiB free in {folder}"
     if free_mib >= wanted_mib:
         return HostFinding("disk", "ok", found)
     level = "fail" if free_mib < min(DISK_NEEDED_MIB, wanted_mib) else "warn"
-    return HostFinding("disk", level, found, "free some, or work in a folder on another disk")
+    return HostFinding("disk", level, found, "free some space, or work in a folder on another disk")
 
 
 def _size(path: Path) -> int:
@@ -163,11 +163,11 @@ def _size(path: Path) -> int:
 
 
 def _is_left(segment: Path) -> bool:
-    """Whether no process holds `segment`: each that uses it keeps a shared lock on it."""
+    """No process uses `segment`: each that does holds a shared lock on it."""
     try:
         with segment.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:  # in use, gone meanwhile, or another user's
+    except OSError:  # in use, gone, or another user's
         return False
     return True
 
@@ -176,11 +176,11 @@ DEV = Path("/dev")
 
 
 def video_devices(needed: Sequence[str] = (), dev: Path = DEV) -> HostFinding:
-    """Devices the profile names exist, and all there are may be opened.
+    """The video devices of the profile exist, and this user may open every video device.
 
     Args:
         needed: paths of devices, or their numbers.
-        dev: folder of the devices.
+        dev: folder of devices.
     """
     present = sorted(dev.glob("video[0-9]*"))
     wanted = [dev / f"video{name}" if name.isdecimal() else Path(name) for name in needed]
@@ -190,7 +190,7 @@ def video_devices(needed: Sequence[str] = (), dev: Path = DEV) -> HostFinding:
         return HostFinding(
             "video devices",
             "fail",
-            f"{', '.join(missing)} not there; devices: {there}",
+            f"{', '.join(missing)} not found; devices: {there}",
             "plug the camera in, or correct its source in the profile; in a container: "
             f"--device={missing[0]}",
         )
@@ -213,22 +213,22 @@ _ADVICE = "sudo apt install chrony (needed when nodes run on more than one host)
 
 
 def wall_clock() -> HostFinding:
-    """The kernel says the wall clock is synchronised."""
+    """The wall clock is synchronised, as the kernel reports: time stamps cross hosts."""
     state = kernel_state()
     if state is None:
-        return HostFinding("wall clock", "warn", "cannot be told here", _ADVICE)
-    return judge(state)
+        return HostFinding("wall clock", "warn", "unknown here", _ADVICE)
+    return clock_finding(state)
 
 
-def judge(state: int) -> HostFinding:
-    """What adjtimex returned, in words."""
+def clock_finding(state: int) -> HostFinding:
+    """Finding on the return value of adjtimex."""
     if state == TIME_ERROR:
         return HostFinding("wall clock", "warn", "not synchronised", _ADVICE)
     return HostFinding("wall clock", "ok", "synchronised")
 
 
 def kernel_state() -> int | None:
-    """What adjtimex says of the clock, None where it cannot be asked."""
+    """Return value of adjtimex, None where it cannot be called."""
     try:
         libc = ctypes.CDLL(ctypes.util.find_library("c") or "libc.so.6", use_errno=True)
         state = int(libc.adjtimex(ctypes.create_string_buffer(TIMEX_BYTES)))
@@ -245,7 +245,7 @@ def terminal(
     encoding: str | None = None,
     columns: int | None = None,
 ) -> HostFinding:
-    """The terminal shows UTF-8 and is wide enough; arguments stand in for what is really there."""
+    """The terminal shows UTF-8 and is wide enough; arguments replace what it reports."""
     environ = os.environ if environ is None else environ
     encoding = encoding or str(sys.stdout.encoding or "ascii")
     columns = columns or shutil.get_terminal_size().columns

@@ -1,4 +1,4 @@
-"""What a check of the host says."""
+"""Finding of a check of the host."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ Level = Literal["ok", "warn", "fail"]
 
 @dataclass(frozen=True, slots=True)
 class HostFinding:
-    """The result of one check.
+    """Result of one check.
 
     Args:
-        name: what was looked at.
-        level: ``ok``; ``warn``: works, but worse than it could; ``fail``: something will not work.
-        found: what is there.
-        advice: the package, command or setting that helps; empty when all is well.
+        name: of the check.
+        level: ``ok``; ``warn``: works, with limits; ``fail``: something will not work.
+        found: what the check found.
+        advice: the package, command or setting that helps; empty with ``ok``.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What a host has to be able to do, as a profile says."""
+"""Requirements of a profile on its hosts."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """What this host is for.
+    """Requirements on one host.
 
     Args:
-        roles: sets of libraries that must be there; of the others a missing one is only a warning.
-        is_router: the router is to run here, so its port has to be free or already a router's.
-        endpoints: where the router is looked for.
-        devices: video devices that have to exist.
+        roles: sets of libraries that are required; others only give a warning.
+        is_router: the router runs here: its port has to be free, or a router's already.
+        endpoints: of the router.
+        devices: required video devices.
     """
 
     roles: frozenset[Role] = frozenset({"base"})
@@ -31,7 +31,7 @@ class Needs:
 
 
 def needs_of(profile: Profile, host: str | None = None) -> Needs:
-    """What `profile` asks of one of its hosts; of all of them together when `host` is None.
+    """Requirements of `profile` on one of its hosts, or on all together when `host` is None.
 
     Raises:
         ProfileError: the profile has no such host; lists those it has.

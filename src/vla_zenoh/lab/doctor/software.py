@@ -1,4 +1,4 @@
-"""Python and the libraries: there, new enough, and able to load."""
+"""Checks of software: Python, libraries, OpenGL, the robot description."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ SYSTEM_PACKAGES = {
     "libxcb.so.1": "libxcb1",
 }
 
-# One interpreter for a whole role, and not this one: a broken library may crash it.
+# In an interpreter of its own, which a broken library may crash.
 _PROBE = """
 import importlib, json, sys
 print(json.dumps(None), flush=True)
@@ -71,7 +71,7 @@ for name in sys.argv[1:]:
 
 
 def python_version(version: tuple[int, ...] = tuple(sys.version_info[:3])) -> HostFinding:
-    """The interpreter is new enough."""
+    """The Python version."""
     text = ".".join(map(str, version))
     if version < OLDEST_PYTHON:
         return HostFinding("Python", "fail", text, "install Python 3.11 or newer")
@@ -79,7 +79,7 @@ def python_version(version: tuple[int, ...] = tuple(sys.version_info[:3])) -> Ho
 
 
 def load_errors(modules: list[str]) -> dict[str, str]:
-    """Modules that cannot be imported, with the reason, found out in another process."""
+    """Module -> why it cannot be imported, found out in another process."""
     command = [sys.executable, "-c", _PROBE, *modules]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=LIMIT_S)
@@ -97,7 +97,7 @@ def load_errors(modules: list[str]) -> dict[str, str]:
 
 
 def version_fault(distribution: str, version: str) -> str:
-    """Why `version` will not do, or nothing."""
+    """Why `version` is not supported, empty: it is."""
     oldest, first_unknown = VERSIONS.get(distribution, ((), None))
     numbers = tuple(int(part) for part in re.findall(r"\d+", version)[:3])
     if numbers < oldest:
@@ -108,7 +108,7 @@ def version_fault(distribution: str, version: str) -> str:
 
 
 def libraries(role: Role, *, required: bool) -> HostFinding:
-    """Everything a role of a host needs is installed, loads, and has a version that works."""
+    """The libraries of a role are installed, load, and have a supported version."""
     name = f"libraries: {PURPOSE[role]}"
     level = "fail" if required else "warn"
     install = how_to_install("" if role == "base" else role)
@@ -137,7 +137,7 @@ def libraries(role: Role, *, required: bool) -> HostFinding:
 
 
 def msgpack_in_c() -> HostFinding:
-    """msgpack is the compiled one; the one in Python is some thirty times slower."""
+    """msgpack is compiled; its Python fallback is some thirty times slower."""
     import msgpack
 
     if msgpack.Packer.__module__ == "msgpack._cmsgpack":
@@ -145,7 +145,7 @@ def msgpack_in_c() -> HostFinding:
     return HostFinding(
         "msgpack",
         "warn",
-        "the slow implementation in Python",
+        "the slow fallback in Python",
         "unset MSGPACK_PUREPYTHON, or: pip install --force-reinstall --only-binary :all: msgpack",
     )
 
@@ -154,24 +154,24 @@ NAME = "pictures"
 
 
 def opengl(wanted: str | None = None) -> HostFinding:
-    """What the simulator will draw with.
+    """The renderer of the simulator.
 
     Args:
-        wanted: ``auto`` or the way to draw that is asked for; None: as the environment says.
+        wanted: ``auto`` or a backend; None: from the environment.
     """
     try:
-        return judge(choose_backend(wanted))
+        return renderer_finding(choose_backend(wanted))
     except NodeError as error:
         advice = f"do what it says, or let the simulator choose: unset {VARIABLE}"
         return HostFinding(NAME, "fail", str(error), advice)
 
 
-def judge(backend: Backend) -> HostFinding:
-    """What was chosen, in words."""
+def renderer_finding(backend: Backend) -> HostFinding:
+    """Finding on the selected backend."""
     if backend.name != RAYCAST:
         return HostFinding(NAME, "ok", f"drawn by OpenGL through {backend.name}")
     if not backend.reason:
-        return HostFinding(NAME, "ok", "ray cast, as asked for")
+        return HostFinding(NAME, "ok", "ray cast, as requested")
     return HostFinding(
         NAME,
         "warn",
@@ -182,12 +182,12 @@ def judge(backend: Backend) -> HostFinding:
 
 
 def robot(profile: Profile, host: str | None = None) -> Iterator[HostFinding]:
-    """The robot's description, its meshes, and whether it has what the profile names.
+    """The robot description loads, with meshes and every name in the profile.
 
     Args:
         profile: the lab.
-        host: which of its hosts this computer is; None: all of them. Nothing is said of one that
-            does not run the command node.
+        host: which of its hosts this computer is; None: all of them. Hosts without the command
+            node have no finding.
     """
     hosts = [profile.hosts[host]] if host is not None else list(profile.hosts.values())
     if not any("command" in part.nodes for part in hosts):
@@ -197,8 +197,8 @@ def robot(profile: Profile, host: str | None = None) -> Iterator[HostFinding]:
 
         make_reachability_filter(profile)
     except (MissingExtraError, ImportError):
-        return  # told with the libraries
-    except (VlaZenohError, ValueError) as error:  # the latter Pinocchio's, of what is no URDF
+        return  # see `libraries`
+    except (VlaZenohError, ValueError) as error:  # ValueError: Pinocchio's, of a malformed URDF
         advice = "vla-zenoh profile check"
         yield HostFinding("robot", "fail", f"{profile.robot.description}: {error}", advice)
         return

@@ -1,12 +1,11 @@
-"""The whole loop in one thread on a virtual clock: robot, cameras, worker, command node.
+"""Lockstep: robot, cameras, workers and command node in one thread on a virtual clock.
 
-The same `Commander`, `ArmGuard` and `assemble` as in the nodes, and every record goes through
-the codec as on the wire; only sessions, threads and waiting are left out. A run is reproducible to
-the bit and as fast as the computer: for tests, for making data, for measuring what latency does.
+Runs the `Commander`, `ArmGuard` and `assemble` of the nodes, with every record through the codec;
+only sessions, threads and waiting are left out. Runs are bit-reproducible and faster than real
+time: for tests, data generation and latency studies.
 
-Faults are put in from outside: `Lockstep.tamper` stands on the wire and may drop, delay, repeat or
-change every message; `Lockstep.set_clock` sets the wall clock of one node; `Lockstep.alive` names
-the nodes that others believe alive.
+Fault injection: `Lockstep.tamper` may drop, delay, repeat or change every message;
+`Lockstep.set_clock` sets the wall clock of one node; `Lockstep.alive` holds the live nodes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The loop itself: who hears what when."""
+"""The lockstep loop: virtual time, message delivery, and a tick of every node."""
 
 from __future__ import annotations
 
@@ -46,23 +46,23 @@ if TYPE_CHECKING:
 TICK_NS = 1_000_000
 """One step of the world."""
 START_NS = 1_700_000_000_000_000_000
-"""The virtual wall clock begins here; any time that is not zero will do."""
+"""Start of the virtual wall clock."""
 SIM, CAMERA, COMMAND = "sim", "camera", "command"
 
 
 class Lockstep:
-    """See the package. Settings are put with `put`; time goes on with `run` and `run_until`.
+    """All nodes of one robot in lockstep. `put` publishes a setting, `run` advances time.
 
     Args:
         profile: limits, timing, cameras.
         world: the simulated robot.
         policy: the model; its ``load`` is called here if it has one.
         delays: see `Delays`.
-        picture: what a camera sees, by name; None: small gray pictures.
+        picture: image of a camera, by name; None: small gray images.
         reach: see `Commander`.
-        dry_run: likewise.
+        dry_run: see `Commander`.
         seed: of the jitter.
-        others: more workers, by name; they run in the shadow until one is chosen.
+        others: more workers, by name; they run without effect until selected.
     """
 
     def __init__(
@@ -107,17 +107,17 @@ class Lockstep:
 
     # -- from outside -------------------------------------------------------------------------
     def put(self, name: str, value: str | bool | float | None = None) -> None:
-        """Put a setting; it counts from the next tick of the commander on."""
+        """Publish a setting, for the next tick of the commander."""
         self._inbox.settings = [*self._inbox.settings, Setting(name, value)]
 
     def run(self, duration_s: float) -> None:
-        """Let `duration_s` pass."""
+        """Advance time by `duration_s`."""
         end_ns = self.now_ns + round(duration_s * 1e9)
         while self.now_ns < end_ns:
             self._tick()
 
     def run_until(self, condition: Callable[[], bool], limit_s: float) -> bool:
-        """Let time pass until `condition` holds, at most `limit_s`; says whether it does."""
+        """Advance time until `condition` holds, at most by `limit_s`; whether it holds."""
         end_ns = self.now_ns + round(limit_s * 1e9)
         while not condition() and self.now_ns < end_ns:
             self._tick()
@@ -149,7 +149,7 @@ class Lockstep:
             self._publish_pictures()
         self._receive()
         for worker in self.workers.values():
-            chunk = worker.turn(self.now_ns, self.wall_ns(worker.source))
+            chunk = worker.step(self.now_ns, self.wall_ns(worker.source))
             if chunk is not None:
                 # Published when the inference is over, and stamped with that time.
                 end_ns = chunk.inference_end_ns - self._clock_ns[worker.source]
@@ -234,7 +234,7 @@ class Lockstep:
         take: Callable[[Stamped[Any]], None],
         sent_ns: int | None = None,
     ) -> None:
-        """Put a record on the wire; `take` gets it with the virtual time of its arrival."""
+        """Send a record; `take` receives it with the virtual time of its arrival."""
         sent_ns = self.now_ns if sent_ns is None else sent_ns
         self._seq[f"{source} {type(record).__name__}"] += 1
         seq = self._seq[f"{source} {type(record).__name__}"]
@@ -257,7 +257,7 @@ class Lockstep:
         take(Stamped(header, record, message.arrival_ns))
 
     def _at(self, node: str, arrived: Stamped[Any]) -> Stamped[Any]:
-        """As `node` dates it."""
+        """With the time of arrival on the clock of `node`."""
         return replace(arrived, received_ns=arrived.received_ns + self._clock_ns[node])
 
     def _deliver(self, arrival_ns: int, arrive: Callable[[], None]) -> None:

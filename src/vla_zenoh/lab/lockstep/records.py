@@ -1,4 +1,4 @@
-"""What takes how long in lockstep, what is on its wire, and what is kept of a run."""
+"""Delays, messages and trace of a lockstep run."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from vla_zenoh.types import FloatArray, Header, JointCommand, PoseCommand
 
 @dataclass(frozen=True, slots=True)
 class Delays:
-    """What takes how long.
+    """Latencies of a lockstep run.
 
     Args:
         inference_s: from observation to chunk.
-        jitter: share by which an inference varies, either way.
+        jitter: share by which an inference varies.
         camera_s: from capture to the worker.
-        camera_hz: pictures per second.
-        wire_s: everything else on its way.
+        camera_hz: images per second.
+        wire_s: of every other message.
     """
 
     inference_s: float = 0.0
@@ -30,13 +30,13 @@ class Delays:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One record on the wire.
+    """One message on the wire.
 
     Args:
         kind: class of the record.
-        header: what its writer says of it.
-        payload: the record as bytes.
-        arrival_ns: virtual time at which it arrives.
+        header: of the writer.
+        payload: encoded record.
+        arrival_ns: virtual time of arrival.
     """
 
     kind: type[Any]
@@ -46,20 +46,20 @@ class Message:
 
 
 Tamper = Callable[[Message], Iterable[Message]]
-"""What arrives in place of a message: nothing, itself, several, others."""
+"""Replaces a message by any number of messages."""
 
 
 @dataclass(slots=True)
 class LockstepTrace:
-    """What was commanded and where the TCP was, one entry per command tick.
+    """Commanded and measured motion, one entry per command tick.
 
     Args:
         time_ns: (n,) virtual wall clock.
-        commands: the pose commands; None where nothing was streamed.
-        joints: likewise the joint commands.
+        commands: pose commands; None: no stream.
+        joints: joint commands; None: no stream.
         position_m: measured TCP, (3,) each.
         rotation: measured TCP, (3, 3) each.
-        width_m: measured opening.
+        width_m: measured gripper width.
     """
 
     time_ns: list[int] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""A worker on the virtual clock."""
+"""Worker in lockstep."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STATE_KINDS: dict[str, type[Any]] = {
 
 
 class LockstepWorker:
-    """A worker on the virtual clock: one inference at a time, at the task's rate."""
+    """Worker in lockstep: one inference at a time, at the task's rate."""
 
     def __init__(
         self, profile: Profile, name: str, policy: Policy, delays: Delays, jitter: random.Random
@@ -49,7 +49,7 @@ class LockstepWorker:
             load()
 
     def take_task(self, task: Stamped[Task]) -> None:
-        """The task, as the command node published it."""
+        """Receive a task."""
         known, self.task = self.task, task.record
         if known is not None and known.requested_hz != self.task.requested_hz:
             self._due_ns = min(self._due_ns, self._asked_ns)
@@ -60,21 +60,21 @@ class LockstepWorker:
                 reset()
 
     def take_state(self, state: Stamped[Any]) -> None:
-        """A state; kept if the model asked for it."""
+        """Receive a state; kept if the model's spec lists it."""
         for part, history in self._states.items():
             if isinstance(state.record, STATE_KINDS[part]):
                 history.add(state)
 
     def take_picture(self, camera: str, picture: Stamped[Image]) -> None:
-        """The newest picture of a camera."""
+        """Receive an image."""
         self._images[camera] = picture
 
-    def turn(self, now_ns: int, wall_ns: int) -> ActionChunk | None:
-        """Begin an inference if it is time and there is something to see.
+    def step(self, now_ns: int, wall_ns: int) -> ActionChunk | None:
+        """Infer if a request is due and an observation is complete.
 
         Args:
             now_ns: virtual time.
-            wall_ns: this worker's wall clock, in which a chunk is dated.
+            wall_ns: this worker's wall clock.
         """
         self._asked_ns = now_ns
         if self.task is None or now_ns < self._due_ns or wall_ns < self._not_before_ns:
@@ -95,7 +95,7 @@ class LockstepWorker:
         steps = check_steps(self.spec.action, answer.steps)
         share = 1.0 + self._delays.jitter * self._jitter.uniform(-1.0, 1.0)
         duration_ns = round(self._delays.inference_s * share * 1e9)
-        # One inference at a time, and a period that was missed is not made up for.
+        # One inference at a time; missed periods are not made up for.
         period_ns = round(1e9 / self.task.requested_hz)
         self._due_ns = max(self._due_ns + period_ns, now_ns + duration_ns)
         self._not_before_ns = wall_ns + duration_ns

@@ -1,7 +1,7 @@
-"""Tasks for the scene ``bricks``: what is asked, in which words, and whether it was done. Pure.
+"""Tasks for the scene ``bricks``: goals, prompts, and a judge. Pure.
 
-Reset the scene with a seed, draw a `TaskEpisode` for it from the objects' true poses, put its
-prompt, and let a `TaskJudge` look on::
+Reset the scene with a seed, draw a `TaskEpisode` from the objects' true poses, publish its prompt,
+and feed a `TaskJudge`::
 
     episode = draw_episode(seed, objects)
     judge = Judge(episode.order, objects)

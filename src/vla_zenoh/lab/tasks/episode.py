@@ -1,4 +1,4 @@
-"""Draws what is asked in an episode, to fit where the objects stand."""
+"""Draws the task of an episode to fit the layout of the objects."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from vla_zenoh.lab.tasks.wording import phrase
 from vla_zenoh.types import FloatArray, ObjectPoses
 
 PUSH_BEHIND_M, PUSH_AHEAD_M = 0.06, 0.11
-"""A brick is only to be pushed where so much room is free behind it, and before it."""
+"""Free room behind and ahead of a brick that is to be pushed."""
 CLEAR_M = 0.055
-"""Other objects are at least so far from the line of a push; the box further by its half."""
+"""Clearance of other objects from the line of a push; the box adds half its size."""
 BOX_HALF_M = 0.07
 REACH_X_M, REACH_Y_M = (0.32, 0.70), (-0.36, 0.36)
 """Where a pushed brick may end."""
@@ -39,7 +39,7 @@ class TaskEpisode:
 
     Args:
         seed: of the layout and of the draw.
-        order: what is to be done.
+        order: goal.
         prompt: the same in words.
     """
 
@@ -56,17 +56,17 @@ def draw_episode(
     target: str | None = None,
     held_out: bool = False,
 ) -> TaskEpisode:
-    """A task that can be done where the objects stand; the same for the same arguments.
+    """Draw a feasible task; deterministic in its arguments.
 
     Args:
         seed: the layout's, or any number.
-        objects: where everything is after the reset.
+        objects: true poses after the reset.
         family: one of `FAMILIES`; None: any.
         target: colour of the brick to move; None: any.
-        held_out: say it in words that no model may be trained with.
+        held_out: use a wording that no model may be trained with.
 
     Raises:
-        ResourceError: no such task in this layout; a push needs a free way.
+        ResourceError: no such task in this layout; a push needs free room.
     """
     random = np.random.default_rng((_STREAM, seed))
     chosen = family or FAMILIES[int(random.integers(len(FAMILIES)))]
@@ -74,7 +74,7 @@ def draw_episode(
     if not orders:
         raise ResourceError(
             f"no task {chosen!r}{f' with the {target} brick' if target else ''} can be done in "
-            f"layout {seed}; take another seed"
+            f"layout {seed}; use another seed"
         )
     order = orders[int(random.integers(len(orders)))]
     prompt = phrase(order, int(random.integers(1 << 30)), held_out=held_out)
@@ -82,7 +82,7 @@ def draw_episode(
 
 
 def draw_stay(seed: int) -> TaskEpisode:
-    """A prompt without sense: the arm has to stay."""
+    """A nonsense prompt: the arm has to stay."""
     order = Order(STAY)
     return TaskEpisode(seed, order, phrase(order, seed))
 
@@ -95,13 +95,13 @@ def _orders(family: str, objects: ObjectPoses) -> Iterator[Order]:
     elif family == PUSH:
         for colour in COLOURS:
             for direction in DIRECTIONS:
-                if _way_is_free(objects, brick(colour), np.array(DIRECTIONS[direction])):
+                if _room_is_free(objects, brick(colour), np.array(DIRECTIONS[direction])):
                     yield Order(PUSH, colour, direction=direction)
     else:
         raise ResourceError(f"no family {family!r} of tasks; {', '.join(FAMILIES)}")
 
 
-def _way_is_free(objects: ObjectPoses, pushed: str, along: FloatArray) -> bool:
+def _room_is_free(objects: ObjectPoses, pushed: str, along: FloatArray) -> bool:
     places = {n: p[:2] for n, p in zip(objects.names, objects.position_m, strict=True)}
     start = places.pop(pushed)
     end = start + PUSH_AHEAD_M * along
@@ -111,7 +111,7 @@ def _way_is_free(objects: ObjectPoses, pushed: str, along: FloatArray) -> bool:
         way = place - start
         nearest = np.clip(way @ along, -PUSH_BEHIND_M, PUSH_AHEAD_M) * along
         apart = np.abs(way - nearest)
-        # The box is a square that lies along the axes, everything else is small and round.
+        # The box is an axis-aligned square, everything else is small and round.
         if name == BOX:
             apart = np.maximum(apart - BOX_HALF_M, 0.0)
         if np.hypot(*apart) < CLEAR_M:

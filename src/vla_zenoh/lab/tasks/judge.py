@@ -1,4 +1,4 @@
-"""Whether a task was done, and if not, what went wrong: from true poses, not from pictures."""
+"""Judges whether a task was done, and the kind of failure, from true poses."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from vla_zenoh.lab.tasks.order import BOX, COLOURS, DIRECTIONS, PUSH, PUT, STACK
 from vla_zenoh.types import FloatArray, ObjectPoses
 
 LIMIT_S = 30.0
-"""Time for one task; a policy that does its task at all needs about a third of it."""
+"""Time limit of a task; a policy that can do it needs about a third."""
 SETTLED_S = 0.5
-"""So long everything has to be as it should."""
+"""The goal has to hold for this long."""
 
 IN_BOX_M, IN_BOX_HEIGHT_M = 0.067, 0.05
-"""A brick in the box: its centre so near to the box's, along either axis, and so low."""
+"""A brick in the box: distance of centres along either axis, and height."""
 BRICK_HEIGHT_M = 0.0192
 ON_TOP_M, ON_TOP_HEIGHT_M = 0.0159, 0.004
-"""A brick on another: centres apart by less than half a brick, one brick higher up to this."""
+"""A brick on another: horizontal distance of centres, and tolerance on its height."""
 PUSHED_M = 0.05
-"""A brick that was pushed: moved so far along the direction, and less than half of it beside."""
+"""A pushed brick: distance along the direction, and less than half of it beside."""
 RELEASED_M = 0.045
-"""The gripper has let go of a brick (of 0.032 m) when it is opened this wide."""
+"""Gripper width at which a brick (of 0.032 m) is released."""
 LIFTED_M = 0.03
 MOVED_M = 0.02
 DISTURBED_M = 0.04
-"""A brick that was not meant may be brushed, but not moved as far as this."""
+"""Another brick may be brushed, but not moved this far."""
 SHUT_M = 0.02
 TABLE_EDGE_Z_M = -0.01
 STAYED_M = 0.01
@@ -41,17 +41,17 @@ KNOCKED, OFF_COURSE, NOT_MOVED, TIMEOUT, MOVED = (
     "moved",
 )
 FAILURES = {
-    WRONG_BRICK: "a brick that was not meant was lifted, moved or put in the box",
+    WRONG_BRICK: "another brick was lifted, moved or put in the box",
     FELL: "a brick fell off the table",
-    DROPPED: "the brick was lifted, and lies somewhere else than it should",
-    MISSED_GRASP: "the gripper shut on nothing and the brick was never lifted",
+    DROPPED: "the brick was lifted, but is not at its goal",
+    MISSED_GRASP: "the gripper closed on nothing and the brick was never lifted",
     KNOCKED: "the brick was moved, but never lifted",
     OFF_COURSE: "the brick was pushed, but not far enough or in another direction",
     NOT_MOVED: "no brick was moved",
-    TIMEOUT: "time was over while the brick was held, or before it was let go",
-    MOVED: "the arm was to stay, and it or a brick moved",
+    TIMEOUT: "the time limit was reached while the brick was held",
+    MOVED: "the arm had to stay, and it or a brick moved",
 }
-"""Kinds of failure and what they mean."""
+"""Kinds of failure and their meaning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Verdict:
     Args:
         success: the order was carried out.
         failure: one of `FAILURES`; empty after a success.
-        time_s: when it was decided, on the caller's clock.
+        time_s: of the verdict, on the caller's clock.
     """
 
     success: bool
@@ -70,15 +70,15 @@ class Verdict:
 
 
 class TaskJudge:
-    """Looks on while an order is carried out.
+    """Judges one task from the poses of the objects.
 
     Args:
-        order: what is to be done.
-        before: all objects at the beginning.
-        tcp_m: (3,) where the TCP is at the beginning; only ``stay`` looks at it.
+        order: goal.
+        before: all objects at the start.
+        tcp_m: (3,) TCP at the start; only ``stay`` needs it.
 
     Raises:
-        RecordError: an object the order speaks of is not there.
+        RecordError: an object of the scene is missing.
     """
 
     def __init__(self, order: Order, before: ObjectPoses, tcp_m: FloatArray | None = None) -> None:
@@ -106,13 +106,13 @@ class TaskJudge:
         time_s: float,
         tcp_m: FloatArray | None = None,
     ) -> Verdict | None:
-        """Take in how it stands now; call it several times a second.
+        """Process the current state; call it several times a second.
 
         Args:
             objects: true poses.
             width_m: opening of the gripper.
-            time_s: never less than the last time.
-            tcp_m: (3,) measured TCP; only ``stay`` looks at it.
+            time_s: monotonic.
+            tcp_m: (3,) measured TCP; only ``stay`` needs it.
 
         Returns:
             The verdict as soon as it is certain, else None.
@@ -140,16 +140,16 @@ class TaskJudge:
         return None
 
     def end(self) -> Verdict:
-        """The verdict now that time is over."""
+        """The verdict at the time limit."""
         failure = self._failure()
         return Verdict(not failure, failure, self._time_s)
 
     def _failure(self) -> str:
         order = self.order
         if order.family == STAY:
-            moved = self._tcp_moved or any(self._way_m(colour) > STAYED_M for colour in COLOURS)
+            moved = self._tcp_moved or any(self._moved_m(colour) > STAYED_M for colour in COLOURS)
             return MOVED if moved else ""
-        way_m = self._way_m(order.target)
+        way_m = self._moved_m(order.target)
         if order.family == PUSH:
             return OFF_COURSE if way_m > STAYED_M else NOT_MOVED
         height_m = self._now[brick(order.target)][2] - self._before[brick(order.target)][2]
@@ -167,12 +167,12 @@ class TaskJudge:
         for colour in COLOURS:
             if colour == self.order.target:
                 continue
-            if colour in self._lifted or self._way_m(colour) > DISTURBED_M:
+            if colour in self._lifted or self._moved_m(colour) > DISTURBED_M:
                 return True
         return False
 
-    def _way_m(self, colour: str) -> float:
-        """How far a brick is from where it was, over the table."""
+    def _moved_m(self, colour: str) -> float:
+        """Horizontal distance of a brick from its start."""
         name = brick(colour)
         return float(np.hypot(*(self._now[name] - self._before[name])[:2]))
 

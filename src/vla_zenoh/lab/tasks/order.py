@@ -1,4 +1,4 @@
-"""What can be asked of the arm, apart from the words it is asked in."""
+"""Goal of a task, independent of its wording."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def brick(colour: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What is to be done.
+    """Goal of a task.
 
     Args:
         family: ``put`` into the box, ``stack`` on another brick, ``push`` over the table; ``stay``
-            is what a prompt without sense asks for.
-        target: colour of the brick that is to be moved; empty for ``stay``.
-        onto: colour of the brick below it; for ``stack`` alone.
-        direction: one of `DIRECTIONS`; for ``push`` alone.
+            for a nonsense prompt.
+        target: colour of the brick to move; empty for ``stay``.
+        onto: colour of the brick below it; only for ``stack``.
+        direction: one of `DIRECTIONS`; only for ``push``.
 
     Raises:
-        RecordError: the parts do not fit together.
+        RecordError: the parts do not match.
     """
 
     family: str

@@ -1,7 +1,7 @@
-"""An order in words: many wordings a model may be trained with, others it has never read.
+"""Prompts of tasks: wordings to train with, held-out wordings, and the way back from a prompt.
 
 In a wording ``{x}`` is the colour of the brick to move, ``{y}`` that of the brick below, ``{d}`` a
-way to say the direction.
+phrase for the direction.
 """
 
 from __future__ import annotations
@@ -123,16 +123,16 @@ NONSENSE = (
     "hello robot",
     "put the brick in the box",
 )
-"""Nothing of this is a task: whoever reads it has to stay where it is."""
+"""Prompts without a task: the arm has to stay."""
 
 
 def phrase(order: Order, choice: int, *, held_out: bool = False) -> str:
-    """One way to say `order`.
+    """A prompt for `order`.
 
     Args:
-        order: what is meant; not ``stay``.
-        choice: any number, which wording.
-        held_out: one that no model may be trained with.
+        order: goal.
+        choice: any number; selects the wording.
+        held_out: use a wording that no model may be trained with.
     """
     if order.family == STAY:
         return NONSENSE[choice % len(NONSENSE)]
@@ -143,7 +143,7 @@ def phrase(order: Order, choice: int, *, held_out: bool = False) -> str:
 
 
 def parse_prompt(prompt: str) -> Order | None:
-    """The order that `prompt` is a wording of; None: of none that is known here.
+    """The goal of `prompt`, for judging; None: no known wording.
 
     Case, punctuation and spaces do not matter.
     """
@@ -151,7 +151,7 @@ def parse_prompt(prompt: str) -> Order | None:
 
 
 def is_nonsense(prompt: str) -> bool:
-    """It is one of those that ask for nothing."""
+    """The prompt is one of `NONSENSE`."""
     return _plain(prompt) in {_plain(text) for text in NONSENSE}
 
 

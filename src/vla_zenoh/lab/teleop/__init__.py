@@ -1,1 +1,1 @@
-"""An arm driven by hand: keys and sticks to wishes, wishes to the action steps of a worker."""
+"""Teleoperation: a worker whose policy is the operator at the keyboard, gamepad or SpaceMouse."""

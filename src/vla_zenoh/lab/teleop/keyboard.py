@@ -1,8 +1,8 @@
-"""Bytes from a terminal to key strokes.
+"""Keyboard of teleoperation: terminal bytes to keystrokes, held keys to operator input. Pure.
 
-Most terminals only say that a key was typed, again and again while it is held. Those with the
-keyboard protocol of kitty (https://sw.kovidgoyal.net/kitty/keyboard-protocol/) also say when it is
-let go; `BEGIN` asks for it, and others ignore what they do not know.
+Most terminals repeat a held key and do not report its release. Terminals with kitty's keyboard
+protocol (https://sw.kovidgoyal.net/kitty/keyboard-protocol/) do report it; `BEGIN` requests it, and
+other terminals ignore the request.
 """
 
 from __future__ import annotations
@@ -14,12 +14,39 @@ from typing import NamedTuple
 from vla_zenoh.lab.teleop.policy import AXES, OperatorInput, clipped_twist
 
 BEGIN = b"\x1b[>11u\x1b[?u\x1b[?1004h"
-"""Tell releases (1 + 2 + 8), say whether you do, and tell when the window loses the focus."""
+"""Report releases (1 + 2 + 8), confirm that, and report when the window loses the focus."""
 END = b"\x1b[?1004l\x1b[<u"
-"""Everything as it was."""
-
+"""Undo `BEGIN`."""
 MAX_SEQUENCE = 32
 CTRL = 4
+HOLD_S = 0.15
+"""Without reports of releases a key counts as held for this long; repeats come at 20 to 30 Hz."""
+
+MOVES: dict[str, tuple[int, float]] = {
+    "w": (0, 1.0),
+    "s": (0, -1.0),
+    "a": (1, 1.0),
+    "d": (1, -1.0),
+    "r": (2, 1.0),
+    "f": (2, -1.0),
+    "l": (3, 1.0),
+    "j": (3, -1.0),
+    "i": (4, 1.0),
+    "k": (4, -1.0),
+    "u": (5, 1.0),
+    "o": (5, -1.0),
+}
+"""Key -> axis of the twist and direction."""
+OPENINGS = {".": 1.0, ",": -1.0}
+TOGGLE = "space"
+LEVELS = "12345"
+QUIT, STOP, ACTIVATE, TAKE_OVER = "quit", "stop", "activate", "take_over"
+KEY_COMMANDS = {"q": QUIT, "ctrl+c": QUIT, "x": STOP, "enter": ACTIVATE, "tab": TAKE_OVER}
+LEGEND = """\
+  w/s  x forward, back     l/j  rotate about x   space  gripper         enter  (de)activate
+  a/d  y left, right       i/k  rotate about y   . ,    open, close     tab    take over, return
+  r/f  z up, down          u/o  rotate about z   1-5    speed           x STOP      q quit"""
+
 _ESCAPE = 0x1B
 _CSI = re.compile(rb"\x1b\[([0-?]*)[ -/]*([@-~])")
 _NAMES = {"\r": "enter", "\n": "enter", "\t": "tab", " ": "space", "\x03": "ctrl+c"}
@@ -29,30 +56,33 @@ _CODES = {13: "enter", 9: "tab", 32: "space", 27: "escape"}
 class KeyEvent(Enum):
     """What happened to a key."""
 
-    TYPED = "typed"  # pressed or still held: this terminal does not tell
+    TYPED = "typed"  # pressed or repeated: this terminal does not distinguish
     PRESSED = "pressed"
     HELD = "held"
     RELEASED = "released"
 
 
 class Keystroke(NamedTuple):
-    """One event of one key: its name (`w`, `space`, `enter`, `ctrl+c`) and what happened.
+    """One event of one key.
 
-    Besides keys there are `releases`: this terminal tells them; and `unfocused`: it hears no more.
+    Args:
+        key: its name (`w`, `space`, `enter`, `ctrl+c`); or `releases`: this terminal reports them;
+            or `unfocused`: the window has lost the focus.
+        event: what happened to it.
     """
 
     key: str
-    how: KeyEvent
+    event: KeyEvent
 
 
 class KeystrokeParser:
-    """Takes bytes as they come, cut anywhere."""
+    """Parses terminal bytes, split anywhere."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def read(self, data: bytes) -> list[Keystroke]:
-        """Strokes that are complete now; what is not known is left out."""
+        """Keystrokes complete by now; unknown sequences are dropped."""
         rest, out = self._rest + data, []
         while rest:
             if rest[0] != _ESCAPE:
@@ -88,73 +118,41 @@ def _sequence(parameters: str, final: str) -> list[Keystroke]:
     try:
         code = int(fields[0][0])
         modifiers = int(fields[1][0] or 1) - 1 if len(fields) > 1 else 0
-        event = int(fields[1][1]) if len(fields) > 1 and len(fields[1]) > 1 else 1
+        number = int(fields[1][1]) if len(fields) > 1 and len(fields[1]) > 1 else 1
     except ValueError:
         return []
-    how = {1: KeyEvent.PRESSED, 2: KeyEvent.HELD, 3: KeyEvent.RELEASED}.get(event)
+    event = {1: KeyEvent.PRESSED, 2: KeyEvent.HELD, 3: KeyEvent.RELEASED}.get(number)
     name = _CODES.get(code) or (chr(code).lower() if 0x20 < code < 0x7F else "")
-    if how is None or not name:
+    if event is None or not name:
         return []
-    return [Keystroke(f"ctrl+{name}" if modifiers & CTRL else name, how)]
-
-
-HOLD_S = 0.15
-"""Where releases are not told, a key counts as held for so long after it was typed: repeats come
-at 20 to 30 Hz."""
-
-MOVES: dict[str, tuple[int, float]] = {
-    "w": (0, 1.0),
-    "s": (0, -1.0),
-    "a": (1, 1.0),
-    "d": (1, -1.0),
-    "r": (2, 1.0),
-    "f": (2, -1.0),
-    "l": (3, 1.0),
-    "j": (3, -1.0),
-    "i": (4, 1.0),
-    "k": (4, -1.0),
-    "u": (5, 1.0),
-    "o": (5, -1.0),
-}
-"""Key -> axis of the twist and direction."""
-OPENINGS = {".": 1.0, ",": -1.0}
-TOGGLE = "space"
-LEVELS = "12345"
-QUIT, STOP, ACTIVATE, TAKE_OVER = "quit", "stop", "switch", "give"
-KEY_COMMANDS = {"q": QUIT, "ctrl+c": QUIT, "x": STOP, "enter": ACTIVATE, "tab": TAKE_OVER}
-"""Keys that are said once: end, emergency stop, activate or deactivate, take or give the arm."""
-
-LEGEND = """\
-  w/s  x forward, back     l/j  turn about x     space  gripper         enter  (de)activate
-  a/d  y left, right       i/k  turn about y     . ,    wider, less     tab    take or give
-  r/f  z up, down          u/o  turn about z     1-5    speed           x STOP      q end"""
+    return [Keystroke(f"ctrl+{name}" if modifiers & CTRL else name, event)]
 
 
 class Keyboard:
-    """Held keys of a terminal. Time is the caller's, in s, of any steady clock.
+    """Held keys of a terminal. Times are the caller's, in s, of a monotonic clock.
 
     Attributes:
-        level: chosen speed, from 0.
-        tells_releases: this terminal says when a key is let go.
+        level: selected speed, from 0.
+        reports_releases: this terminal reports when a key is released.
     """
 
     def __init__(self, level: int = 2) -> None:
         self.level = level
-        self.tells_releases = False
+        self.reports_releases = False
         self._until_s: dict[str, float] = {}
         self._new: set[str] = set()
         self._toggles = 0
 
-    def take(self, stroke: Keystroke, now_s: float) -> str | None:
-        """One stroke; the order it gives, if it gives one."""
-        key, how = stroke
+    def update(self, stroke: Keystroke, now_s: float) -> str | None:
+        """Process one keystroke; the command it gives, one of `KEY_COMMANDS`, if any."""
+        key, event = stroke
         if key == "releases":
-            self.tells_releases = True
-        elif key == "unfocused":  # its releases will not be told
+            self.reports_releases = True
+        elif key == "unfocused":  # no releases will be reported
             self.release_all()
         elif key in MOVES or key in OPENINGS:
-            self._hold(key, how, now_s)
-        elif how in (KeyEvent.TYPED, KeyEvent.PRESSED):
+            self._hold(key, event, now_s)
+        elif event in (KeyEvent.TYPED, KeyEvent.PRESSED):
             if key == TOGGLE:
                 self._toggles += 1
             elif key in LEVELS:
@@ -162,21 +160,21 @@ class Keyboard:
             return KEY_COMMANDS.get(key)
         return None
 
-    def _hold(self, key: str, how: KeyEvent, now_s: float) -> None:
-        if how is KeyEvent.RELEASED:
+    def _hold(self, key: str, event: KeyEvent, now_s: float) -> None:
+        if event is KeyEvent.RELEASED:
             self._until_s.pop(key, None)
             return
         if key not in self._until_s:
             self._new.add(key)
-        self._until_s[key] = now_s + HOLD_S if how is KeyEvent.TYPED else float("inf")
+        self._until_s[key] = now_s + HOLD_S if event is KeyEvent.TYPED else float("inf")
 
     def release_all(self) -> None:
-        """No key is held any more."""
+        """Release every key."""
         self._until_s.clear()
         self._new.clear()
 
     def read(self, now_s: float) -> OperatorInput:
-        """What is wanted since the last look: a key that was only tapped counts once."""
+        """Input since the last call: a key that was only tapped counts once."""
         self._until_s = {key: until for key, until in self._until_s.items() if until > now_s}
         down = self._new | set(self._until_s)
         self._new = set()

@@ -1,4 +1,4 @@
-"""Teleoperation: a `WorkerNode` whose policy is a person at this terminal."""
+"""Teleoperation: a `WorkerNode` whose policy is the operator at this terminal."""
 
 from __future__ import annotations
 
@@ -37,52 +37,52 @@ SHOW_PERIOD_S = 0.2
 
 
 class Teleop:
-    """See the module.
+    """The teleoperation worker with its keyboard and status line.
 
     Args:
         profile: the effective profile.
-        session: the worker's; its node has the rights of a worker.
-        people: a session that may put settings; None: the keys for them do nothing.
+        session: with the rights of a worker.
+        operator: session with the rights of an operator; None: keys for settings do nothing.
         name: of the worker.
-        stick: a device beside the keyboard.
+        device: beside the keyboard.
         frame: axes of a step.
-        level: chosen speed at first.
+        level: initial speed, from 0.
 
     Raises:
-        NodeError: there is no terminal, or a worker of this name is alive.
+        NodeError: no terminal, or a worker of this name is alive.
     """
 
     def __init__(
         self,
         profile: Profile,
         session: zenoh.Session,
-        people: zenoh.Session | None,
+        operator: zenoh.Session | None,
         name: str = "teleop",
         *,
-        stick: InputDevice | None = None,
+        device: InputDevice | None = None,
         frame: Frame = "base",
         level: int = 2,
     ) -> None:
-        self._typed, self._keyboard = KeystrokeParser(), Keyboard(level)
+        self._parser, self._keyboard = KeystrokeParser(), Keyboard(level)
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._stick, self._name = stick, name
-        self._terminal = Terminal(self._read, self._hung_up)
+        self._device, self._name = device, name
+        self._terminal = Terminal(self._read, self._terminal_gone)
         self.policy = TeleopPolicy(
-            profile, name, self._wish, lambda: self._keyboard.level, frame=frame
+            profile, name, self._input, lambda: self._keyboard.level, frame=frame
         )
         self.worker = WorkerNode(profile, session, self.policy, name)
-        self._client = Client(profile, people).subscribe() if people is not None else None
-        self._others = profile.task.worker
-        self._news: deque[str] = deque(maxlen=16)
+        self._client = Client(profile, operator).subscribe() if operator is not None else None
+        self._other_worker = profile.task.worker
+        self._lines: deque[str] = deque(maxlen=16)
 
     def run(self, stop: threading.Event) -> None:
         """Until `stop`, Ctrl-C, q, or the end of the terminal."""
         self._stop = stop
         with self._terminal as terminal:
             for line in LEGEND.splitlines():
-                terminal.say(line)
-            shown = threading.Thread(target=self._show, args=(terminal,), name="screen")
+                terminal.print(line)
+            shown = threading.Thread(target=self._show_status, args=(terminal,), name="screen")
             shown.start()
             try:
                 self.worker.run(stop)
@@ -93,50 +93,52 @@ class Teleop:
     # -- in -----------------------------------------------------------------------------------
     def _read(self, data: bytes) -> None:
         with self._lock:
-            strokes = self._typed.read(data)
-            orders = [self._keyboard.take(stroke, time.monotonic()) for stroke in strokes]
-        for order in orders:
-            if order is not None:
-                self._carry_out(order)
+            strokes = self._parser.read(data)
+            commands = [self._keyboard.update(stroke, time.monotonic()) for stroke in strokes]
+        for command in commands:
+            if command is not None:
+                self._execute(command)
 
-    def _hung_up(self) -> None:
+    def _terminal_gone(self) -> None:
         with self._lock:
             self._keyboard.release_all()
         self._stop.set()
 
-    def _wish(self) -> OperatorInput:
+    def _input(self) -> OperatorInput:
         with self._lock:
             typed = self._keyboard.read(time.monotonic())
-        return typed if self._stick is None else combined(typed, self._stick.read())
+        return typed if self._device is None else combined(typed, self._device.read())
 
-    def _carry_out(self, order: str) -> None:
+    def _execute(self, command: str) -> None:
         client = self._client
-        if order == QUIT:
+        if command == QUIT:
             self._stop.set()
         elif client is None:
-            self._news.append("these keys need the certificate of an operator on this computer")
-        elif order == STOP:
-            client.publish(client.keys.stop, "stop")
-        elif order == ACTIVATE:
+            self._lines.append("this key needs the certificate of an operator on this computer")
+        elif command == STOP:
+            client.stop()
+        elif command == ACTIVATE:
             active = client.task is not None and client.task.active
             client.publish(client.keys.active, "false" if active else "true")
-        elif order == TAKE_OVER:
-            obeyed = client.task.worker if client.task is not None else ""
-            if obeyed != self._name:
-                self._others = obeyed or self._others
-            client.publish(client.keys.worker, self._others if obeyed == self._name else self._name)
+        elif command == TAKE_OVER:
+            current = client.task.worker if client.task is not None else ""
+            if current != self._name:
+                self._other_worker = current or self._other_worker
+            client.publish(
+                client.keys.worker, self._other_worker if current == self._name else self._name
+            )
 
     # -- out ----------------------------------------------------------------------------------
-    def _show(self, terminal: Terminal) -> None:
+    def _show_status(self, terminal: Terminal) -> None:
         while not self._stop.wait(SHOW_PERIOD_S):
             for node, _, event in self._client.pop_events() if self._client else ():
                 if event.level != "info" or event.kind == "transition":
-                    self._news.append(f"{node}: {event.what} {event.why}".rstrip())
-            while self._news:
-                terminal.say(one_line(self._news.popleft()))
-            terminal.show(self._line())
+                    self._lines.append(f"{node}: {event.what} {event.why}".rstrip())
+            while self._lines:
+                terminal.print(one_line(self._lines.popleft()))
+            terminal.show(self._status_line())
 
-    def _line(self) -> str:
+    def _status_line(self) -> str:
         speed = self.policy.speeds[self._keyboard.level]
         task = self._client.task if self._client else None
         status = self._client.status("command") if self._client else None
@@ -150,21 +152,21 @@ class Teleop:
             if value
         )
         return one_line(
-            f"{state}, obeys {whose} | {100 * speed.translation_m_s:g} cm/s, "
+            f"{state}, follows {whose} | {100 * speed.translation_m_s:g} cm/s, "
             f"{speed.rotation_rad_s:.2g} rad/s | {moving or 'still'}"
         )[:118]
 
 
-LOOK_S = 0.2
+POLL_S = 0.2
 _DISABLED = b"\x00"
 
 
 class Terminal:
-    """Reads keys in a thread while the block lasts.
+    """The terminal in raw mode: reads bytes on a thread inside the block, and restores it after.
 
     Args:
-        read: is given bytes as they come, on that thread.
-        gone: called once when there will be no more.
+        read: called with bytes, on that thread.
+        gone: called once when the terminal is gone.
 
     Raises:
         NodeError: standard input is no terminal.
@@ -173,28 +175,28 @@ class Terminal:
     def __init__(self, read: Callable[[bytes], None], gone: Callable[[], None]) -> None:
         if not (sys.stdin.isatty() and sys.stdout.isatty()):
             raise NodeError(
-                "teleop needs a terminal: its keyboard says what the arm does; start it in one, "
-                "without pipes (over ssh: `ssh -t`)"
+                "teleop needs a terminal for its keyboard; start it in one, without pipes "
+                "(over ssh: `ssh -t`)"
             )
         self._read, self._gone = read, gone
         self._in, self._out = sys.stdin.fileno(), sys.stdout.fileno()
         self._end = threading.Event()
-        self._thread = threading.Thread(target=self._listen, name="keyboard", daemon=True)
+        self._thread = threading.Thread(target=self._read_keys, name="keyboard", daemon=True)
 
     def __enter__(self) -> Terminal:
         self._before = termios.tcgetattr(self._in)
         tty.setcbreak(self._in)  # Ctrl-C stays a signal
         mode = termios.tcgetattr(self._in)
-        # Ctrl-Z would leave an arm with a worker that sleeps.
+        # Ctrl-Z would suspend the worker of an active arm.
         mode[6][termios.VSUSP] = _DISABLED
         termios.tcsetattr(self._in, termios.TCSADRAIN, mode)
         os.write(self._out, BEGIN)
         self._thread.start()
         return self
 
-    def _listen(self) -> None:
+    def _read_keys(self) -> None:
         while not self._end.is_set():
-            ready, _, _ = select.select([self._in], [], [], LOOK_S)
+            ready, _, _ = select.select([self._in], [], [], POLL_S)
             if not ready:
                 continue
             try:
@@ -207,17 +209,17 @@ class Terminal:
             self._read(data)
 
     def show(self, line: str) -> None:
-        """Replace the last line."""
+        """Replace the status line."""
         os.write(self._out, f"\r\x1b[K{line}".encode())
 
-    def say(self, line: str) -> None:
-        """A line that stays, above it."""
+    def print(self, line: str) -> None:
+        """Print a line above it."""
         os.write(self._out, f"\r\x1b[K{line}\r\n".encode())
 
     def __exit__(self, *_: object) -> None:
         self._end.set()
-        self._thread.join(2 * LOOK_S)
-        # A terminal that is gone has nothing to be put back.
+        self._thread.join(2 * POLL_S)
+        # The terminal may be gone.
         try:
             os.write(self._out, END + b"\r\x1b[K")
             termios.tcsetattr(self._in, termios.TCSAFLUSH, self._before)

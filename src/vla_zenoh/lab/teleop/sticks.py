@@ -1,8 +1,4 @@
-"""Gamepad and SpaceMouse: their axes as wishes.
-
-Both are read where they are asked, without a thread. Forward is x, left is y, up is z, as ROS's
-REP 103 has it.
-"""
+"""Gamepad and SpaceMouse as operator input: x forward, y left, z up, as in ROS REP 103."""
 
 from __future__ import annotations
 
@@ -13,20 +9,22 @@ from vla_zenoh.errors import MissingExtraError, NodeError, PeerError
 from vla_zenoh.lab.teleop.policy import OperatorInput, clipped_twist, without_dead_zone
 
 MAX_READS = 64
-"""A SpaceMouse says more often how it stands than it is asked: only the newest counts."""
+"""A SpaceMouse sends states faster than they are read: only the newest counts."""
 
 
 class Gamepad:
-    """The first gamepad that SDL knows. Left stick: x and y; right stick: z and about z; D-pad:
-    about x and y; triggers: gripper narrower and wider; A: gripper open or close.
+    """The first gamepad that SDL knows.
+
+    Left stick: x and y; right stick: z and about z; D-pad: about x and y; triggers: close and open
+    the gripper; A: toggle it.
 
     Raises:
         MissingExtraError: pygame-ce is not installed.
-        NodeError: there is none.
+        NodeError: no gamepad.
     """
 
     def __init__(self) -> None:
-        # SDL wants a screen for its events; the dummy one is enough for sticks.
+        # SDL needs a video driver for its events; the dummy one is enough.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -55,7 +53,9 @@ class Gamepad:
         pygame.event.pump()
         pygame.event.clear()
         if not pad.attached():
-            raise PeerError("device_lost", f"gamepad {self.name!r} is gone; plug it in, start anew")
+            raise PeerError(
+                "device_lost", f"gamepad {self.name!r} is gone; plug it in and start again"
+            )
 
         def axis(number: int) -> float:
             return without_dead_zone(pad.get_axis(number) / 32767)
@@ -85,11 +85,11 @@ class Gamepad:
 
 
 class SpaceMouse:
-    """The first 3Dconnexion SpaceMouse. First button: gripper open or close.
+    """The first 3Dconnexion SpaceMouse; its first button toggles the gripper.
 
     Raises:
         MissingExtraError: pyspacemouse is not installed.
-        NodeError: there is none, it cannot be opened, or the library hidapi is missing.
+        NodeError: no SpaceMouse, it cannot be opened, or the library hidapi is missing.
     """
 
     def __init__(self) -> None:
@@ -99,10 +99,10 @@ class SpaceMouse:
             raise MissingExtraError("pyspacemouse", "teleop") from error
         try:
             self._mouse: Any = pyspacemouse.open(axis_convention=pyspacemouse.AxisConvention.ROS)
-        except Exception as error:  # of the system's HID library too, which raises what it likes
+        except Exception as error:  # of the system's HID library too
             raise NodeError(
                 f"no SpaceMouse can be used: {error} It needs the system's hidapi "
-                "(Debian: libhidapi-hidraw0) and the right to read /dev/hidraw*; or leave --device "
+                "(Debian: libhidapi-hidraw0) and read access to /dev/hidraw*; or leave --device "
                 "out and use the keyboard"
             ) from error
         self.name = str(self._mouse.name)

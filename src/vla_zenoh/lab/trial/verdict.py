@@ -18,7 +18,7 @@ END_WORDS: dict[End, str] = {
     "policy": "the policy reported that it is done",
     "time": "the time limit was reached",
     "lost": "the command node braked and ended it",
-    "stopped": "emergency stop",
+    "stopped": "stopped by an emergency stop",
     "taken": "another client took the arm, or changed its task",
     "recording": "the recording failed",
     "refused": "activation was rejected",

@@ -10,11 +10,12 @@ import rerun as rr
 from vla_zenoh.lab.view import paths
 from vla_zenoh.types import ActionChunk, Cause, FloatArray, NodeStatus
 
-STAGES = {
-    "end to end": (150, 158, 172),
-    "camera to worker": (94, 166, 255),
+STAGE_COLOURS = {
+    "capture_to_worker": (94, 166, 255),
     "inference": (236, 92, 206),
-    "worker to command": (255, 176, 58),
+    "worker_to_command": (255, 176, 58),
+    "command_to_pose": (240, 220, 110),
+    "end_to_end": (150, 158, 172),
 }
 
 
@@ -29,14 +30,14 @@ class Charts:
     def __init__(self, stream: rr.RecordingStream, joints: Sequence[str]) -> None:
         self._stream, self._joints = stream, tuple(joints)
         self._newest: tuple[str, int] | None = None
-        for stage, colour in STAGES.items():
+        for stage, colour in STAGE_COLOURS.items():
             self._style(paths.below(paths.LATENCY, stage), stage, colour)
         for origin in (paths.SPEED, paths.GRIPPER):
             for name in (paths.COMMANDED, paths.MEASURED):
                 # An order holds until the next one.
                 held = origin == paths.GRIPPER and name == paths.COMMANDED
                 self._style(f"{origin}/{name}", name, paths.COLOURS[name], held=held)
-        self._style(f"{paths.TRACKING}/distance", "distance", STAGES["end to end"])
+        self._style(f"{paths.TRACKING}/distance", "distance", STAGE_COLOURS["end_to_end"])
         self._style(f"{paths.BOUNDS}/share", "share", paths.COLOURS[paths.COMMANDED])
 
     def _style(
@@ -57,15 +58,8 @@ class Charts:
         if cause is None or (cause.worker, cause.chunk_seq) == self._newest:
             return
         self._newest = (cause.worker, cause.chunk_seq)
-        seen_ns = cause.observation_stamp_ns
-        values_ns = (
-            stamp_ns - seen_ns,
-            cause.observed_ns - seen_ns,
-            cause.inference_end_ns - cause.inference_start_ns,
-            stamp_ns - cause.inference_end_ns,
-        )
-        for stage, value_ns in zip(STAGES, values_ns, strict=True):
-            self._put(paths.below(paths.LATENCY, stage), value_ns / 1e6)
+        for stage, duration_ms in cause.latency_ms(stamp_ns).items():
+            self._put(paths.below(paths.LATENCY, stage), duration_ms)
 
     def shadow(self, chunk: ActionChunk) -> None:
         """What the model of a worker that is not obeyed took."""

@@ -71,11 +71,11 @@ class RerunLogger:
         self.keys = keys or profile.keys
         self._types = RecordTypes(self.keys)
         self._command_status = self.keys.status(COMMAND_NODE)
-        shapes, missing = load_robot_model(profile)
-        self._kinematics = shapes.kinematics if shapes is not None else None
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
-        self._scene = Scene(stream, profile, shapes)
+        robot, missing = load_robot_model(profile, stream)
+        self._kinematics = robot.kinematics if robot is not None else None
+        self._scene = Scene(stream, profile, robot)
         self._charts = Charts(stream, profile.robot.arm_joints)
         self._words = TextPanels(stream, to_yaml(profile), missing)
         self._drawn_ns: dict[str, int] = {}

@@ -65,13 +65,13 @@ class Scene:
     Args:
         stream: to log into.
         profile: for the workspace.
-        shapes: of the robot; None: only poses are shown.
+        robot: its model; None: only poses are shown.
     """
 
     def __init__(
-        self, stream: rr.RecordingStream, profile: Profile, shapes: RobotModel | None
+        self, stream: rr.RecordingStream, profile: Profile, robot: RobotModel | None
     ) -> None:
-        self._stream, self._shapes = stream, shapes
+        self._stream, self._robot = stream, robot
         self._trails = {name: PoseTrail(stream, name) for name in paths.COLOURS}
         self._goals: deque[tuple[int, Pose]] = deque(maxlen=HISTORY)
         self._measured: Pose | None = None
@@ -86,33 +86,22 @@ class Scene:
         low, high = np.array([space.x_m, space.y_m, space.z_m]).T
         box = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[(120, 130, 150, 70)], radii=0.001)
         log(f"{paths.WORLD}/workspace", box, static=True)
-        for mesh in self._shapes.meshes if self._shapes is not None else ():
-            log(
-                paths.below(paths.ROBOT, mesh.link),
-                rr.Mesh3D(
-                    vertex_positions=mesh.vertices_m,
-                    triangle_indices=mesh.triangles,
-                    vertex_normals=mesh.normals,
-                    albedo_factor=mesh.colour,
-                ),
-                static=True,
-            )
 
     # -- robot and poses ----------------------------------------------------------------------
     def joints(self, names: Sequence[str], positions: FloatArray) -> None:
         """The robot's joints are there now."""
-        if self._shapes is not None:
-            self._shapes.move(dict(zip(names, positions.tolist(), strict=True)))
+        if self._robot is not None:
+            self._robot.move(dict(zip(names, positions.tolist(), strict=True)))
             self.robot_moved()
 
     def gripper(self, width_m: float) -> None:
         """The gripper is so far open now; drawn with the next joints."""
-        if self._shapes is not None:
-            self._shapes.open(width_m)
+        if self._robot is not None:
+            self._robot.open(width_m)
 
     def robot_moved(self) -> None:
         """Draw the robot where its joints are."""
-        for link, pose in self._shapes.placements() if self._shapes is not None else ():
+        for link, pose in self._robot.placements() if self._robot is not None else ():
             self._log_pose(paths.below(paths.ROBOT, link), pose)
 
     def pose(self, name: str, stamp_ns: int, pose: Pose) -> None:

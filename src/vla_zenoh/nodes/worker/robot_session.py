@@ -188,7 +188,7 @@ class RobotSession:
         except CodecError as error:
             self.node.reject(error.reason, f"camera {camera}: {error}")
             return None
-        writer.heard(header, arrival.mono_ns)
+        writer.accept(header, arrival.mono_ns)
         self.node.traffic.received(str(sample.key_expr), header, arrival.nth)
         header, image = self.node.clocks.to_local_clock(header, image)
         return Stamped(header, image, self.node.arrival_wall_ns(arrival))

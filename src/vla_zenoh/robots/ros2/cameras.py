@@ -1,4 +1,4 @@
-"""Camera topics: a thread each, which decodes what is wanted and keeps the stamps."""
+"""Camera topics of a ROS 2 robot: one thread each decodes the images that have subscribers."""
 
 from __future__ import annotations
 
@@ -22,23 +22,20 @@ from vla_zenoh.types import Event
 
 WAIT_S = 0.1
 SAME_S = 2.0
-"""A sensor has noise; drivers that skip a picture now and then are borne with."""
-
-Tell = Callable[[Event], None]
-Refuse = Callable[[str, str, str], None]
+"""A sensor has noise; a driver that repeats an image for less than this is tolerated."""
 
 
 class Camera:
-    """One camera: `run` is the body of its thread.
+    """One camera topic: `run` is the body of its thread.
 
     Args:
-        name: the camera's.
-        topic: where its pictures come from.
-        node: on whose behalf; only its streams and clock are used by the thread.
-        link: to the ROS graph.
+        name: of the camera.
+        topic: of its images.
+        node: on the bus; the thread uses only its publishers and clock.
+        graph: the ROS graph.
         messages: of the robot's distribution, for this thread alone.
-        tell: writes an event; may be called from any thread.
-        refuse: counts a refusal likewise.
+        emit: emits an event; may be called from any thread.
+        reject: counts a rejection; may be called from any thread.
     """
 
     def __init__(
@@ -46,65 +43,67 @@ class Camera:
         name: str,
         topic: Ros2Camera,
         node: Node,
-        link: RosGraph,
+        graph: RosGraph,
         messages: Messages,
-        tell: Tell,
-        refuse: Refuse,
+        emit: Callable[[Event], None],
+        reject: Callable[[str, str, str], None],
     ) -> None:
-        self._topic, self._node, self._messages, self._refuse = topic, node, messages, refuse
-        self.outlet = CameraPublisher(
-            name, node.profile.cameras[name], topic.topic, node, tell, SAME_S
+        self._topic, self._node, self._messages, self._reject = topic, node, messages, reject
+        self.publisher = CameraPublisher(
+            name, node.profile.cameras[name], topic.topic, node, emit, SAME_S
         )
-        self.outlet.backend = topic.type
-        self._newness = StampFilter()
-        self._looked_s = -LOOK_S
-        self._slot = link.read(topic.topic, topic.type, LatestSample(MAX_PICTURE_BYTES), SENSOR)
+        self.publisher.backend = topic.type
+        self._stamps = StampFilter()
+        self._decoded_s = -LOOK_S
+        self._image = graph.subscribe(
+            topic.topic, topic.type, LatestSample(MAX_PICTURE_BYTES), SENSOR
+        )
 
     def run(self, stop: threading.Event) -> None:
-        """Serve until `stop` is set."""
+        """Publish images until `stop` is set."""
         last_s = time.monotonic()
         while not stop.is_set():
-            if self._slot.wait(WAIT_S):
-                arrival = self._slot.pop()
-                if arrival is not None and self._take(arrival):
+            if self._image.wait(WAIT_S):
+                arrival = self._image.pop()
+                if arrival is not None and self._handle(arrival):
                     last_s = time.monotonic()
             silent_s = time.monotonic() - last_s
             if silent_s > STALL_S:
-                self.outlet.lose(f"no picture on {self._topic.topic} for {silent_s:.0f} s")
+                self.publisher.lose(f"no image on {self._topic.topic} for {silent_s:.0f} s")
 
-    def _take(self, arrival: ReceivedSample) -> bool:
-        """Whether it was a picture."""
-        outlet, now_s = self.outlet, time.monotonic()
-        due = outlet.due(arrival.mono_ns)
-        if not (due and outlet.has_subscribers) and now_s - self._looked_s < LOOK_S:
-            if outlet.state == OK:
-                outlet.captured(arrival.mono_ns)
-            return outlet.state == OK
-        self._looked_s = now_s
+    def _handle(self, arrival: ReceivedSample) -> bool:
+        """Publish an image, or check it now and then; whether it is a valid one."""
+        publisher, now_s = self.publisher, time.monotonic()
+        due = publisher.due(arrival.mono_ns)
+        if not (due and publisher.has_subscribers) and now_s - self._decoded_s < LOOK_S:
+            if publisher.state == OK:
+                publisher.captured(arrival.mono_ns)
+            return publisher.state == OK
+        self._decoded_s = now_s
         try:
-            picture = self._read(arrival)
-            outlet.check(picture.rgb, arrival.mono_ns, picture.stamp_ns or None)
-            if picture.stamp_ns:
-                self._newness.check(picture.stamp_ns)
+            image = self._decode(arrival)
+            publisher.check(image.rgb, arrival.mono_ns, image.stamp_ns or None)
+            if image.stamp_ns:
+                self._stamps.check(image.stamp_ns)
         except CodecError as error:
-            self._refuse(error.reason, f"{self._topic.topic}: {error}", outlet.name)
-            if error.reason in ("encoding", "frame"):  # they will all be like that
-                outlet.lose(str(error))
+            self._reject(error.reason, f"{self._topic.topic}: {error}", publisher.name)
+            if error.reason in ("encoding", "frame"):  # of all further images as well
+                publisher.lose(str(error))
             return False
-        outlet.captured(arrival.mono_ns)
-        outlet.set_state(OK)
-        if due and outlet.has_subscribers:
-            settings = outlet.profile
-            rgb = resize(picture.rgb, settings.width, settings.height)
-            stamp_ns = picture.stamp_ns or self._node.clock.wall_at(arrival.mono_ns)
-            outlet.publish_rgb(rgb, arrival.mono_ns, stamp_ns)
+        publisher.captured(arrival.mono_ns)
+        publisher.set_state(OK)
+        if due and publisher.has_subscribers:
+            settings = publisher.profile
+            rgb = resize(image.rgb, settings.width, settings.height)
+            stamp_ns = image.stamp_ns or self._node.clock.wall_at(arrival.mono_ns)
+            publisher.publish_rgb(rgb, arrival.mono_ns, stamp_ns)
         return True
 
-    def _read(self, arrival: ReceivedSample) -> RosImage:
+    def _decode(self, arrival: ReceivedSample) -> RosImage:
         payload = arrival.sample.payload.to_bytes()
-        picture: RosImage = table.read(self._messages, self._topic.type, payload)
-        if self._topic.frame is not None and picture.frame != self._topic.frame:
+        image: RosImage = table.read(self._messages, self._topic.type, payload)
+        if self._topic.frame is not None and image.frame != self._topic.frame:
             raise CodecError(
-                "frame", f"in frame {picture.frame[:60]!r}, wanted {self._topic.frame!r}"
+                "frame", f"in frame {image.frame[:60]!r}, wanted {self._topic.frame!r}"
             )
-        return picture
+        return image

@@ -1,4 +1,4 @@
-"""Our ends in the ROS graph: topics, services and actions over one Zenoh session."""
+"""Publishers, subscribers, services and action clients in a ROS graph, over one Zenoh session."""
 
 from __future__ import annotations
 
@@ -20,12 +20,10 @@ from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.qos import DEFAULT, Qos
 from vla_zenoh.profile.ros2 import Ros2Profile
 
-Slot = TypeVar("Slot", LatestSample, CallbackRing)
-Done = Callable[[bytes | None], None]
-"""Takes the answer of a service, None where there was none."""
+Buffer = TypeVar("Buffer", LatestSample, CallbackRing)
 
 CALL_S = 5.0
-"""Longest wait for a service to answer."""
+"""Timeout of a service call."""
 
 _COMMANDS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
@@ -36,8 +34,8 @@ MAX_ATTACHMENT_BYTES = 1024
 _CDR = zenoh.Encoding("application/cdr")
 
 
-class Writer:
-    """Writes one topic."""
+class RosPublisher:
+    """Publishes one topic."""
 
     def __init__(self, session: zenoh.Session, key: str, gid: bytes | None) -> None:
         self._publisher = session.declare_publisher(key, encoding=_CDR, **_COMMANDS)
@@ -45,47 +43,54 @@ class Writer:
         self._seq = itertools.count(1)
 
     @property
-    def heard(self) -> bool:
-        """Somebody listens: with a bridge, a subscriber in DDS."""
+    def has_subscribers(self) -> bool:
+        """Whether there is a subscriber; behind a bridge, one in DDS."""
         return self._publisher.matching_status.matching  # pyright: ignore  # stub says bool
 
-    def put(self, payload: bytes) -> None:
-        """Write CDR bytes."""
+    def publish(self, payload: bytes) -> None:
+        """Publish CDR bytes."""
         self._publisher.put(payload, attachment=_attachment(self._gid, self._seq))
 
 
-class Caller:
-    """Calls one service."""
+class ServiceClient:
+    """Client of one service."""
 
-    def __init__(self, session: zenoh.Session, key: str, gid: bytes | None, wait_s: float) -> None:
-        self._session, self._key, self._gid, self._wait_s = session, key, gid, wait_s
+    def __init__(
+        self, session: zenoh.Session, key: str, gid: bytes | None, timeout_s: float
+    ) -> None:
+        self._session, self._key, self._gid, self._timeout_s = session, key, gid, timeout_s
         self._seq = itertools.count(1)
 
-    def call(self, request: bytes, done: Done, wait_s: float | None = None) -> None:
-        """Ask; `done` is called once, on Zenoh's thread.
+    def call(
+        self,
+        request: bytes,
+        done: Callable[[bytes | None], None],
+        timeout_s: float | None = None,
+    ) -> None:
+        """Call the service; `done` is called once, on Zenoh's thread.
 
         Args:
             request: CDR bytes.
-            done: takes the answer, or None where none came in time.
-            wait_s: how long an answer is waited for; None: as long as the caller was made for.
+            done: receives the answer in CDR, or None after the timeout.
+            timeout_s: None: that of the client.
         """
         answers: list[bytes] = []
 
-        def take(reply: zenoh.Reply) -> None:
+        def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                with contextlib.suppress(CodecError):  # too large to be an answer
+                with contextlib.suppress(CodecError):  # too large
                     answers.append(bytes_of(reply.ok.payload))
 
-        def end() -> None:
+        def on_end() -> None:
             done(answers[0] if answers else None)
 
         self._session.get(
             self._key,
-            zenoh.handlers.Callback(take, end, indirect=False),
+            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
             payload=request,
             encoding=_CDR,
             attachment=_attachment(self._gid, self._seq),
-            timeout=self._wait_s if wait_s is None else wait_s,
+            timeout=self._timeout_s if timeout_s is None else timeout_s,
             target=zenoh.QueryTarget.BEST_MATCHING if self._gid is None else _ALL_COMPLETE,
         )
 
@@ -100,22 +105,22 @@ def _attachment(gid: bytes | None, seq: itertools.count[int]) -> bytes | None:
 
 
 class Request:
-    """A call of one of our services, to be answered once, from any thread."""
+    """Call of one of our services; answer it once, from any thread."""
 
     def __init__(self, query: zenoh.Query, key: str, with_attachment: bool) -> None:
         self._query, self._key = query, key
         payload = query.payload
         self.payload = bytes_of(payload)
-        self._given: Attachment | None = None
+        self._attachment: Attachment | None = None
         if with_attachment:
             attachment = query.attachment
-            self._given = attachments.decode(
+            self._attachment = attachments.decode(
                 None if attachment is None else bytes_of(attachment, MAX_ATTACHMENT_BYTES)
             )
 
     def answer(self, response: bytes) -> None:
-        """Reply with CDR bytes; number and gid of the request go back with them."""
-        given = self._given
+        """Reply with CDR bytes, and with number and gid of the request."""
+        given = self._attachment
         attachment = None
         if given is not None:
             attachment = attachments.encode(Attachment(given.seq, time.time_ns(), given.gid))
@@ -123,19 +128,22 @@ class Request:
             self._query.reply(self._key, response, encoding=_CDR, attachment=attachment)
 
     def drop(self, why: str) -> None:
-        """Answer with an error, which ROS callers see as no answer."""
+        """Reply with an error; ROS clients see no answer."""
         with self._query:
             self._query.reply_err(why.encode())
 
 
 class RosGraph:
-    """See the module.
+    """A node of a ROS graph: declares its publishers, subscribers, services and clients.
 
     Args:
-        session: one that reaches the bridge or the router of the robot.
+        session: to the bridge or the router of the robot.
         profile: the section ros2.
         messages: of the robot's distribution.
-        node: our name in the ROS graph.
+        node: its name.
+
+    Attributes:
+        buffers: of all subscribers.
     """
 
     def __init__(
@@ -154,12 +162,11 @@ class RosGraph:
         self._lock = threading.Lock()
         self._others: set[str] = set()
         self._declared: list[Any] = []
-        self.slots: list[LatestSample | CallbackRing] = []
-        """Of all topics that are read."""
+        self.buffers: list[LatestSample | CallbackRing] = []
         own = self._wire.node_token()
         self._declared.append(session.liveliness().declare_token(own))
 
-        def seen(sample: zenoh.Sample) -> None:
+        def on_token(sample: zenoh.Sample) -> None:
             token = str(sample.key_expr)
             with self._lock:
                 if sample.kind == zenoh.SampleKind.PUT and token != own:
@@ -169,27 +176,27 @@ class RosGraph:
 
         self._declared.append(
             session.liveliness().declare_subscriber(
-                self._wire.others(), zenoh.handlers.Callback(seen, indirect=False), history=True
+                self._wire.others(), zenoh.handlers.Callback(on_token, indirect=False), history=True
             )
         )
 
     @property
     def others(self) -> int:
-        """Bridges, or nodes of rmw_zenoh, that are there beside us."""
+        """Number of bridges, or of other nodes of rmw_zenoh."""
         with self._lock:
             return len(self._others)
 
     def _declare(self, endpoint: Endpoint) -> tuple[str, bytes | None]:
-        """Announce an endpoint; its key, and its gid where the wire has gids."""
+        """Declare an endpoint; its key, and its gid where the wire format has gids."""
         token = self._wire.token(endpoint, next(self._numbers))
         self._declared.append(self.session.liveliness().declare_token(token))
         return self._wire.key(endpoint), attachments.gid_of(token) if self._rmw else None
 
-    def read(self, name: str, kind: str, slot: Slot, qos: Qos = DEFAULT) -> Slot:
-        """Let samples of a topic fall into `slot`."""
+    def subscribe(self, name: str, kind: str, buffer: Buffer, qos: Qos = DEFAULT) -> Buffer:
+        """Subscribe to a topic; its samples go to `buffer`."""
         key, _ = self._declare(Endpoint(EntityRole.SUBSCRIBER, name, kind, qos))
-        self.slots.append(slot)
-        handler = zenoh.handlers.Callback(slot, indirect=False)
+        self.buffers.append(buffer)
+        handler = zenoh.handlers.Callback(buffer, indirect=False)
         if qos.transient_local:
             subscriber = zenoh.ext.declare_advanced_subscriber(
                 self.session,
@@ -200,14 +207,15 @@ class RosGraph:
         else:
             subscriber = self.session.declare_subscriber(key, handler)
         self._declared.append(subscriber)
-        return slot
+        return buffer
 
-    def write(self, name: str, kind: str, qos: Qos = DEFAULT) -> Writer:
-        """A writer of a topic."""
-        return Writer(self.session, *self._declare(Endpoint(EntityRole.PUBLISHER, name, kind, qos)))
+    def publisher(self, name: str, kind: str, qos: Qos = DEFAULT) -> RosPublisher:
+        """Publisher of a topic."""
+        endpoint = Endpoint(EntityRole.PUBLISHER, name, kind, qos)
+        return RosPublisher(self.session, *self._declare(endpoint))
 
-    def serve(self, name: str, kind: str, take: Callable[[Request], None]) -> None:
-        """Take calls of a service of ours, on Zenoh's thread."""
+    def serve(self, name: str, kind: str, on_request: Callable[[Request], None]) -> None:
+        """Serve a service; `on_request` is called on Zenoh's thread."""
         key, _ = self._declare(Endpoint(EntityRole.SERVER, name, kind))
 
         def handle(query: zenoh.Query) -> None:
@@ -217,24 +225,25 @@ class RosGraph:
                 with query:
                     query.reply_err(str(error).encode())
                 return
-            take(request)
+            on_request(request)
 
         handler = zenoh.handlers.Callback(handle, indirect=False)
         self._declared.append(self.session.declare_queryable(key, handler, complete=True))
 
-    def call(self, name: str, kind: str, wait_s: float = CALL_S) -> Caller:
-        """A caller of somebody's service."""
-        return Caller(self.session, *self._declare(Endpoint(EntityRole.CLIENT, name, kind)), wait_s)
+    def client(self, name: str, kind: str, timeout_s: float = CALL_S) -> ServiceClient:
+        """Client of a service."""
+        endpoint = Endpoint(EntityRole.CLIENT, name, kind)
+        return ServiceClient(self.session, *self._declare(endpoint), timeout_s)
 
-    def call_action(self, name: str, kind: str) -> dict[str, Caller]:
-        """Callers of an action's services: ``send_goal``, ``get_result``, ``cancel_goal``."""
+    def action_client(self, name: str, kind: str) -> dict[str, ServiceClient]:
+        """Clients of an action's services: ``send_goal``, ``get_result``, ``cancel_goal``."""
         action = Endpoint(EntityRole.ACTION_CLIENT, name, kind)
         parts = parts_of(action)
-        if self._rmw:  # there every part is announced, a bridge is told of the action
-            return {part: self.call(end.name, end.type, CALL_S) for part, end in parts.items()}
+        if self._rmw:  # there every part is declared; a bridge wants the action alone
+            return {part: self.client(end.name, end.type, CALL_S) for part, end in parts.items()}
         self._declare(action)
         return {
-            part: Caller(self.session, self._wire.key(end), None, CALL_S)
+            part: ServiceClient(self.session, self._wire.key(end), None, CALL_S)
             for part, end in parts.items()
         }
 

@@ -1,7 +1,7 @@
-"""Services for ROS people: what they ask becomes a setting of ours. Topics: see `RosTopics`.
+"""ROS services that control the robot: activate, stop, reset, prompt. Topics: see `RosTopics`.
 
-A thread of its own, because a setting has to be agreed to by the command node before it is
-answered. A stop waits for nothing, and what was asked before it is not done after it.
+They run in a thread of their own, because the command node has to confirm a setting before the call
+is answered. A stop is sent at once, and no call made before it is carried out after it.
 """
 
 from __future__ import annotations
@@ -35,41 +35,41 @@ from vla_zenoh.interop.ros2.services import (
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.ros2.estop_order import EstopOrder
 from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
-from vla_zenoh.robots.ros2.ros_topics import Refuse, RosTopics, text_of
+from vla_zenoh.robots.ros2.ros_topics import Reject, RosTopics, prompt_text
 
 STATUS_PERIOD_S = 1.0
-TURN_S = 0.05
+POLL_S = 0.05
 MAX_WAITING = 32
-STOP_PATIENCE_S = 2.0
+STATE_TIMEOUT_S = 2.0
 
 
 class RosServices:
-    """See the module.
+    """Serves the control services, the control topics and the status topic.
 
     Args:
         profile: the effective profile.
         session: to our own router.
-        link: to the ROS graph.
+        graph: the ROS graph.
         messages: of the robot's distribution, for this thread alone.
-        prefix: what names of services and topics begin with.
-        refuse: counts a refusal; may be called from any thread.
+        prefix: of the names of services and topics.
+        reject: counts a rejection; may be called from any thread.
     """
 
     def __init__(
         self,
         profile: Profile,
         session: zenoh.Session,
-        link: RosGraph,
+        graph: RosGraph,
         messages: Messages,
         prefix: str,
-        refuse: Refuse,
+        reject: Reject,
     ) -> None:
-        self._robot, self._messages, self._refuse = profile.robot.name, messages, refuse
+        self._robot, self._messages, self._reject = profile.robot.name, messages, reject
         self._client = Client(profile, session).subscribe()
         self._stops = EstopOrder(session, profile.keys.stop)
         self._calls: queue.Queue[tuple[Service, Request, int]] = queue.Queue(MAX_WAITING)
-        self._asked_ns = 0
-        self._do: dict[str, Callable[[Any], str]] = {
+        self._called_ns = 0
+        self._handlers: dict[str, Callable[[Any], str]] = {
             SET_ACTIVE.name: self._set_active,
             STOP.name: self._stop,
             RESET.name: self._reset,
@@ -77,58 +77,58 @@ class RosServices:
             SET_REQUEST.name: self._set_request,
         }
         for service in SERVICES:
-            link.serve(f"{prefix}/{service.name}", service.type, self._taker(service))
-        self._wishes = RosTopics(
-            self._client, link, Messages(messages.distribution), prefix, refuse, self._stops
+            graph.serve(f"{prefix}/{service.name}", service.type, self._enqueue(service))
+        self._topics = RosTopics(
+            self._client, graph, Messages(messages.distribution), prefix, reject, self._stops
         )
-        self._status = link.write(f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)
+        self._status = graph.publisher(f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)
 
-    def _taker(self, service: Service) -> Callable[[Request], None]:
-        def take(request: Request) -> None:
-            if service is STOP:  # before all that wait
+    def _enqueue(self, service: Service) -> Callable[[Request], None]:
+        def enqueue(request: Request) -> None:
+            if service is STOP:  # overtakes the calls in the queue
                 self._stops.stop(lambda: self._client.publish(self._client.keys.stop, ""))
             try:
                 self._calls.put_nowait((service, request, time.monotonic_ns()))
             except queue.Full:
                 request.drop("too many calls at once")
 
-        return take
+        return enqueue
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set."""
         topics = threading.Thread(
-            target=self._wishes.run, args=(stop,), name="ros2 wishes", daemon=True
+            target=self._topics.run, args=(stop,), name="ros2 topics", daemon=True
         )
         topics.start()
         next_status_s = time.monotonic()
         while not stop.is_set():
             with contextlib.suppress(queue.Empty):
-                self._answer(*self._calls.get(timeout=TURN_S))
+                self._answer(*self._calls.get(timeout=POLL_S))
             if time.monotonic() >= next_status_s:
                 next_status_s = time.monotonic() + STATUS_PERIOD_S
-                self._tell_status()
+                self._publish_status()
         topics.join()
 
     # -- services -----------------------------------------------------------------------------
-    def _answer(self, service: Service, request: Request, asked_ns: int) -> None:
+    def _answer(self, service: Service, request: Request, called_ns: int) -> None:
         try:
             asked = self._messages.decode(request_of(service.type), request.payload)
         except CodecError as error:
-            self._refuse(error.reason, f"{service.name}: {error}", service.name)
+            self._reject(error.reason, f"{service.name}: {error}", service.name)
             request.drop(str(error))
             return
-        # An error in place of an answer never reaches a ROS client: it would wait for ever.
-        self._asked_ns = asked_ns
+        # An error reply never reaches a ROS client, which would wait for ever.
+        self._called_ns = called_ns
         try:
             if service is not STOP:
-                self._stops.check(asked_ns)
-            said, success = self._do[service.name](asked), True
+                self._stops.check(called_ns)
+            text, success = self._handlers[service.name](asked), True
         except CodecError as error:
-            self._refuse(error.reason, f"{service.name}: {error}", service.name)
-            said, success = str(error), False
+            self._reject(error.reason, f"{service.name}: {error}", service.name)
+            text, success = str(error), False
         except (SessionError, zenoh.ZError) as error:
-            said, success = str(error), False
-        response = self._messages.new(response_of(service.type), success=success, message=said)
+            text, success = str(error), False
+        response = self._messages.new(response_of(service.type), success=success, message=text)
         request.answer(self._messages.encode(response))
 
     def _set_active(self, asked: Any) -> str:
@@ -136,11 +136,11 @@ class RosServices:
 
     def _activate(self, wanted: bool) -> str:
         if wanted:
-            self._stops.check(self._asked_ns)  # what comes before it in a request may take seconds
+            self._stops.check(self._called_ns)  # earlier parts of a request may take seconds
             task = self._client.activate()
             return f"active: worker {task.worker}, {task.prompt!r}"
         if not self._client.deactivate():
-            raise SessionError("the command node does not say that the arm stands")
+            raise SessionError("the command node does not confirm that the arm stands")
         return "inactive, the arm stands"
 
     def _stop(self, asked: Any) -> str:
@@ -149,7 +149,7 @@ class RosServices:
 
     def _reset(self, asked: Any) -> str:
         self._stops.unless_stopped(
-            self._asked_ns, lambda: self._client.publish(self._client.keys.reset, "")
+            self._called_ns, lambda: self._client.publish(self._client.keys.reset, "")
         )
         self._await_state("inactive")
         return "inactive"
@@ -159,18 +159,18 @@ class RosServices:
             status = self._client.status("command")
             return status is not None and status.state == wanted
 
-        if not self._client.wait_for(reached, STOP_PATIENCE_S):
+        if not self._client.wait_for(reached, STATE_TIMEOUT_S):
             status = self._client.status("command")
             now = "silent" if status is None else status.state
             raise SessionError(f"the command node is {now}, not {wanted}")
 
     def _set_prompt(self, asked: Any) -> str:
-        return f"prompt {self._client.set_prompt(text_of(asked.prompt)).prompt!r}"
+        return f"prompt {self._client.set_prompt(prompt_text(asked.prompt)).prompt!r}"
 
     def _set_request(self, asked: Any) -> str:
-        """One after the other: inactive first where that is asked, active last.
+        """Apply the fields one after the other: deactivation first, activation last.
 
-        What is refused ends it; what came before stays.
+        The first rejected one ends it; those before it stay applied.
         """
         done = []
         if not asked.active:
@@ -187,8 +187,8 @@ class RosServices:
             done.append(self._activate(True))
         return "; ".join(done)
 
-    def _tell_status(self) -> None:
+    def _publish_status(self) -> None:
         message = diagnostics.write(
             self._messages, self._robot, self._client.snapshot(), Stamp(time.time_ns(), "")
         )
-        self._status.put(self._messages.encode(message))
+        self._status.publish(self._messages.encode(message))

@@ -1,8 +1,7 @@
-"""What a ROS 2 robot's topics say of its arm: joint states, its transforms, its external wrench."""
+"""Subscribes to a ROS 2 robot's joint states, transforms and external wrench."""
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -26,30 +25,31 @@ from vla_zenoh.profile.ros2 import Ros2Profile
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.types import FloatArray
 
-INBOX = 64
-WRENCH_PATIENCE_NS = 200_000_000
+BUFFER = 64
+WRENCH_TIMEOUT_NS = 200_000_000
 
 
 class StateSubscriber:
-    """See the module.
+    """State of the arm and gripper from the robot's topics.
 
     Args:
-        node: on whose behalf.
-        link: to the ROS graph.
+        node: on the bus; its counters get the rejections.
+        graph: the ROS graph.
         messages: of the robot's distribution.
         ros2: the profile's section.
         kinematics: of the arm.
 
     Attributes:
-        state: of arm and gripper, the newest.
+        state: newest joint states of arm and gripper.
         clock: of the robot.
         rate: of joint states.
+        received_ns: monotonic time of the newest joint state, None before the first.
     """
 
     def __init__(
         self,
         node: Node,
-        link: RosGraph,
+        graph: RosGraph,
         messages: Messages,
         ros2: Ros2Profile,
         kinematics: Kinematics,
@@ -58,107 +58,105 @@ class StateSubscriber:
         self.state = JointReading(node.profile, kinematics)
         self.clock = RobotClock()
         self.rate = RateMeter()
-        self._heard_ns: int | None = None
+        self.received_ns: int | None = None
         self._wrench: Wrench | None = None
-        self._frames = TransformBuffer() if ros2.tcp == "tf" else None
         topics = dict.fromkeys((ros2.joint_states, ros2.finger_states or ros2.joint_states))
-        self._joint_slots = [
-            link.read(topic, joint_state.TYPE, CallbackRing(INBOX), SENSOR) for topic in topics
+        self._joint_states = [
+            graph.subscribe(topic, joint_state.TYPE, CallbackRing(BUFFER), SENSOR)
+            for topic in topics
         ]
-        self._tf_slots = []
-        if self._frames is not None:
-            self._tf_slots = [
-                (link.read(TF, transforms.TYPE, CallbackRing(INBOX), SENSOR), False),
+        self._transforms = TransformBuffer()
+        self._tf = []
+        if ros2.tcp == "tf":
+            self._tf = [
+                (graph.subscribe(TF, transforms.TYPE, CallbackRing(BUFFER), SENSOR), False),
                 (
-                    link.read(TF_STATIC, transforms.TYPE, CallbackRing(INBOX), STATIC_TRANSFORMS),
+                    graph.subscribe(
+                        TF_STATIC, transforms.TYPE, CallbackRing(BUFFER), STATIC_TRANSFORMS
+                    ),
                     True,
                 ),
             ]
-        self._wrench_slot = None
+        self._wrenches = None
         if ros2.wrench is not None:
-            self._wrench_slot = link.read(ros2.wrench.topic, wrench.TYPE, CallbackRing(4), SENSOR)
+            self._wrenches = graph.subscribe(
+                ros2.wrench.topic, wrench.TYPE, CallbackRing(4), SENSOR
+            )
 
-    @property
-    def age_s(self) -> float | None:
-        """Of the newest joint state, None before the first."""
-        return None if self._heard_ns is None else (time.monotonic_ns() - self._heard_ns) / 1e9
-
-    def take(self) -> bool:
-        """Take what arrived; whether the arm's joints are known anew."""
-        self._take_transforms()
-        self._take_wrench()
-        return self._take_joints()
+    def update(self) -> bool:
+        """Process the messages that arrived; whether there is a new state of the arm's joints."""
+        self._update_transforms()
+        self._update_wrench()
+        return self._update_joints()
 
     def tcp(self, stamp_ns: int) -> tuple[Pose | None, FloatArray]:
-        """The TCP and its (6,) twist; None where its transforms are not known, or not of then."""
+        """TCP pose and its (6,) twist; the pose is None where tf has none of that time."""
         tcp, twist = self.state.tcp()
-        return (tcp if self._frames is None else self._tcp_of(self._frames, stamp_ns)), twist
+        return (self._tcp_by_tf(stamp_ns) if self._tf else tcp), twist
 
     def wrench(self, stamp_ns: int) -> FloatArray | None:
-        """(6,) external N and Nm, None where none was heard lately."""
+        """(6,) external wrench in N and Nm, None where there is none of that time."""
         found = self._wrench
-        if found is None or abs(stamp_ns - found.stamp_ns) > WRENCH_PATIENCE_NS:
+        if found is None or abs(stamp_ns - found.stamp_ns) > WRENCH_TIMEOUT_NS:
             return None
         return found.wrench
 
     # -- topics -------------------------------------------------------------------------------
-    def _refuse(self, topic: str, error: CodecError) -> None:
+    def _reject(self, topic: str, error: CodecError) -> None:
         self._node.reject(error.reason, f"{topic}: {error}", topic)
 
-    def _read(self, kind: str, arrival: ReceivedSample) -> Any:
+    def _decode(self, kind: str, arrival: ReceivedSample) -> Any:
         return table.read(self._messages, kind, arrival.sample.payload.to_bytes())
 
-    def _take_joints(self) -> bool:
+    def _update_joints(self) -> bool:
         fresh = False
-        for slot in self._joint_slots:
-            for arrival in slot.drain():
-                topic = str(arrival.sample.key_expr)
+        for buffer in self._joint_states:
+            for arrival in buffer.drain():
                 try:
-                    joints = self._read(joint_state.TYPE, arrival)
+                    joints = self._decode(joint_state.TYPE, arrival)
                     arrived_ns = self._node.arrival_wall_ns(arrival)
                     if self.state.take(joints, joints.stamp_ns or arrived_ns) is None:
-                        continue  # of the fingers alone, or another robot's
+                        continue  # of the fingers alone, or of another robot
                 except CodecError as error:
-                    self._refuse(topic, error)
+                    self._reject(str(arrival.sample.key_expr), error)
                     continue
                 fresh = True
                 self.clock.take(joints.stamp_ns, arrived_ns)
-                self._heard_ns = arrival.mono_ns
+                self.received_ns = arrival.mono_ns
                 self.rate.tick()
         return fresh
 
-    def _take_transforms(self) -> None:
-        for slot, static in self._tf_slots:
-            for arrival in slot.drain():
-                assert self._frames is not None
+    def _update_transforms(self) -> None:
+        for buffer, static in self._tf:
+            for arrival in buffer.drain():
                 try:
-                    self._frames.take(self._read(transforms.TYPE, arrival), static=static)
+                    self._transforms.take(self._decode(transforms.TYPE, arrival), static=static)
                 except CodecError as error:
-                    self._refuse(TF_STATIC if static else TF, error)
+                    self._reject(TF_STATIC if static else TF, error)
 
-    def _take_wrench(self) -> None:
-        if self._wrench_slot is None or self._ros2.wrench is None:
+    def _update_wrench(self) -> None:
+        if self._wrenches is None or self._ros2.wrench is None:
             return
         frame = self._ros2.wrench.frame or self._node.profile.robot.base_frame
-        for arrival in self._wrench_slot.drain():
+        for arrival in self._wrenches.drain():
             try:
-                found: Wrench = self._read(wrench.TYPE, arrival)
+                found: Wrench = self._decode(wrench.TYPE, arrival)
                 if found.frame != frame:
                     raise CodecError("frame", f"in frame {found.frame[:60]!r}, wanted {frame!r}")
                 if not np.isfinite(found.wrench).all():
                     raise CodecError("invalid", "a wrench that is NaN or infinite")
             except CodecError as error:
-                self._refuse(self._ros2.wrench.topic, error)
+                self._reject(self._ros2.wrench.topic, error)
             else:
                 stamp_ns = found.stamp_ns or self._node.arrival_wall_ns(arrival)
                 self._wrench = found._replace(stamp_ns=stamp_ns)
 
-    def _tcp_of(self, frames: TransformBuffer, stamp_ns: int) -> Pose | None:
+    def _tcp_by_tf(self, stamp_ns: int) -> Pose | None:
         profile = self._node.profile
-        found = frames.find(profile.robot.base_frame, profile.robot.tcp_frame)
+        base, tip = profile.robot.base_frame, profile.robot.tcp_frame
+        found = self._transforms.find(base, tip)
         if found is None:
-            way = f"{profile.robot.base_frame} -> {profile.robot.tcp_frame}"
-            self._refuse(TF, CodecError("no_transform", f"{way} is not known"))
+            self._reject(TF, CodecError("no_transform", f"{base} -> {tip} is not known"))
             return None
         pose, oldest_ns, newest_ns = found
         behind_s, ahead_s = (stamp_ns - oldest_ns) / 1e9, (newest_ns - stamp_ns) / 1e9
@@ -168,6 +166,6 @@ class StateSubscriber:
                 if behind_s > ahead_s
                 else f"{ahead_s:.3f} s ahead of the joints: was a clock set?"
             )
-            self._refuse(TF, CodecError("stale", f"the TCP is {why}"))
+            self._reject(TF, CodecError("stale", f"the TCP is {why}"))
             return None
         return pose

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.cli.options import options
-from vla_zenoh.cli.output import console, errors, fail
+from vla_zenoh.cli.output import console, errors, fail, new_table
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
@@ -132,9 +132,7 @@ def _save(folder: Path, view: InferenceView) -> None:
 
 def table(newest: Mapping[str, InferenceView]) -> Table:
     """A table of the newest inference of each worker."""
-    out = Table(header_style="bold")
-    for column in ("worker", "images", "prompt", "raw", "first step", "inference"):
-        out.add_column(column, overflow="fold")
+    out = new_table("worker", "images", "prompt", "raw", "first step", "inference")
     for worker, view in sorted(newest.items()):
         record = view.record
         images = [

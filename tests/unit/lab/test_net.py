@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from vla_zenoh.cli.net import NOBODY, Line, lines_of, pairs_of
+from vla_zenoh.lab.cli.net import NOBODY, Line, lines_of, pairs_of
 from vla_zenoh.types import NodeStatus
 
 HZ, BYTES_S = 200.0, 20_000.0

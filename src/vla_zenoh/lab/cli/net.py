@@ -13,7 +13,7 @@ from rich.table import Table
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.clock_sync import ClockSync
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, fail, print_json, styled
+from vla_zenoh.cli.output import console, fail, new_table, print_json, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import NodeStatus
@@ -89,7 +89,7 @@ def net(
         while time.monotonic() < end_s:
             for node in tuple(client.alive):
                 clocks.track(node)
-            clocks.tick()
+            clocks.poll()
             time.sleep(POLL_S)
         statuses = {name: found for name, (found, _, alive) in client.snapshot().items() if alive}
         own_links = tuple(sorted(str(link.dst) for link in client.session.info.links()))
@@ -225,9 +225,8 @@ def tables(
         lines: of nodes and keys.
         bound_ms: a larger clock offset is marked.
     """
-    hosts = Table(header_style="bold", title=f"robot {robot}", title_justify="left")
-    for column in ("from", "to", "round trip", "clock ahead by", "link", "measured by"):
-        hosts.add_column(column, overflow="fold")
+    columns = ("from", "to", "round trip", "clock ahead by", "link", "measured by")
+    hosts = new_table(*columns, title=f"robot {robot}")
     for pair in pairs:
         wrong = abs(pair.offset_ms) > bound_ms
         clock = f"{pair.offset_ms:+.2f} +- {pair.uncertainty_ms:.2f} ms"
@@ -239,9 +238,7 @@ def tables(
             one_line(", ".join(pair.links)),
             one_line(f"{pair.by} of {pair.of}"),
         )
-    keys = Table(header_style="bold")
-    for column in ("key", "node", "host", "rate", "kbit/s", "lost by"):
-        keys.add_column(column, overflow="fold")
+    keys = new_table("key", "node", "host", "rate", "kbit/s", "lost by")
     for line in lines:
         lost = ", ".join(f"{node} {count}" for node, count in sorted(line.lost.items()))
         keys.add_row(

@@ -1,0 +1,221 @@
+"""The arm of a robot node: command stream and gripper commands in, states out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from vla_zenoh.bus.buffers import CallbackRing
+from vla_zenoh.bus.node import Node
+from vla_zenoh.codec.records import SMALL_BYTES
+from vla_zenoh.errors import CodecError
+from vla_zenoh.guard.arm_guard import Measured
+from vla_zenoh.guard.gripper_guard import GripperGuard
+from vla_zenoh.keys import Kind
+from vla_zenoh.kinematics.so3 import quat_from_rotation
+from vla_zenoh.robots.command_follower import CommandFollower
+from vla_zenoh.robots.driver import Measurement, RobotDriver
+from vla_zenoh.types import Event, GripperCommand, GripperState
+
+NOT_READY = ("braking", "stalled", "unheeded")
+"""States in which the robot is well, but not ready for commands; its gripper state says so too."""
+FAULT_AGAIN_NS = 100_000_000
+"""A fault without measurements is published again after this, for late subscribers."""
+
+
+class Arm:
+    """Runs one arm through its driver, tick by tick.
+
+    Args:
+        node: on the bus.
+        driver: of the robot.
+
+    Attributes:
+        follower: of the command streams.
+    """
+
+    def __init__(self, node: Node, driver: RobotDriver) -> None:
+        self._node, self._driver = node, driver
+        self.follower = CommandFollower(node, driver)
+        self._gripper_commands = GripperCommands(node, driver)
+        keys = node.keys
+        self._joint_out = node.declare_publisher(keys.state_joint, Kind.STATE)
+        self._pose_out = node.declare_publisher(keys.state_pose, Kind.STATE)
+        self._gripper_out = node.declare_publisher(keys.state_gripper, Kind.STATE)
+        # A little less than the period: readings come at multiples of another one.
+        self._period_ns = 0.9e9 / node.profile.timing.state_hz
+        self._seq = self._published_ns = self._mono_ns = 0
+        self._gripper = GripperState(node.profile.robot.gripper.max_width_m, False, False)
+        self._published_fault = self._was = ""
+
+    # -- one tick -----------------------------------------------------------------------------
+    def step(self, now_ns: int, mono_ns: int, stall_s: float) -> None:
+        """Run one tick.
+
+        Args:
+            now_ns: wall clock, for stamps.
+            mono_ns: the same time on the monotonic clock.
+            stall_s: how late the tick is.
+        """
+        simulated = self._driver.simulated
+        self._mono_ns = mono_ns
+        self.follower.begin(mono_ns, stall_s)
+        if not simulated:
+            self._read(mono_ns)
+        self._follow(now_ns, mono_ns)
+        if self.follower.accepting:
+            self._gripper_commands.update(now_ns, self.follower)
+        if simulated:
+            self._read(mono_ns)
+
+    def brake_step(self, now_ns: int, mono_ns: int, stall_s: float) -> None:
+        """Run one tick of nothing but `move`, to bring the arm to rest."""
+        self._mono_ns = mono_ns
+        self.follower.begin(mono_ns, stall_s)
+        self._follow(now_ns, mono_ns)
+
+    def _follow(self, now_ns: int, mono_ns: int) -> None:
+        self.follower.update(now_ns, mono_ns, away=self._driver.away, silent=self._silent)
+
+    def _read(self, mono_ns: int) -> None:
+        measurement = self._driver.read(mono_ns)
+        if measurement is not None:
+            joints, self._gripper = measurement.joints, measurement.gripper or self._gripper
+            self.follower.on_measured(
+                Measured(measurement.tcp, joints.position_rad, joints.velocity_rad_s)
+            )
+        self.publish(measurement, mono_ns)
+
+    # -- states out ---------------------------------------------------------------------------
+    def publish(self, measurement: Measurement | None, mono_ns: int) -> None:
+        """Publish a measurement when it is due; a fault, and its end, at once.
+
+        The gripper state carries the fault, also where there is no valid measurement with it.
+        """
+        fault_changed = self._driver.fault != self._published_fault
+        elapsed_ns = mono_ns - self._published_ns
+        if measurement is None:
+            if fault_changed or (self._driver.fault and elapsed_ns >= FAULT_AGAIN_NS):
+                stamp_ns = mono_ns if self._driver.lockstep else self._node.clock.wall_at(mono_ns)
+                self._publish_gripper(self._gripper, stamp_ns, mono_ns)
+            return
+        if not fault_changed and elapsed_ns < self._period_ns:
+            return
+        joints, pose, stamp_ns = measurement.joints, measurement.pose, measurement.stamp_ns
+        tcp, held_rad = self.follower.held()
+        if tcp is not None:
+            pose = replace(
+                pose,
+                reference_position_m=tcp.position_m,
+                reference_quat_xyzw=quat_from_rotation(tcp.rotation),
+            )
+        if held_rad is not None:
+            joints = replace(joints, reference_rad=held_rad)
+        self._joint_out.publish(joints, stamp_wall_ns=stamp_ns, seq=self._seq)
+        self._pose_out.publish(pose, stamp_wall_ns=stamp_ns, seq=self._seq)
+        self._publish_gripper(measurement.gripper, stamp_ns, mono_ns)
+
+    def _publish_gripper(self, gripper: GripperState | None, stamp_ns: int, mono_ns: int) -> None:
+        fault, state = self._driver.fault, self.state
+        if gripper is not None:
+            mode = state if state in NOT_READY else self._driver.gripper_mode
+            gripper = replace(gripper, mode=mode, faults=(fault,) if fault else ())
+            self._gripper_out.publish(gripper, stamp_wall_ns=stamp_ns, seq=self._seq)
+        self._seq += 1
+        self._published_ns, self._published_fault = mono_ns, fault
+
+    # -- state --------------------------------------------------------------------------------
+    @property
+    def age_s(self) -> float | None:
+        """Age of the newest valid measurement, None before the first."""
+        measured_ns = self._driver.measured_ns
+        return None if measured_ns is None else max(0, self._mono_ns - measured_ns) / 1e9
+
+    @property
+    def _silent(self) -> bool:
+        age_s = None if self._driver.simulated else self.age_s
+        return age_s is not None and age_s > self._node.profile.timing.state_timeout_s
+
+    @property
+    def state(self) -> str:
+        """State of the arm, one word."""
+        if self._driver.fault:
+            return "fault"
+        if self._driver.measured_ns is None:
+            return "waiting"
+        if self._silent:
+            return "silent"
+        if self.follower.braking:
+            return "braking"
+        if self.follower.stalled:
+            return "stalled"
+        return "unheeded" if self.follower.unheeded else "running"
+
+    def changed(self) -> bool:
+        """Whether the state changed since the last call; a transition is emitted as an event."""
+        if self._driver.simulated and self._published_ns != self._mono_ns:
+            return False  # ticks are many: looked at whenever a state is published
+        state, was = self.state, self._was
+        if state == was:
+            return False
+        self._was = state
+        if was:
+            level = "info" if state == "running" else "warning"
+            self._node.emit(Event(level, "transition", f"{was}->{state}", self._why(state)))
+        return True
+
+    def _why(self, state: str) -> str:
+        if state == "stalled":
+            return (
+                f"the loop stood still for {self.follower.stall_s:.3f} s while it moved the arm, "
+                f"which stands at its last set-point{self._driver.stalled_hint}"
+            )
+        timeout_s = self._node.profile.timing.command_timeout_s
+        return {
+            "fault": self._driver.fault,
+            "silent": self._driver.silent_why,
+            "braking": f"no command/{self.follower.mode} for {timeout_s:g} s while the arm moved",
+            "unheeded": "command stream rejected: its first set-point does not match the arm's "
+            "current pose, or its beginning was lost",
+        }.get(state, "")
+
+
+class GripperCommands:
+    """Gripper commands of the arm's writer, from the bus to the driver.
+
+    Args:
+        node: on the bus; its counters get the rejections.
+        driver: of the robot.
+    """
+
+    def __init__(self, node: Node, driver: RobotDriver) -> None:
+        self._node, self._driver = node, driver
+        key = node.keys.command_gripper
+        self._commands = node.subscribe(key, CallbackRing(16, SMALL_BYTES))
+        self._guard = GripperGuard(node.profile.robot.gripper)
+
+    def update(self, now_ns: int, follower: CommandFollower) -> None:
+        """Accept or reject the commands that arrived.
+
+        Args:
+            now_ns: wall clock, for their age.
+            follower: of the arm; a gripper command of another writer is rejected.
+        """
+        for arrival in self._commands.drain():
+            command = self._node.decode(GripperCommand, arrival)
+            if command is None:
+                continue
+            if self._driver.no_gripper:
+                self._node.reject("no_gripper", f"command/gripper: {self._driver.no_gripper}")
+                continue
+            try:
+                accepted = self._guard.accept(
+                    command,
+                    follower.writer,
+                    0 if self._driver.lockstep else now_ns,  # in lockstep a command has no age
+                    writer_active=follower.writer_active,
+                )
+            except CodecError as error:
+                self._node.reject(error.reason, f"command/gripper {error}")
+                continue
+            self._node.counters["gripper_bounded"] = self._guard.bounded
+            self._driver.grip(accepted, now_ns)

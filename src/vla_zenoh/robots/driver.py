@@ -1,0 +1,205 @@
+"""Contract of a robot driver: the members of `vla_zenoh.robot.Robot`, with checked records."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from vla_zenoh.bus.clock import FixedRate, Tick
+from vla_zenoh.bus.node import Node
+from vla_zenoh.guard.arm_guard import Measured
+from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
+from vla_zenoh.profile import Profile
+from vla_zenoh.robots.command_follower import CommandFollower
+from vla_zenoh.types import (
+    FloatArray,
+    GripperCommand,
+    GripperState,
+    JointCommand,
+    JointState,
+    PoseCommand,
+    PoseState,
+)
+from vla_zenoh.types.commands import JointReference, PoseReference
+
+if TYPE_CHECKING:
+    from vla_zenoh.kinematics.kinematics import Kinematics
+
+STREAMING = "streaming"
+"""State in the commands that a driver sends: the guard has already judged that of the writer."""
+
+
+class Measurement(NamedTuple):
+    """Checked state of a robot at one time.
+
+    Args:
+        stamp_ns: wall clock.
+        joints: of the arm.
+        tcp: pose of the TCP in the base frame.
+        pose: the same with twist and wrench; a simulation adds its reference.
+        gripper: its mode and faults are set by the node; None: unknown.
+    """
+
+    stamp_ns: int
+    joints: JointState
+    tcp: Pose
+    pose: PoseState
+    gripper: GripperState | None
+
+
+class DriverStatus(NamedTuple):
+    """A driver's part of the node's status; see `vla_zenoh.types.NodeStatus` for the fields."""
+
+    detail: Mapping[str, Any]
+    ages_s: Mapping[str, float] = {}
+    rates_hz: Mapping[str, float] = {}
+    latency_ms: Mapping[str, tuple[float, float]] = {}
+
+
+class SteppedNode(Protocol):
+    """The node as a driver runs it in lockstep."""
+
+    def publish_state(self, measurement: Measurement, mono_ns: int) -> None:
+        """Publish a measurement."""
+        ...
+
+    def step(self, tick: Tick) -> None:
+        """Run one tick."""
+        ...
+
+    def watch(self) -> None:
+        """Publish the status when it is due."""
+        ...
+
+
+class RateLimiter(Protocol):
+    """Clock of the node's loop."""
+
+    def wait(self) -> Tick:
+        """Sleep until the next tick."""
+        ...
+
+
+class RobotDriver:
+    """One kind of robot as `RobotNode` drives it; a subclass needs `read` and `move`.
+
+    One thread, the node's loop, calls everything. A call must return within a fraction of
+    `period_s`. An exception ends the node after it braked the arm by further calls of `move`.
+
+    Attributes:
+        name: of the node.
+        profile: the effective profile.
+        period_s: of the loop.
+        modes: command streams that the robot follows, ``pose`` or ``joint``.
+        has_arm: False: the node serves other devices of the robot and moves nothing.
+        simulated: `read` steps a simulation by one period, towards the reference of the last
+            `move`, which is called at every tick. A real robot is read first, and moved only while
+            a stream is followed or braked: it holds its last set-point by itself.
+        lockstep: time is simulated as well; `serve_lockstep` replaces the loop.
+        switch_interval_s: how long another thread may hold the interpreter.
+        loop: name of the loop's rate in the status.
+        fault: why the robot does not move; empty: it is well.
+        measured_ns: monotonic time of the newest valid measurement, None before the first.
+        gripper_mode: mode of the gripper state while the arm is ready.
+        no_gripper: why gripper commands are rejected; empty: the robot has a gripper.
+        away: reason to reject commands, one word, while the robot cannot be moved.
+        silent_why, stalled_hint: sentences for the events of these states.
+    """
+
+    name = ""
+    has_arm, simulated, lockstep = True, False, False
+    switch_interval_s = 5e-4
+    loop = "loop"
+    fault = ""
+    measured_ns: int | None = None
+    gripper_mode = "ready"
+    no_gripper = ""
+    away = ""
+    silent_why = stalled_hint = ""
+
+    def __init__(self, profile: Profile) -> None:
+        self.profile = profile
+        self.period_s = 1.0 / profile.timing.command_hz
+        self.modes: tuple[str, ...] = (profile.robot.command,)
+
+    # -- required -----------------------------------------------------------------------------
+    def read(self, mono_ns: int) -> Measurement | None:
+        """The newest state; None: nothing new, or nothing valid.
+
+        Args:
+            mono_ns: time of this tick on the monotonic clock.
+        """
+        raise NotImplementedError
+
+    def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
+        """Set the set-point of the robot's controller; `now_ns` is its time on the wall clock."""
+        raise NotImplementedError
+
+    # -- optional -----------------------------------------------------------------------------
+    def attach(self, node: Node, follower: CommandFollower | None) -> None:
+        """The node is on the bus; `follower` is None where there is no arm."""
+
+    def connect(self) -> None:
+        """Connect to the robot before the loop starts; it may take long."""
+
+    def grip(self, command: GripperCommand, now_ns: int) -> None:
+        """Start a gripper motion."""
+
+    def poll(self, mono_ns: int) -> None:
+        """Begin a tick: handle other inputs than commands."""
+
+    def status(self) -> DriverStatus:
+        """Collect the driver's part of the status."""
+        return DriverStatus({})
+
+    def status_changed(self) -> bool:
+        """Whether the status should be published before it is due."""
+        return False
+
+    def serve_lockstep(self, node: SteppedNode, stop: threading.Event) -> None:
+        """Run the node's ticks when simulated time advances, until `stop` is set."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Disconnect; the arm stands."""
+
+    def pace(self) -> RateLimiter:
+        """Clock of the loop."""
+        return FixedRate(self.profile.timing.command_hz)
+
+    # -- geometry -----------------------------------------------------------------------------
+    def state_now(self) -> Measured | None:
+        """State at this moment, where a driver knows more than its last measurement."""
+        return None
+
+    @cached_property
+    def kinematics(self) -> Kinematics:
+        """Kinematics of the arm."""
+        from vla_zenoh.kinematics.kinematics import make_kinematics  # a simulation has its own
+
+        return make_kinematics(self.profile)
+
+    @property
+    def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper limit of the joints, (n,) each in the order of the profile."""
+        arm = self.kinematics
+        order = [arm.arm_joints.index(name) for name in self.profile.robot.arm_joints]
+        return arm.lower_rad[order], arm.upper_rad[order]
+
+    def forward(self, position_rad: FloatArray) -> Pose:
+        """TCP pose with the joints at `position_rad` (n,), in the order of the profile."""
+        names = self.profile.robot.arm_joints
+        return self.kinematics.forward(self.kinematics.ordered(names, position_rad))
+
+
+def command_of(
+    reference: PoseReference | JointReference, joints: tuple[str, ...]
+) -> PoseCommand | JointCommand:
+    """A reference as a command record; `joints` are the names of the arm's joints."""
+    if isinstance(reference, JointReference):
+        return JointCommand(joints, *reference, STREAMING)
+    position_m, rotation, twist, acceleration = reference
+    quat_xyzw = quat_from_rotation(rotation)
+    return PoseCommand(position_m, quat_xyzw, twist, acceleration, position_m, quat_xyzw, STREAMING)

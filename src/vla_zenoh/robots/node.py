@@ -1,0 +1,200 @@
+"""The robot node: one loop for every robot, whatever its driver.
+
+Commands in, states out: a tick reads the robot, checks its command streams, moves it along them,
+publishes its state and reports transitions. When the node ends, by a signal or an exception, it
+brakes the arm first.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+import time
+
+import zenoh
+
+from vla_zenoh.bus.clock import Tick
+from vla_zenoh.bus.metrics import RateMeter
+from vla_zenoh.bus.node import Node
+from vla_zenoh.errors import NodeError
+from vla_zenoh.guard.arm_guard import max_braking_time_s
+from vla_zenoh.robots.arm import Arm
+from vla_zenoh.robots.driver import Measurement, RateLimiter, RobotDriver
+from vla_zenoh.runtime.scheduling import realtime_thread
+from vla_zenoh.sanitize import one_line
+from vla_zenoh.types import Event
+
+FAILURES = 3
+"""After this many failed ticks in a row the arm counts as impossible to brake."""
+LEAST_S, SLACK_S = 1.0, 0.2
+"""The last brake may take this long at least, and this much longer than the limits allow."""
+MAX_REASON = 300
+WATCH_S = 0.05
+
+
+class RobotNode:
+    """A robot on the bus.
+
+    Args:
+        driver: of the robot; the node takes name and profile from it.
+        session: open session, closed by its owner.
+
+    Raises:
+        NodeError: a node of this name is alive already.
+    """
+
+    def __init__(self, driver: RobotDriver, session: zenoh.Session) -> None:
+        self.driver = driver
+        node = self.node = Node(driver.name, driver.profile, session)
+        self.arm = Arm(node, driver) if driver.has_arm else None
+        driver.attach(node, self.arm.follower if self.arm is not None else None)
+        self._rate = RateMeter()
+        self._realtime = False
+        self._watched_s = 0.0
+        self._brake_until_ns = 0
+
+    # -- running ------------------------------------------------------------------------------
+    def run(self, stop: threading.Event) -> None:
+        """Drive the robot until `stop` is set.
+
+        Raises:
+            NodeError: the driver failed.
+        """
+        driver = self.driver
+        sys.setswitchinterval(driver.switch_interval_s)
+        try:
+            driver.connect()
+            gc.collect()
+            gc.freeze()
+            if driver.lockstep:
+                driver.serve_lockstep(self, stop)
+                return
+            with realtime_thread() as self._realtime:
+                self._loop(driver.pace(), stop)
+        finally:
+            self._close()
+
+    def _close(self) -> None:
+        try:
+            self.driver.close()
+        except NodeError as error:  # an exception before this one matters more
+            self.node.reject("robot_failed", str(error))
+        finally:
+            self.node.publish_status("stopped", now=True)
+            self.node.close()
+
+    def _loop(self, pace: RateLimiter, stop: threading.Event) -> None:
+        try:
+            while True:
+                tick = pace.wait()
+                if stop.is_set() and self._may_end(tick.nominal_ns):
+                    return
+                self.step(tick)
+        except Exception as error:
+            how = "ends"
+            if self.arm is not None and not self.driver.simulated:
+                braked = self._brake_to_stop(self.arm, pace)
+                how = "braked, and ends" if braked else "not braked, and ends"
+            if isinstance(error, NodeError):
+                self.node.reject("robot_failed", str(error))
+            else:
+                why = f"{one_line(repr(error), MAX_REASON)}: {how}"
+                self.node.emit(Event("error", "fault", "broken", why))
+            raise
+
+    def publish_state(self, measurement: Measurement, mono_ns: int) -> None:
+        """Publish a measurement."""
+        if self.arm is not None:
+            self.arm.publish(measurement, mono_ns)
+
+    def step(self, tick: Tick) -> None:
+        """Run one tick."""
+        if tick.periods > 1:
+            self.node.counters[f"{self.node.name}.missed_ticks"] += tick.periods - 1
+        mono_ns = tick.nominal_ns
+        self.driver.poll(mono_ns)
+        if self.arm is not None:
+            now_ns = mono_ns if self.driver.lockstep else self.node.clock.wall_at(mono_ns)
+            self.arm.step(now_ns, mono_ns, tick.stall_s)
+        self._rate.tick()
+        self._watch()
+
+    # -- the last brake -----------------------------------------------------------------------
+    def _may_end(self, mono_ns: int) -> bool:
+        """Whether the node may end at this tick; commands are rejected from the first call on."""
+        if self.arm is None or self.driver.simulated:
+            return True
+        follower = self.arm.follower
+        follower.stop_accepting()
+        if not follower.moving:
+            return True
+        patience_s = max(LEAST_S, max_braking_time_s(self.node.profile) + SLACK_S)
+        self._brake_until_ns = self._brake_until_ns or mono_ns + round(patience_s * 1e9)
+        if mono_ns < self._brake_until_ns:
+            return False
+        self._emit_not_braked(
+            f"after {patience_s:.1f} s the arm is still braking; left where it is, because the "
+            "loop came too late too often"
+        )
+        return True
+
+    def _brake_to_stop(self, arm: Arm, pace: RateLimiter) -> bool:
+        """Brake after an exception, tolerating single failures; whether the arm came to rest."""
+        arm.follower.stop_accepting()
+        failures = 0
+        while arm.follower.moving:
+            tick = pace.wait()
+            try:
+                mono_ns = tick.nominal_ns
+                arm.brake_step(self.node.clock.wall_at(mono_ns), mono_ns, tick.stall_s)
+                failures = 0
+            except Exception as error:
+                failures += 1
+                if failures == FAILURES:
+                    self._emit_not_braked(f"it cannot be braked: {one_line(error, MAX_REASON)}")
+                    return False
+            if self._may_end(tick.nominal_ns):
+                break
+        return not arm.follower.moving
+
+    def _emit_not_braked(self, why: str) -> None:
+        self.node.emit(Event("error", "fault", "not_braked", why))
+
+    # -- status -------------------------------------------------------------------------------
+    @property
+    def state(self) -> str:
+        """State of the node, one word."""
+        return "running" if self.arm is None else self.arm.state
+
+    def _watch(self) -> None:
+        changed = self.driver.status_changed() or (self.arm is not None and self.arm.changed())
+        if not changed and time.monotonic() - self._watched_s < WATCH_S:
+            return
+        self._watched_s = time.monotonic()
+        self.watch(now=changed)
+
+    def watch(self, *, now: bool = False) -> None:
+        """Follow the system's clock, and publish the status when it is due, or `now`."""
+        self.node.adopt_system_time()
+        if self.node.status_due(self.state) or now:
+            self.publish_status(now=now)
+
+    def publish_status(self, *, now: bool = False) -> None:
+        """Publish the status."""
+        node, driver, found = self.node, self.driver, self.driver.status()
+        detail = {**found.detail, "realtime": self._realtime}
+        if self.arm is not None:
+            follower = self.arm.follower
+            detail["following"] = follower.following
+            node.counters[f"{node.name}.stream_silences"] = follower.silences
+            if not driver.simulated:
+                node.counters[f"{node.name}.stalls"] = follower.stalls
+        node.publish_status(
+            self.state,
+            detail=detail,
+            ages_s=found.ages_s,
+            rates_hz={driver.loop: self._rate.rate_hz, **found.rates_hz},
+            latency_ms=found.latency_ms,
+            now=now,
+        )

@@ -1,1 +1,0 @@
-"""An arm driven by a Python file."""

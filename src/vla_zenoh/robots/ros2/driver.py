@@ -1,0 +1,328 @@
+"""Driver of a ROS 2 robot: joint states in, set-points out; its cameras and services beside them.
+
+Neither ROS nor DDS runs here: messages are CDR on keys of zenoh-bridge-ros2dds, or of a robot with
+rmw_zenoh. Cameras and services have threads of their own.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import zenoh
+
+from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.errors import ProfileError, RecordError
+from vla_zenoh.interop.joint_reading import pose_state
+from vla_zenoh.interop.ros2 import table
+from vla_zenoh.interop.ros2.graph import camera_topics
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.interop.ros2.qos import COMMAND
+from vla_zenoh.interop.ros2.samples import Stamp
+from vla_zenoh.interop.ros2.topics import pose
+from vla_zenoh.profile import Profile, SessionProfile
+from vla_zenoh.profile.ros2 import Ros2Output, Ros2Profile
+from vla_zenoh.profile.session import TRUSTED_PROTOCOLS
+from vla_zenoh.robots.command_follower import CommandFollower
+from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
+from vla_zenoh.robots.ros2.cameras import Camera
+from vla_zenoh.robots.ros2.gripper import Gripper
+from vla_zenoh.robots.ros2.ros_graph import RosGraph
+from vla_zenoh.robots.ros2.ros_services import RosServices
+from vla_zenoh.robots.ros2.state_subscriber import StateSubscriber
+from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
+from vla_zenoh.types import Event, GripperCommand, GripperState
+from vla_zenoh.types.commands import JointReference, PoseReference
+
+NAME = "ros2"
+JOIN_S = 0.3
+MAX_DEFINITION_BYTES = 65_536
+FINGERS_TIMEOUT_NS = 1_000_000_000
+"""Gripper nodes publish more slowly than arms."""
+LEAD_PERIODS = 2
+"""A trajectory's point lies this many command periods ahead."""
+
+
+class Ros2Driver(RobotDriver):
+    """The ROS 2 robot of a profile; with another ``robot.driver``, its cameras and services alone.
+
+    Args:
+        profile: the effective profile, with its section ros2.
+
+    Raises:
+        ProfileError: the section ros2 is missing or names what is not known.
+    """
+
+    name = NAME
+
+    def __init__(self, profile: Profile) -> None:
+        super().__init__(profile)
+        if profile.ros2 is None:
+            raise ProfileError(
+                f"profile {profile.name!r} has no section ros2; give --profile panda_ros2, or your "
+                "own"
+            )
+        self._ros2 = profile.ros2
+        self._messages = read_messages(profile.ros2)
+        self.has_arm = profile.robot.driver == NAME
+        if profile.ros2.gripper is None:
+            self.no_gripper = "the profile has no ros2.gripper"
+        self.silent_why = (
+            f"nothing on {profile.ros2.joint_states}; is the robot or the bridge gone?"
+        )
+        self._halt = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._deferred: deque[Callable[[], None]] = deque(maxlen=256)
+        self._others = 0
+        self._bad_cameras: tuple[bool, ...] = ()
+        self._clock_reported = self._fingers_lost = False
+        self._own_session: zenoh.Session | None = None
+
+    def attach(self, node: Node, follower: CommandFollower | None) -> None:
+        """Join the ROS graph.
+
+        Raises:
+            ProfileError: a message type cannot carry what the profile wants.
+            SessionError: ros2.connect does not answer.
+            SecurityError: it is reached by TLS, and this node's certificate is missing.
+        """
+        profile, ros2 = self.profile, self._ros2
+        self._node, self._follower, session = node, follower, node.session
+        if ros2.connect is not None:
+            settings = _session_settings(profile, ros2.connect)
+            self._own_session = open_session(settings, identity=NAME, wait_s=ROUTER_PATIENCE_S)
+        name = "".join(each if each.isalnum() else "_" for each in profile.robot.name)
+        graph = self.graph = RosGraph(
+            self._own_session or session, ros2, self._messages, f"vla_{name}"
+        )
+        if self.has_arm:
+            self.gripper = Gripper(node, graph, self._messages, ros2.gripper, self._width_m)
+            self.states = StateSubscriber(node, graph, self._messages, ros2, self.kinematics)
+            self._declare_output(graph)
+        self._cameras = [
+            Camera(camera, topic, node, graph, read_messages(ros2), self._emit, self._reject)
+            for camera, topic in camera_topics(profile).items()
+        ]
+        self._services = None
+        if ros2.services is not None:
+            self._services = RosServices(
+                profile, session, graph, read_messages(ros2), ros2.services, self._reject
+            )
+        for buffer in graph.buffers:
+            node.watch_buffer(buffer)
+
+    def _declare_output(self, graph: RosGraph) -> None:
+        ros2, command = self._ros2, self.profile.robot.command
+        output = ros2.joint_command if command == "joint" else ros2.pose_command
+        if output is None:
+            raise ProfileError(f"ros2 lacks {command}_command")
+        self._output = output
+        self._frame = output.frame or self.profile.robot.base_frame
+        self._write = self._writing(output)
+        self._writer = graph.publisher(output.topic, output.type, COMMAND)
+
+    def _writing(self, output: Ros2Output) -> table.Write:
+        """Function that fills a message of the output's type.
+
+        Raises:
+            ProfileError: the type cannot carry the commands.
+        """
+        posture_rad = np.array(self.profile.robot.home_rad)
+        key = f"command_{self.profile.robot.command}"
+        for row in table.writings(posture_rad, round(LEAD_PERIODS * self.period_s * 1e9)):
+            if (row.type, row.key) == (output.type, key):
+                return row.write
+        if key == "command_joint":
+            raise ProfileError(f"joint positions cannot be sent as {output.type}")
+        pose.check(self._messages, output.type)
+        return pose.writer(posture_rad)
+
+    # -- for the threads ----------------------------------------------------------------------
+    def _emit(self, event: Event) -> None:
+        self._deferred.append(lambda: self._node.emit(event))
+
+    def _reject(self, reason: str, why: str, about: str) -> None:
+        self._deferred.append(lambda: self._node.reject(reason, why, about))
+
+    def connect(self) -> None:
+        """Start the threads of cameras and services."""
+        bodies = [camera.run for camera in self._cameras]
+        if self._services is not None:
+            bodies.append(self._services.run)
+        for index, body in enumerate(bodies):
+            thread = threading.Thread(
+                target=body, args=(self._halt,), name=f"ros2 {index}", daemon=True
+            )
+            thread.start()
+            self._threads.append(thread)
+
+    def close(self) -> None:
+        """Stop the threads and leave the ROS graph."""
+        self._halt.set()
+        deadline_s = time.monotonic() + JOIN_S
+        for thread in self._threads:
+            thread.join(max(0.0, deadline_s - time.monotonic()))
+        self.graph.close()
+        if self._own_session is not None:
+            self._own_session.close()
+
+    # -- the arm ------------------------------------------------------------------------------
+    def poll(self, mono_ns: int) -> None:
+        """Handle answers of the gripper, and events of the threads."""
+        if self._follower is not None:
+            # With no subscriber a set-point is dropped: then no controller holds it.
+            heard = self._writer.has_subscribers
+            self.away = "" if heard else "not_heard"
+            self.gripper_mode = "ready" if heard else f"not listening at {self._output.topic[:100]}"
+            if self._follower.accepting:
+                follower = self._follower
+                self.gripper.poll(follower.writer, writer_active=follower.writer_active)
+        while self._deferred:
+            self._deferred.popleft()()
+        self._check_peers()
+
+    def read(self, mono_ns: int) -> Measurement | None:
+        """The newest joint states, with the robot's own stamp."""
+        states = self.states
+        fresh = states.update()
+        self.measured_ns = states.received_ns
+        self._check_clock()
+        if not fresh:
+            return None
+        joints, stamp_ns = states.state.joints, states.state.stamp_ns
+        assert joints is not None
+        try:
+            tcp, twist = states.tcp(stamp_ns)
+            if tcp is None:
+                return None
+            record = pose_state(tcp, twist, states.wrench(stamp_ns), None)
+        except RecordError as error:  # finite, but too large for a record
+            topic = self._ros2.joint_states
+            self._node.reject("invalid", f"{topic}: {error}", topic)
+            return None
+        return Measurement(stamp_ns, joints, tcp, record, self._gripper_state(stamp_ns))
+
+    def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
+        """Publish a set-point."""
+        command = command_of(reference, self.profile.robot.arm_joints)
+        stamp = Stamp(now_ns, self._frame)
+        message = self._write(self._messages, self._output.type, command, stamp)
+        self._writer.publish(self._messages.encode(message))
+        self._node.counters["ros2.commands_sent"] += 1
+
+    def grip(self, command: GripperCommand, now_ns: int) -> None:
+        """Send the gripper a goal."""
+        self.gripper.move(command, now_ns)
+
+    def _width_m(self) -> float | None:
+        """Opening between the fingers, None where it is not known."""
+        return None if self._fingers_lost else self.states.state.width_m
+
+    def _gripper_state(self, stamp_ns: int) -> GripperState | None:
+        gripper, fingers = self.gripper, self.profile.robot.finger_joints
+        record = self.states.state.gripper(
+            busy=gripper.busy, wanted_m=gripper.wanted_m, held=gripper.holding
+        )
+        if record is None:
+            return None
+        silent_ns = stamp_ns - self.states.state.width_stamp_ns
+        lost = bool(fingers) and silent_ns > FINGERS_TIMEOUT_NS
+        if lost and not self._fingers_lost:
+            why = f"no joint state of {', '.join(fingers)}"
+            self._node.emit(Event("warning", "fault", "fingers_lost", why))
+        self._fingers_lost = lost
+        return None if lost else record
+
+    # -- status -------------------------------------------------------------------------------
+    def _check_clock(self) -> None:
+        """Emit an event when the robot's clock begins to differ from this one."""
+        clock = self.states.clock
+        if clock.differs == self._clock_reported or clock.offset_s is None:
+            return
+        self._clock_reported = clock.differs
+        if clock.differs:
+            why = (
+                f"the robot's stamps are {clock.offset_s:+.3f} s behind this clock; "
+                "synchronise both (chrony or ptp)"
+            )
+            self._node.emit(Event("warning", "notice", "robot_clock", why))
+
+    def _check_peers(self) -> None:
+        """Emit an event when the other side appears or disappears."""
+        others, before = self.graph.others, self._others
+        self._others = others
+        if bool(others) == bool(before):
+            return
+        what = "bridge" if self._ros2.bridge == "ros2dds" else "ROS 2 node"
+        level, change, why = (
+            ("info", "bridge:gone->there", f"a {what} is there")
+            if others
+            else ("warning", "bridge:there->gone", f"no {what} is there any more")
+        )
+        self._node.emit(Event(level, "transition", change, why))
+
+    def status_changed(self) -> bool:
+        """Whether a camera went bad or recovered."""
+        bad = tuple(camera.publisher.fault is not None for camera in self._cameras)
+        changed, self._bad_cameras = bad != self._bad_cameras, bad
+        return changed
+
+    def status(self) -> DriverStatus:
+        """Arm, cameras and ROS graph."""
+        node, publishers = self._node, [camera.publisher for camera in self._cameras]
+        figures = {publisher.name: publisher.figures() for publisher in publishers}
+        for publisher in publishers:
+            for name, count in publisher.counters().items():
+                node.counters[name] = count
+        detail = {
+            "cameras": {publisher.name: publisher.detail() for publisher in publishers},
+            "bridge": self._ros2.bridge,
+            "others": self.graph.others,
+        }
+        ages_s, rates_hz = {}, {name: rate_hz for name, (rate_hz, _) in figures.items()}
+        if self._follower is not None:
+            states = self.states
+            node.counters["ros2.unstamped"] = states.clock.unstamped
+            node.counters["ros2.efforts_missing"] = states.state.efforts_missing
+            detail |= {
+                "held": self._follower.holds,
+                "robot_clock_behind_s": states.clock.offset_s,
+                "width_m": states.state.width_m,
+            }
+            rates_hz["joint_states"] = states.rate.rate_hz
+            if self.measured_ns is not None:
+                ages_s["joint_states"] = (time.monotonic_ns() - self.measured_ns) / 1e9
+        latency_ms = {name: late for name, (_, late) in figures.items() if late is not None}
+        return DriverStatus(detail, ages_s, rates_hz, latency_ms)
+
+
+def read_messages(ros2: Ros2Profile) -> Messages:
+    """Messages of the profile's distribution, and those of its definition files.
+
+    Raises:
+        ProfileError: a file is missing or no definition.
+    """
+    texts: dict[str, str] = {}
+    for kind, path in ros2.messages.items():
+        try:
+            with Path(path).expanduser().open("rb") as file:
+                texts[kind] = file.read(MAX_DEFINITION_BYTES).decode("utf-8")
+        except (OSError, ValueError, RuntimeError) as error:
+            raise ProfileError(f"ros2.messages.{kind}: {path} cannot be read: {error}") from error
+    return Messages(ros2.distribution, texts)
+
+
+def _session_settings(profile: Profile, endpoints: tuple[str, ...]) -> SessionProfile:
+    """Settings of the session to the robot's own bridge or router."""
+    lease_ms = profile.session.lease_ms
+    if all(endpoint.partition("/")[0] in TRUSTED_PROTOCOLS for endpoint in endpoints):
+        security = profile.session.security
+        return SessionProfile(
+            connect=endpoints, listen=endpoints, lease_ms=lease_ms, security=security
+        )
+    return SessionProfile(connect=endpoints, lease_ms=lease_ms)

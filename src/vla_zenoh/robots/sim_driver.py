@@ -1,0 +1,257 @@
+"""Driver of the simulated robot: MuJoCo and its torque controllers, stepped by 1 ms per tick.
+
+The arm follows poses or joint positions. Real time by default: ticks keep to the clock, and up to
+`CATCH_UP_NS` of lost time is caught up; more is given up and counted. In lockstep simulated time
+stands still until a query on ``sim/step`` advances it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import zenoh
+
+from vla_zenoh.bus.buffers import CallbackRing, bytes_of
+from vla_zenoh.bus.clock import Tick
+from vla_zenoh.bus.node import Node
+from vla_zenoh.codec import message, records, settings
+from vla_zenoh.errors import CodecError, NodeError
+from vla_zenoh.guard.arm_guard import Measured
+from vla_zenoh.keys import Kind
+from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.profile import Profile
+from vla_zenoh.robots.command_follower import CommandFollower
+from vla_zenoh.robots.driver import DriverStatus, Measurement, RateLimiter, RobotDriver, SteppedNode
+from vla_zenoh.simulation.world import STEP_NS, build_world
+from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
+from vla_zenoh.types.commands import JointReference, PoseReference
+
+CATCH_UP_NS = 50_000_000
+SCENE_HZ, OBJECTS_HZ, SUBSCRIBERS_HZ = 60.0, 10.0, 4.0
+MAX_LOCKSTEP_NS = 60_000_000_000
+MAX_STEP_BYTES = 1024
+WATCH_S = 0.2
+LEAST_FORCE_N = 0.1
+"""A gripper that may press with no force would not move."""
+
+
+class SimDriver(RobotDriver):
+    """The simulated robot of a profile.
+
+    Args:
+        profile: the effective profile.
+        lockstep: advance time by queries on ``sim/step`` only.
+
+    Raises:
+        ResourceError: scene or robot description are missing.
+    """
+
+    name, loop = "sim", "control"
+    simulated = True
+    switch_interval_s = 1e-4  # nothing else of ours runs here; Zenoh's callbacks must not wait
+
+    def __init__(self, profile: Profile, *, lockstep: bool = False) -> None:
+        super().__init__(profile)
+        self.world = build_world(profile)
+        self.lockstep = lockstep
+        self.modes, self.period_s = ("pose", "joint"), STEP_NS / 1e9
+        self._ticks = self._stamp_ns = 0
+        self._scene_wanted = self._objects_wanted = self._was_reset = False
+        self._newest: Measurement | None = None
+        self._step_lock = threading.Lock()
+        self._state_every, self._scene_every, self._objects_every, self._look_every = (
+            max(1, round(1e9 / STEP_NS / rate_hz))
+            for rate_hz in (profile.timing.state_hz, SCENE_HZ, OBJECTS_HZ, SUBSCRIBERS_HZ)
+        )
+
+    def attach(self, node: Node, follower: CommandFollower | None) -> None:
+        """Subscribe to resets, and publish the scene."""
+        assert follower is not None
+        assert follower.reference is not None
+        keys = node.keys
+        self._node, self._follower, self._reference = node, follower, follower.reference
+        self._resets = node.subscribe(keys.sim_reset, CallbackRing(4, settings.MAX_SETTING_BYTES))
+        self._scene = node.declare_publisher(keys.sim_scene, Kind.STATE)
+        self._objects = node.declare_publisher(keys.sim_objects, Kind.TELEMETRY)
+
+    # -- one millisecond ----------------------------------------------------------------------
+    def poll(self, mono_ns: int) -> None:
+        """Carry out resets."""
+        for arrival in self._resets.drain():
+            seed = self._node.decode_text(_decode_seed, arrival)
+            if seed is not None:
+                self._reset(seed.value)
+
+    def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
+        """Set the reference and the stamp of the next step."""
+        self._reference, self._stamp_ns = reference, now_ns
+
+    def grip(self, command: GripperCommand, now_ns: int) -> None:
+        """Open or close."""
+        force_n = max(command.force_n, LEAST_FORCE_N)
+        self.world.set_gripper(command.width_m, command.speed_m_s, force_n)
+
+    def read(self, mono_ns: int) -> Measurement | None:
+        """Step the world; its state at multiples of the period of ``timing.state_hz``."""
+        self._ticks += 1
+        self.measured_ns = mono_ns
+        if not self.fault:
+            try:
+                if isinstance(self._reference, JointReference):
+                    self.world.tick_joint(self._reference)
+                else:
+                    self.world.tick(self._reference)
+            except NodeError as error:
+                self.fault = str(error)
+                self._node.reject("simulation_fault", self.fault)
+        self._publish_scene(self._stamp_ns)
+        return None if self._ticks % self._state_every else self._measure(self._stamp_ns)
+
+    def _measure(self, stamp_ns: int) -> Measurement:
+        if self.fault and self._newest is not None:  # a diverged state may not be finite
+            return self._newest._replace(stamp_ns=stamp_ns)
+        world = self.world
+        self._newest = Measurement(
+            stamp_ns,
+            world.joint_state(),
+            Pose(*world.tcp()),
+            world.pose_state(self._reference),
+            world.gripper_state(),
+        )
+        return self._newest
+
+    def _publish_scene(self, stamp_ns: int) -> None:
+        if self._ticks % self._look_every == 0:
+            self._scene_wanted = self._scene.has_subscribers
+            self._objects_wanted = self._objects.has_subscribers
+        if self._scene_wanted and self._ticks % self._scene_every == 0:
+            scene = SceneState(self.profile.sim.scene, self.world.qpos(), self.world.seed)
+            self._scene.publish(scene, stamp_wall_ns=stamp_ns)
+        if self._objects_wanted and self._ticks % self._objects_every == 0:
+            objects = self.world.objects()
+            poses = ObjectPoses(
+                tuple(objects),
+                np.array([position_m for position_m, _ in objects.values()]).reshape(-1, 3),
+                np.array([quat_xyzw for _, quat_xyzw in objects.values()]).reshape(-1, 4),
+            )
+            self._objects.publish(poses, stamp_wall_ns=stamp_ns)
+
+    def _reset(self, seed: int | None) -> None:
+        if self._follower.following and not self.fault:
+            why = "sim/reset: the arm is being commanded; deactivate first"
+            self._node.reject("reset_refused", why)
+            return
+        self.world.reset(self.profile.sim.seed if seed is None else seed)
+        self.fault = ""
+        self._follower.restart()
+        self._node.counters["sim.resets"] += 1
+        self._was_reset = True
+
+    def status_changed(self) -> bool:
+        """Whether there was a reset."""
+        was_reset, self._was_reset = self._was_reset, False
+        return was_reset
+
+    # -- geometry -----------------------------------------------------------------------------
+    def state_now(self) -> Measured:
+        """State of the world."""
+        state = self.world.joint_state()
+        return Measured(Pose(*self.world.tcp()), state.position_rad, state.velocity_rad_s)
+
+    @property
+    def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
+        """Joint limits of the world's robot."""
+        return self.world.joint_range_rad
+
+    # -- time ---------------------------------------------------------------------------------
+    def pace(self) -> RateLimiter:
+        """Ticks of 1 ms that keep to the clock."""
+        return RealTimePace(self._node)
+
+    def serve_lockstep(self, node: SteppedNode, stop: threading.Event) -> None:
+        """Publish the first state, and answer ``sim/step`` until `stop` is set."""
+        self.measured_ns = 0
+        node.publish_state(self._measure(0), 0)
+        self._node.serve(self._node.keys.sim_step, lambda query: self._answer_step(node, query))
+        while not stop.wait(WATCH_S):
+            with self._step_lock:
+                node.watch()
+
+    def _answer_step(self, node: SteppedNode, query: zenoh.Query) -> None:
+        """Advance by a msgpack map ``{"ns": ..}``; the reply is the state after it."""
+        payload = query.payload
+        try:
+            asked = message.unpack(bytes_of(payload, MAX_STEP_BYTES)) if payload is not None else {}
+            if not isinstance(asked, dict) or type(asked.get("ns")) is not int:
+                raise CodecError("malformed", 'wanted a map {"ns": nanoseconds to advance}')
+            duration_ns = asked["ns"]
+            if not 0 < duration_ns <= MAX_LOCKSTEP_NS or duration_ns % STEP_NS:
+                raise CodecError("invalid", f"ns: wanted a multiple of {STEP_NS}, at most 60 s")
+        except CodecError as error:
+            self._node.reject(error.reason, f"sim/step: {error}")
+            query.reply_err(str(error).encode())
+            return
+        world = self.world
+        with self._step_lock:
+            for _ in range(duration_ns // STEP_NS):
+                node.step(Tick(1, (self._ticks + 1) * STEP_NS, 0.0, 0.0))
+            state = {
+                "time_ns": self._ticks * STEP_NS,
+                "joint": records.encode(world.joint_state()),
+                "pose": records.encode(world.pose_state(self._reference)),
+                "gripper": records.encode(world.gripper_state()),
+            }
+        query.reply(self._node.keys.sim_step, message.pack(state))
+
+    # -- status -------------------------------------------------------------------------------
+    def status(self) -> DriverStatus:
+        """Scene, command mode and fault."""
+        self._node.counters["sim.torque_saturated"] = self.world.saturated
+        return DriverStatus(
+            {
+                "scene": self.profile.sim.scene,
+                "command": self._follower.mode,
+                "lockstep": self.lockstep,
+                "fault": self.fault,
+            }
+        )
+
+
+class RealTimePace:
+    """Ticks of 1 ms on the monotonic clock; late ones follow each other at once.
+
+    Args:
+        node: its counters get the late ticks and the time given up.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._counters = node.counters
+        self._counters["sim.overruns"] = 0
+        self._next_ns = time.monotonic_ns()
+
+    def wait(self) -> Tick:
+        """Sleep until the next multiple of 1 ms, or return at once to catch up."""
+        self._next_ns += STEP_NS
+        late_ns = time.monotonic_ns() - self._next_ns
+        if late_ns < 0:
+            time.sleep(-late_ns / 1e9)
+        elif late_ns > CATCH_UP_NS:
+            self._counters["sim.time_given_up_ms"] += late_ns // 1_000_000
+            self._next_ns += late_ns
+        elif late_ns > STEP_NS:
+            self._counters["sim.overruns"] += 1
+        return Tick(1, self._next_ns, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Seed:
+    """A seed; None for that of the profile."""
+
+    value: int | None
+
+
+def _decode_seed(payload: bytes) -> _Seed:
+    return _Seed(settings.decode_seed(payload))

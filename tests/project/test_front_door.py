@@ -1,0 +1,58 @@
+"""What ``import vla_zenoh`` gives, and the examples that use it."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import vla_zenoh
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+
+@pytest.mark.parametrize("name", vla_zenoh.__all__)
+def test_a_public_name_is_there_and_says_what_it_is(name: str) -> None:
+    found = getattr(vla_zenoh, name)
+    assert found.__doc__
+    assert name in dir(vla_zenoh)
+
+
+def test_a_name_that_is_not_public_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'conect'"):
+        _ = vla_zenoh.conect
+
+
+def test_types_and_modules_export_the_same_names() -> None:
+    """What a type checker sees is what Python finds."""
+    tree = ast.parse(Path(vla_zenoh.__file__).read_text("utf-8"))
+    (checked,) = [node for node in tree.body if isinstance(node, ast.If)]
+    names = {
+        alias.name: node.module
+        for node in checked.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert {name: f"vla_zenoh.{module}" for name, module in vla_zenoh._MODULE_OF.items()} == names
+    assert sorted(names) == sorted(vla_zenoh.__all__)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
+def test_an_example_is_in_the_table_of_the_docs(path: Path) -> None:
+    text = (ROOT / "docs" / "how-to" / "python.md").read_text("utf-8")
+    assert f"`examples/{path.name}`" in text
+
+
+def test_the_reference_pages_are_those_of_the_code() -> None:
+    done = subprocess.run(
+        [sys.executable, ROOT / "scripts" / "reference.py", "--check"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
