@@ -207,7 +207,7 @@ class Limits(Section):
         step_rad: largest rotation of one action step.
         approach_m_s: speed towards an absolute target that is further away than a step.
         approach_rad_s: angular speed towards it.
-        out_of_bounds: ``clamp`` shortens to the limit and emits an event, ``reject`` rejects the
+        out_of_bounds: ``clamp`` shortens to the limit and emits an event, ``refuse`` rejects the
             whole chunk.
         lead_m: leash: largest distance of the goal from the commanded pose.
         lead_rad: leash: largest angle between the two.

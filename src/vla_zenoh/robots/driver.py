@@ -74,7 +74,7 @@ class SteppedNode(Protocol):
         ...
 
 
-class RateLimiter(Protocol):
+class Pace(Protocol):
     """Clock of the node's loop."""
 
     def wait(self) -> Tick:
@@ -165,7 +165,7 @@ class RobotDriver:
     def close(self) -> None:
         """Disconnect; the arm stands."""
 
-    def pace(self) -> RateLimiter:
+    def pace(self) -> Pace:
         """Clock of the loop."""
         return FixedRate(self.profile.timing.command_hz)
 

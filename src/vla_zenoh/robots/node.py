@@ -20,7 +20,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.arm_guard import max_braking_time_s
 from vla_zenoh.robots.arm import Arm
-from vla_zenoh.robots.driver import Measurement, RateLimiter, RobotDriver
+from vla_zenoh.robots.driver import Measurement, Pace, RobotDriver
 from vla_zenoh.runtime.scheduling import realtime_thread
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event
@@ -84,7 +84,7 @@ class RobotNode:
             self.node.publish_status("stopped", now=True)
             self.node.close()
 
-    def _loop(self, pace: RateLimiter, stop: threading.Event) -> None:
+    def _loop(self, pace: Pace, stop: threading.Event) -> None:
         try:
             while True:
                 tick = pace.wait()
@@ -139,7 +139,7 @@ class RobotNode:
         )
         return True
 
-    def _brake_to_stop(self, arm: Arm, pace: RateLimiter) -> bool:
+    def _brake_to_stop(self, arm: Arm, pace: Pace) -> bool:
         """Brake after an exception, tolerating single failures; whether the arm came to rest."""
         arm.follower.stop_accepting()
         failures = 0

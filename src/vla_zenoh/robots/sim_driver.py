@@ -24,7 +24,7 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.command_follower import CommandFollower
-from vla_zenoh.robots.driver import DriverStatus, Measurement, RateLimiter, RobotDriver, SteppedNode
+from vla_zenoh.robots.driver import DriverStatus, Measurement, Pace, RobotDriver, SteppedNode
 from vla_zenoh.simulation.world import STEP_NS, build_world
 from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
 from vla_zenoh.types.commands import JointReference, PoseReference
@@ -167,7 +167,7 @@ class SimDriver(RobotDriver):
         return self.world.joint_range_rad
 
     # -- time ---------------------------------------------------------------------------------
-    def pace(self) -> RateLimiter:
+    def pace(self) -> Pace:
         """Ticks of 1 ms that keep to the clock."""
         return RealTimePace(self._node)
 
