@@ -1,4 +1,4 @@
-"""The contract between a robot and vla-zenoh: a class in one file moves any arm, without ROS.
+"""Contract of a robot driver: one class in a Python file drives any arm, without ROS.
 
     from vla_zenoh.robot import Command, Reading
 
@@ -12,9 +12,9 @@
         def move(self, command: Command) -> None:
             self._arm.servo_joints(command.position_rad)
 
-The profile says ``robot: {driver: arm}`` and ``arm: {file: my_arm.py, options: {address:
-10.0.0.3}}``. Limits, smoothing, watchdogs and brakes are before it: what `move` is given is
-jerk-limited, and comes to rest by itself when those who command fall silent.
+The profile has ``robot: {driver: arm}`` and ``arm: {file: my_arm.py, options: {address:
+10.0.0.3}}``. The node applies limits, smoothing, watchdogs and brakes before it: the commands that
+`move` receives are jerk-limited, and come to rest when the command stream falls silent.
 """
 
 from __future__ import annotations
@@ -28,37 +28,37 @@ from numpy.typing import ArrayLike
 from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
 
 Command = PoseCommand | JointCommand
-"""Where the arm has to be now. ``robot.command`` of the profile says which of them it is:
+"""Set-point of the robot's controller; ``robot.command`` of the profile selects the kind:
 
 - ``joint``: `position_rad` and `velocity_rad_s`, (n,) in the order of ``robot.arm_joints``;
 - ``pose``: of ``robot.tcp_frame`` in ``robot.base_frame``: `position_m` (3,), `quat_xyzw` (4,),
-  `twist` (6,) m/s and rad/s along the base axes, for a Cartesian controller of the robot's own.
+  `twist` (6,) m/s and rad/s along the base axes, for the robot's own Cartesian controller.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What the robot measured last.
+    """Newest measurement of the robot.
 
-    It is taken whole, or, where anything in it is no number or nothing this arm can be, refused,
-    counted and told; but its fault counts all the same.
+    A reading with a value that is not a number, or that this arm cannot have, is rejected whole and
+    counted; its fault counts all the same.
 
     Args:
-        position_rad: (n,) of the joints, in the order of ``robot.arm_joints``; m where they slide.
-        velocity_rad_s: (n,); None: the robot does not say, they are made of differences.
-        effort_nm: (n,); None likewise: zero. Where it is the external torque alone, give
-            ``limits.contact.effort_stop_nm``, so that it is looked at.
-        width_m: of the gripper, None where there is none or it does not say: what was asked for
-            last is believed.
+        position_rad: (n,) of the joints, in the order of ``robot.arm_joints``; m for prismatic
+            joints.
+        velocity_rad_s: (n,); None: not measured, computed from differences of the position.
+        effort_nm: (n,); None: not measured, zero. Where it is the external torque alone, set
+            ``limits.contact.effort_stop_nm`` to have it monitored.
+        width_m: opening of the gripper; None: not measured, that of the last command is assumed.
         moving: the gripper moves.
-        holding: it holds something.
-        wrench: (6,) N and Nm from outside at the TCP, base axes, without the weight of arm and
-            tool; `limits.contact` looks at it. None: not measured.
-        fault: why the robot does not move (emergency stop, reflex, protective stop); the arm is
-            then stopped until it is gone and a person has put ``reset``. Say it however briefly it
-            lasts, and also where nothing else is new.
-        measured_ns: on the clock of `time.monotonic_ns`; None: just now. Say it where a library
-            keeps the newest state for you: else an arm that fell silent looks like one that stands.
+        holding: the gripper holds an object.
+        wrench: (6,) external N and Nm at the TCP, base axes, without the weight of arm and tool,
+            monitored by `limits.contact`. None: not measured.
+        fault: why the robot does not move (emergency stop, reflex, protective stop). The arm is
+            stopped until the fault is gone and an operator has published ``reset``. Report it
+            however brief it is, and also where nothing else is new.
+        measured_ns: time of the measurement by `time.monotonic_ns`; None: now. Set it where a
+            library caches the newest state: otherwise a dead link looks like an arm at rest.
     """
 
     position_rad: ArrayLike
@@ -74,39 +74,38 @@ class Reading:
 
 @runtime_checkable
 class Robot(Protocol):
-    """A robot. Only `read` and `move` are needed; the others are called if they are there.
+    """A robot. `read` and `move` are required, ``connect``, ``grip`` and ``close`` optional.
 
-    All is called by one thread, ``timing.command_hz`` times a second, and must return within a
-    fraction of that: what waits for the robot has a thread of its own.
+    One thread calls all of them, ``timing.command_hz`` times a second; a call must return within a
+    fraction of that period. Code that waits for the robot needs a thread of its own.
 
-    ``connect()`` runs once before the first reading, and may take as long as it needs.
-    ``grip(width_m, speed_m_s, force_n)`` asks for an absolute opening; it returns at once.
-    ``close()`` runs at the end, when the arm stands, also where ``connect()`` failed.
+    ``connect()`` runs once before the first reading, and may take long.
+    ``grip(width_m, speed_m_s, force_n)`` starts a motion to an absolute opening, and returns.
+    ``close()`` runs at the end, when the arm stands, also after a ``connect()`` that failed.
 
-    What any of them raises ends the node, after the motion was braked by further calls of `move`,
-    unless that raises three times in a row; under ``up`` it is started again, and begins with
-    ``connect()``.
+    An exception ends the node, after it braked the motion by further calls of `move`, unless those
+    raise three times in a row. ``up`` restarts the node, which begins with ``connect()``.
     """
 
     def read(self) -> Reading | None:
-        """The newest state; None: there is none yet."""
+        """The newest state; None: there is no new one."""
         ...
 
     def move(self, command: Command) -> None:
-        """Be there now. While this is not called the robot has to hold what it was given last."""
+        """Set the set-point. Between calls the robot has to hold the last one."""
         ...
 
 
 def numbers(name: str, given: ArrayLike, count: int) -> FloatArray:
-    """`given` as (count,) float64, which may hold NaN.
+    """`given` as a (count,) array of float64, which may contain NaN.
 
     Raises:
-        ValueError: it is something else.
+        ValueError: it has another shape or type.
     """
     try:
         array = np.asarray(given, np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} is no list of numbers: {error}") from error
+        raise ValueError(f"{name} is not a list of numbers: {error}") from error
     if array.shape != (count,):
         raise ValueError(f"{name} has shape {array.shape}, wanted ({count},)")
     return array

@@ -200,7 +200,7 @@ def process(*words: str, profile: Path, **more: Any) -> Iterator[subprocess.Pope
 
 
 def test_a_replay_onto_a_live_robot_is_refused(run_file: Path, chain: Chain) -> None:
-    with pytest.raises(NodeError, match=r"robot 'panda' lives \(command, sim\).*--as NAME"):
+    with pytest.raises(NodeError, match=r"robot 'panda' is alive \(command, sim\).*--as NAME"):
         Replay(chain.profile, chain.session, open_recording(run_file))
 
 
@@ -208,7 +208,10 @@ def test_pictures_beside_a_live_camera_are_left_out(run_file: Path, chain: Chain
     file = open_recording(run_file)
     replayed = Replay(chain.profile, chain.session, file, groups={CAMERAS}).run(threading.Event())
     assert replayed.left_out.keys() == {"camera"}
-    assert (replayed.samples.total(), replayed.failure) == (0, "nothing of it is to be put")
+    assert (replayed.samples.total(), replayed.failure) == (
+        0,
+        "nothing to publish",
+    )
 
 
 def test_a_replay_ends_when_a_robot_comes_to_life(run_file: Path, chain: Chain) -> None:
@@ -221,14 +224,14 @@ def test_a_replay_ends_when_a_robot_comes_to_life(run_file: Path, chain: Chain) 
     token = chain.session.liveliness().declare_token(ghost.keys.alive("command"))
     thread.join(PATIENCE_S)
     token.undeclare()
-    assert "robot 'sleeper' lives (command)" in found[0].failure
+    assert "robot 'sleeper' is alive (command)" in found[0].failure
 
 
 def test_only_pictures_may_be_replayed_beside_a_live_robot(run_file: Path, chain: Chain) -> None:
     ghost = ghost_of(chain, "blind")
     token = chain.session.liveliness().declare_token(ghost.keys.alive("command"))
     file = open_recording(run_file)
-    with pytest.raises(NodeError, match=r"robot 'blind' lives \(command\)"):
+    with pytest.raises(NodeError, match=r"robot 'blind' is alive \(command\)"):
         Replay(ghost, chain.session, file, groups={CAMERAS, "state"})
     replayed = Replay(ghost, chain.session, file, groups={CAMERAS}, speed=8).run(threading.Event())
     token.undeclare()

@@ -18,9 +18,8 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.interop.ros2.activation_filter import QUIET_S, ActivationFilter
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.ros2.estop_order import EstopOrder
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
-from vla_zenoh.robots.ros2.ros_topics import ACTIVATION_NS, RosTopics
+from vla_zenoh.robots.ros2.ros_topics import ACTIVATION_NS, EstopOrder, RosTopics
 
 
 class Rig(NamedTuple):

@@ -220,7 +220,7 @@ def test_a_player_is_refused_where_the_robot_lives(lab: Lab, run_file: Path) -> 
     lab.chain.settle()
     done = replay(lab, run_file, "player", ROBOT)
     assert done.returncode == 1
-    assert f"robot '{ROBOT}' lives" in done.stderr
+    assert f"robot '{ROBOT}' is alive" in done.stderr
     assert "replay" not in lab.chain.client.snapshot()
     assert lab.chain.state() == "inactive"
 

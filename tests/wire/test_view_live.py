@@ -94,7 +94,7 @@ def answers(port: int) -> bool:
 def test_a_robot_at_work_is_written_for_rerun(chain: Chain, tmp_path: Path) -> None:
     path = tmp_path / "live.rrd"
     with view("--save", str(path), chain=chain) as command:
-        until("it looks", lambda: bool(command.said("looking at robot")), READY_PATIENCE_S)
+        until("it looks", lambda: bool(command.said("viewing robot")), READY_PATIENCE_S)
         chain.client.set_prompt(f"HARD: go up x{STEPS}")
         chain.client.activate()
         chain.until("the steps are done", lambda: bool(chain.detail("policy_done")))
@@ -130,7 +130,7 @@ def test_without_a_screen_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch) ->
 def test_the_served_view_ends_with_ctrl_c_and_leaves_no_process(chain: Chain) -> None:
     port = two_free_ports()
     with view("--serve", "--port", str(port), chain=chain) as command:
-        until("it looks", lambda: bool(command.said("looking at robot")), READY_PATIENCE_S)
+        until("it looks", lambda: bool(command.said("viewing robot")), READY_PATIENCE_S)
         assert f"http://127.0.0.1:{port}/?url=rerun%2Bhttp" in command.said("open in a browser")
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=10) as page:
             assert b"rerun" in page.read().lower()
@@ -146,7 +146,7 @@ def test_the_served_view_ends_with_ctrl_c_and_leaves_no_process(chain: Chain) ->
 def test_it_ends_when_the_viewer_is_closed(chain: Chain) -> None:
     port = two_free_ports()
     with view("--serve", "--port", str(port), chain=chain) as command:
-        until("it looks", lambda: bool(command.said("looking at robot")), READY_PATIENCE_S)
+        until("it looks", lambda: bool(command.said("viewing robot")), READY_PATIENCE_S)
         (viewer,) = children(command.process.pid)
         os.kill(viewer, signal.SIGKILL)
         assert command.process.wait(END_PATIENCE_S) == 0

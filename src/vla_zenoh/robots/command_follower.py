@@ -89,7 +89,7 @@ class CommandFollower:
         """Begin a tick.
 
         Args:
-            mono_ns: on the monotonic clock, which nobody sets.
+            mono_ns: on the monotonic clock.
             stall_s: how late the tick is. The robot stopped at its last set-point: after a long
                 stall motion resumes from there, at rest.
         """

@@ -38,8 +38,8 @@ from vla_zenoh.types.commands import PoseReference
 MIN_MOBILITY = 0.01
 
 
-class ArmState(NamedTuple):
-    """State of an arm of n joints, input of an impedance law; everything in the base frame.
+class ArmDynamics(NamedTuple):
+    """State and dynamics of an arm of n joints, input of an impedance law; in the base frame.
 
     Args:
         position_rad: (n,).
@@ -167,7 +167,7 @@ class CartesianImpedance:
         if posture_rad is not None:
             self._posture_rad = np.array(posture_rad, float)
 
-    def take_over(self, torque_nm: FloatArray, state: ArmState) -> None:
+    def take_over(self, torque_nm: FloatArray, state: ArmDynamics) -> None:
         """Take over from another law that held the arm at rest with `torque_nm` (n,).
 
         The part of that torque beyond the model (friction, payload) goes into the integral, so that
@@ -180,7 +180,7 @@ class CartesianImpedance:
         self._integral = np.minimum(np.maximum(wrench, -self._integral_limit), self._integral_limit)
         self._posture_rad = state.position_rad.copy()
 
-    def torque(self, reference: PoseReference, state: ArmState) -> ImpedanceOutput:
+    def torque(self, reference: PoseReference, state: ArmDynamics) -> ImpedanceOutput:
         """One control period: joint torques that pull the TCP to `reference`."""
         jacobian, transposed = state.jacobian, state.jacobian.T
         error = np.empty(6)
@@ -231,7 +231,7 @@ class CartesianImpedance:
         total = self._integral + step
         self._integral = np.minimum(np.maximum(total, -self._integral_limit), self._integral_limit)
 
-    def _posture_torque(self, state: ArmState) -> FloatArray:
+    def _posture_torque(self, state: ArmDynamics) -> FloatArray:
         position = state.position_rad
         below = np.maximum(self._soft_lower_rad - position, 0.0)
         above = np.maximum(position - self._soft_upper_rad, 0.0)

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.simulation.cartesian_impedance import ArmState
+from vla_zenoh.simulation.cartesian_impedance import ArmDynamics
 from vla_zenoh.types import FloatArray
 from vla_zenoh.types.commands import JointReference
 
@@ -106,7 +106,7 @@ class JointImpedance:
         """Clear the integral."""
         self._integral = np.zeros_like(self._integral)
 
-    def take_over(self, torque_nm: FloatArray, state: ArmState) -> None:
+    def take_over(self, torque_nm: FloatArray, state: ArmDynamics) -> None:
         """Take over from another law that held the arm at rest with `torque_nm` (n,).
 
         The part of that torque beyond the model (friction, payload) goes into the integral, so that
@@ -114,7 +114,7 @@ class JointImpedance:
         """
         self._integral = self._bounded(torque_nm - state.bias_nm)
 
-    def torque(self, reference: JointReference, state: ArmState) -> JointImpedanceOutput:
+    def torque(self, reference: JointReference, state: ArmDynamics) -> JointImpedanceOutput:
         """One control period: joint torques that pull the arm to `reference`."""
         error = reference.position_rad - state.position_rad
         stretch = np.abs(error) / self.gains.max_error_rad

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from vla_zenoh.errors import RecordError, ResourceError
-from vla_zenoh.simulation.cartesian_impedance import ArmState
+from vla_zenoh.simulation.cartesian_impedance import ArmDynamics
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import GRIPPER, PREFIX, STEP_S, TCP_SITE
 from vla_zenoh.types import FloatArray, GripperState
@@ -61,10 +61,10 @@ class SimulatedArm:
         self._inertia = np.zeros((model.nv, model.nv))
         self._scratch = mujoco.MjData(model)
 
-    def state(self) -> ArmState:
+    def state(self) -> ArmDynamics:
         """State for an impedance law; some arrays are views, valid until the next step."""
         mujoco.mj_fullM(self._model, self._data, self._inertia)
-        return ArmState(
+        return ArmDynamics(
             position_rad=self.position_rad,
             velocity_rad_s=self.velocity_rad_s,
             tcp_position_m=self.tcp_position_m,

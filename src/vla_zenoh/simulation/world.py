@@ -13,7 +13,7 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.appearance import DISTRACTORS, draw_appearance
 from vla_zenoh.simulation.cartesian_impedance import (
-    ArmState,
+    ArmDynamics,
     CartesianImpedance,
     ImpedanceGains,
     ImpedanceOutput,
@@ -263,7 +263,7 @@ class World:
 
     # -- inside --------------------------------------------------------------------------------
 
-    def _switch_to(self, law: CartesianImpedance | JointImpedance) -> ArmState:
+    def _switch_to(self, law: CartesianImpedance | JointImpedance) -> ArmDynamics:
         state = self._arm.state()
         if self._active_law is not law:
             if self._active_law is not None:

@@ -24,9 +24,8 @@ from typer.testing import CliRunner
 
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.evaluation.combined import overall
 from vla_zenoh.lab.evaluation.csv_file import COLUMNS, evaluate_csv
-from vla_zenoh.lab.evaluation.files import evaluate
+from vla_zenoh.lab.evaluation.evaluate import combined, evaluate
 from vla_zenoh.lab.evaluation.result import Evaluation
 
 TOLERANCE = 1e-12  # of lengths that are sums of a few floats
@@ -175,7 +174,7 @@ def test_an_arm_that_stands_is_idle(tmp_path: Path) -> None:
 def test_all_runs_together_are_all_their_requests(tmp_path: Path) -> None:
     short = evaluate_csv(write(tmp_path / "a.csv", rows(2)))
     long = evaluate_csv(write(tmp_path / "b.csv", rows(30, success="False", error="x")))
-    both = overall([short, long]).row()
+    both = combined([short, long]).row()
     values = [100, 101, *range(100, 130)]
     assert (both["record_id"], both["n_rows"]) == ("ALL", 32)
     assert both["e2e_mean_ms"] == pytest.approx(np.mean(values))

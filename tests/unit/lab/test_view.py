@@ -166,7 +166,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
     show = RerunLogger(PROFILE, stream := stream_to(folder / "run.rrd"))
     for entry in open_recording(folder / "run.mcap").entries():
         show.log(entry)
-    assert show.refused == {}
+    assert show.rejected == {}
     stream.disconnect()
     return Shown(folder / "run.rrd")
 
@@ -239,7 +239,7 @@ def test_a_shape_that_rerun_cannot_draw_is_named() -> None:
 
 def test_without_a_description_all_else_is_shown(tmp_path: Path) -> None:
     show, shown = heard(tmp_path, *run())
-    assert show.refused == {}
+    assert show.rejected == {}
     assert not any(path.startswith("world/robot") for path in shown.paths)
     assert shown.values("world/pose/measured", "Transform3D:translation")
     assert "The robot itself is not shown" in shown.texts("text/now")[-1]
@@ -372,7 +372,7 @@ def test_broken_samples_are_counted_by_key_and_reason_and_shown(tmp_path: Path) 
     ]
     before = put(KEYS.command_pose, command(-SECOND), -SECOND)
     show, shown = heard(tmp_path, before, *broken)
-    assert show.refused == {
+    assert show.rejected == {
         "state/pose: malformed": 1,
         "state/pose: no_header": 1,
         "camera/front/jpeg: malformed": 1,
@@ -388,7 +388,7 @@ def test_broken_samples_are_counted_by_key_and_reason_and_shown(tmp_path: Path) 
 def test_what_is_not_of_the_robot_is_passed_over(tmp_path: Path) -> None:
     other = Keys("somebody")
     show, _ = heard(tmp_path, Sample(other.prompt, b"go", TEXT, None, ZERO_NS))
-    assert (show.shown, show.refused) == ({}, {})
+    assert (show.shown, show.rejected) == ({}, {})
 
 
 def test_a_stamp_of_another_clock_does_not_stretch_the_time_line(tmp_path: Path) -> None:

@@ -138,7 +138,7 @@ def test_every_chunk_is_counted_once(times_a: list[int], times_b: list[int]) -> 
 
 def test_where_the_arm_was_is_the_nearest_state_and_unknown_without_one() -> None:
     history = ArmStateHistory()
-    with pytest.raises(RecordError, match="is not known"):
+    with pytest.raises(RecordError, match="pose of the arm is unknown"):
         history.at(START_NS)
     for index in range(10):
         pose = PoseState(np.array([0.1 * index, 0, 0]), np.array([0, 0, 0, 1.0]), np.zeros(6))

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from vla_zenoh import resources
-from vla_zenoh.simulation.cartesian_impedance import ArmState, CartesianImpedance, ImpedanceGains
+from vla_zenoh.simulation.cartesian_impedance import ArmDynamics, CartesianImpedance, ImpedanceGains
 from vla_zenoh.types.commands import PoseReference
 
 URDF = "example-robot-data:panda_description/urdf/panda.urdf"
@@ -31,14 +31,14 @@ class Arm:
         self.data = self.model.createData()
         self.tcp = self.model.getFrameId("panda_hand_tcp")
 
-    def state(self, q: np.ndarray, v: np.ndarray) -> ArmState:
+    def state(self, q: np.ndarray, v: np.ndarray) -> ArmDynamics:
         model, data, axes = self.model, self.data, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         pin.computeAllTerms(model, data, q, v)
         pin.updateFramePlacements(model, data)
         pin.forwardKinematics(model, data, q, v, np.zeros(JOINTS))
         drift = pin.getFrameClassicalAcceleration(model, data, self.tcp, axes).vector
         upper = np.triu(data.M)
-        return ArmState(
+        return ArmDynamics(
             position_rad=q,
             velocity_rad_s=v,
             tcp_position_m=data.oMf[self.tcp].translation.copy(),
@@ -65,11 +65,11 @@ def controller(arm: Arm, gains: ImpedanceGains, **changes: np.ndarray) -> Cartes
     return CartesianImpedance(gains, **(settings | changes), period_s=PERIOD_S)
 
 
-def reference_at(state: ArmState) -> PoseReference:
+def reference_at(state: ArmDynamics) -> PoseReference:
     return PoseReference(state.tcp_position_m, state.tcp_rotation, np.zeros(6), np.zeros(6))
 
 
-def moved(state: ArmState, by_m: tuple[float, float, float]) -> PoseReference:
+def moved(state: ArmDynamics, by_m: tuple[float, float, float]) -> PoseReference:
     return reference_at(state)._replace(position_m=state.tcp_position_m + by_m)
 
 

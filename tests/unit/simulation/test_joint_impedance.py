@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from vla_zenoh import resources
-from vla_zenoh.simulation.cartesian_impedance import ArmState, CartesianImpedance, ImpedanceGains
+from vla_zenoh.simulation.cartesian_impedance import ArmDynamics, CartesianImpedance, ImpedanceGains
 from vla_zenoh.simulation.joint_impedance import JointGains, JointImpedance
 from vla_zenoh.types import FloatArray
 from vla_zenoh.types.commands import JointReference, PoseReference
@@ -29,13 +29,13 @@ def model() -> pin.Model:
     return pin.buildReducedModel(whole, fingers, np.zeros(whole.nq))
 
 
-def state_at(model: pin.Model, q: FloatArray, v: FloatArray) -> ArmState:
+def state_at(model: pin.Model, q: FloatArray, v: FloatArray) -> ArmDynamics:
     data, axes = model.createData(), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     tcp = model.getFrameId("panda_hand_tcp")
     pin.computeAllTerms(model, data, q, v)
     pin.updateFramePlacements(model, data)
     upper = np.triu(data.M)
-    return ArmState(
+    return ArmDynamics(
         position_rad=q,
         velocity_rad_s=v,
         tcp_position_m=data.oMf[tcp].translation.copy(),
@@ -47,7 +47,7 @@ def state_at(model: pin.Model, q: FloatArray, v: FloatArray) -> ArmState:
     )
 
 
-def resting(model: pin.Model) -> ArmState:
+def resting(model: pin.Model) -> ArmDynamics:
     return state_at(model, HOME_RAD, np.zeros(JOINTS))
 
 
@@ -181,7 +181,7 @@ def test_a_joint_at_its_torque_limit_winds_nothing_up(model: pin.Model) -> None:
 def test_arms_with_fewer_or_more_joints_have_gains(joints: int, last: float) -> None:
     law = JointImpedance(JointGains(), effort_nm=np.full(joints, 100.0), period_s=PERIOD_S)
     zeros = np.zeros(joints)
-    state = ArmState(
+    state = ArmDynamics(
         zeros, zeros, np.zeros(3), np.eye(3), np.zeros((6, joints)), np.zeros(6), np.eye(joints),
         zeros,
     )  # fmt: skip

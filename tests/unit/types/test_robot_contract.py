@@ -98,5 +98,5 @@ def test_numbers_of_the_wrong_form_are_named() -> None:
     np.testing.assert_array_equal(numbers("position_rad", [1, 2], 2), [1.0, 2.0])
     with pytest.raises(ValueError, match="position_rad has shape \\(3,\\), wanted \\(2,\\)"):
         numbers("position_rad", [1, 2, 3], 2)
-    with pytest.raises(ValueError, match="velocity_rad_s is no list of numbers"):
+    with pytest.raises(ValueError, match="velocity_rad_s is not a list of numbers"):
         numbers("velocity_rad_s", ["fast", "slow"], 2)

@@ -11,7 +11,7 @@ import typer
 from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.evaluation.files import MCAP
+from vla_zenoh.lab.evaluation.evaluate import MCAP
 
 dataset_app = typer.Typer(
     name="dataset", help="Turn recorded runs into training data.", no_args_is_help=True

@@ -16,8 +16,7 @@ from rich.table import Table
 
 from vla_zenoh.cli.output import console, errors, fail, new_table, plain_types
 from vla_zenoh.lab.evaluation import tables
-from vla_zenoh.lab.evaluation.combined import overall, to_mapping
-from vla_zenoh.lab.evaluation.files import evaluate
+from vla_zenoh.lab.evaluation.evaluate import combined, evaluate, to_mapping
 from vla_zenoh.lab.evaluation.result import STAGES, Evaluation
 
 IMAGES = 8
@@ -83,7 +82,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def _rows(runs: Sequence[Evaluation]) -> str:
-    rows = [run.row() for run in (*runs, *([overall(runs)] if len(runs) > 1 else ()))]
+    rows = [run.row() for run in (*runs, *([combined(runs)] if len(runs) > 1 else ()))]
     names = list(dict.fromkeys(name for row in rows for name in row))
     out = io.StringIO(newline="")
     writer = csv.DictWriter(out, names, lineterminator="\n")
@@ -106,9 +105,9 @@ def _show(runs: Sequence[Evaluation]) -> None:
         table.add_row(*row)
     if len(runs) > 1:
         table.add_section()
-        table.add_row(*tables.summary_row(overall(runs))[:shown_columns], style="bold")
+        table.add_row(*tables.summary_row(combined(runs))[:shown_columns], style="bold")
     screen.print(table)
-    shown = runs[0] if len(runs) == 1 else overall(runs)
+    shown = runs[0] if len(runs) == 1 else combined(runs)
     _show_latency([*runs, shown] if len(runs) > 1 else runs)
     if len(runs) == 1:
         _show_segments(shown)

@@ -210,8 +210,8 @@ def _summarise(logger: RerunLogger, save: Path | None) -> None:
         f"{logger.shown.total():,} samples of {len(logger.shown)} keys{where}",
         soft_wrap=True,
     )
-    if logger.refused:
-        worst = logger.refused.most_common(SHOWN_REASONS)
+    if logger.rejected:
+        worst = logger.rejected.most_common(SHOWN_REASONS)
         reasons = ", ".join(f"{why} ({count})" for why, count in worst)
         screen.print(f"not shown: {reasons}", style="yellow")
     if logger.dropped:

@@ -1,1 +1,1 @@
-"""How far the actions of two workers are apart."""
+"""Comparison of the actions of two workers."""

@@ -1,8 +1,8 @@
-"""How far apart two workers are: what each asked for, seen at the same moment, after the same time.
+"""Difference between two workers' actions for the same observation and the same time ahead.
 
-Chunks are paired by the time of their observation. Both are carried out in thought from the pose
-the arm then had, up to the end of the shorter one, so that workers of any spec can be compared:
-deltas with absolute poses, one step with fifty.
+Chunks are paired by the time of their observation. Both are integrated from the pose that the arm
+had then, up to the end of the shorter one, so workers of any spec can be compared: deltas with
+absolute poses, one step with fifty.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from vla_zenoh.types import ActionChunk, FloatArray, GripperState, PoseState
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 DEFAULT_TOLERANCE_S = 0.06
-"""Two pictures' time at 30 Hz: observations this near in time show the same."""
+"""Two frames at 30 Hz: observations this close in time show the same."""
 MOVES_M = 1e-3
-"""A worker that asks for less has no direction."""
+"""A smaller requested displacement has no direction."""
 GRIPPER_SHARE = 0.25
-"""Of the gripper's width: one that wants so much more open disagrees with the other."""
+"""Share of the gripper's width by which two requests must differ to count as different."""
 
 
 class ArmState(NamedTuple):
-    """Where arm and gripper were."""
+    """Measured pose and opening of the gripper."""
 
     pose: Pose
     width_m: float
 
 
 class ArmStateHistory:
-    """Where the arm was, by the stamps of its states; these are added in their order."""
+    """Measured states of the arm by their stamps, added in order."""
 
     def __init__(self) -> None:
         self._poses: tuple[list[int], list[PoseState]] = ([], [])
         self._grippers: tuple[list[int], list[GripperState]] = ([], [])
 
     def add(self, stamp_ns: int, state: PoseState | GripperState) -> None:
-        """Take a state; one that is older than the last is left out."""
+        """Add a state; one older than the last is left out."""
         stamps, states = self._poses if isinstance(state, PoseState) else self._grippers
         if not stamps or stamp_ns >= stamps[-1]:
             stamps.append(stamp_ns)
@@ -54,11 +54,11 @@ class ArmStateHistory:
         """The measured pose and width nearest to `stamp_ns`.
 
         Raises:
-            RecordError: there is none.
+            RecordError: no pose or no gripper state was added.
         """
         if not self._poses[0] or not self._grippers[0]:
             raise RecordError(
-                "where the arm was is not known: no state/pose or no state/gripper was heard"
+                "the pose of the arm is unknown: no state/pose or no state/gripper was received"
             )
         pose = self._poses[1][_nearest(self._poses[0], stamp_ns)]
         gripper = self._grippers[1][_nearest(self._grippers[0], stamp_ns)]
@@ -72,12 +72,12 @@ def _nearest(stamps: Sequence[int], stamp_ns: int) -> int:
 
 
 class RequestedPath(NamedTuple):
-    """What a chunk asks for.
+    """Waypoints that a chunk requests.
 
     Args:
         dt_s: between two waypoints.
-        poses: W_0, where the arm was, to W_H.
-        widths_m: likewise; None where the chunk says nothing of the gripper.
+        poses: W_0, the measured pose, to W_H.
+        widths_m: openings of the gripper; None where the chunk has no gripper.
     """
 
     dt_s: float
@@ -89,7 +89,7 @@ class RequestedPath(NamedTuple):
         return self.dt_s * (len(self.poses) - 1)
 
     def at(self, time_s: float) -> tuple[Pose, float | None]:
-        """Pose and width asked for `time_s` after the observation."""
+        """Requested pose and width `time_s` after the observation."""
         index = min(int(time_s / self.dt_s + 1e-9), len(self.poses) - 2)
         share = min(time_s / self.dt_s - index, 1.0)
         pose = interpolate(self.poses[index], self.poses[index + 1], share)
@@ -105,18 +105,18 @@ class Disagreement:
     Args:
         pairs: chunks of both whose observations are near in time.
         only_a: chunks of A without a partner.
-        only_b: likewise.
-        unreadable: pairs that one spec gives no meaning to.
+        only_b: chunks of B without a partner.
+        unreadable: pairs with a step that does not fit its spec.
         apart_s: mean time between the observations of a pair.
-        after_s: mean time after which the ways are compared.
+        after_s: mean time ahead at which the paths are compared.
         mean: (6,) mean of the absolute difference along `AXES`, m and rad.
         p95: (6,) its 95th percentile.
         bias: (6,) mean of B minus A.
-        distance_m: mean distance between the positions asked for.
+        distance_m: mean distance between the requested positions.
         angle_rad: mean angle between the orientations.
         cosine: mean cosine between the directions, where both move; None: never.
         moving: pairs in which both move.
-        gripper: share of pairs in which one wants it more open; None: not both say.
+        gripper: share of pairs in which the requested widths differ; None: not both have one.
     """
 
     pairs: int
@@ -138,10 +138,10 @@ class Disagreement:
 def requested_path(
     spec: ActionSpec, chunk: ActionChunk, start: ArmState, max_width_m: float
 ) -> RequestedPath:
-    """What `chunk` asks for from `start` on.
+    """Waypoints that `chunk` requests from `start`.
 
     Raises:
-        RecordError: a number that its meaning cannot have.
+        RecordError: a step that does not fit the spec.
     """
     poses, widths_m = [start.pose], [start.width_m]
     for step in chunk.steps:
@@ -161,14 +161,14 @@ def compare(
     max_width_m: float,
     tolerance_s: float = DEFAULT_TOLERANCE_S,
 ) -> Disagreement:
-    """How far B is from A.
+    """Difference between workers A and B.
 
     Args:
         a: chunks of one worker, in any order.
         b: of the other.
-        spec_a: what the first one's steps mean.
-        spec_b: likewise.
-        standing_at: where the arm was at a wall time (ns).
+        spec_a: of A's steps.
+        spec_b: of B's steps.
+        standing_at: state of the arm at a wall time (ns).
         max_width_m: of the gripper.
         tolerance_s: observations further apart are not compared.
     """
@@ -237,7 +237,7 @@ def _row(one: RequestedPath, other: RequestedPath, max_width_m: float) -> _Row:
 def _pairs(
     a: Sequence[ActionChunk], b: Sequence[ActionChunk], tolerance_ns: int
 ) -> list[tuple[ActionChunk, ActionChunk]]:
-    """Nearest in time, every chunk once, in the order of A's observations."""
+    """Pairs nearest in time, each chunk used once, in the order of A's observations."""
     ordered = sorted(b, key=lambda chunk: chunk.observation_stamp_ns)
     stamps = [chunk.observation_stamp_ns for chunk in ordered]
     taken: set[int] = set()

@@ -1,1 +1,1 @@
-"""Recorded runs as data to train on."""
+"""Export of recorded runs as training data."""

@@ -1,9 +1,8 @@
-"""What a run holds to learn from: one episode for each time the arm obeyed one worker.
+"""Episodes of a run: one for each interval in which the arm obeyed one worker.
 
-A frame is one step of that worker's chunks as it was published, at the time from which it counts:
-step k of a chunk belongs to its observation's stamp plus k steps. Steps that a newer chunk replaced
-are left out; where a chunk ran out before the next one came, the arm stood, and frames that ask for
-no motion say so. Thus frames follow each other in the rhythm of the spec's `dt_s`.
+A frame is one step of that worker's chunks: step k of a chunk belongs to the stamp of its
+observation plus k steps. Steps that a newer chunk replaced are left out. If a chunk ran out before
+the next one arrived, frames without motion fill the gap, so all frames are `dt_s` apart.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ class Frame:
 
     Args:
         stamp_ns: wall clock.
-        action: (D,) float32 as the spec says.
-        prompt: in force then.
+        action: (D,) float32, with the meaning of the spec.
+        prompt: in force at that time.
     """
 
     stamp_ns: int
@@ -39,16 +38,16 @@ class Frame:
 
 @dataclass(slots=True)
 class RecordedEpisode:
-    """See the module.
+    """An interval in which the arm obeyed one worker, as frames.
 
     Args:
-        run: it is of.
-        worker: that was obeyed.
-        spec: what its actions mean.
-        since_ns: when the arm began to obey it, wall clock.
-        until_ns: when it ended.
+        run: the recorded run.
+        worker: the obeyed worker.
+        spec: of its actions.
+        since_ns: start, wall clock.
+        until_ns: end, wall clock.
         frames: oldest first.
-        success: whether the task was done; None: nobody knows.
+        success: whether the task was done; None: unknown.
     """
 
     run: Run
@@ -76,11 +75,11 @@ def fps_of(spec: ActionSpec) -> int:
 
 
 def episodes_of(run: Run, worker: str | None = None) -> list[RecordedEpisode]:
-    """Every episode that has frames.
+    """All episodes with frames.
 
     Args:
-        run: to look through.
-        worker: only its episodes.
+        run: the recorded run.
+        worker: only episodes of this worker.
 
     Raises:
         RecordingError: a chunk's spec is not in the recording.
@@ -114,8 +113,8 @@ def _spec_of(run: Run, chunks: list[RecordedSample]) -> ModelSpec:
     specs = [run.specs[each] for each in hashes if each in run.specs]
     if len(specs) != len(hashes):
         raise RecordingError(
-            f"{run.path}: the spec of worker {chunks[0].record.worker!r} is not in it, so nobody "
-            "can say what its actions mean; record a second or more before activating"
+            f"{run.path}: the spec of worker {chunks[0].record.worker!r} is not in it, so the "
+            "meaning of its actions is unknown; record a second or more before activating"
         )
     if len(specs) > 1:
         raise RecordingError(
@@ -148,7 +147,7 @@ def _frames(run: Run, spec: ActionSpec, chunks: list[RecordedSample], until_ns: 
 
 
 def hold(spec: ActionSpec, last: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(D,) the step that asks for no motion after `last`."""
+    """(D,) the step without motion after `last`."""
     if spec.kind == "absolute":
         out = last.copy()
     else:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 LEVELS = 256
 STRIDE = 4
-"""Of a picture every fourth row and column counts."""
+"""Only every fourth row and column of an image counts."""
 
 
 def of_numbers(rows: ArrayLike) -> dict[str, list[Any]]:
@@ -28,7 +28,7 @@ def of_numbers(rows: ArrayLike) -> dict[str, list[Any]]:
 
 
 class Colours:
-    """How often each level of each channel was seen; of shares in [0, 1] like LeRobot's."""
+    """Histogram of the colours of images; statistics are in [0, 1] as LeRobot's."""
 
     def __init__(self) -> None:
         self.levels = np.zeros((3, LEVELS), np.int64)
@@ -42,12 +42,12 @@ class Colours:
         self.count += 1
 
     def join(self, other: Colours) -> None:
-        """Take in what another one saw."""
+        """Add the counts of another histogram."""
         self.levels += other.levels
         self.count += other.count
 
     def statistics(self) -> dict[str, list[Any]]:
-        """As `of_numbers`, each of shape (3, 1, 1); count is that of pictures."""
+        """As `of_numbers`, each of shape (3, 1, 1); count is the number of images."""
         values = np.arange(LEVELS) / (LEVELS - 1)
         channels: dict[str, list[float]] = {}
         for levels in self.levels:

@@ -1,4 +1,4 @@
-"""What the columns of a dataset hold, and the state of the robot as one of them."""
+"""Columns of a dataset, and the state of the robot as one of them."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ NAMES = {
     "fingers_m": ["left_finger", "right_finger"],
 }
 NEAR_NS = 100_000_000
-"""A state belongs to a frame when it lies no further from it than this."""
+"""Largest distance in time between a frame and its state."""
 
 
 def state_names(parts: Sequence[str], joints: int) -> list[str]:
-    """A name for each number.
+    """Names of the numbers of a state.
 
     Args:
         parts: of the state.
@@ -47,21 +47,21 @@ def state_names(parts: Sequence[str], joints: int) -> list[str]:
 
 
 def joints_of(episode: RecordedEpisode) -> int:
-    """How many joints the arm was recorded with; 0: none were."""
+    """Number of recorded arm joints; 0 without joint states."""
     return len(episode.run.joints[0].record.names) if episode.run.joints else 0
 
 
 def action_names(spec: ActionSpec) -> list[str]:
-    """A name for each number of a step."""
+    """Names of the numbers of a step."""
     gripper = [] if spec.gripper == "none" else [f"gripper_{spec.gripper}"]
     return [*NAMES["position"], *NAMES[spec.rotation], *gripper]
 
 
 def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.float32]:
-    """(n, S) the robot's state at each frame.
+    """(n, S) state of the robot at each frame.
 
     Raises:
-        RecordingError: it is not in the recording.
+        RecordingError: no state was recorded near a frame.
     """
     run = episode.run
     streams = {"joint": run.joints, "pose": run.poses, "gripper": run.grippers}
@@ -93,7 +93,7 @@ def _nearest(stream: list[RecordedSample], at_ns: int) -> RecordedSample | None:
 
 
 def _max_width_m(profile_yaml: str) -> float:
-    """Of the profile in force; 1 where the recording has none, so that a fraction is the width."""
+    """From the profile in force; 1 without one, so that fractions equal widths."""
     try:
         return float(yaml.safe_load(profile_yaml)["robot"]["gripper"]["max_width_m"])
     except (TypeError, KeyError, ValueError, yaml.YAMLError):

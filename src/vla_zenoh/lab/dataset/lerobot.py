@@ -1,10 +1,10 @@
-"""A LeRobotDataset in its format v3.0: parquet, MP4 and JSON, without LeRobot.
+"""Writes a LeRobotDataset in format v3.0, parquet, MP4 and JSON, without LeRobot.
 
     data/chunk-000/file-000.parquet                     frames, one row group an episode
     videos/<camera key>/chunk-000/file-000.mp4          one file an episode
     meta/info.json stats.json tasks.parquet episodes/chunk-000/file-000.parquet
 
-Beside it ``meta/vla_zenoh.json`` says for each episode from which run it is, and holds the spec.
+In addition ``meta/vla_zenoh.json`` holds the spec and the source of each episode.
 """
 
 from __future__ import annotations
@@ -46,21 +46,21 @@ DATA, EPISODES = f"data/{PART}.parquet", f"meta/episodes/{PART}.parquet"
 VIDEOS, TASKS = f"videos/{{video_key}}/{PART}.mp4", "meta/tasks.parquet"
 INFO, STATS, OURS = "meta/info.json", "meta/stats.json", "meta/vla_zenoh.json"
 DATA_MB, VIDEO_MB = 100, 200
-"""Sizes at which LeRobot begins another file when it adds to a dataset."""
+"""Sizes at which LeRobot starts another file when it appends to a dataset."""
 COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
 class Written(NamedTuple):
-    """What became of it.
+    """Result of an export.
 
     Args:
         folder: of the dataset.
-        episodes: how many.
-        frames: of all.
+        episodes: number of episodes.
+        frames: number of frames.
         fps: frames per second.
-        cameras: whose pictures are in it.
-        tasks: every prompt.
-        successes: episodes that did their task; None: of none it is known.
+        cameras: names of its cameras.
+        tasks: all prompts.
+        successes: number of successful episodes; None if unknown for all.
     """
 
     folder: Path
@@ -75,17 +75,17 @@ class Written(NamedTuple):
 def export(
     folder: Path, episodes: Sequence[RecordedEpisode], cameras: Sequence[str], parts: Sequence[str]
 ) -> Written:
-    """Write a dataset; `folder` is there only when it is whole.
+    """Write a dataset; `folder` appears only once it is complete.
 
     Args:
         folder: must not exist, or be empty.
-        episodes: in the order they get.
-        cameras: whose pictures.
+        episodes: in their order.
+        cameras: whose images to export.
         parts: of the state, see `vla_zenoh.policy.state_vector`.
 
     Raises:
-        RecordingError: the folder is not empty; there are no episodes; their actions do not mean
-            the same; something of them was not recorded.
+        RecordingError: the folder is not empty; there are no episodes; their actions differ in
+            meaning; a part of them was not recorded.
         MissingExtraError: pyarrow or PyAV is not installed.
     """
     if not episodes:
@@ -158,7 +158,7 @@ class _Dataset:
         return path
 
     def _write_videos(self, camera: str) -> list[EpisodeVideo]:
-        """One of each episode, in their order; each run is read twice."""
+        """The video of each episode, in their order; each run is read twice."""
         out: dict[int, EpisodeVideo] = {}
         runs = {id(episode.run): episode.run for episode in self._episodes}
         for run in runs.values():
@@ -178,7 +178,7 @@ class _Dataset:
         return [out[at] for at in range(len(self._episodes))]
 
     def _write_data(self) -> list[dict[str, NDArray[Any]]]:
-        """Rows of each episode, as they were written."""
+        """Write the frames; returns the rows of each episode."""
         pa = self._pa
         numbers = {STATE: len(self._state_names), ACTION: self._spec.action.dimension}
         schema = pa.schema(
@@ -217,7 +217,7 @@ class _Dataset:
     def _write_tasks(self) -> None:
         pa = self._pa
         table = pa.table({"task_index": range(len(self._tasks)), "task": self._tasks})
-        # LeRobot reads it with pandas and takes the words from the index.
+        # LeRobot reads it with pandas and takes the tasks from the index.
         kinds = (("task_index", "int64", "int64"), ("task", "unicode", "object"))
         columns = [
             {

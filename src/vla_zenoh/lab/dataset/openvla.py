@@ -20,7 +20,7 @@ FIGURES = ("mean", "std", "max", "min", "q01", "q99")
 def openvla_statistics(folder: Path, name: str) -> dict[str, Any]:
     """Figures of actions and state under `name`, as OpenVLA's fine-tuning writes and reads them.
 
-    The mask says which numbers are scaled from [q01, q99] to [-1, 1]: all but the gripper's.
+    The mask marks the numbers that are scaled from [q01, q99] to [-1, 1]: all but the gripper's.
 
     Raises:
         RecordingError: the folder holds no such dataset.

@@ -1,4 +1,4 @@
-"""Whether an episode did what it was told: a person said so, or the simulator's true poses tell."""
+"""Success of an episode, by the verdict of a person or by the simulator's true poses."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.lab.trial.verdict import verdict_in
 
 AFTER_NS = int(1.2 * SETTLED_S * 1e9)
-"""A brick that was just let go is looked at for so long after the end."""
+"""Time after the end in which a brick that was just released is judged."""
 
 
 def succeeded(episode: RecordedEpisode) -> bool | None:
-    """The verdict of a person, else that of the true poses; None: nobody knows.
+    """The verdict of a person, else that of the true poses; None if unknown.
 
-    That is: the person called the episode void; or nobody was asked, and its prompt is no known
-    task, or changed, or no true poses are recorded.
+    It is unknown if the person called the episode void, or if there is no verdict of a person and
+    the prompt changed or is no known task, or no true poses were recorded.
     """
-    said = verdict_in(episode.run.file.ended, episode.worker)
-    if said is not None:
-        return None if said == "void" else said == "success"
+    verdict_of_person = verdict_in(episode.run.file.ended, episode.worker)
+    if verdict_of_person is not None:
+        return None if verdict_of_person == "void" else verdict_of_person == "success"
     prompts = {frame.prompt for frame in episode.frames}
     order = parse_prompt(prompts.pop()) if len(prompts) == 1 else None
     run = episode.run

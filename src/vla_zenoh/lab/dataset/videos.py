@@ -1,4 +1,4 @@
-"""The pictures of an episode as a video: one frame for each of its frames."""
+"""Images of an episode as a video, with one video frame for each frame of the episode."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ OLDEST_NS = 500_000_000
 
 
 def stamps_of(run: Run, camera: str) -> list[int]:
-    """When each picture was taken, in the order in which they were heard."""
+    """Time of capture of each image, in the order of reception."""
     return [picture.stamp_ns for picture in pictures(run.file, camera)]
 
 
 def chosen(episode: RecordedEpisode, camera: str, stamps: list[int]) -> list[int]:
-    """For each frame the newest picture that was not taken after it.
+    """Number of the newest image captured before each frame.
 
     Raises:
-        RecordingError: there is none, or only one that is too old.
+        RecordingError: no image, or only one that is too old.
     """
     order = sorted(range(len(stamps)), key=stamps.__getitem__)
     in_time = [stamps[index] for index in order]
@@ -66,12 +66,12 @@ class EpisodeVideo:
 def write_videos(
     run: Run, camera: str, wanted: list[tuple[Path, list[int]]], fps: int
 ) -> list[EpisodeVideo]:
-    """Write the video of each episode of a run while its pictures are read once.
+    """Write the videos of all episodes of a run while reading its images once.
 
     Args:
-        run: it is of.
-        camera: whose pictures.
-        wanted: for each episode the file and the numbers of its pictures, never falling.
+        run: the recorded run.
+        camera: its name.
+        wanted: file and image numbers of each episode; numbers never decrease.
         fps: frames per second.
     """
     videos = [EpisodeVideo(path, fps) for path, _ in wanted]

@@ -1,7 +1,7 @@
-"""What became of runs: figures of our recordings and of the thesis's CSV files alike.
+"""Evaluation of recorded runs, and of the CSV of the thesis this package grew from.
 
-`files.evaluate` reads what it is given, `csv_file` and `run_file` make a `result.Evaluation` each,
-`result.overall` one of all of them, and `report` a page with plots.
+`evaluate.evaluate` makes a `result.Evaluation` of each file, `evaluate.combined` one of all
+of them, and `report` a page with plots.
 """
 
 from __future__ import annotations

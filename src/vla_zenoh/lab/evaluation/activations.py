@@ -1,7 +1,7 @@
-"""What belongs together in a recording: when the arm obeyed whom, and for which prompt.
+"""Intervals of a recording: when the arm obeyed which worker, and for which prompt.
 
-Stamps of the writers say it, not when something reached the recorder: so a replayed run is cut as
-the original is.
+They follow the stamps of the writers, not the reception, so a replayed run is divided as the
+original is.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from vla_zenoh.types import Task
 
 
 def until(stream: Sequence[RecordedSample], until_ns: int) -> list[RecordedSample]:
-    """What is stamped before a time."""
+    """Entries stamped before a time."""
     return [entry for entry in stream if entry.header.stamp_wall_ns < until_ns]
 
 
 def obeyed_chunks(run: Run) -> list[RecordedSample]:
-    """Chunks of the obeyed worker that came while the arm obeyed: the requests."""
+    """Chunks of the obeyed worker while the arm was active: the requests."""
     spans = activations(run)
     starts = [since_ns for since_ns, _, _ in spans]
     out: list[RecordedSample] = []
@@ -32,12 +32,12 @@ def obeyed_chunks(run: Run) -> list[RecordedSample]:
 
 
 def activations(run: Run) -> list[tuple[int, int, str]]:
-    """(since ns, until ns, worker) of each time in which the arm obeyed one worker."""
+    """(since ns, until ns, worker) of each interval in which the arm obeyed one worker."""
     return _spans(run, lambda task: task.worker)
 
 
 def prompt_intervals(run: Run) -> list[tuple[int, int, str]]:
-    """The same for prompts."""
+    """(since ns, until ns, prompt) of each interval with one prompt in force."""
     return _spans(run, lambda task: task.prompt)
 
 
@@ -45,19 +45,19 @@ def _spans(run: Run, of: Callable[[Task], str]) -> list[tuple[int, int, str]]:
     out: list[tuple[int, int, str]] = []
     since_ns, now = 0, None
     for entry in run.tasks:
-        said = of(entry.record) if entry.record.active else None
-        if said != now:
+        value = of(entry.record) if entry.record.active else None
+        if value != now:
             stamp_ns = entry.header.stamp_wall_ns
             if now is not None:
                 out.append((since_ns, stamp_ns, now))
-            since_ns, now = stamp_ns, said
+            since_ns, now = stamp_ns, value
     if now is not None:
         out.append((since_ns, last_ns(run) + 1, now))
     return out
 
 
 def last_ns(run: Run) -> int:
-    """The last stamp of robot and models: a recorder may listen on after them."""
+    """The last stamp of robot and models; a recorder may run on after it."""
     streams = (run.tasks, run.chunks, run.commands, run.joint_commands, run.poses)
     stamps = (stream[-1].header.stamp_wall_ns for stream in streams if stream)
     return max(stamps, default=run.ended_ns)

@@ -39,7 +39,7 @@ _TRUE, _FALSE = TRUE_WORDS | {"1.0"}, FALSE_WORDS | {"0.0"}
 
 
 def has_our_columns(path: Path) -> bool:
-    """Whether the first line names any of the columns that only such files have."""
+    """Whether the first line names a column that only such files have."""
     try:
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
             return not set(TIMES).isdisjoint(next(csv.reader(file), []))
@@ -48,14 +48,14 @@ def has_our_columns(path: Path) -> bool:
 
 
 def evaluate_csv(path: Path, first: int | None = None) -> Evaluation:
-    """Evaluate a file; what is missing in it is in `Evaluation.problems`.
+    """Evaluate a file; `Evaluation.problems` lists what is missing in it.
 
     Args:
         path: of the file.
-        first: only so many rows.
+        first: only this many rows.
 
     Raises:
-        RecordingError: it cannot be read, or holds none of the columns.
+        RecordingError: the file cannot be read, or has none of the columns.
     """
     header, rows = _read(path)
     missing = [name for name in COLUMNS if name not in header]
@@ -96,7 +96,7 @@ def _read(path: Path) -> tuple[list[str], list[dict[str, str | None]]]:
 
 
 class _Table:
-    """Columns of a file as numbers; cells that are none become NaN and are told."""
+    """Columns of a file as numbers; other cells become NaN and are reported as a problem."""
 
     def __init__(
         self, rows: Sequence[dict[str, str | None]], header: Sequence[str], problems: list[str]
@@ -106,19 +106,19 @@ class _Table:
     def has(self, *names: str) -> bool:
         return all(name in self._header for name in names)
 
-    def words(self, name: str) -> list[str]:
+    def texts(self, name: str) -> list[str]:
         return [(row.get(name) or "").strip() for row in self.rows]
 
     def zero(self, name: str) -> int:
-        """The first whole number in a column, 0 without one."""
-        words = self.words(name) if self.has(name) else []
+        """The first integer of a column, 0 without one."""
+        words = self.texts(name) if self.has(name) else []
         return next((int(word) for word in words if _is_whole(word)), 0)
 
     def column(self, name: str, zero: int = 0) -> FloatArray:
-        """Numbers less `zero`: nanoseconds of a wall clock are more than a float can tell apart."""
+        """Numbers minus `zero`: a float does not resolve the nanoseconds of a wall clock."""
         values = np.full(len(self.rows), np.nan)
         wrong: list[tuple[int, str]] = []
-        for index, word in enumerate(self.words(name)):
+        for index, word in enumerate(self.texts(name)):
             try:
                 values[index] = int(word) - zero if _is_whole(word) else float(word) - zero
             except (ValueError, OverflowError):
@@ -156,7 +156,7 @@ def _latency(run: Evaluation, table: _Table) -> None:
 def _success(run: Evaluation, table: _Table) -> None:
     if not table.has("success"):
         return
-    words = [word.lower() for word in table.words("success")]
+    words = [word.lower() for word in table.texts("success")]
     run.succeeded = sum(word in _TRUE for word in words)
     strange = [word for word in words if word not in _TRUE | _FALSE]
     if strange:
@@ -164,7 +164,7 @@ def _success(run: Evaluation, table: _Table) -> None:
             f"column success: {len(strange)} of {len(words)} cells are neither true nor false "
             f"({strange[0][:40]!r}); they count as failed"
         )
-    errors = table.words("error") if table.has("error") else [""] * len(words)
+    errors = table.texts("error") if table.has("error") else [""] * len(words)
     run.refusals = Counter(
         error or "no reason given"
         for word, error in zip(words, errors, strict=True)
@@ -182,7 +182,7 @@ def _motion(run: Evaluation, table: _Table) -> None:
     run.path_m, run.path_rad = trajectory.path_m(position), trajectory.turned_rad(turns)
     run.width_m = table.column("gw") if table.has("gw") else np.zeros(0)
     run.width_t_s = run.request_t_s if len(run.width_m) else np.zeros(0)
-    prompts = table.words("prompt") if table.has("prompt") else [""] * count
+    prompts = table.texts("prompt") if table.has("prompt") else [""] * count
     run.prompts = [prompt for prompt, _ in groupby(prompts) if prompt]
     t_s = run.request_t_s
     if np.isfinite(position).any():

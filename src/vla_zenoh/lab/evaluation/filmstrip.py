@@ -1,4 +1,4 @@
-"""Pictures at chosen moments: what each camera took, and what the model was given of it."""
+"""Film strip of a run: images of each camera at chosen moments, and the inputs of the model."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ QUALITY = 80
 
 
 def filmstrip(run: Run, chunks: Sequence[ActionChunk], count: int) -> list[CameraView]:
-    """For each camera `count` pictures, evenly over the run.
+    """`count` images of each camera, evenly over the run.
 
-    With chunks they are the pictures that chunks were made of. What the model was given of them
-    stands beside: as it was recorded, else as its spec says where it asks for another size.
+    With chunks they are images that chunks were inferred from, each with the input of the model
+    beside it: the recorded one, else one prepared by the spec if that resizes images.
     """
     stamps = [chunk.observation_stamp_ns for chunk in chunks]
     if not stamps:
@@ -45,7 +45,7 @@ def filmstrip(run: Run, chunks: Sequence[ActionChunk], count: int) -> list[Camer
 
 
 def _asked(run: Run, chunks: Sequence[ActionChunk], camera: str) -> CameraSpec | None:
-    """What the models' specs say of a camera."""
+    """The spec of a camera in the models' specs."""
     hashes = dict.fromkeys(chunk.spec_hash for chunk in chunks)
     specs = [run.specs[name] for name in hashes if name in run.specs]
     cameras = (each for spec in specs for each in spec.observation.cameras)
@@ -53,7 +53,7 @@ def _asked(run: Run, chunks: Sequence[ActionChunk], camera: str) -> CameraSpec |
 
 
 def _nearest(found: Iterable[RecordedImage], stamps: Sequence[int]) -> list[RecordedImage]:
-    """For each stamp the picture that was taken nearest to it, in one pass over the file."""
+    """The image captured nearest to each stamp, in one pass over the file."""
     best: list[RecordedImage | None] = [None] * len(stamps)
     for picture in found:
         for index, stamp_ns in enumerate(stamps):
@@ -82,7 +82,7 @@ def _views(
             seen = prepare_image(image, asked.model_copy(update={"colour": "rgb"}))
             out.append(CameraView(t_s, camera, _small(seen), model=True))
     except (CodecError, SpecError):
-        return []  # no picture that can be shown
+        return []  # not an image that can be shown
     return out
 
 

@@ -1,4 +1,4 @@
-"""A recording of ours: what was asked, commanded and measured, and how long each stage took."""
+"""Evaluates a recording: requested, commanded and measured motion, and latencies by stage."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from vla_zenoh.lab.recording.run import RecordedSample, Run, load_run
 from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray, NodeStatus
 
 GAP_S = 0.05
-"""A stream that says nothing for longer was interrupted: nothing is derived across the gap."""
+"""A longer gap in a stream is an interruption; nothing is derived across it."""
 
 
 class MeasuredMotion(NamedTuple):
-    """A stream of poses: stamps in s since the run began, (n, 3), (n, 4), (n, 6)."""
+    """A stream of poses: stamps (n,) in s since the start of the run, (n, 3), (n, 4), (n, 6)."""
 
     t_s: FloatArray
     position_m: FloatArray
@@ -37,28 +37,28 @@ class MeasuredMotion(NamedTuple):
     twist: FloatArray
 
     def part(self, since_s: float, until_s: float) -> MeasuredMotion:
-        """What is stamped within."""
+        """The samples stamped within an interval."""
         first, last = np.searchsorted(self.t_s, (since_s, until_s))
         return MeasuredMotion(*(column[first:last] for column in self))
 
 
 def evaluate_run(path: Path, first: int | None = None, *, pictures: int = 0) -> Evaluation:
-    """Evaluate a recording; what cannot be read in it is in `Evaluation.problems`.
+    """Evaluate a recording; `Evaluation.problems` lists what cannot be read.
 
     Args:
         path: of the file.
-        first: only up to so many chunks of the obeyed worker.
-        pictures: how many moments to show of each camera.
+        first: only this many chunks of the obeyed worker.
+        pictures: number of moments to show of each camera.
 
     Raises:
-        RecordingError: it cannot be opened, or is of another program.
+        RecordingError: the file cannot be opened, or is of another program.
     """
     run = load_run(path)
     return evaluate_loaded(run, first, pictures=pictures)
 
 
 def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) -> Evaluation:
-    """`evaluate_run` of what is in memory already."""
+    """`evaluate_run` of a run in memory."""
     zero_ns = run.began_ns
     name = run.path.parent.name if run.path.stem == "run" else run.path.stem
     out = Evaluation(name, "mcap", run.path, problems=list(run.problems))
@@ -141,7 +141,7 @@ def _measured(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
 
 
 def _commanded(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
-    """Pose commands; where joints are commanded, the pose that the controller holds."""
+    """Pose commands; for joint commands the reference pose of the controller."""
     if run.commands:
         return _stream(
             (
@@ -194,7 +194,7 @@ def _motion(out: Evaluation, measured: MeasuredMotion, commanded: MeasuredMotion
 
 
 def _seams(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
-    """Jerk of the command stream, and what happens where one chunk takes over from another."""
+    """Jerk of the command stream, and steps where a chunk replaces another."""
     jerk: list[float] = []
     goal_mm: list[float] = []
     velocity_mm_s: list[float] = []
@@ -208,7 +208,7 @@ def _seams(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
         if before.cause and after.cause and _chunk(before.cause) != _chunk(after.cause):
             goal = after.goal_position_m - before.goal_position_m
             goal_mm.append(float(np.linalg.norm(goal)) * 1e3)
-            # What acceleration explains is no step.
+            # The step is what the acceleration does not explain.
             gained = (before.acceleration[:3] + after.acceleration[:3]) / 2 * apart_s
             step = after.twist[:3] - before.twist[:3] - gained
             velocity_mm_s.append(float(np.linalg.norm(step)) * 1e3)
@@ -256,7 +256,7 @@ def _idle(out: Evaluation, active: Sequence[tuple[float, float]], measured: Meas
 def _counted(
     first: Mapping[str, NodeStatus], last: Mapping[str, NodeStatus], prefix: str
 ) -> Counter[str]:
-    """What nodes counted while it was recorded; of a node that was started anew, all."""
+    """Increase of the nodes' counters during the recording; from zero if a node restarted."""
     out: Counter[str] = Counter()
     for node, status in last.items():
         before = first[node]
@@ -276,7 +276,7 @@ def _segments(
     measured: MeasuredMotion,
     until_ns: int,
 ) -> None:
-    """One for each prompt that was in force while the arm obeyed."""
+    """A segment for each prompt in force while the arm was active."""
     zero_ns = run.began_ns
     steps = {(e.record.worker, e.header.seq): len(e.record.steps) for e in run.chunks}
     for since_ns, end_ns, prompt in prompt_intervals(run):

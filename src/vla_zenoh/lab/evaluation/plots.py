@@ -1,4 +1,4 @@
-"""Plots of a run for the page, as plotly's JSON: its JavaScript draws them."""
+"""Plots of a run for the HTML page, as JSON for plotly's JavaScript."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LAYOUT: dict[str, Any] = {
 
 
 def library() -> str:
-    """The JavaScript that draws, for the page's head.
+    """plotly's JavaScript, for the head of the page.
 
     Raises:
         MissingExtraError: plotly is not installed.
@@ -37,7 +37,7 @@ def library() -> str:
 
 
 def plots_of(run: Evaluation) -> list[str]:
-    """All plots of a run that it has the figures for, ready to stand in a script."""
+    """All plots that the run has figures for, as JSON that is safe inside a script element."""
     made = (
         _path(run),
         _position(run),
@@ -46,7 +46,7 @@ def plots_of(run: Evaluation) -> list[str]:
         _histogram(run),
         _width(run),
     )
-    # A prompt may hold what ends a script; JSON says the same without it.
+    # A prompt may contain the end of the script element; JSON can escape it.
     return [figure.to_json().replace("<", "\\u003c") for figure in made if figure is not None]
 
 

@@ -1,4 +1,4 @@
-"""One page with tables and plots that needs nothing but itself."""
+"""HTML page with tables and plots, in one file without network access."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from vla_zenoh import __version__
 from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.lab.evaluation import plots
-from vla_zenoh.lab.evaluation.combined import overall
+from vla_zenoh.lab.evaluation.evaluate import combined
 from vla_zenoh.lab.evaluation.result import STAGES, CameraView, Evaluation
 from vla_zenoh.lab.evaluation.tables import LATENCY_COLUMNS, figures, latency_rows, segment_rows
 
@@ -30,7 +30,7 @@ def page(runs: Sequence[Evaluation], faults: Mapping[str, str]) -> str:
         raise MissingExtraError("jinja2", "record") from error
     text = files("vla_zenoh.lab.evaluation").joinpath(TEMPLATE).read_text("utf-8")
     template = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(text)
-    shown = [overall(runs), *runs] if len(runs) > 1 else list(runs)
+    shown = [combined(runs), *runs] if len(runs) > 1 else list(runs)
     return template.render(
         version=__version__,
         library=Markup(plots.library()),
@@ -48,7 +48,7 @@ def _shown(run: Evaluation, markup: Any) -> dict[str, Any]:
         "problems": run.problems,
         "figures": figures(run),
         "latency": latency_rows(run),
-        # Over all runs each prompt would stand there once more.
+        # The combined run would repeat every prompt.
         "segments": segment_rows(run) if run.path else [],
         "plots": [markup(plot) for plot in plots.plots_of(run)],
         "strips": _strips(run.views),
@@ -57,7 +57,7 @@ def _shown(run: Evaluation, markup: Any) -> dict[str, Any]:
 
 
 def _strips(views: Sequence[CameraView]) -> list[dict[str, Any]]:
-    """Pictures in rows: one for each camera, and one for what the model was given of it."""
+    """Rows of images: one per camera, and one of the model's inputs from it."""
     rows: dict[tuple[str, bool], list[dict[str, str]]] = {}
     for view in views:
         source = f"data:image/jpeg;base64,{b64encode(view.jpeg).decode()}"

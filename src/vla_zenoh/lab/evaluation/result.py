@@ -1,4 +1,4 @@
-"""What an evaluation found out, and how it is written as a row."""
+"""Results of an evaluation, and their form as a row."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ STAGES = {
     "worker_to_command": "of that, until the command node has it",
     "command_to_pose": "of that, until the pose command",
 }
-"""Stages of a request, and what they are."""
+"""Stages of a request, and their meaning."""
 THESIS_NAMES = {"e2e": "end_to_end", "backend": "inference", "outbound": "outbound"}
-"""How the thesis calls its three stages."""
+"""Names of the thesis for its three stages."""
 
 
 @dataclass(frozen=True, slots=True)
 class PromptSegment:
-    """What one prompt led to.
+    """Motion of the arm during one prompt.
 
     Args:
-        prompt: as put.
+        prompt: as published.
         requests: carried out.
-        seconds: how long.
-        path_m: length of the way.
-        path_rad: length of the way in rotation.
-        moved_m: (3,) from its first pose to its last.
-        turned_rad: (3,) rotation vector likewise, base axes.
-        asked_m: along the asked axis; None where it is not known what was asked.
-        asked_rad: about it.
-        along_m: reached along the asked axis.
+        seconds: duration.
+        path_m: length of the path.
+        path_rad: length of the path in rotation.
+        moved_m: (3,) displacement from the first pose to the last.
+        turned_rad: (3,) rotation vector from the first pose to the last, base axes.
+        asked_m: requested along the axis of the prompt; None where the request is unknown.
+        asked_rad: requested about that axis.
+        along_m: reached along it.
         along_rad: reached about it.
-        drift_m: furthest distance from the asked line (from the start, where none was asked).
-        drift_rad: largest rotation off the asked axis.
-        width_m: gripper, first and last, where known.
+        drift_m: largest distance from the requested line; from the start without one.
+        drift_rad: largest rotation off the requested axis.
+        width_m: first and last opening of the gripper, where known.
     """
 
     prompt: str
@@ -80,13 +80,13 @@ class PlotTrace:
 
 @dataclass(frozen=True, slots=True)
 class CameraView:
-    """A picture of the strip.
+    """An image of the film strip.
 
     Args:
         t_s: since the run began.
         camera: its name.
         jpeg: a small JPEG file.
-        model: it is what the model was given, not what the camera took.
+        model: input of the model, not the image of the camera.
     """
 
     t_s: float
@@ -97,37 +97,37 @@ class CameraView:
 
 @dataclass(slots=True)
 class Evaluation:
-    """One run, or all of them.
+    """Figures of one run, or of all runs.
 
     Args:
         name: ``record_id``.
         kind: ``mcap`` or ``csv``.
-        path: of the file; None for all of them.
+        path: of the file; None for all runs.
         requests: rows of a CSV file; chunks of the obeyed worker.
-        succeeded: of those, how many; None where it is not known.
-        seconds: from the first to the last of them.
+        succeeded: number of those that succeeded; None where unknown.
+        seconds: from the first request to the last.
         prompts: in their order.
         stages_ms: stage -> one value per request.
         request_t_s: time of each request, (n,).
-        path_m: length of the way of the TCP; of the measured one where it is known.
-        path_rad: likewise in rotation.
-        command_path_m: of the commanded one.
-        command_path_rad: likewise.
-        tracking_mm: commanded against measured position at the same time.
-        tracking_mrad: likewise for orientation.
-        jerk: (n,) size of the commanded jerk in m/s^3 (rad/s^3 where joints are commanded).
+        path_m: length of the path of the TCP; of the measured one where known.
+        path_rad: length of that path in rotation.
+        command_path_m: length of the commanded path.
+        command_path_rad: length of the commanded path in rotation.
+        tracking_mm: distance between commanded and measured position at the same time.
+        tracking_mrad: angle between commanded and measured orientation.
+        jerk: (n,) norm of the commanded jerk in m/s^3 (rad/s^3 for joint commands).
         jerk_unit: of `jerk`.
-        active_s: how long the arm obeyed.
-        idle_s: how long of it it stood.
-        seam_goal_mm: by how much the goal jumped where a new chunk took over.
-        seam_velocity_mm_s: by how much the commanded velocity did.
-        refusals: reason -> how often.
-        skipped: reason -> how often; what belongs to normal running.
+        active_s: time in which the arm was active.
+        idle_s: part of that time in which it stood still.
+        seam_goal_mm: step of the goal where a new chunk replaced another.
+        seam_velocity_mm_s: step of the commanded velocity there.
+        refusals: rejections, by reason.
+        skipped: chunks left out in normal operation, by reason.
         width_m: gripper opening, (n,).
-        width_t_s: when, (n,).
-        gripper_orders: how many.
-        segments: what each prompt led to.
-        problems: what could not be read, in words.
+        width_t_s: times of `width_m`, (n,).
+        gripper_orders: number of gripper commands.
+        segments: motion during each prompt.
+        problems: messages about what could not be read.
         measured: for plots.
         commanded: for plots.
         marks: (seconds, prompt), for plots.
@@ -218,7 +218,7 @@ class Evaluation:
         return out
 
     def to_dict(self) -> dict[str, Any]:
-        """`row`, and beside it what does not fit into one."""
+        """`row` and the figures that do not fit into one."""
         return self.row() | {
             "file": str(self.path) if self.path else None,
             "prompts": self.prompts,

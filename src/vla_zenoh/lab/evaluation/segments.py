@@ -1,4 +1,4 @@
-"""What each prompt led to: the way along what was asked, and off it."""
+"""Motion during each prompt: along the requested axis, and off it."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ def segment(
     quat_xyzw: FloatArray,
     width_m: FloatArray,
 ) -> PromptSegment:
-    """One prompt.
+    """The segment of one prompt.
 
     Args:
-        prompt: as put; of HARD ones it is known what they ask for.
+        prompt: as published; the motion that HARD ones request is known.
         requests: steps carried out.
-        seconds: how long.
+        seconds: duration.
         position_m: (n, 3), may hold NaN.
-        quat_xyzw: (n, 4), likewise.
-        width_m: (m,) gripper, likewise.
+        quat_xyzw: (n, 4), may hold NaN.
+        width_m: (m,) gripper opening, may hold NaN.
     """
     moved, turned = _since_first(position_m), rotvecs(quat_xyzw)
     asked = _asked(prompt)
@@ -78,7 +78,7 @@ def _last(rows: FloatArray) -> tuple[float, ...]:
 def _split(
     moved: FloatArray, axis: int | None, amount: float | None
 ) -> tuple[float | None, float | None]:
-    """How far it went in the end along the asked axis, and how far off it at most."""
+    """Final displacement along the axis, and the largest one off it."""
     there = moved[np.isfinite(moved).all(axis=1)]
     if not len(there):
         return None, None

@@ -1,4 +1,4 @@
-"""Figures as words, for the screen and the page."""
+"""Figures as text, for the screen and the page."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ SUMMARY_COLUMNS = (
     "idle s",
     "refused",
 )
-"""Requests, share that succeeded, end-to-end latency, way of the TCP, furthest off the asked axis,
-tracking error (p95), time it stood while active, refusals."""
+"""Requests, success rate, end-to-end latency, path of the TCP, largest distance off the requested
+axis, tracking error (p95), time standing while active, rejections."""
 NARROW = 7
-"""So many of these columns fit on a terminal of 80."""
+"""Number of these columns that fit on a terminal of 80 characters."""
 NONE = "-"
 
 

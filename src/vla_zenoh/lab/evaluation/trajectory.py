@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from vla_zenoh.types import FloatArray
 
 STILL_M_S, STILL_RAD_S = 0.002, 0.01
-"""An arm that is slower stands."""
+"""A slower arm counts as standing still."""
 
 
 def known(rows: FloatArray) -> FloatArray:
-    """The rows whose numbers are all finite."""
+    """Rows of finite numbers."""
     return rows[np.isfinite(rows).all(axis=1)] if len(rows) else rows
 
 
 def path_m(position_m: FloatArray) -> float | None:
-    """Length of the way through points (n, 3); incomplete points are left out."""
+    """Length of the path through points (n, 3); incomplete points are left out."""
     points = known(position_m)
     if not len(points):
         return None
@@ -32,7 +30,7 @@ def angles_rad(quat_xyzw: FloatArray, other_xyzw: FloatArray) -> FloatArray:
 
 
 def turned_rad(quat_xyzw: FloatArray) -> float | None:
-    """Length of the way through orientations (n, 4), on geodesics; incomplete ones left out."""
+    """Length of the path through orientations (n, 4) on geodesics; incomplete ones left out."""
     turns = known(quat_xyzw)
     if not len(turns):
         return None
@@ -40,7 +38,7 @@ def turned_rad(quat_xyzw: FloatArray) -> float | None:
 
 
 def relative(quat_xyzw: FloatArray, other_xyzw: FloatArray) -> FloatArray:
-    """In each row what turns the first orientation into the second, about axes of the base."""
+    """Rotation from the first to the second orientation of each row, base axes."""
     v, w = -quat_xyzw[:, :3], quat_xyzw[:, 3:]
     u, s = other_xyzw[:, :3], other_xyzw[:, 3:]
     vector = s * v + w * u + np.cross(u, v)
@@ -48,7 +46,7 @@ def relative(quat_xyzw: FloatArray, other_xyzw: FloatArray) -> FloatArray:
 
 
 def rotvecs(quat_xyzw: FloatArray) -> FloatArray:
-    """Rotation vectors (n, 3) in rad since the first orientation that is known, base axes."""
+    """Rotation vectors (n, 3) in rad from the first known orientation, base axes."""
     found = known(quat_xyzw)
     if not len(found):
         return np.full((len(quat_xyzw), 3), np.nan)
@@ -60,7 +58,7 @@ def rotvecs(quat_xyzw: FloatArray) -> FloatArray:
 
 
 def with_w(vector_xyz: FloatArray) -> FloatArray:
-    """Unit quaternions (n, 4) of their x, y, z: w is the positive root of what is missing to 1."""
+    """Unit quaternions (n, 4) from x, y, z; w is positive."""
     w = np.sqrt(np.clip(1.0 - np.sum(vector_xyz**2, axis=1, keepdims=True), 0.0, None))
     full = np.hstack([vector_xyz, w])
     norm = np.linalg.norm(full, axis=1, keepdims=True)
@@ -68,11 +66,6 @@ def with_w(vector_xyz: FloatArray) -> FloatArray:
 
 
 def idle_s(t_s: FloatArray, speed_m_s: FloatArray, turn_rad_s: FloatArray) -> float:
-    """Time in which the arm stands; (n,) times and (n - 1,) speeds between them."""
+    """Time in which the arm stands still, of (n,) times and the (n - 1,) speeds between them."""
     still = (speed_m_s < STILL_M_S) & (turn_rad_s < STILL_RAD_S)
     return float(np.diff(t_s)[still].sum())
-
-
-def concatenated(parts: Sequence[FloatArray]) -> FloatArray:
-    """All values in one array, empty when there are none."""
-    return np.concatenate(parts) if parts else np.zeros(0)

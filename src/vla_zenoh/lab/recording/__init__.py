@@ -1,7 +1,7 @@
-"""A run in a file: MCAP that Foxglove, Rerun and ``ros2 bag`` open, written and read without loss.
+"""Recordings: MCAP files that Foxglove, Rerun and ``ros2 bag`` open, without loss.
 
-`writer.RunWriter` takes samples as they were heard, `reader.open_recording` gives them back, and
-`run.load_run` makes records of them. Nothing here speaks Zenoh or has a clock.
+`recorder.Recorder` writes the keys of a robot to a file, `reader.open_recording` reads the samples,
+`run.load_run` decodes them, and `replay.Replay` publishes them again.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""A file that is whole after every write, whatever ends the program or fills the disk.
+"""An MCAP file that is complete after every write, even if the program is killed.
 
-MCAP is written in chunks. After each, the few bytes that end a file are put behind it, and the next
-chunk goes over them. So a file whose writer was killed opens in any tool, up to the last chunk.
+MCAP is written in chunks. After each chunk come the few bytes that end a file, and the next chunk
+overwrites them. So any tool opens the file of a killed writer, up to the last chunk.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ END = _end()
 
 
 class CrashSafeFile:
-    """Where the MCAP writer writes to: kept in memory until `commit`.
+    """Output stream of the MCAP writer: kept in memory until `commit`.
 
     Args:
-        path: of the file; one that is there is overwritten.
+        path: of the file; an existing file is overwritten.
 
     Raises:
-        RecordingError: it cannot be made.
+        RecordingError: the file cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -52,28 +52,28 @@ class CrashSafeFile:
         return self._waiting.write(data)
 
     def tell(self) -> int:
-        """Position in the file that is to be."""
+        """Position in the file after `commit`."""
         return self._done + self._waiting.tell()
 
     def flush(self) -> None:
-        """Nothing: see `commit`."""
+        """Do nothing; `commit` writes."""
 
     # -- for us -------------------------------------------------------------------------------
     @property
     def size(self) -> int:
-        """Bytes of the file as it is on the disk."""
+        """Size of the file on disk, in bytes."""
         return self._done + len(END)
 
     @property
     def waiting(self) -> int:
-        """Bytes that `commit` would write."""
+        """Number of bytes that `commit` would write."""
         return self._waiting.tell()
 
     def commit(self, *, last: bool = False) -> None:
-        """Write what is kept. When it does not fit, the file stays as it was.
+        """Write the bytes so far. If they do not fit, the file stays as it was.
 
         Args:
-            last: the MCAP writer has written the file's end itself.
+            last: the MCAP writer has already written the end of the file.
 
         Raises:
             RecordingError: the disk is full, or broken.
@@ -101,7 +101,7 @@ class CrashSafeFile:
             os.ftruncate(self._file, self._done + len(END))
 
     def close(self) -> None:
-        """Close the file; what was not committed is lost. Closing it again does nothing."""
+        """Close the file; bytes since the last `commit` are lost. Closing twice does nothing."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1

@@ -1,7 +1,6 @@
-"""Samples out of an MCAP file of ours, in the order in which they were heard.
+"""Reads the samples of a recording in the order of reception.
 
-A file whose writer was killed, or that was cut off, gives what it has; `RunFile.damage` then says
-so.
+A file that was cut off is read as far as it goes; `Recording.damage` then holds the reason.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which record a key carries."""
+"""Type of the record that each key carries."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ RECORDS: tuple[type, ...] = (
 
 
 class RecordTypes:
-    """Answers for the keys of one robot; what it was asked it knows by heart."""
+    """Record types of the keys of one robot; look-ups are cached."""
 
     def __init__(self, keys: Keys) -> None:
         self._keys = keys
@@ -58,7 +58,7 @@ class RecordTypes:
         }
 
     def of(self, key: str) -> type | None:
-        """The record that travels on `key`; None where it is a picture, plain text or unknown."""
+        """The record type of `key`; None for images, plain text and unknown keys."""
         if key not in self._known:
             self._known[key] = self._look_up(key)
         return self._known[key]

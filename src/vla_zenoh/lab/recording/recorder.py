@@ -30,9 +30,9 @@ from vla_zenoh.types import Event
 NAME = "recorder"
 QUEUE_BYTES = 64 * 1024 * 1024
 QUEUE_SAMPLES = 50_000
-"""Some ten seconds of a robot with two cameras."""
+"""About ten seconds of a robot with two cameras."""
 COMMIT_S = 0.5
-"""Who kills the recorder with -9 loses at most what was said in this time."""
+"""A recorder killed with -9 loses at most the samples of this period."""
 POLL_S, WRITE_S = 0.1, 0.025
 ANSWER_S = 1.0
 SWITCH_INTERVAL_S = 5e-4
@@ -41,16 +41,16 @@ RECORDING, FAILED, STOPPED = "recording", "failed", "stopped"
 
 @dataclass(slots=True)
 class RecordingResult:
-    """What became of a recording.
+    """Result of a recording.
 
     Args:
         path: of the file.
-        seconds: how long it was recorded.
+        seconds: duration.
         size_bytes: of the file.
-        cpu_s: processor time that writing took, without Zenoh's threads.
+        cpu_s: processor time of the writing thread.
         samples: by key.
-        dropped: by key, because the disk did not keep up.
-        failure: why it ended early; empty when it did not.
+        dropped: samples by key that the disk was too slow for.
+        failure: why it ended early; empty if it did not.
     """
 
     path: Path
@@ -63,37 +63,37 @@ class RecordingResult:
 
 
 def recorded_keys(keys: Keys, given: Sequence[str] = (), *, raw: bool = False) -> tuple[str, ...]:
-    """Which key expressions are recorded.
+    """Key expressions to record.
 
     Args:
         keys: of the robot.
-        given: these alone, below ``<root>/<robot>/`` or whole; empty: everything the robot says
-            but raw pictures, which are 1 MB each.
-        raw: raw pictures too.
+        given: only these, below ``<root>/<robot>/`` or whole; empty: all keys of the robot but raw
+            images, which are 1 MB each.
+        raw: raw images as well.
     """
     found = dict.fromkeys(map(keys.full, given)) or dict.fromkeys(keys.without_raw_images)
     if raw:
         found[keys.all_raw_images] = None
-    # What two expressions mean would be heard, and recorded, twice.
+    # A key that two expressions match would be received, and recorded, twice.
     return tuple(
         each for each in found if not any(covers(other, each) for other in found if other != each)
     )
 
 
 class Recorder:
-    """Records from `start` to `close`.
+    """Node that records the keys of a robot from `start` to `close`.
 
     Args:
-        profile: the effective profile; it goes into the file.
-        session: an open session, closed by whoever opened it.
+        profile: the effective profile; it is kept in the file.
+        session: an open session; the caller closes it.
         path: of the file.
-        expressions: which keys, see `recorded_keys`; None: what that gives by itself.
-        name: the node's; a second recorder needs another one.
+        expressions: keys to record; None: the default of `recorded_keys`.
+        name: node name; a second recorder needs another one.
         queue_bytes: payloads in memory at most.
 
     Raises:
-        RecordingError: the file cannot be made.
-        NodeError: a node of this name is alive already.
+        RecordingError: the file cannot be created.
+        NodeError: a node of this name is already alive.
     """
 
     def __init__(
@@ -127,12 +127,12 @@ class Recorder:
 
     # -- life ---------------------------------------------------------------------------------
     def start(self) -> Recorder:
-        """Begin to listen.
+        """Subscribe and begin to record.
 
         Raises:
             RecordingError: not a key expression.
         """
-        # Else Zenoh's thread may wait 5 ms for the writing one at every sample, and hears late.
+        # With Python's default of 5 ms, Zenoh's thread may wait that long for the writing thread.
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         self._queue.subscribe(self._expressions)
         self._thread.start()
@@ -140,7 +140,7 @@ class Recorder:
         return self
 
     def _ask_settings(self) -> None:
-        """Settings are put once and kept by the command node: those in force stand at the top."""
+        """Ask the command node for the settings in force: each is published only once."""
         keys = self.node.keys
         wanted = [zenoh.KeyExpr(expression) for expression in self._expressions]
         for key in (keys.prompt, keys.worker, keys.rate, keys.speed, keys.active):
@@ -162,14 +162,14 @@ class Recorder:
         return self.close()
 
     def stop_listening(self) -> None:
-        """Take no more samples; the file stays open until `close`."""
+        """Unsubscribe; the file stays open until `close`."""
         self._queue.close()
 
     def close(self, ended: Mapping[str, Any] | None = None) -> RecordingResult:
-        """Stop listening, write what is queued, and finish the file.
+        """Unsubscribe, write the queued samples and finish the file.
 
         Args:
-            ended: what else is to stand at its end.
+            ended: further metadata for the end of the file.
         """
         self.stop_listening()
         self._ended = ended or {}

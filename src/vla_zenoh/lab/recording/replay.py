@@ -1,4 +1,4 @@
-"""Puts a recorded run on keys again, with its own timing. Never onto a robot that lives."""
+"""Publishes a recorded run with its original timing, never onto a live robot."""
 
 from __future__ import annotations
 
@@ -49,38 +49,38 @@ GROUPS = (
     "event",
     "sim",
 )
-"""Parts of a recording that can be chosen: what stands behind the robot in a key."""
+"""Parts of a recording that can be selected: the first chunk of a key after the robot."""
 AHEAD = 400
-"""Samples that are made ready before their time."""
+"""Samples that are decoded ahead of their time."""
 START_AFTER_NS = 500_000_000
-"""Until the first sample: publishers are known to the router by then."""
+"""Delay of the first sample: the router knows the publishers by then."""
 SLICE_S = 0.1
 SWITCH_INTERVAL_S = 5e-4
 MAX_ERRORS = 1_000_000
-# One way for all: Zenoh keeps the order within a priority, and nothing is dropped.
+# One priority for all: Zenoh keeps the order within a priority, and drops nothing.
 QOS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.BLOCK,
     "priority": zenoh.Priority.DATA,
     "express": True,
 }
 _BYSTANDERS = ("worker-", "camera", "recorder", "router", NAME)
-"""Names of nodes that neither are a robot nor move one."""
+"""Prefixes of nodes that neither are a robot nor move one."""
 
 
 @dataclass(slots=True)
 class ReplayResult:
-    """How a replay went.
+    """Result of a replay.
 
     Args:
-        samples: put, by key.
-        seconds: how long it took.
+        samples: published, by key.
+        seconds: duration.
         passes: over the file.
-        left_out: samples not put, by node that speaks for itself already.
-        late_ms: by how much puts were late: p50, p95, max.
-        interval_error_ms: by how much the time between two samples of a key differed from the
-            recorded one: p50, p95, max.
+        left_out: samples not published, by node that is alive and publishes its own.
+        late_ms: lateness of samples: p50, p95, max.
+        interval_error_ms: difference to the recorded interval between two samples of a key: p50,
+            p95, max.
         damage: why reading the file ended early.
-        failure: why the replay did.
+        failure: why the replay ended early.
     """
 
     samples: Counter[str] = field(default_factory=Counter)
@@ -94,19 +94,19 @@ class ReplayResult:
 
 
 class Replay:
-    """See the module.
+    """Node that publishes the samples of a recording.
 
     Args:
-        profile: of the robot it is replayed as.
-        session: an open session, closed by whoever opened it.
-        file: what to replay.
-        groups: which of `GROUPS`.
+        profile: of the robot that the recording is replayed as.
+        session: an open session; the caller closes it.
+        file: the recording.
+        groups: parts to replay, of `GROUPS`.
         speed: 2 is twice as fast.
-        loop: begin anew at the end.
+        loop: start again at the end.
 
     Raises:
-        NodeError: a robot lives on these keys, and more than pictures is to be put; or nobody says
-            whether one does.
+        NodeError: a robot is alive on these keys and `groups` is more than cameras; or the
+            liveliness query failed.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Replay:
         self._speed, self._loop = speed, loop
         self._here, self._there = file.keys, profile.keys
         self._alive = alive_nodes(session, profile.keys)
-        self._refuse_a_live_robot()
+        self._reject_live_robot()
         self.node = Node(NAME, profile, session)
         self.node.on_alive(self._on_alive)
         self._publishers: dict[str, Any] = {}
@@ -133,26 +133,26 @@ class Replay:
         self._errors_ns: deque[int] = deque(maxlen=MAX_ERRORS)
         self._last: dict[str, tuple[int, int]] = {}
 
-    # -- who is there -------------------------------------------------------------------------
+    # -- liveliness ---------------------------------------------------------------------------
     def _on_alive(self, name: str, alive: bool) -> None:
         (self._alive.add if alive else self._alive.discard)(name)
 
     def _live_robot(self) -> list[str]:
         return sorted(name for name in list(self._alive) if not name.startswith(_BYSTANDERS))
 
-    def _refuse_a_live_robot(self) -> None:
+    def _reject_live_robot(self) -> None:
         live = self._live_robot()
         if live and self._groups != {CAMERAS}:
             raise NodeError(
-                f"robot {self._there.robot!r} lives ({', '.join(live)}): a replay would command "
-                "it, or tell it what is not so. Replay as another one with --as NAME, or only its "
-                "pictures with --only cameras"
+                f"robot {self._there.robot!r} is alive ({', '.join(live)}): a replay would command "
+                "it, or mislead it with old states. Replay as another robot with --as NAME, or "
+                "only the cameras with --only cameras"
             )
 
     # -- running ------------------------------------------------------------------------------
     def run(self, stop: threading.Event) -> ReplayResult:
-        """Replay until the end, or until `stop` is set."""
-        # Else this thread may wait 5 ms for the one that reads ahead.
+        """Replay up to the end, or until `stop` is set."""
+        # With Python's default of 5 ms, this thread may wait that long for the reading one.
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         began_s = time.monotonic()
         try:
@@ -171,7 +171,7 @@ class Replay:
     def _all_passes(self, stop: threading.Event) -> None:
         while not stop.is_set():
             if not self._one_pass(stop):
-                self.replayed.failure = self.replayed.failure or "nothing of it is to be put"
+                self.replayed.failure = self.replayed.failure or "nothing to publish"
                 return
             self.replayed.passes += 1
             if not self._loop:
@@ -181,7 +181,7 @@ class Replay:
         ready: queue.Queue[tuple[int, Sample] | None] = queue.Queue(AHEAD)
         ending = threading.Event()
         self._last.clear()
-        # Wall and monotonic clock are read once: a clock that is set does not tear the pass.
+        # Both clocks are read once: setting the wall clock does not disturb the pass.
         starts_ns = self.node.clock.wall_ns() + START_AFTER_NS
         to_mono_ns = time.monotonic_ns() - self.node.clock.wall_ns()
         reader = threading.Thread(
@@ -243,12 +243,12 @@ class Replay:
         due_ns = sample.received_ns + to_mono_ns
         while (left_s := (due_ns - time.monotonic_ns()) / 1e9) > 0:
             if left_s > SLICE_S:
-                self._watch()
+                self._check_robot()
                 if stop.wait(SLICE_S):
                     return
             else:
                 time.sleep(left_s)
-        self._watch()
+        self._check_robot()
         now_ns = time.monotonic_ns()
         self._publishers[sample.key].put(
             sample.payload, encoding=sample.encoding, attachment=sample.attached
@@ -265,21 +265,21 @@ class Replay:
         self._last[sample.key] = (recorded_ns, now_ns)
 
     def _put_raw(self, publisher: Any, sample: Sample) -> None:
-        """Pixels for a worker that takes those, made of the JPEG that the recording holds."""
-        with suppress(CodecError):  # who wants JPEG sees that it is none
+        """Publish the JPEG decoded, for a worker that subscribes to raw images."""
+        with suppress(CodecError):  # subscribers of the JPEG reject it themselves
             image = image_codec.decode_jpeg(sample.payload)
             schema = zenoh.Encoding.ZENOH_BYTES.with_schema(image_codec.raw_schema(image))
             publisher.put(
                 image_codec.encode_raw(image), encoding=schema, attachment=sample.attached
             )
 
-    def _watch(self) -> None:
-        """Status, and an end at once when a robot comes to life.
+    def _check_robot(self) -> None:
+        """Publish status, and end at once when a robot comes alive.
 
         Raises:
-            NodeError: it does.
+            NodeError: a robot is alive.
         """
-        self._refuse_a_live_robot()
+        self._reject_live_robot()
         if self.node.status_due("replaying"):
             self.node.counters["samples"] = self.replayed.samples.total()
             detail = {"file": str(self._file.path), "pass": self.replayed.passes + 1}
@@ -287,23 +287,23 @@ class Replay:
 
 
 def parse_groups(names: Collection[str]) -> frozenset[str]:
-    """The groups that `names` say; none says all.
+    """The groups of these names; without names all of them.
 
     Raises:
-        RecordingError: there is no such group; names those there are.
+        RecordingError: an unknown group; the message lists the known ones.
     """
     plain = {"cameras": "camera", "states": "state", "commands": "command", "deltas": "delta"}
     groups = {plain.get(name, name) for name in names}
     unknown = sorted(groups - set(GROUPS))
     if unknown:
         raise RecordingError(
-            f"--only {unknown[0]}: there is no such part; there are cameras, {', '.join(GROUPS)}"
+            f"--only {unknown[0]}: unknown part; known are cameras, {', '.join(GROUPS)}"
         )
     return frozenset(groups or GROUPS)
 
 
 def _hand_over(ready: queue.Queue[Any], item: Any, ending: threading.Event) -> bool:
-    """Put into the queue, or False when nobody takes from it any more."""
+    """Add to the queue; False once the reader of the queue is ending."""
     while not ending.is_set():
         try:
             ready.put(item, timeout=SLICE_S)

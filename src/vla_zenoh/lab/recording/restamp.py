@@ -1,9 +1,8 @@
-"""A recorded sample moved to another time, robot and writer, so that it is new to who hears it.
+"""Moves recorded samples to another time, robot and source.
 
-Every stamp moves alike: that of the header, and every field of the record whose name ends in
-``_ns`` (when a chunk's observation was taken, until when it is valid, ...). At the original speed
-all move by one and the same number of nanoseconds, so every latency in them stays what it was. At
-another speed ages shrink or grow as everything else does.
+All stamps move alike: that of the header, and every field of the record whose name ends in ``_ns``
+(of the observation, the end of validity, ...). At the original speed they move by one constant, so
+all latencies stay the same. At another speed ages scale as all other times do.
 """
 
 from __future__ import annotations
@@ -23,12 +22,13 @@ class Restamper:
     """Moves samples of one pass over a file.
 
     Args:
-        began_ns: when the recording began, wall clock of its recorder.
-        starts_ns: when the pass begins, wall clock here.
+        began_ns: start of the recording, wall clock of its recorder.
+        starts_ns: start of the pass, wall clock here.
         speed: 2 is twice as fast.
         here: the recorded robot's keys.
         there: of the robot it is replayed as.
-        suffix: a word that differs from pass to pass: what is said again is not taken for an echo.
+        suffix: of the sources, another one in each pass: subscribers drop repeated sequence numbers
+            of the same source.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Restamper:
         self._here, self._there, self._suffix = here, there, suffix
 
     def moved_ns(self, stamp_ns: int) -> int:
-        """A stamp of the recording as one of the pass; 0 means none and stays."""
+        """A stamp of the recording moved to the pass; 0 means none and stays."""
         if stamp_ns == 0:
             return 0
         since_ns = stamp_ns - self._began_ns
@@ -47,7 +47,7 @@ class Restamper:
         return max(0, self._starts_ns + since_ns)
 
     def move(self, entry: Sample) -> Sample:
-        """The sample to put, `received_ns` being when it is to be put."""
+        """The sample to publish, at the time `received_ns`."""
         header = entry.header
         if header is not None:
             node, _, _ = header.source.partition("#")
@@ -67,7 +67,7 @@ class Restamper:
 
 
 def _stamps_moved(fields: Mapping[str, Any], moved_ns: Callable[[int], int]) -> dict[str, Any]:
-    """Maps in maps are gone into as far as records have them: a command's cause."""
+    """Fields with moved stamps, also in the only nested map of records, the cause of a command."""
     out = dict(fields)
     for name, value in fields.items():
         if name.endswith(STAMP) and type(value) is int:

@@ -1,4 +1,4 @@
-"""A recorded run as records: what evaluation, viewers and exports work on."""
+"""A recorded run as decoded records, for evaluation and export."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MAX_PROBLEMS = 20
 
 
 class RecordedSample(NamedTuple):
-    """A record, its header, when it was heard (wall clock of the recorder), and on which key."""
+    """A record with its header, time of reception (wall clock of the recorder) and key."""
 
     header: Header
     record: Any
@@ -43,7 +43,7 @@ class RecordedSample(NamedTuple):
 
 
 class RecordedImage(NamedTuple):
-    """A JPEG file, when it was heard, and when it was taken."""
+    """A JPEG file with its times of reception and capture, and its sequence number."""
 
     received_ns: int
     stamp_ns: int
@@ -52,7 +52,7 @@ class RecordedImage(NamedTuple):
 
 
 class RecordedSetting(NamedTuple):
-    """What somebody put on a setting's key."""
+    """A published setting."""
 
     received_ns: int
     name: str
@@ -61,9 +61,9 @@ class RecordedSetting(NamedTuple):
 
 @dataclass(slots=True)
 class Run:
-    """All records of one robot in a file, oldest first; a minute is some 60 MB of memory.
+    """All records of one robot in a file, oldest first; a minute takes some 60 MB of memory.
 
-    Pictures stay in the file: see `pictures`.
+    Images stay in the file, see `pictures`.
     """
 
     file: Recording
@@ -88,11 +88,11 @@ class Run:
     picture_counts: Counter[str] = field(default_factory=Counter)
     """Pictures by camera."""
     problems: list[str] = field(default_factory=list)
-    """What could not be read, in words."""
+    """Messages about what could not be read."""
     began_ns: int = 0
-    """When the first sample was heard."""
+    """Reception of the first sample."""
     ended_ns: int = 0
-    """When the last one was."""
+    """Reception of the last sample."""
 
     @property
     def path(self) -> Path:
@@ -110,18 +110,18 @@ class Run:
         return (self.ended_ns - self.began_ns) / 1e9
 
     def prompts(self) -> list[tuple[int, str]]:
-        """(wall ns, prompt) of each prompt that was put."""
+        """(wall ns, prompt) of each published prompt."""
         return [(put.received_ns, put.text) for put in self.settings if put.name == "prompt"]
 
     def first_commands(self) -> list[tuple[Cause, int]]:
-        """For each chunk its cause, and the stamp of the first command that carries it out."""
+        """`first_commands` of the pose commands, else of the joint commands."""
         return first_commands(self.commands or self.joint_commands)
 
 
 def first_commands(commands: Sequence[RecordedSample]) -> list[tuple[Cause, int]]:
-    """For each chunk its cause, and the stamp of the first of `commands` that carries it out.
+    """The cause of each chunk, and the stamp of its first command in `commands`.
 
-    The stamp, because whoever records may hear late what a robot heard in time.
+    The stamp, not the reception: a recorder may receive late what the robot received in time.
     """
     out: list[tuple[Cause, int]] = []
     newest: tuple[str, int] | None = None
@@ -134,14 +134,14 @@ def first_commands(commands: Sequence[RecordedSample]) -> list[tuple[Cause, int]
 
 
 def load_run(path: Path) -> Run:
-    """Read a file of ``vla-zenoh record``; what cannot be read is in `Run.problems`.
+    """Read a file of ``vla-zenoh record``; `Run.problems` lists what cannot be read.
 
     Raises:
-        RecordingError: it cannot be opened at all, or is of another program.
+        RecordingError: the file cannot be opened, or is of another program.
         MissingExtraError: rosbags is not installed.
     """
     file = open_recording(path)
-    run, keys, refused = Run(file), file.keys, Counter[str]()
+    run, keys, rejected = Run(file), file.keys, Counter[str]()
     lists = {
         PoseState: run.poses,
         JointState: run.joints,
@@ -166,24 +166,24 @@ def load_run(path: Path) -> Run:
             elif entry.encoding == JPEG:
                 run.picture_counts[_camera(keys, entry.key)] += 1
             else:
-                refused[f"{keys.short(entry.key)}: bytes that are no record"] += 1
+                rejected[f"{keys.short(entry.key)}: bytes that are no record"] += 1
             continue
         try:
             record = entry.record()
         except CodecError as error:
-            refused[f"{keys.short(entry.key)}: {error.reason} records"] += 1
+            rejected[f"{keys.short(entry.key)}: {error.reason} records"] += 1
             continue
         if entry.header is None:
             continue
         _keep(run, lists, RecordedSample(entry.header, record, entry.received_ns, entry.key))
     if file.damage:
         run.problems.append(f"{path.name} is {file.damage}; evaluated up to there")
-    run.problems += [f"{what} ({count})" for what, count in refused.most_common(MAX_PROBLEMS)]
+    run.problems += [f"{what} ({count})" for what, count in rejected.most_common(MAX_PROBLEMS)]
     return run
 
 
 def _of_interest(keys: Keys) -> Callable[[str], bool]:
-    """Everything of the robot but raw pictures, and those that models saw."""
+    """All keys of the robot but raw images and the input images of models."""
 
     def wanted(key: str) -> bool:
         group = keys.group(key)
@@ -200,16 +200,16 @@ def _camera(keys: Keys, key: str) -> str:
     return keys.short(key).split("/")[1]
 
 
-def _keep(run: Run, lists: dict[type, list[RecordedSample]], heard: RecordedSample) -> None:
-    kept = lists.get(type(heard.record))
+def _keep(run: Run, lists: dict[type, list[RecordedSample]], received: RecordedSample) -> None:
+    kept = lists.get(type(received.record))
     if kept is not None:
-        kept.append(heard)
-    elif isinstance(heard.record, ModelSpec):
-        run.specs[heard.record.hash] = heard.record
-    elif isinstance(heard.record, NodeStatus):
-        node = last_chunk(heard.key)
-        run.first_statuses.setdefault(node, heard.record)
-        run.statuses[node] = heard.record
+        kept.append(received)
+    elif isinstance(received.record, ModelSpec):
+        run.specs[received.record.hash] = received.record
+    elif isinstance(received.record, NodeStatus):
+        node = last_chunk(received.key)
+        run.first_statuses.setdefault(node, received.record)
+        run.statuses[node] = received.record
 
 
 def pictures(file: Recording, camera: str) -> Iterator[RecordedImage]:
@@ -218,7 +218,7 @@ def pictures(file: Recording, camera: str) -> Iterator[RecordedImage]:
 
 
 def seen_pictures(file: Recording, worker: str, camera: str) -> Iterator[RecordedImage]:
-    """What a model was given of a camera; `seq` is its chunk's, the stamp the observation's."""
+    """Input images of a model; `seq` is that of the chunk, the stamp that of the observation."""
     return _jpegs(file, file.keys.seen(worker, camera))
 
 

@@ -1,7 +1,7 @@
-"""A robot and its model to look at, in Rerun: samples of a live robot or of a recording.
+"""Live and recorded runs in Rerun.
 
-`show.Show` takes samples as they were heard and logs them into a Rerun stream; `layout` says how
-the views stand, `shapes` what the robot looks like. Nothing here speaks Zenoh or has a clock.
+`rerun_logger.RerunLogger` logs samples into a Rerun stream, `layout` arranges the views, `viewer`
+starts the viewer, `listener` receives the samples of a live robot.
 """
 
 from __future__ import annotations

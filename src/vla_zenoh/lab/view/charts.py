@@ -1,4 +1,4 @@
-"""Figures over time: latencies, speeds, gripper, tracking, bounds, joints."""
+"""Time series: latencies, speeds, gripper, tracking, speed override, joints."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ STAGE_COLOURS = {
 
 
 class Charts:
-    """Logs figures at the time the stream is set to.
+    """Logs time series at the current time of a Rerun stream.
 
     Args:
         stream: to log into.
-        joints: names of the arm's, in the profile's order.
+        joints: names of the arm joints, in the order of the profile.
     """
 
     def __init__(self, stream: rr.RecordingStream, joints: Sequence[str]) -> None:
@@ -34,7 +34,7 @@ class Charts:
             self._style(paths.below(paths.LATENCY, stage), stage, colour)
         for origin in (paths.SPEED, paths.GRIPPER):
             for name in (paths.COMMANDED, paths.MEASURED):
-                # An order holds until the next one.
+                # A gripper command holds until the next one.
                 held = origin == paths.GRIPPER and name == paths.COMMANDED
                 self._style(f"{origin}/{name}", name, paths.COLOURS[name], held=held)
         self._style(f"{paths.TRACKING}/distance", "distance", STAGE_COLOURS["end_to_end"])
@@ -54,7 +54,7 @@ class Charts:
 
     # -- latency ------------------------------------------------------------------------------
     def command(self, stamp_ns: int, cause: Cause | None) -> None:
-        """The first command of a chunk ends its way; later ones say nothing new."""
+        """Latencies of a chunk, at its first command."""
         if cause is None or (cause.worker, cause.chunk_seq) == self._newest:
             return
         self._newest = (cause.worker, cause.chunk_seq)
@@ -62,7 +62,7 @@ class Charts:
             self._put(paths.below(paths.LATENCY, stage), duration_ms)
 
     def shadow(self, chunk: ActionChunk) -> None:
-        """What the model of a worker that is not obeyed took."""
+        """Inference time of a worker in the shadow."""
         took_ns = chunk.inference_end_ns - chunk.inference_start_ns
         self._put(paths.below(paths.LATENCY, f"inference of {chunk.worker}"), took_ns / 1e6)
 
@@ -72,7 +72,7 @@ class Charts:
         self._put(f"{paths.SPEED}/{name}", float(np.linalg.norm(twist[:3])) * 1e3)
 
     def tracking(self, apart_m: float) -> None:
-        """How far the measured TCP is from the commanded one."""
+        """Distance between the measured and the commanded TCP."""
         self._put(f"{paths.TRACKING}/distance", apart_m * 1e3)
 
     def joints(self, names: Sequence[str], position_rad: FloatArray) -> None:
@@ -82,11 +82,11 @@ class Charts:
                 self._put(paths.below(paths.JOINTS, name), value)
 
     def gripper(self, name: str, width_m: float) -> None:
-        """Width between the fingers: `commanded` or `measured`."""
+        """Opening of the gripper: `commanded` or `measured`."""
         self._put(f"{paths.GRIPPER}/{name}", width_m * 1e3)
 
     def status(self, status: NodeStatus) -> None:
-        """What the command node says of its bounds."""
+        """Share of the speed that limits leave, as the command node reports it."""
         share = status.detail.get("speed_share")
         if isinstance(share, (int, float)):
             self._put(f"{paths.BOUNDS}/share", share * 100.0)

@@ -1,4 +1,4 @@
-"""How the views stand in Rerun's window."""
+"""Arrangement of the views in Rerun's window."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import rerun.blueprint as rrb
 from vla_zenoh.lab.view import paths
 
 WINDOW_S = 20.0
-"""Of plots, up to the time looked at."""
+"""Length of plots, up to the cursor."""
 EYE_M, LOOK_AT_M = (1.4, -0.98, 0.86), (0.34, 0.0, 0.3)
 BACKGROUND = (22, 25, 31)
 GRID_M = 0.1
@@ -25,15 +25,15 @@ def blueprint(
     widest_mm: float,
     live: bool,
 ) -> rrb.Blueprint:
-    """The views for these pictures.
+    """The blueprint for these cameras.
 
     Args:
         cameras: of the robot.
-        seen: worker to the cameras whose pictures its model is given.
-        widest_mm: opening of the gripper.
-        live: follow what comes in.
+        seen: worker -> cameras that its model uses.
+        widest_mm: largest opening of the gripper.
+        live: follow the newest data.
     """
-    left = rrb.Vertical(_scene(), _words(), row_shares=[3, 1])
+    left = rrb.Vertical(_scene(), _texts(), row_shares=[3, 1])
     pictures, plots = _pictures(cameras, seen), _plots(widest_mm)
     right = rrb.Vertical(*pictures, plots, row_shares=_shares(cameras, seen))
     return rrb.Blueprint(
@@ -62,7 +62,7 @@ def _scene() -> Any:
     )
 
 
-def _words() -> Any:
+def _texts() -> Any:
     columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
     log = rrb.TextLogView(origin=paths.EVENTS, name="Events", columns=columns)
     now = rrb.TextDocumentView(origin=paths.NOW, name="Now")
@@ -87,7 +87,7 @@ def _pictures(cameras: Collection[str], seen: Mapping[str, Collection[str]]) -> 
                 rrb.Spatial2DView(origin=paths.seen(worker, name), name=f"{worker} sees {name}")
                 for name in sorted(seen[worker])
             ),
-            rrb.TextDocumentView(origin=paths.said(worker), name=f"{worker} answers"),
+            rrb.TextDocumentView(origin=paths.answer(worker), name=f"{worker} answers"),
             name=worker,
         )
         for worker in sorted(seen)

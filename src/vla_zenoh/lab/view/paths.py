@@ -1,4 +1,4 @@
-"""Where things stand in a Rerun recording, and in which colours."""
+"""Entity paths and colours of a Rerun recording."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ NOW, EVENTS, PROFILE = "text/now", "events", "text/profile"
 GOAL, COMMANDED, MEASURED = "goal", "commanded", "measured"
 COLOURS = {GOAL: (86, 205, 124), COMMANDED: (255, 176, 58), MEASURED: (94, 166, 255)}
 CHUNK, SHADOW = (236, 92, 206), (150, 110, 160)
-"""Chunks of the obeyed worker, and of the others."""
+"""Colours of chunks of the obeyed worker, and of workers in the shadow."""
 
 
 def below(path: str, name: str) -> str:
-    """`path` and a name of anybody's choice below it."""
+    """The path of any name below `path`."""
     return f"{path}/{rr.escape_entity_path_part(name)}"
 
 
 def picture(camera: str) -> str:
-    """What a camera sees."""
+    """Images of a camera."""
     return below(CAMERA, camera)
 
 
 def seen(worker: str, camera: str) -> str:
-    """What a worker's model was given of a camera."""
+    """Input images of a worker's model from a camera."""
     return below(below(SEEN, worker), camera)
 
 
-def said(worker: str) -> str:
-    """What a worker's model answered, in words."""
+def answer(worker: str) -> str:
+    """Answers of a worker's model, as text."""
     return f"{below(SEEN, worker)}/answer"

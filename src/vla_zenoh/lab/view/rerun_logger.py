@@ -1,4 +1,4 @@
-"""Samples of a robot, live or recorded, into a Rerun stream."""
+"""Logs the samples of a robot, live or recorded, into a Rerun stream."""
 
 from __future__ import annotations
 
@@ -39,24 +39,24 @@ from vla_zenoh.types import (
 )
 
 DRAW_NS = 33_000_000
-"""States and commands are drawn this often at most; none of their causes is overlooked."""
+"""Shortest interval between two drawings of a state or command; every cause is logged."""
 APART_NS = 10_000_000_000
-"""A stamp that far from when it was heard is of another clock: the latter counts."""
+"""A stamp that far from the reception is of another clock: the reception counts."""
 JPEG_BEGINS = b"\xff\xd8\xff"
 COMMAND_NODE = "command"
 APPLICATION = "vla-zenoh"
 
 
 class RerunLogger:
-    """Takes samples in the order heard and logs what they show.
+    """Logs samples, in the order of reception, into a Rerun stream.
 
-    What cannot be shown is counted in `refused`, and stands in the view itself.
+    Samples that cannot be shown are counted in `rejected`, which the view displays.
 
     Args:
         profile: of the robot.
         stream: a Rerun stream, with its sink.
-        keys: those the samples are on; the profile's own without it.
-        live: the view follows what comes in.
+        keys: of the samples; None: those of the profile.
+        live: the view follows the newest data.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class RerunLogger:
         self._kinematics = robot.kinematics if robot is not None else None
         self._scene = Scene(stream, profile, robot)
         self._charts = Charts(stream, profile.robot.arm_joints)
-        self._words = TextPanels(stream, to_yaml(profile), missing)
+        self._texts = TextPanels(stream, to_yaml(profile), missing)
         self._drawn_ns: dict[str, int] = {}
         self._specs: dict[str, ModelSpec] = {}
         self._obeyed = profile.task.worker
@@ -87,11 +87,11 @@ class RerunLogger:
         self._seen: defaultdict[str, set[str]] = defaultdict(set)
         self._layout()
         self.shown: Counter[str] = Counter()
-        """Samples that came and could be read, by key."""
-        self.refused: Counter[str] = Counter()
+        """Samples that were logged, by key."""
+        self.rejected: Counter[str] = Counter()
         """Samples that cannot be shown, by key and reason."""
         self.dropped = 0
-        """Samples that whoever feeds this had to leave out."""
+        """Samples that the source of the samples had to drop."""
         self._log_record: dict[type, Callable[[Sample, int, Any], None]] = {
             PoseState: self._pose_state,
             JointState: self._joint_state,
@@ -132,9 +132,9 @@ class RerunLogger:
                 self._setting(sample)
             self.shown[sample.key] += 1
         except CodecError as error:
-            self.refused[f"{self.keys.short(sample.key)}: {error.reason}"] += 1
+            self.rejected[f"{self.keys.short(sample.key)}: {error.reason}"] += 1
         except RecordError:
-            self.refused[f"{self.keys.short(sample.key)}: does not fit its spec"] += 1
+            self.rejected[f"{self.keys.short(sample.key)}: does not fit its spec"] += 1
 
     def _stamp_ns(self, sample: Sample) -> int:
         stamp_ns = sample.received_ns
@@ -163,7 +163,7 @@ class RerunLogger:
         if group == paths.CAMERA and second != "jpeg":
             return
         if not second or sample.encoding != JPEG or not sample.payload.startswith(JPEG_BEGINS):
-            raise CodecError("malformed", "it is no JPEG")
+            raise CodecError("malformed", "not a JPEG")
         if group == paths.CAMERA:
             path, known, name = paths.picture(first), self._cameras, first
         else:
@@ -175,8 +175,8 @@ class RerunLogger:
 
     def _setting(self, sample: Sample) -> None:
         if sample.header is not None or "/" in self.keys.short(sample.key):
-            raise CodecError("malformed", "bytes that are no record")
-        self._words.setting(self.keys.short(sample.key), settings.decode_text(sample.payload))
+            raise CodecError("malformed", "neither a record nor a setting")
+        self._texts.setting(self.keys.short(sample.key), settings.decode_text(sample.payload))
 
     # -- the robot ----------------------------------------------------------------------------
     def _pose_state(self, _: Sample, stamp_ns: int, state: PoseState) -> None:
@@ -232,7 +232,7 @@ class RerunLogger:
     def _chunk(self, _: Sample, stamp_ns: int, chunk: ActionChunk) -> None:
         spec = self._specs.get(chunk.spec_hash)
         if spec is None:
-            raise CodecError("no_spec", "no spec says what its numbers mean")
+            raise CodecError("no_spec", "no spec of this chunk was received")
         obeyed = chunk.worker == self._obeyed
         self._scene.chunk(stamp_ns, chunk, spec, obeyed)
         if not obeyed:
@@ -242,19 +242,19 @@ class RerunLogger:
         if seen.worker not in self._seen:
             self._seen[seen.worker] = set()
             self._layout()
-        self._words.answer(seen)
+        self._texts.answer(seen)
 
-    # -- words --------------------------------------------------------------------------------
+    # -- texts --------------------------------------------------------------------------------
     def _on_task(self, _: Sample, stamp_ns: int, task: Task) -> None:
         self._obeyed = task.worker
-        self._words.task(task)
-        self._words.now(stamp_ns, self.refused, self.dropped)
+        self._texts.task(task)
+        self._texts.now(stamp_ns, self.rejected, self.dropped)
 
     def _status(self, sample: Sample, stamp_ns: int, status: NodeStatus) -> None:
         if sample.key == self._command_status:
             self._charts.status(status)
-            self._words.status(status)
-        self._words.now(stamp_ns, self.refused, self.dropped)
+            self._texts.status(status)
+        self._texts.now(stamp_ns, self.rejected, self.dropped)
 
     def _event(self, sample: Sample, stamp_ns: int, event: Event) -> None:
-        self._words.event(last_chunk(sample.key), stamp_ns, event)
+        self._texts.event(last_chunk(sample.key), stamp_ns, event)

@@ -22,15 +22,15 @@ TRAIL_NS = 6_000_000_000
 TRAIL_PERIOD_NS = 100_000_000
 TRAIL_STEP_M = 0.0005
 HISTORY = 2000
-"""Goals that are kept: some seconds of a command stream, observations are not older."""
+"""Goals kept: some seconds of a command stream; observations are not older."""
 STALE_NS = 2_000_000_000
-"""A ribbon that no newer chunk of its worker has replaced for so long is taken away."""
+"""Age at which a ribbon that no newer chunk of its worker replaces is removed."""
 TRAIL_RADIUS_M, RIBBON_RADIUS_M, AXIS_M = 0.0018, 0.003, 0.06
 OBJECT_RADIUS_M = 0.012
 
 
 class PoseTrail:
-    """Where a pose has been of late."""
+    """Recent path of a pose."""
 
     def __init__(self, stream: rr.RecordingStream, name: str) -> None:
         self._stream, self._name = stream, name
@@ -38,9 +38,9 @@ class PoseTrail:
         self._drawn_ns, self._drawn = 0, 0
 
     def add(self, stamp_ns: int, position_m: FloatArray) -> None:
-        """Go on to `position_m`, and draw now and then."""
+        """Append `position_m`, and draw at intervals."""
         points = self._points
-        if points and stamp_ns < points[-1][0]:  # a replay began anew
+        if points and stamp_ns < points[-1][0]:  # a replay started again
             points.clear()
             self._drawn_ns = 0
         if not points or np.linalg.norm(position_m - points[-1][1]) > TRAIL_STEP_M:
@@ -60,7 +60,7 @@ class PoseTrail:
 
 
 class Scene:
-    """Logs what stands in the robot's base frame, at the time the stream is set to.
+    """Logs the 3-D view in the base frame of the robot, at the current time of a Rerun stream.
 
     Args:
         stream: to log into.
@@ -89,31 +89,31 @@ class Scene:
 
     # -- robot and poses ----------------------------------------------------------------------
     def joints(self, names: Sequence[str], positions: FloatArray) -> None:
-        """The robot's joints are there now."""
+        """Move the robot to measured joint positions."""
         if self._robot is not None:
             self._robot.move(dict(zip(names, positions.tolist(), strict=True)))
             self.robot_moved()
 
     def gripper(self, width_m: float) -> None:
-        """The gripper is so far open now; drawn with the next joints."""
+        """Set the opening of the gripper; drawn with the next joints."""
         if self._robot is not None:
             self._robot.open(width_m)
 
     def robot_moved(self) -> None:
-        """Draw the robot where its joints are."""
+        """Draw the robot at its current joints."""
         for link, pose in self._robot.placements() if self._robot is not None else ():
             self._log_pose(paths.below(paths.ROBOT, link), pose)
 
     def pose(self, name: str, stamp_ns: int, pose: Pose) -> None:
-        """`goal`, `commanded` or `measured` is here now."""
+        """Draw the pose `goal`, `commanded` or `measured`."""
         self._log_pose(f"{paths.POSES}/{name}", pose, rr.TransformAxes3D(AXIS_M))
         self._trails[name].add(stamp_ns, pose.position_m)
         if name == paths.MEASURED:
             self._measured = pose
-            self._take_stale_ribbons(stamp_ns)
+            self._remove_stale_ribbons(stamp_ns)
 
     def goal(self, stamp_ns: int, pose: Pose) -> None:
-        """Keep a goal of the command stream: chunks stand on those of their observation."""
+        """Keep a goal of the command stream: chunks start at the goal of their observation."""
         if self._goals and stamp_ns < self._goals[-1][0]:
             self._goals.clear()
         self._goals.append((stamp_ns, pose))
@@ -124,20 +124,18 @@ class Scene:
 
     # -- chunks -------------------------------------------------------------------------------
     def chunk(self, stamp_ns: int, chunk: ActionChunk, spec: ModelSpec, obeyed: bool) -> None:
-        """Draw what a chunk asks for: from the goal its observation saw, through its steps.
+        """Draw the waypoints of a chunk, from the goal in force at its observation.
 
         Raises:
-            RecordError: a step that this spec's meaning cannot have.
+            RecordError: a step that does not fit the spec.
         """
-        start = self._stands_on(chunk)
+        start = self._start_of(chunk)
         if start is None:
             return
         action, before, goals = spec.action, start, []
         for step in chunk.steps:
             if len(step) != action.dimension:
-                raise RecordError(
-                    f"a step has {len(step)} numbers, its spec says {action.dimension}"
-                )
+                raise RecordError(f"a step has {len(step)} numbers, its spec {action.dimension}")
             before = step_pose(action, np.asarray(step, np.float64), before)
             goals.append(Goal(before, 0.0))
         dt_ns = max(int(action.dt_s * 1e9), 1)
@@ -150,11 +148,11 @@ class Scene:
         steps = rr.Points3D(line[1:], radii=1.8 * RIBBON_RADIUS_M, colors=[colour])
         self._stream.log(f"{path}/steps", steps)
 
-    def _stands_on(self, chunk: ActionChunk) -> Pose | None:
+    def _start_of(self, chunk: ActionChunk) -> Pose | None:
         """The goal that was in force when its observation was taken, else the measured pose.
 
-        The command stream says where the step under way ends; how far it had come by then the
-        worker's chunk before says.
+        The command stream holds the end of the current step; its progress follows from the
+        worker's previous chunk.
         """
         seen_ns = chunk.observation_stamp_ns
         goal = next((pose for stamp, pose in reversed(self._goals) if stamp <= seen_ns), None)
@@ -166,7 +164,7 @@ class Scene:
         ends = plan.goals[plan.index_at(seen_ns)].pose.position_m
         return Pose(goal.position_m + plan.goal_at(seen_ns).pose.position_m - ends, goal.rotation)
 
-    def _take_stale_ribbons(self, stamp_ns: int) -> None:
+    def _remove_stale_ribbons(self, stamp_ns: int) -> None:
         for worker, drawn_ns in list(self._ribbons.items()):
             if not 0 <= stamp_ns - drawn_ns < STALE_NS:
                 del self._ribbons[worker]
@@ -174,7 +172,7 @@ class Scene:
 
     # -- objects ------------------------------------------------------------------------------
     def objects(self, objects: ObjectPoses) -> None:
-        """The simulator's objects are there now."""
+        """Draw the simulator's objects."""
         self._stream.log(
             paths.OBJECTS,
             rr.Points3D(

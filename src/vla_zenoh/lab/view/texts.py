@@ -1,4 +1,4 @@
-"""What is said in words: the task and state of now, events, what models answer."""
+"""Text panels: task and state, events, answers of models."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from vla_zenoh.types import Event, InferenceDebug, NodeStatus, Task
 
 LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 BOUND_NS = 1_000_000_000
-"""A bound counts as acting for so long after the last event of it."""
+"""Time after its last event for which a limit counts as active."""
 MAX_RAW = 600
 
 
 class TextPanels:
-    """Logs texts at the time the stream is set to.
+    """Logs texts at the current time of a Rerun stream.
 
     Args:
         stream: to log into.
         profile_yaml: the profile in force.
-        missing: why the robot itself is not shown; empty when it is.
+        missing: why the robot itself is not shown; empty if it is.
     """
 
     def __init__(self, stream: rr.RecordingStream, profile_yaml: str, missing: str = "") -> None:
@@ -42,26 +42,26 @@ class TextPanels:
 
     # -- now ----------------------------------------------------------------------------------
     def task(self, task: Task) -> None:
-        """The settings as the command node agreed to them."""
+        """Keep the task that the command node published."""
         self._task = task
 
     def status(self, status: NodeStatus) -> None:
-        """What the command node says of itself."""
+        """Keep the status of the command node."""
         self._status = status
 
-    def now(self, stamp_ns: int, refused: Counter[str], dropped: int) -> None:
-        """Write what holds now, where it is something else than before.
+    def now(self, stamp_ns: int, rejected: Counter[str], dropped: int) -> None:
+        """Log the current state if it has changed.
 
         Args:
             stamp_ns: now.
-            refused: samples that cannot be shown, by reason.
-            dropped: samples that came faster than they were shown.
+            rejected: samples that cannot be shown, by key and reason.
+            dropped: samples that came faster than they could be shown.
         """
         lines = [*self._of_task(), "", *self._of_bounds(stamp_ns), *self._of_refusals()]
         if self._missing:
             lines.append(f"- The robot itself is not shown: {plain(self._missing)}")
-        if refused:
-            named = ", ".join(f"{plain(why)} ({count})" for why, count in refused.most_common(5))
+        if rejected:
+            named = ", ".join(f"{plain(why)} ({count})" for why, count in rejected.most_common(5))
             lines.append(f"- **Not shown here:** {named}")
         if dropped:
             lines.append(f"- **Left out here, too slow:** {dropped} samples")
@@ -73,7 +73,7 @@ class TextPanels:
     def _of_task(self) -> list[str]:
         task = self._task
         if task is None:
-            return ["No command node has spoken."]
+            return ["No task received from a command node."]
         state = self._status.state if self._status is not None else ""
         why = str(self._status.detail.get("why", "")) if self._status is not None else ""
         return [
@@ -101,7 +101,7 @@ class TextPanels:
 
     # -- log ----------------------------------------------------------------------------------
     def event(self, node: str, stamp_ns: int, event: Event) -> None:
-        """Something happened."""
+        """Log an event."""
         if event.kind == "limit":
             self._bounds[event.what] = (stamp_ns, plain(f"{event.what} {event.why}".strip()))
         parts = [f"{node}: {event.what}"]
@@ -116,12 +116,12 @@ class TextPanels:
         self._stream.log(paths.below(paths.EVENTS, node), rr.TextLog(" ".join(parts), level=level))
 
     def setting(self, name: str, text: str) -> None:
-        """Somebody put a setting."""
-        said = f"{name}: {text}" if text else name
-        self._stream.log(f"{paths.EVENTS}/settings", rr.TextLog(said, level="INFO"))
+        """Log a published setting."""
+        line = f"{name}: {text}" if text else name
+        self._stream.log(f"{paths.EVENTS}/settings", rr.TextLog(line, level="INFO"))
 
     def answer(self, seen: InferenceDebug) -> None:
-        """What a model was asked, and what it answered."""
+        """Log a request to a model and its answer."""
         first = " ".join(f"{value:+.4f}" for value in seen.steps[0]) if len(seen.steps) else ""
         lines = [
             f"**{plain(seen.prompt)}**",
@@ -132,7 +132,7 @@ class TextPanels:
             f"first step `{first}`",
             *_raw(seen.raw),
         ]
-        self._document(paths.said(seen.worker), "\n".join(lines))
+        self._document(paths.answer(seen.worker), "\n".join(lines))
 
 
 def _raw(raw: Mapping[str, Any]) -> list[str]:
@@ -143,5 +143,5 @@ def _raw(raw: Mapping[str, Any]) -> list[str]:
 
 
 def plain(text: str) -> str:
-    """Anybody's text without what Markdown would make of it."""
+    """Text with Markdown characters escaped."""
     return "".join(f"\\{c}" if c in "\\`*_{}[]<>()#+!|~" else c for c in " ".join(text.split()))

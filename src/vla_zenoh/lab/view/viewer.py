@@ -1,4 +1,4 @@
-"""Rerun's viewer as a process of its own: a window, or a server for browsers."""
+"""Starts Rerun's viewer as a process: a window, or a server for browsers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CLOSE_PATIENCE_S = 5.0
 POLL_S = 0.05
 HERE = "127.0.0.1"
 MEMORY = "25%"
-"""What a server keeps of the data for browsers that come later."""
+"""Memory limit of the data that a server keeps for browsers that connect later."""
 
 
 @dataclass(slots=True)
@@ -26,9 +26,9 @@ class Viewer:
     """A running viewer.
 
     Args:
-        data_url: where a Rerun stream sends its data.
-        page_url: for a browser; empty where it is a window.
-        process: the viewer's.
+        data_url: for the data of a Rerun stream.
+        page_url: for a browser; empty for a window.
+        process: of the viewer.
     """
 
     data_url: str
@@ -37,11 +37,11 @@ class Viewer:
 
     @property
     def closed(self) -> bool:
-        """Somebody closed it, or it died."""
+        """Whether the viewer was closed or has died."""
         return self.process.poll() is not None
 
     def close(self) -> None:
-        """End it, where it still runs."""
+        """Terminate the viewer if it is running."""
         self.process.terminate()
         try:
             self.process.wait(CLOSE_PATIENCE_S)
@@ -63,43 +63,43 @@ def open_window() -> Viewer:
             "browser: --serve, or write a file for later: --save FILE.rrd"
         )
     port = _free_port()
-    words = ("--bind", HERE, "--port", str(port), "--hide-welcome-screen", "--expect-data-soon")
-    return Viewer(_data_url(HERE, port), "", _start(words, HERE, port))
+    arguments = ("--bind", HERE, "--port", str(port), "--hide-welcome-screen", "--expect-data-soon")
+    return Viewer(_data_url(HERE, port), "", _start(arguments, HERE, port))
 
 
 def open_headless(width_px: int, height_px: int) -> Viewer:
-    """Open Rerun's viewer without a window, for pictures of it.
+    """Open Rerun's viewer without a window, for screenshots.
 
     Raises:
         NodeError: the viewer does not start; it needs a Vulkan driver.
         MissingExtraError: rerun-sdk is not installed.
     """
     port = _free_port()
-    words = ("--headless", "--bind", HERE, "--port", str(port))
+    arguments = ("--headless", "--bind", HERE, "--port", str(port))
     size = ("--window-size", f"{width_px}x{height_px}")
-    return Viewer(_data_url(HERE, port), "", _start((*words, *size), HERE, port))
+    return Viewer(_data_url(HERE, port), "", _start((*arguments, *size), HERE, port))
 
 
 def open_server(address: str, port: int) -> Viewer:
     """Serve Rerun's viewer for browsers.
 
     Args:
-        address: of this computer to listen at; 0.0.0.0 for all.
-        port: of the page; the data are at the next one.
+        address: of this computer to bind to; 0.0.0.0 for all.
+        port: of the page; the data use the next port.
 
     Raises:
         NodeError: a port is taken, or the server does not start.
         MissingExtraError: rerun-sdk is not installed.
     """
     for each in (port, port + 1):
-        _refuse_a_taken_port(address, each)
-    words = (
+        _check_port_free(address, each)
+    arguments = (
         *("--serve-web", "--bind", address, "--port", str(port + 1)),
         *("--web-viewer-port", str(port), "--server-memory-limit", MEMORY),
     )
     shown = socket.gethostname() if address in ("0.0.0.0", "::") else address
     local = HERE if address in ("0.0.0.0", "::") else address
-    process = _start(words, local, port + 1)
+    process = _start(arguments, local, port + 1)
     page = f"http://{shown}:{port}/?url={_data_url(shown, port + 1).replace('+', '%2B')}"
     return Viewer(_data_url(local, port + 1), page, process)
 
@@ -116,15 +116,15 @@ def _program() -> Path:
     return Path(rerun_cli.__file__).with_name("rerun.exe" if os.name == "nt" else "rerun")
 
 
-def _start(words: Sequence[str], host: str, port: int) -> subprocess.Popen[bytes]:
-    # Rerun sends data on its use, unless it is told otherwise or believes to be on a CI machine.
+def _start(arguments: Sequence[str], host: str, port: int) -> subprocess.Popen[bytes]:
+    # Rerun sends usage data, unless configured otherwise or on a CI machine.
     quiet = {"CI": "true", "RUST_LOG": os.environ.get("RUST_LOG", "error")}
     process = subprocess.Popen(
-        [str(_program()), *words],
+        [str(_program()), *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         env={**os.environ, **quiet},
-        start_new_session=True,  # Ctrl-C is ours to handle: the last data are sent before
+        start_new_session=True,  # Ctrl-C reaches this process alone, which sends the last data
     )
     end_s = time.monotonic() + READY_PATIENCE_S
     while process.poll() is None and time.monotonic() < end_s:
@@ -136,7 +136,7 @@ def _start(words: Sequence[str], host: str, port: int) -> subprocess.Popen[bytes
     process.kill()
     process.wait()
     raise NodeError(
-        f"Rerun's viewer did not start (exit code {process.returncode}); what it said is above. "
+        f"Rerun's viewer did not start (exit code {process.returncode}); its output is above. "
         "Look with a browser: --serve, or write a file for later: --save FILE.rrd"
     )
 
@@ -147,7 +147,7 @@ def _free_port() -> int:
         return probe.getsockname()[1]
 
 
-def _refuse_a_taken_port(address: str, port: int) -> None:
+def _check_port_free(address: str, port: int) -> None:
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

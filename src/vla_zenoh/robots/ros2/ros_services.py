@@ -33,9 +33,8 @@ from vla_zenoh.interop.ros2.services import (
     Service,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.robots.ros2.estop_order import EstopOrder
 from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
-from vla_zenoh.robots.ros2.ros_topics import Reject, RosTopics, prompt_text
+from vla_zenoh.robots.ros2.ros_topics import EstopOrder, Reject, RosTopics, prompt_text
 
 STATUS_PERIOD_S = 1.0
 POLL_S = 0.05

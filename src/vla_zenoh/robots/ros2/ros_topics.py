@@ -9,16 +9,17 @@ import threading
 import time
 from collections.abc import Callable
 
+import zenoh
+
 from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample
 from vla_zenoh.bus.client import Client
 from vla_zenoh.codec import settings
-from vla_zenoh.errors import CodecError
+from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.interop.ros2 import table
 from vla_zenoh.interop.ros2.activation_filter import QUIET_S, ActivationFilter
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.services import ACTIVE_TOPIC, PROMPT_TOPIC
 from vla_zenoh.interop.ros2.topics import plain
-from vla_zenoh.robots.ros2.estop_order import EstopOrder
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 
 POLL_S = 0.05
@@ -27,6 +28,59 @@ ACTIVATION_NS = 500_000_000
 """An activation may take this long."""
 
 Reject = Callable[[str, str, str], None]
+
+
+class EstopOrder:
+    """Times of the last emergency stops, of this process and of others.
+
+    A reset or an activation that waits, while another call is answered or this process does not
+    run, must not undo a stop that came later and was sent at once.
+
+    Args:
+        session: to subscribe to the stops of others.
+        key: of stops.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._lock = threading.Lock()
+        self._ours_ns = self._others_ns = -1
+        handler = zenoh.handlers.Callback(self._on_stop, indirect=False)
+        self._subscriber = session.declare_subscriber(
+            key, handler, allowed_origin=zenoh.Locality.REMOTE
+        )
+
+    def _on_stop(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._others_ns = time.monotonic_ns()
+
+    def stop(self, publish: Callable[[], None]) -> None:
+        """Stop by calling `publish`."""
+        with self._lock:
+            self._ours_ns = time.monotonic_ns()
+            publish()
+
+    def overtook(self, asked_ns: int) -> bool:
+        """Whether a stop came after `asked_ns` on the monotonic clock."""
+        return max(self._ours_ns, self._others_ns) > asked_ns
+
+    def check(self, asked_ns: int) -> None:
+        """Check that no stop came after `asked_ns`.
+
+        Raises:
+            SessionError: one came.
+        """
+        if self.overtook(asked_ns):
+            raise SessionError("an emergency stop came after this request; send it again")
+
+    def unless_stopped(self, asked_ns: int, publish: Callable[[], None]) -> None:
+        """Call `publish`; no stop of this process comes between the check and it.
+
+        Raises:
+            SessionError: a stop came after `asked_ns`.
+        """
+        with self._lock:
+            self.check(asked_ns)
+            publish()
 
 
 class RosTopics:

@@ -1,0 +1,111 @@
+"""Evaluates files and folders, and combines the runs into one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.errors import RecordingError
+from vla_zenoh.lab.evaluation.csv_file import evaluate_csv, has_our_columns
+from vla_zenoh.lab.evaluation.result import STAGES, Evaluation
+
+MCAP, CSV = ".mcap", ".csv"
+COMBINED = "ALL"
+"""``record_id`` of all runs together."""
+_IDENTITY, _SERIES = {"name", "kind", "path"}, {"request_t_s", "width_m", "width_t_s"}
+_OF_ONE_RUN = _IDENTITY | _SERIES | {"problems", "measured", "commanded", "marks", "views"}
+
+
+def evaluate(
+    paths: Sequence[Path], first: int | None = None, *, pictures: int = 0
+) -> tuple[list[Evaluation], dict[str, str]]:
+    """Evaluate every file, and in every folder the recordings, in the order of their names.
+
+    Args:
+        paths: files and folders.
+        first: only this many requests of each.
+        pictures: number of moments to show of each camera.
+
+    Returns:
+        Evaluations, and the reason for each file that has none.
+    """
+    runs: list[Evaluation] = []
+    faults: dict[str, str] = {}
+    for path in paths:
+        found = _recordings_in(path) if path.is_dir() else [path]
+        if not found:
+            faults[str(path)] = f"{path} holds neither recordings (.mcap) nor the thesis's CSV"
+        for file in found:
+            try:
+                runs.append(_evaluate(file, first, pictures))
+            except RecordingError as error:
+                faults[str(file)] = str(error)
+    return runs, faults
+
+
+def _recordings_in(folder: Path) -> list[Path]:
+    """Recordings below a folder; other CSV files are left out."""
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in (MCAP, CSV))
+    return [path for path in files if path.suffix.lower() == MCAP or _is_table(path)]
+
+
+def _is_table(path: Path) -> bool:
+    return path.stat().st_size == 0 or has_our_columns(path)
+
+
+def _evaluate(path: Path, first: int | None, pictures: int) -> Evaluation:
+    if path.suffix.lower() == CSV:
+        return evaluate_csv(path, first)
+    # CSV alone needs no MCAP library.
+    from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
+
+    return evaluate_run(path, first, pictures=pictures)
+
+
+def combined(runs: Sequence[Evaluation]) -> Evaluation:
+    """All runs as one: values of all requests together, lengths and counts added up."""
+    out = Evaluation(COMBINED, "/".join(sorted({run.kind for run in runs})))
+    for each in fields(Evaluation):
+        if each.name not in _OF_ONE_RUN and each.name != "stages_ms":
+            setattr(out, each.name, _joined([getattr(run, each.name) for run in runs]))
+    if any(run.succeeded is None for run in runs):
+        out.succeeded = None
+    out.prompts = list(dict.fromkeys(out.prompts))
+    out.stages_ms = {
+        stage: _joined([run.stages_ms[stage] for run in runs if stage in run.stages_ms])
+        for stage in STAGES
+        if any(stage in run.stages_ms for run in runs)
+    }
+    units = {run.jerk_unit for run in runs if len(run.jerk)}
+    out.jerk_unit = next(iter(units), "m_s3")
+    if len(units) > 1:
+        out.jerk = np.zeros(0)
+    return out
+
+
+def _joined(values: Sequence[Any]) -> Any:
+    """Arrays and lists one after the other, counters and numbers added up without None."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    if isinstance(known[0], np.ndarray):
+        return np.concatenate(known)
+    if isinstance(known[0], Counter):
+        return sum(known, Counter())
+    if isinstance(known[0], list):
+        return [each for value in known for each in value]
+    return sum(known) if isinstance(known[0], (int, float)) else None
+
+
+def to_mapping(runs: Sequence[Evaluation], faults: Mapping[str, str]) -> dict[str, Any]:
+    """All runs and faults, ready for JSON."""
+    return {
+        "runs": [run.to_dict() for run in runs],
+        "overall": combined(runs).to_dict() if runs else None,
+        "faults": dict(faults),
+    }
