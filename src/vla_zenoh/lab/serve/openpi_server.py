@@ -15,7 +15,7 @@ from typing import Any
 
 from vla_zenoh.errors import MissingExtraError, PeerError, SpecError
 from vla_zenoh.interop import openpi
-from vla_zenoh.interop.served_policy import ServedPolicy
+from vla_zenoh.lab.serve.served_policy import ServedPolicy
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
 
 try:
