@@ -28,15 +28,24 @@ NODE_KINDS: tuple[NodeKind, ...] = (
     "worker",
 )
 SIMULATED: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")
-CAMERA_SOURCES = ("sim:CAMERA", "v4l2:DEVICE", "rtsp://...", "file:PATH", "ros2:TOPIC")
+CAMERA_SOURCES = {
+    "sim": "sim:CAMERA",
+    "v4l2": "v4l2:DEVICE",
+    "rtsp": "rtsp://HOST/PATH",
+    "rtsps": "rtsps://HOST/PATH",
+    "file": "file:PATH",
+    "ros2": "ros2:TOPIC",
+}
+"""Kind of a camera's source -> how it is written. `nodes.camera.grabber.make_source` opens them."""
 MIN_PERIODS = 3
 """A healthy link may be silent for up to this many periods."""
 
 
 def _source(value: str) -> str:
     kind, colon, rest = value.partition(":")
-    if not colon or not rest or kind not in ("sim", "v4l2", "rtsp", "rtsps", "file", "ros2"):
-        raise ValueError(f"{value!r} is not a camera: write one of {', '.join(CAMERA_SOURCES)}")
+    if not colon or not rest or kind not in CAMERA_SOURCES:
+        known = ", ".join(CAMERA_SOURCES.values())
+        raise ValueError(f"{value!r} is not a camera: write one of {known}")
     if kind in ("rtsp", "rtsps") and not rest.removeprefix("//"):
         raise ValueError(f"{value!r} lacks the host: write rtsp://HOST/PATH")
     return value
