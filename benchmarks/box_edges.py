@@ -187,7 +187,7 @@ def _outside(place_m: Any, low: Any, high: Any) -> float:
 
 
 def main() -> int:
-    """See the module."""
+    """Command line of the benchmark."""
     parser = argparse.ArgumentParser(description="How far an arm leaves its workspace box.")
     parser.add_argument("-n", type=int, default=100, help="policies at each face and edge")
     parser.add_argument("--seed", type=int, default=1, help="of the first one")

@@ -219,7 +219,7 @@ def plot(rows: list[dict[str, Any]], file: Path) -> None:
 
 
 def main() -> int:
-    """See the module."""
+    """Command line of the benchmark."""
     parser = argparse.ArgumentParser(description="How steadily an arm moves.")
     parser.add_argument("--profile", default="panda_sim", help="name or path")
     parser.add_argument("--perfect", action="store_true", help="without physics, much faster")

@@ -2,9 +2,9 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "pyzmq>=26", "pin>=4", "example-robot-data>=6"]
 # ///
-"""Asks a GR00T policy server (N1.5, N1.6 and later) over ZeroMQ.
+"""Queries a GR00T policy server (N1.5, N1.6 and later) over ZeroMQ.
 
-Servers that speak in pickles are refused.
+Servers that send pickles are rejected.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from vla_zenoh.policy.model_options import address, one_of
 
 
 class Groot(Adapter):
-    """See the module.
+    """Client of a GR00T policy server.
 
     Args:
         url: of the server, as tcp://HOST:PORT.
         version: n1.5 (flat names), n1.6 (nested ones; also N1.7).
-        preset: libero or bridge, see vla_zenoh/interop/presets.py; none: all is told.
+        preset: libero or bridge, see vla_zenoh/interop/presets.py; none: no defaults.
         timeout_s: for connecting, and for each answer.
-        api_token: where the server wants one.
-        profile: of the robot: its gripper and, where answers are joints, its arm.
-        layout: see vla_zenoh/interop/options.py. Pictures are video.NAME, states state.NAME.
+        api_token: if the server requires one.
+        profile: of the robot: its gripper and, if answers are joints, its arm.
+        layout: see vla_zenoh/interop/field_mapping.py. Pictures are video.NAME, states state.NAME.
     """
 
     joints = True
@@ -76,7 +76,7 @@ class Groot(Adapter):
         socket.setsockopt(zmq.SNDTIMEO, milliseconds)
         socket.setsockopt(zmq.RCVTIMEO, milliseconds)
         socket.setsockopt(zmq.MAXMSGSIZE, groot.MAX_BYTES)
-        # Without a server questions would be kept, and asked when it is there again.
+        # Without this, requests to an absent server would be queued and sent later.
         socket.setsockopt(zmq.IMMEDIATE, 1)
         socket.connect(self.where)
         try:
@@ -84,7 +84,7 @@ class Groot(Adapter):
         except PeerError as error:
             if error.reason != "peer_error":
                 raise
-            modalities = None  # a server that does not know the question says nothing of itself
+            modalities = None  # a server without this endpoint does not describe itself
         return groot.mismatches(modalities, self.mapping)
 
     def _ask(self, fields: dict[str, Any], *, begins: bool) -> Any:
@@ -99,14 +99,14 @@ class Groot(Adapter):
         try:
             self._socket.send(groot.request(endpoint, data, self._token))
         except zmq.Again as error:
-            raise PeerError("peer_gone", f"nobody answers at {self.where}") from error
+            raise PeerError("peer_gone", f"no answer from {self.where}") from error
         try:
             return self._socket.recv()
         except zmq.Again as error:
             raise TimeoutError from error
 
     def close(self) -> None:
-        """Let go of the socket."""
+        """Close the socket."""
         super().close()
         socket, self._socket = self._socket, None
         if socket is not None:

@@ -2,9 +2,9 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "websockets>=15", "pin>=4", "example-robot-data>=6"]
 # ///
-"""Asks a policy server that speaks openpi's wire.
+"""Queries a policy server with openpi's protocol.
 
-vllm-omni does so too, and ``vla-zenoh lab serve-openpi``.
+vllm-omni speaks it too, and ``vla-zenoh lab serve-openpi``.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ CLOSE_S = 0.1
 
 
 class OpenPi(Adapter):
-    """See the module.
+    """Client of an openpi policy server.
 
     Args:
-        url: of the server, as ws://HOST:PORT; wss:// likewise.
-        preset: libero, droid or own, see vla_zenoh/interop/presets.py; none: all is told.
+        url: of the server, as ws://HOST:PORT or wss://HOST:PORT.
+        preset: libero, droid or own, see vla_zenoh/interop/presets.py; none: no defaults.
         timeout_s: for connecting, and for each answer.
         dialect: openpi, vllm (knows resets and sessions), auto: by the path of the URL.
         api_key: sent as ``Authorization: Api-Key``.
-        profile: of the robot: its gripper and, where answers are joints, its arm.
-        layout: see vla_zenoh/interop/options.py.
+        profile: of the robot: its gripper and, if answers are joints, its arm.
+        layout: see vla_zenoh/interop/field_mapping.py.
     """
 
     joints = True
@@ -77,7 +77,7 @@ class OpenPi(Adapter):
         if self._connection is not None:
             if self._connection.state is State.OPEN:
                 return []
-            self.close()  # it was closed while nothing was asked: a server may do that
+            self.close()  # the server closed it while idle
         connection = self._connection = self._until_closed.enter_context(
             connect(
                 self.where,
@@ -87,10 +87,10 @@ class OpenPi(Adapter):
                 proxy=None,
                 open_timeout=self.timeout_s,
                 close_timeout=CLOSE_S,
-                ping_interval=None,  # a server that thinks does not answer pings
+                ping_interval=None,  # a server that infers does not answer pings
             )
         )
-        # A stopped server reads nothing, and sending would wait for it without end.
+        # A stopped server reads nothing, and sending would block forever.
         seconds = struct.pack("ll", int(self.timeout_s), int(self.timeout_s % 1 * 1e6))
         connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, seconds)
         metadata = openpi.read_metadata(connection.recv(self.timeout_s))
@@ -108,11 +108,11 @@ class OpenPi(Adapter):
         return self._connection.recv(self.timeout_s)
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Close the connection."""
         super().close()
         connection, self._connection = self._connection, None
         if connection is not None:
-            # Not the polite way, which waits for a server that may be stopped.
+            # Not the closing handshake, which waits for a server that may be stopped.
             with suppress(OSError):
                 connection.socket.shutdown(socket.SHUT_RDWR)
             with suppress(OSError, WebSocketException):

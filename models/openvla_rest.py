@@ -2,10 +2,9 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy"]
 # ///
-"""Asks OpenVLA's or OpenVLA-OFT's REST server: ``POST /act``.
+"""Queries the REST server of OpenVLA or OpenVLA-OFT: ``POST /act``.
 
-Every question has a connection of its own, which is ended after `timeout_s` whatever the server
-does.
+Every request has its own connection, which is closed after `timeout_s` whatever the server does.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from vla_zenoh.policy.model_options import address, yes_no
 
 
 class OpenVlaRest(Adapter):
-    """See the module.
+    """Client of an OpenVLA REST server.
 
     Args:
-        url: of the server, as http://HOST:PORT; https:// likewise; /act is added.
-        preset: bridge, libero or oft_libero, see vla_zenoh/interop/presets.py; none: all is told.
+        url: of the server, as http://HOST:PORT or https://HOST:PORT; /act is added.
+        preset: bridge, libero or oft_libero, see vla_zenoh/interop/presets.py; none: no defaults.
         unnorm_key: statistics the server unnormalises with, empty: its own choice.
         encoded: yes: JSON within JSON, for servers without json_numpy on the wire.
-        timeout_s: for each question.
+        timeout_s: for each request.
         profile: of the robot, for its gripper.
-        layout: see vla_zenoh/interop/options.py.
+        layout: see vla_zenoh/interop/field_mapping.py.
     """
 
     lost = (OSError, http.client.HTTPException)
@@ -63,7 +62,7 @@ class OpenVlaRest(Adapter):
         self._unnorm_key, self._encoded = unnorm_key, yes_no("encoded", encoded)
 
     def _connect(self) -> list[str]:
-        return []  # each question does, and the server says nothing of itself
+        return []  # each request does, and the server does not describe itself
 
     def _ask(self, fields: dict[str, Any], *, begins: bool) -> Any:
         body = openvla_rest.request(fields, self._unnorm_key, encoded=self._encoded)
@@ -83,7 +82,7 @@ class OpenVlaRest(Adapter):
         timer: threading.Timer | None = None
         try:
             connection.connect()
-            # The time-out of a socket is for one read; a server may give a byte a second.
+            # A socket's time-out is per read; a server may send a byte a second.
             timer = threading.Timer(self.timeout_s, end, (connection.sock,))
             timer.daemon = True
             timer.start()

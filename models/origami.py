@@ -2,10 +2,10 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "eclipse-zenoh>=1.9,<2", "pin>=4", "example-robot-data>=6"]
 # ///
-"""Asks a policy that answers Zenoh queries as origami-zenoh-v1 says, by way of the router it uses.
+"""Queries a policy by origami-zenoh-v1: Zenoh queries through the router of the policy.
 
-An answer must carry the number of its question. The policy speaks of joints, so its actions become
-poses by the kinematics of the profile's arm.
+An answer must carry the number of its request. The policy's actions are joints, which become poses
+by the kinematics of the profile's arm.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class Origami(Adapter):
-    """See the module.
+    """Client of an origami-zenoh policy.
 
     Args:
         url: the router, as tcp/HOST:PORT.
@@ -35,7 +35,7 @@ class Origami(Adapter):
         preset: north_right; see vla_zenoh/interop/presets.py.
         timeout_s: for each answer.
         profile: of the robot whose arm and gripper are meant.
-        layout: see vla_zenoh/interop/options.py.
+        layout: see vla_zenoh/interop/field_mapping.py.
     """
 
     joints = True
@@ -105,7 +105,7 @@ class Origami(Adapter):
             self.close()
             raise PeerError("peer_gone", f"no router at {self._url}: {error}") from error
         if time.monotonic() - asked_s < 0.5 * self.timeout_s:
-            raise PeerError("peer_gone", f"nobody behind {self._url} answers {operation}")
+            raise PeerError("peer_gone", f"no policy behind {self._url} answers {operation}")
         raise TimeoutError
 
     def _opened(self) -> zenoh.Session:
@@ -126,11 +126,11 @@ class Origami(Adapter):
         return self._session
 
     def _lose(self) -> None:
-        # The session is one with the router. Answers are told apart by the numbers of questions.
+        # The session is with the router, and answers carry the numbers of their requests.
         self._known = False
 
     def close(self) -> None:
-        """Let go of the session."""
+        """Close the session."""
         import zenoh
 
         super().close()

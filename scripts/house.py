@@ -35,7 +35,7 @@ NODES = (
 )
 LAB, FRONT = "lab", ("lab", "cli")
 PROGRAMS = ("router", "sim", "camera", "worker", "command")
-START_S, MOVING_S, END_S = 30.0, 4.0, 10.0
+START_S, MOVING_S, END_S, KEEP_S = 60.0, 4.0, 10.0, 0.5
 MODEL = """
 # /// script
 # dependencies = []
@@ -46,8 +46,10 @@ from vla_zenoh.policy import ActionSpec, ActionSteps, CameraSpec, ModelSpec, Obs
 class Policy:
     spec = ModelSpec(
         name="look",
-        observation=ObservationSpec(cameras=(CameraSpec("front", 224, 224),)),
-        action=ActionSpec(dt_s=0.2),
+        observation=ObservationSpec(
+            cameras=(CameraSpec(camera="front", width=224, height=224, resize="pad"),)
+        ),
+        action=ActionSpec(horizon=1, dt_s=0.2, rotation="rpy", gripper="none"),
     )
 
     def infer(self, observation):
@@ -155,7 +157,7 @@ def measure(src: Path) -> dict[str, Any]:
 
 
 def traced_program(out: Path, arguments: list[str]) -> None:
-    """Be ``vla-zenoh`` with `arguments`; at the end write when each file's code was last called."""
+    """Be ``vla-zenoh`` with `arguments`, and write when each file's code was last called."""
     import threading
 
     last: dict[str, float] = {}
@@ -164,16 +166,20 @@ def traced_program(out: Path, arguments: list[str]) -> None:
         if event == "call":
             last[frame.f_code.co_filename] = time.time()
 
+    def keep() -> None:
+        while True:  # a node may end without unwinding
+            time.sleep(KEEP_S)
+            beside = out.with_suffix(".part")
+            beside.write_text(json.dumps(dict(last)), "utf-8")
+            beside.replace(out)
+
+    threading.Thread(target=keep, daemon=True).start()
     threading.setprofile(note)
     sys.setprofile(note)
     from vla_zenoh.cli.main import app_entry
 
     sys.argv = ["vla-zenoh", *arguments]
-    try:
-        app_entry()
-    finally:
-        sys.setprofile(None)
-        out.write_text(json.dumps(dict(last)), "utf-8")
+    app_entry()
 
 
 def trace(src: Path) -> list[str]:
@@ -211,7 +217,7 @@ def trace(src: Path) -> list[str]:
             begun = time.time() + 1.0
             time.sleep(1.0 + MOVING_S)
             until = time.time()
-            time.sleep(0.5)
+            time.sleep(2 * KEEP_S)
         finally:
             for process in reversed(programs):
                 process.send_signal(signal.SIGINT)

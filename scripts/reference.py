@@ -277,7 +277,6 @@ REASONS = {
     "simulation_fault": "the simulation became unstable",
     "spec_mismatch": "chunk: another spec than the one agreed at activation",
     "stale": "older than the limit of its kind",
-    "stalled": "the robot node stood still; the command stream begins again",
     "stopped": "ROS topic `active`: `true` with an emergency stop behind it",
     "superseded": "chunk: a newer one is in force",
     "too_many_models": "camera: more image sizes requested than are made",
@@ -290,6 +289,8 @@ COUNTERS = {
     "arm.commands_given": "set-points given to the Python class",
     "arm.missed_ticks": "ticks of the robot node that were skipped",
     "arm.stalls": "times the robot node stood still",
+    "sim.missed_ticks": "ticks of the robot node that were skipped",
+    "sim.stalls": "times the robot node stood still",
     "arm.stream_silences": "times the command stream fell silent",
     "command.chunks_dropped": "chunks dropped because more arrived than are kept",
     "command.gripper_timeouts": "gripper commands that the gripper did not carry out in time",
@@ -338,10 +339,14 @@ def counted_in_code() -> tuple[set[str], set[str]]:
                 first = node.args[0]
                 if name in REJECTING and isinstance(first, ast.Constant):
                     reasons.add(str(first.value))
-            if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
-                held = node.value
-                if isinstance(held, ast.Attribute) and held.attr == "counters":
+            if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Attribute):
+                if node.value.attr.lstrip("_") != "counters":
+                    continue
+                if isinstance(node.slice, ast.Constant):
                     counters.add(str(node.slice.value))
+                elif isinstance(node.slice, ast.JoinedStr):  # node.name before the last part
+                    last = ast.unparse(node.slice).rpartition(".")[2].rstrip("'")
+                    counters |= {name for name in COUNTERS if name.endswith(f".{last}")}
     reasons |= {name.removeprefix("refused.") for name in counters if "refused." in name}
     return reasons, {name for name in counters if "refused." not in name}
 

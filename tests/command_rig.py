@@ -16,6 +16,7 @@ import numpy as np
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import exp3, log3, quat_from_rotation, rotation_from_quat
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile
@@ -140,6 +141,11 @@ class Rig:
         """Let the arm come to where it is to go."""
         self.run(duration_s)
         assert self.commander.at_rest
+
+    def stand_at(self, kinematics: Kinematics, joints_rad: FloatArray) -> None:
+        """The measured joints, and their TCP."""
+        pose, self.joints_rad = kinematics.forward(joints_rad), joints_rad
+        self.position_m, self.quat_xyzw = pose.position_m, quat_from_rotation(pose.rotation)
 
     # -- what the others say ------------------------------------------------------------------
     def pose_state(self) -> Stamped[PoseState]:

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.interop.field_mapping import FieldSource
-from vla_zenoh.interop.options import read_map, read_size
+from vla_zenoh.interop.field_mapping import FieldSource, read_map, read_size
 from vla_zenoh.policy.model_options import read_json, whole_number
 from vla_zenoh.policy.state_vector import read_state
 

@@ -40,8 +40,7 @@ from vla_zenoh_model_lerobot.mapping import (
 )
 
 from vla_zenoh.errors import SpecError, WorkerError
-from vla_zenoh.interop.action_semantics import read_action_semantics
-from vla_zenoh.interop.joints import Forward, make_forward
+from vla_zenoh.interop.action_semantics import Forward, make_forward, read_action_semantics
 from vla_zenoh.policy import (
     ActionSteps,
     CameraSpec,

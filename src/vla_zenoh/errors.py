@@ -73,7 +73,7 @@ class ResourceError(VlaZenohError, FileNotFoundError):
 def how_to_install(extra: str = "") -> str:
     """What brings an extra of this package, or the package itself.
 
-    Never its name alone: it is on no index, and whoever took that name there would be run here.
+    Never by name alone: the package is on no index, and a stranger could register the name there.
     """
     what = f"'.[{extra}]'" if extra else "."
     return f"pip install -c constraints.txt {what} in a checkout of vla-zenoh"

@@ -1,8 +1,8 @@
-"""Every key expression of ours, and what may be said on it. The only file with key text; those of
-ROS 2, which are not ours to choose, stand in ``interop/ros2/keys.py``.
+"""Every key expression of ours, with its payload. The only file with key text; keys of ROS 2 are
+in ``interop/ros2/keys.py``.
 
-A key is ``{root}/{robot}/...``: `Keys` makes them for one robot, `Kind` says what each is for. Who
-reads the table below knows the whole wire.
+A key is ``{root}/{robot}/...``: `Keys` makes the keys of one robot, `Kind` chooses the quality of
+service. The members below are the whole wire protocol.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from enum import Enum
 from vla_zenoh.errors import ProfileError
 
 SCHEMA = 1
-"""Version of headers and payloads; a reader refuses any other."""
+"""Version of the wire. Raise it when a record of the last version cannot be decoded any more, or an
+old node would reject a new one: decoders reject unknown fields, so a new field raises it too."""
+"""Version of headers and payloads; a receiver rejects any other."""
 
 DEFAULT_ROOT = "vla"
 
@@ -25,9 +27,9 @@ _CHUNK = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
 
 class Kind(Enum):
-    """How samples on a key are to be carried (see bus/session.py)."""
+    """Quality of service of a key, see bus/session.py."""
 
-    FRAME = "frame"  # large, newest only, may be dropped
+    FRAME = "frame"  # images: large, newest only, may be dropped
     STATE = "state"  # small, fast, newest only, may be dropped
     CONTROL = "control"  # small, real-time priority, express, may be dropped: a newer one follows
     ORDER = "order"  # small, real-time priority, express, must arrive
@@ -71,11 +73,11 @@ class Keys:
 
     # -- streams of the robot side ------------------------------------------------------------
     def camera_raw(self, camera: str) -> str:
-        """Pixels, C-contiguous RGB uint8 (H, W, 3); written while someone listens."""
+        """Pixels, C-contiguous RGB uint8 (H, W, 3); published while there are subscribers."""
         return self._at("camera", key_chunk(camera, "camera name"), "raw")
 
     def camera_jpeg(self, camera: str) -> str:
-        """A plain JPEG file, encoding image/jpeg; written while someone listens."""
+        """A plain JPEG file, encoding image/jpeg; published while there are subscribers."""
         return self._at("camera", key_chunk(camera, "camera name"), "jpeg")
 
     def camera_fitted(self, camera: str, form: str) -> str:
@@ -96,7 +98,7 @@ class Keys:
 
     @property
     def state_gripper(self) -> str:
-        """`GripperState`, likewise."""
+        """`GripperState`, with the same stamp and seq."""
         return self._at("state", "gripper")
 
     # -- settings: plain text, any client may put ---------------------------------------------
@@ -111,12 +113,12 @@ class Keys:
         return self._at("active")
 
     def holding(self, holder: str) -> str:
-        """Liveliness token of whoever lets the arm obey only for as long as he is there himself."""
+        """Liveliness token of a deadman: the arm stays active while it is there."""
         return self._at("holding", key_chunk(holder, "holder"))
 
     @property
     def worker(self) -> str:
-        """Name of the worker whose chunks are obeyed."""
+        """Name of the worker whose chunks are carried out."""
         return self._at("worker")
 
     @property
@@ -126,12 +128,12 @@ class Keys:
 
     @property
     def speed(self) -> str:
-        """How fast the arm is driven, 0 to 100 percent of what is planned: ``30`` or ``30 %``."""
+        """Speed override, 0 to 100 percent of the planned speed: ``30`` or ``30 %``."""
         return self._at("speed")
 
     @property
     def slower(self) -> str:
-        """Likewise, but it only ever lowers `speed`: for whoever may stop the arm."""
+        """As `speed`, but it can only lower it: for every role that may stop the arm."""
         return self._at("slower")
 
     @property
@@ -159,11 +161,11 @@ class Keys:
         return self._at("spec", key_chunk(worker, "worker name"))
 
     def seen(self, worker: str, camera: str) -> str:
-        """JPEG of exactly what the model saw; written while someone listens."""
+        """JPEG of exactly the image the model was given; published while there are subscribers."""
         return self._at("seen", key_chunk(worker, "worker name"), key_chunk(camera, "camera name"))
 
     def seen_record(self, worker: str) -> str:
-        """`InferenceDebug`: prompt, raw output and steps of the same inference; likewise."""
+        """`InferenceDebug`: prompt, raw output and steps of the same inference."""
         return self._at("seen", key_chunk(worker, "worker name"))
 
     # -- command node -------------------------------------------------------------------------
@@ -174,7 +176,7 @@ class Keys:
 
     @property
     def command_joint(self) -> str:
-        """`JointCommand` likewise, in place of poses where the profile's robot takes joints."""
+        """`JointCommand`, in place of poses if the profile's robot is commanded by joints."""
         return self._at("command", "joint")
 
     @property
@@ -196,7 +198,7 @@ class Keys:
         return self._at("alive", key_chunk(node, "node name"))
 
     def clock(self, node: str) -> str:
-        """Query: the four stamps of NTP; the node answers with when it heard and when it spoke."""
+        """Query for the four stamps of NTP: the reply has its times of arrival and reply."""
         return self._at("clock", key_chunk(node, "node name"))
 
     # -- the simulator's own ------------------------------------------------------------------
@@ -212,7 +214,7 @@ class Keys:
 
     @property
     def sim_reset(self) -> str:
-        """Empty, or a seed as plain text: the arm goes home, objects are placed anew."""
+        """Empty, or a seed as plain text: the arm goes home, objects are placed again."""
         return self._at("sim", "reset")
 
     @property
@@ -339,7 +341,7 @@ def _covers(wide: list[str], narrow: list[str]) -> bool:
 
 
 NO_DEADMAN_TOKEN = "is not there (a liveliness token on the key holding/NAME)"
-"""Said of the one who is to hold the arm active."""
+"""Why a deadman is not accepted."""
 
 
 def worker_node(worker: str) -> str:

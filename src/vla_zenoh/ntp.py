@@ -48,7 +48,7 @@ class Exchange:
 
     @property
     def round_trip_ns(self) -> int:
-        """Time under way, without what the other one took to answer."""
+        """Round trip without the time the peer took to reply."""
         return (self.got - self.asked) - (self.said - self.heard)
 
     @property
@@ -154,7 +154,7 @@ def shift_stamps(header: Header, record: Record, ahead_ns: int) -> tuple[Header,
     """Header and record with their stamps on our clock.
 
     A stamp at an end of what a record takes ("at once", "for ever") stays within it: whether that
-    is stale or never expires is for whoever reads it to say.
+    is stale or never expires is for the receiver to decide.
 
     Args:
         header: of the record.

@@ -1,4 +1,4 @@
-"""Text that anybody may have written, as a terminal can be given it."""
+"""Makes text from untrusted sources safe for a terminal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _TO_SPACES = {ord("\n"): " ", ord("\t"): " "}
 
 
 def printable(text: str) -> str:
-    """`text` from anybody, safe for a terminal: what would steer it is written as an escape."""
+    """`text` with its control characters escaped, safe for a terminal."""
     if text.isprintable():
         return text
     return "".join(
@@ -21,7 +21,7 @@ def printable(text: str) -> str:
 
 
 def one_line(value: object, most: int = 200) -> str:
-    """Likewise, in one line that does not push everything else from the screen.
+    """A value as one safe line of limited length.
 
     Args:
         value: text, or anything that has a text.

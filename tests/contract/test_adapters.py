@@ -100,7 +100,7 @@ def refusal(policy: Policy, prompt: str) -> PeerError:
         with pytest.raises(PeerError) as raised:
             policy.infer(seen(policy, prompt))
         assert time.monotonic() - began_s < 2 * TIMEOUT_S + LATE_S
-        if "tried again" not in str(raised.value) or time.monotonic() > give_up_s:
+        if "retrying" not in str(raised.value) or time.monotonic() > give_up_s:
             return raised.value
         time.sleep(0.02)
 

@@ -236,7 +236,7 @@ def test_the_native_worker_and_the_server_of_the_same_weights_ask_for_the_same(
     native = make(write(tmp_path / "a", statistics={"libero_goal_no_noops": {"action": LIBERO}}))
     served: Any = make_policy(find_model("openvla_rest"), {"preset": "libero"})
     rows = np.array([[0.5, -0.25, 0.125, 0.1, -0.2, 0.3, 1.0]])
-    theirs = served.layout.steps(rows, example_observation(served.spec))
+    theirs = served.mapping.steps(rows, example_observation(served.spec))
     np.testing.assert_allclose(steps_of(native, rows), theirs, atol=ATOL)
     assert native.spec.action.rotation == served.spec.action.rotation
     assert native.spec.action.dt_s == served.spec.action.dt_s
@@ -276,7 +276,7 @@ def test_statistics_that_are_no_metres_are_refused_until_somebody_says_what_they
         ({"rotation": "quat_xyzw"}, r"7 numbers, position 3 \+ quat_xyzw 4 \+ gripper 1 are 8"),
         ({"gripper": "none"}, r"7 numbers, position 3 \+ rpy 3 are 6"),
         ({"horizon": "2"}, "horizon is 2; the model's chunks have 1"),
-        ({"action": "absolute"}, r"not that of data set 'mine', so nobody says .*--set rotation="),
+        ({"action": "absolute"}, r"not that of data set 'mine', so the meaning .*--set rotation="),
         ({"scale_m": "1"}, r"no option 'scale_m'; known: action, frame"),
     ],
 )

@@ -16,7 +16,7 @@ from chain import Chain
 from test_strangers import STRANGER, samples_of
 
 from vla_zenoh.codec import records
-from vla_zenoh.nodes.command.status import SPREAD_S
+from vla_zenoh.nodes.command.node import SPREAD_S
 from vla_zenoh.types import Header
 
 FLOOD_HZ = 10_000

@@ -198,7 +198,7 @@ def test_a_node_that_dies_at_every_start_is_given_up(tmp_path: Path) -> None:
         print(f"given up after {time.monotonic() - began:.1f} s")
         assert running.process.returncode == 1
         assert running.children() == {}
-        assert f"died {GIVE_UP_AFTER} times in a row; giving up" in running.text
+        assert f"crashed {GIVE_UP_AFTER} times in a row; giving up" in running.text
         assert "dies again and again" in running.text
         assert "has no link 'nobody'" in running.text
 
@@ -207,7 +207,7 @@ def test_a_node_that_dies_at_every_start_is_given_up(tmp_path: Path) -> None:
 def test_a_worker_that_dies_at_every_start_leaves_the_robot_to_the_others(tmp_path: Path) -> None:
     path = write_profile(tmp_path, more="workers: [scripted, missing_model]\n")
     with up(str(path)) as running, client_of(path) as (client, recorder):
-        said = f"died {GIVE_UP_AFTER} times in a row; it is left alone"
+        said = f"crashed {GIVE_UP_AFTER} times in a row; not restarting it"
         until("it is left alone", lambda: said in running.text, GIVE_UP_S)
         assert len(running.children()) == len(NODES)
         get_moving(client, recorder)
@@ -292,7 +292,7 @@ def test_a_spared_node_that_dies_again_and_again_is_left_alone_while_others_run(
     supervisor, told = begin(robot, broken("worker-a", "worker"), broken("worker-b", "worker"))
     try:
         lose(supervisor, "worker-a")
-        end = f"worker-a died {GIVE_UP_AFTER} times in a row; it is left alone"
+        end = f"worker-a crashed {GIVE_UP_AFTER} times in a row; not restarting it"
 
         def left() -> bool:
             assert supervisor.poll(spare=("worker",))
@@ -317,7 +317,7 @@ def test_when_nothing_else_is_left_or_can_be_spared_it_is_given_up(kind: str) ->
         lose(supervisor, "last")
         until("given up", lambda: not supervisor.poll(spare=("worker",)), READY_PATIENCE_S)
         assert supervisor.given_up is supervisor.children[0]
-        assert told[-1] == f"last died {GIVE_UP_AFTER} times in a row; giving up"
+        assert told[-1] == f"last crashed {GIVE_UP_AFTER} times in a row; giving up"
     finally:
         supervisor.kill()
 

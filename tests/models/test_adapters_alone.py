@@ -24,7 +24,7 @@ from vla_zenoh.policy import example_observation
 policy = make_policy(find_model(sys.argv[1]), json.loads(sys.argv[2]))
 policy.load()
 observation = example_observation(policy.spec)
-policy.layout.request(observation)
+policy.mapping.request(observation)
 try:
     policy.infer(observation)
 except PeerError as error:

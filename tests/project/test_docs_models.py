@@ -23,7 +23,7 @@ from typer.main import get_command
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import PeerError
 from vla_zenoh.interop.action_semantics import ACTION_OPTIONS, read_action_semantics
-from vla_zenoh.interop.options import DEFAULTS, read_map
+from vla_zenoh.interop.field_mapping import DEFAULTS, read_map
 from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, ORIGAMI
 from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.policy import (
@@ -183,7 +183,7 @@ def test_the_adapter_asks_its_server_and_finds_it_again(tmp_path: Path) -> None:
         with pytest.raises(PeerError, match="no connection to") as raised:
             asked("leave")
         assert raised.value.reason == "peer_gone"
-        with pytest.raises(PeerError, match="tried again in"):
+        with pytest.raises(PeerError, match="retrying in"):
             asked("up")
         until("it answers again", lambda: answers(asked), PATIENCE_S)
         policy.close()

@@ -41,7 +41,7 @@ ALLOWED = {
     "bus": IO - NODE,
     "runtime": IO - NODE,
     "nodes": IO - NODE,
-    "nodes/openpi_server.py": IO - NODE | {"asyncio"},
+    "lab/serve/openpi_server.py": IO - NODE | {"asyncio"},
     "robots": IO - NODE,
     "simulation": frozenset({"mujoco"}),
     "cli": IO - {"torch", "mujoco", "asyncio"},

@@ -23,7 +23,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop import openpi
-from vla_zenoh.interop.served_policy import make_served_policy
+from vla_zenoh.lab.serve.served_policy import make_served_policy
 from vla_zenoh.policy import ModelSpec, example_observation
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile

@@ -40,7 +40,7 @@ class Scene:
 
     def look(self) -> PeerSnapshot:
         self.command.clocks.poll()
-        self.peers = self.ears.look(self.command.clock.wall_ns()) or self.peers
+        self.peers = self.ears.update(self.command.clock.wall_ns()) or self.peers
         return self.peers
 
     def says(self, node: Node, age_s: Any) -> None:

@@ -34,7 +34,7 @@ def _note_states(heard_s: list[float]) -> None:
     """Of the command node: whenever the arm's pose has come."""
     from vla_zenoh.nodes.command.inputs import CommandInputs
 
-    take = CommandInputs.take
+    take = CommandInputs.poll
 
     def take_and_note(self: CommandInputs, now_ns: int) -> Any:
         inputs = take(self, now_ns)
@@ -42,7 +42,7 @@ def _note_states(heard_s: list[float]) -> None:
             heard_s[0] = time.monotonic()
         return inputs
 
-    CommandInputs.take = take_and_note
+    CommandInputs.poll = take_and_note
 
 
 def _install(node: str, path: str) -> None:

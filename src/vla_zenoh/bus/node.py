@@ -319,6 +319,7 @@ class Node:
         kind: type[Record],
         arrival: ReceivedSample,
         writer_filter: SingleWriterFilter | None = None,
+        header: Header | None = None,
     ) -> Stamped[Record] | None:
         """Decode a sample, with its stamps on this node's clock, see `ClockSync`.
 
@@ -326,13 +327,14 @@ class Node:
             kind: type of the record.
             arrival: the sample.
             writer_filter: of its key.
+            header: of the sample, if it is decoded already.
 
         Returns:
             None if the sample was rejected, which is counted and reported.
         """
         key = str(arrival.sample.key_expr)
         try:
-            header = self.header(arrival)
+            header = header or self.header(arrival)
             if writer_filter is not None:  # first: a flood by another source must cost little
                 writer_filter.check(header, arrival.mono_ns)
             record = records.decode(kind, bytes_of(arrival.sample.payload))

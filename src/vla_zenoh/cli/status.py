@@ -1,4 +1,8 @@
-"""vla-zenoh status: state, rates, counters and events of all nodes."""
+"""vla-zenoh status: state, rates, counters and events of all nodes.
+
+Shows what nodes publish in their `NodeStatus`, never a stream: a value to be shown belongs into the
+``detail`` of a node's status.
+"""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ def encode(record: Any) -> bytes:
     """Bytes of a record dataclass or a `ModelSpec`.
 
     Raises:
-        CodecError: larger than `MAX_RECORD_BYTES`: nobody would read it.
+        CodecError: larger than `MAX_RECORD_BYTES`, which every receiver rejects.
     """
     fields = record.to_dict() if isinstance(record, ModelSpec) else _fields(record)
     payload = message.pack(fields)

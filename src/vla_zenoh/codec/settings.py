@@ -57,7 +57,7 @@ def decode_bool(payload: bytes) -> bool:
 
 
 def decode_activation(payload: bytes) -> bool | str:
-    """Likewise, or ``true while NAME``: the name of whoever holds the arm active.
+    """A bool as `decode_bool`, or the deadman's name of ``true while NAME``.
 
     Returns:
         True or False; a name for the latter.

@@ -1,13 +1,11 @@
-"""From action chunks to a smooth, bounded stream of poses. Pure: no Zenoh, no clock, no threads.
+"""From action chunks to a smooth, bounded command stream. Pure: no Zenoh, no clock, no threads.
 
-actions     what the numbers of a chunk mean          -> waypoints
-compose     which goal was in force when              -> plans on a time axis
-limits      step, workspace, leash                    -> the same, bounded, and told
-smoothing   Ruckig on translation and SO(3)           -> pose, twist, acceleration
-gripper     absolute widths, newest wins              -> one command in flight
-states      the state machine as a table
-preflight   every reason not to activate
-commander   all of the above, one `step` per tick
-reference   the robot's side: refuses jumps, brakes when the stream falls silent
-impedance   Cartesian impedance law of the simulated robot
+commander          state machine and settings, one `step` per tick
+chunk_validation   every reason to reject a chunk
+chunk_planner      validate, plan, bound and enqueue chunks
+plan_timeline      plans on a time axis: which goal was in force when
+aggregate          the goal where plans overlap
+motion_pipeline    goals to commands: leash, smoothing, joints, braking
+watchdog           reasons to brake
+preflight          reasons against an activation
 """

@@ -1,4 +1,4 @@
-"""What the numbers of a chunk mean: one step of an `ActionSpec` to a pose and a gripper width."""
+"""Meaning of the numbers of an action step: from `ActionSpec` to TCP pose and gripper width."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from vla_zenoh.policy import ROTATION_SIZE, ActionSpec
 from vla_zenoh.types import FloatArray, unit_quaternion
 
 GRIPPER_SLACK = 0.25
-"""A fraction outside [0, 1] by up to this much is a model's rounding and is clipped."""
+"""A fraction outside [0, 1] by up to this is rounding of a model, and clipped."""
 GRIPPER_SLACK_M = 0.05
-"""A width outside what the gripper has by up to this much likewise."""
+"""A width outside the gripper's range by up to this is clipped, too."""
 
 
 def rotation_of(spec: ActionSpec, numbers: FloatArray) -> FloatArray:
-    """Rotation matrix of a step's rotation numbers.
+    """Rotation matrix (3, 3) of the rotation numbers of a step.
 
     Raises:
-        RecordError: a quaternion that is not unit.
+        RecordError: a quaternion that is not a unit quaternion.
     """
     if spec.rotation == "rpy":
         return rotation_from_rpy(numbers)
@@ -35,7 +35,7 @@ def rotation_of(spec: ActionSpec, numbers: FloatArray) -> FloatArray:
 
 
 def step_pose(spec: ActionSpec, step: FloatArray, before: Pose) -> Pose:
-    """The pose that one step asks for, after the goal `before`.
+    """The pose that a step asks for, from the goal `before`.
 
     A delta in the base frame is ``p + dp, dR R``; in the TCP frame ``p + R dp, R dR``; an absolute
     step is the pose itself.
@@ -56,11 +56,11 @@ def step_pose(spec: ActionSpec, step: FloatArray, before: Pose) -> Pose:
 def step_width(
     spec: ActionSpec, step: FloatArray, before_m: float, max_width_m: float
 ) -> float | None:
-    """The gripper width that one step asks for, after the width `before_m`; None: says nothing.
+    """The gripper width that a step asks for, from `before_m`; None: the model has no gripper.
 
     Raises:
-        RecordError: a number that this meaning cannot have; names the meaning, because the usual
-            cause is that the model's gripper means something else than its spec says.
+        RecordError: a number that this meaning cannot have. The message names the meaning: usually
+            the spec declares another one than the model has.
     """
     if spec.gripper == "none":
         return None

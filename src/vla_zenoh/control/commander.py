@@ -67,6 +67,7 @@ class Commander:
         self.dry_run = dry_run
         self.state = State.INACTIVE
         self.why = "not activated yet"
+        self._ended = ""  # why the last activation did, if nobody ended it
         asked = profile.task
         self.task = Task(0, False, asked.prompt, asked.worker, asked.rate_hz, asked.speed_percent)
         self.pose: Stamped[PoseState] | None = None
@@ -242,6 +243,8 @@ class Commander:
         episode = max(self.task.episode + 1, now_ns // 1_000_000)
         self.task = replace(self.task, episode=episode, **changes)  # pyright: ignore
         self.progress.begin()
+        if changes:
+            self._ended = ""
         if self.state in OBEYING:
             self._watchdog.expect_first(now_ns, self.task.rate_hz, self.task.speed)
 
@@ -267,7 +270,7 @@ class Commander:
         reasons += self.deadman.reasons_against(holder, self._peers.holders)
         reasons += self._motion.unsettled(now_ns)
         if lease is None or self.pose is None or self.gripper_state is None or reasons:
-            self._reject_setting("activate", reasons)
+            self._reject_setting("activate", reasons + self._ended_before())
             return
         self.lease = lease
         self.deadman.begin(holder)
@@ -277,8 +280,13 @@ class Commander:
         blocked = self._watchdog.begin(held_pose(measured), pose_of(measured))
         self._motion.anchor(measured, self.gripper_state.record, joint, now_ns, blocked=blocked)
         held = f", while {holder!r} holds it" if holder else ""
-        self._change(Trigger.ACTIVATE, f"activated with worker {self.task.worker!r}{held}")
+        what = f"activated with worker {self.task.worker!r}{held}"
+        self._change(Trigger.ACTIVATE, "; ".join([what, *self._ended_before()])[:MAX_TEXT])
         self._new_episode(now_ns)
+
+    def _ended_before(self) -> list[str]:
+        """Why the last activation ended; nothing of it may have changed."""
+        return [f"the last activation ended: {self._ended}"] if self._ended else []
 
     def _hold_as_well(self, holder: str) -> None:
         """Add a deadman to an active arm; a present one cannot be replaced without a brake."""
@@ -341,6 +349,8 @@ class Commander:
         old, self.state, self.why = self.state, new, why
         if new not in OBEYING:
             self.contact.end()
+            if old in OBEYING:
+                self._ended = why if trigger is Trigger.LOSE else ""
         level = (
             "info"
             if new in OBEYING or trigger in (Trigger.DEACTIVATE, Trigger.RESET)

@@ -64,13 +64,13 @@ def note(name: str, why: str) -> Finding:
 def check_spec(
     profile: Profile, spec: ModelSpec, *, worker: str, rate_hz: float | None = None
 ) -> list[Finding]:
-    """All that does not fit.
+    """Findings about a spec on a profile.
 
     Args:
         profile: the effective profile.
         spec: what the model declares.
         worker: name of the worker.
-        rate_hz: chunks per second asked of it; None: as the profile says.
+        rate_hz: chunks per second requested; None: by the profile.
     """
     rate_hz = rate_hz or profile.task.rate_hz
     return [
@@ -181,10 +181,10 @@ def _task(profile: Profile, spec: ModelSpec, worker: str) -> Iterator[Finding]:
 def check_chunk(
     spec: ActionSpec, steps: Steps, limits: Limits, max_width_m: float
 ) -> list[Finding]:
-    """All that is not plausible in one chunk.
+    """Findings about the numbers of one chunk.
 
     Args:
-        spec: what the numbers are said to mean.
+        spec: the declared meaning of the numbers.
         steps: (H, D), as `vla_zenoh.policy.check_steps` gives them.
         limits: of the robot.
         max_width_m: of its gripper.
@@ -197,7 +197,7 @@ def check_chunk(
 
 
 def gripper_opening(spec: ActionSpec, steps: Steps) -> NDArray[np.float64] | None:
-    """How far each step opens the gripper, 0 shut to 1 open; None where it does not say so."""
+    """Opening of the gripper at each step, 0 closed to 1 open; None: not given as a fraction."""
     if spec.gripper not in ("open_fraction", "binary"):
         return None
     value = steps[:, -1].astype(np.float64)
@@ -317,7 +317,7 @@ def _gripper(spec: ActionSpec, value: NDArray[np.float64], max_width_m: float) -
     if spec.gripper not in bounds:
         return
     low, high = bounds[spec.gripper]
-    # A choice of two is one whatever the numbers; the others the command node would refuse.
+    # Any number is a valid choice of two; the command node would reject the others.
     level = warning if spec.gripper == "binary" else error
     for found in (float(value.min()), float(value.max())):
         if not low <= found <= high:

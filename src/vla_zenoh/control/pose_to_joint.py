@@ -175,7 +175,9 @@ class PoseToJoint:
         here = self._kinematics.forward(self._now.position_rad)
         lag = self._lag(here, smoother.motion.pose)
         self._update_constraints()
-        self._stopping = braking and (self._stopping or lag > 1.0)
+        # Held joints approach a standing pose for as long as it takes.
+        lags = lag > 1.0 or (bool(self._held) and smoother.at_rest)
+        self._stopping = braking and (self._stopping or lags)
         if self._stopping:
             self._stop(smoother)
             return

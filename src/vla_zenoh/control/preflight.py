@@ -1,4 +1,4 @@
-"""Every reason not to activate, at once: a person should not meet them one by one."""
+"""Preflight: all reasons against an activation, reported at once."""
 
 from __future__ import annotations
 
@@ -17,31 +17,30 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, GripperState, PoseState, Stamped
 
 CHUNK_PATIENCE_S = 2.0
-"""A worker that runs beside the robot publishes chunks all the time; the newest may be this old,
-and one period more."""
+"""Every worker publishes chunks all the time; its newest may be this old, plus one period."""
 CLOCK_TOLERANCE_S = 0.02
-"""A state may seem to come from the future by this much before clocks are said to differ."""
+"""A state may be stamped this far in the future before clocks count as different."""
 CAMERA_PATIENCE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class PeerSnapshot:
-    """What the command node knows of the nodes around it.
+    """What the command node knows about the other nodes.
 
     Args:
-        alive: names of the nodes whose liveliness token stands.
+        alive: names of the nodes that have a liveliness token.
         robot_node: the node that drives the robot.
-        specs: worker -> the spec it published last.
-        spec_sources: worker -> who published that spec; only this source speaks for the worker.
-        worker_complaints: worker -> why it cannot infer, where it said so.
-        camera_ages_s: camera -> age of its newest picture, as its node says.
+        specs: worker -> its newest spec.
+        spec_sources: worker -> source of that spec, the only one whose chunks count.
+        worker_complaints: worker -> why it cannot infer, by its status.
+        camera_ages_s: camera -> age of its newest image, by its node's status.
         camera_nodes: camera -> the node that serves it.
-        hosts: node -> where it runs, as it says.
-        beside: nodes that certainly run on the computer of the command node, and share its clock.
-        clocks: node -> its clock minus that of the command node, where it was measured.
-        holders: who is there to hold the arm active.
-        camera_faults: camera -> why it must not be believed, as its node says: how a sentence that
-            begins with ``camera NAME`` goes on.
+        hosts: node -> its host, by its status.
+        same_host: nodes that certainly run on the command node's host and share its clock.
+        clocks: node -> its clock minus that of the command node, where measured.
+        holders: clients present as a deadman.
+        camera_faults: camera -> why its images are invalid, by its node's status: the rest of a
+            sentence that starts with ``camera NAME``.
     """
 
     alive: frozenset[str] = frozenset()
@@ -69,18 +68,18 @@ def reasons_not_to_activate(
     now_ns: int,
     rate_hz: float = 1.0,
 ) -> list[str]:
-    """All of them as sentences, empty when the arm may move.
+    """All reasons against an activation as sentences, empty if the arm may move.
 
     Args:
         profile: the effective profile.
-        worker: the worker that holds the lease.
+        worker: the worker that gets the lease.
         prompt: the prompt in force.
         around: see `PeerSnapshot`.
         pose: newest TCP pose.
         gripper: newest gripper state.
-        chunk: newest chunk of that worker, made while it was not obeyed.
+        chunk: newest chunk of that worker, published without the lease.
         now_ns: same clock as the records' ``received_ns``.
-        rate_hz: chunks per second asked of the worker.
+        rate_hz: chunks per second requested of the worker.
     """
     return [
         *_robot(profile, peers, pose, now_ns),
@@ -103,7 +102,7 @@ def _robot(
     if peers.robot_node not in peers.alive:
         reasons.append(f"the robot's node {peers.robot_node!r} is not alive")
     if pose is None:
-        return [*reasons, "the TCP pose is not known: nothing was heard on state/pose"]
+        return [*reasons, "the TCP pose is not known: nothing received on state/pose"]
     reasons += _too_old("TCP pose", pose, profile, now_ns)
     delay_s = (pose.received_ns - pose.header.stamp_wall_ns) / 1e9
     if not -CLOCK_TOLERANCE_S <= delay_s <= CLOCK_TOLERANCE_S + profile.timing.state_timeout_s:
@@ -124,7 +123,7 @@ def _robot(
 
 def _gripper(profile: Profile, gripper: Stamped[GripperState] | None, now_ns: int) -> list[str]:
     if gripper is None:
-        return ["the gripper is not known: nothing was heard on state/gripper"]
+        return ["the gripper is not known: nothing received on state/gripper"]
     reasons = _too_old("gripper's state", gripper, profile, now_ns)
     if gripper.record.faults:
         reasons.append(f"the robot reports: {'; '.join(gripper.record.faults)}")
@@ -160,7 +159,7 @@ def _worker(worker: str, prompt: str, peers: PeerSnapshot) -> list[str]:
 
 
 def _spec(profile: Profile, worker: str, peers: PeerSnapshot, rate_hz: float) -> list[str]:
-    """What its spec asks for and the profile does not give."""
+    """Requirements of its spec that the profile does not meet."""
     spec = peers.specs.get(worker)
     if spec is None:
         return []
@@ -186,7 +185,7 @@ def _chunk(
         return []
     oldest_s = profile.timing.max_observation_age_s
     patience_s = max(CHUNK_PATIENCE_S, oldest_s) + 1.0 / rate_hz
-    # What a worker that was restarted had published before says nothing about it.
+    # Chunks from before a restart of the worker do not count.
     ours = chunk is not None and chunk.header.source == peers.spec_sources.get(worker)
     if chunk is None or not ours or now_ns - chunk.received_ns > patience_s * 1e9:
         return [f"worker {worker!r} has published no chunk in the last {patience_s:g} s"]
@@ -225,7 +224,7 @@ def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
     for wanted in spec.observation.cameras:
         camera = wanted.camera
         if camera not in profile.cameras:
-            continue  # said already, by what the spec asks for
+            continue  # reported already, with the spec
         age_s = peers.camera_ages_s.get(camera, math.inf)
         node = peers.camera_nodes.get(camera)
         if node is None or node not in peers.alive:
@@ -238,7 +237,7 @@ def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
 
 
 def _clocks(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
-    """Clocks that are off by more than can be reckoned with, or not known and not our own."""
+    """Clocks with too large an offset, or an unknown one on another host."""
     spec = peers.specs.get(worker)
     cameras = spec.observation.cameras if spec is not None else ()
     nodes = [peers.robot_node, worker_node(worker)]

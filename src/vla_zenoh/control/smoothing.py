@@ -1,21 +1,20 @@
-"""Jerk-limited motion towards a pose that may change at any tick: Ruckig on R^3 x SO(3).
+"""Jerk-limited motion to a target pose that may change at any tick: Ruckig on R^3 x SO(3).
 
 Translation is planned in the base frame. Rotation is planned as the rotation vector ``r`` of
 ``R_anchor^T R``; at every new target the anchor moves to the current smoothed rotation, so ``r``
 starts at zero, stays small, never wraps at pi, and velocity and acceleration carry over exactly
 (at r = 0, r' is the body velocity and r'' the body acceleration).
 
-A motion that already goes along the straight way to its target, or stands, is planned as one
-degree of freedom along that way: it stays on the line whatever the limits become. The same holds
-for its translation or its rotation alone, where what moves beside the way is little: that has
-degrees of freedom of its own. Any other motion has one for each axis. Those along the way, or of
-all axes, are synchronised in time.
+A motion that is already on the straight line to its target, or stands, is planned as one degree of
+freedom along that line: it stays on it whatever the limits become. The same holds for translation
+or rotation alone, if the motion beside the line is small: that gets degrees of freedom of its own.
+Any other motion has one per axis. Those along the line, or of all axes, are synchronised in time.
 
-Ruckig solves for profiles of a given duration by root finding with a precision of 1e-8. An axis
-that stands at its target but carries rounding noise (a velocity of 1e-16) while another axis takes
-long can be given a profile that leaves at full jerk and comes back. So what Ruckig cannot tell from
-zero is set to zero before it plans, and a plan in which an axis leaves the range between its start,
-its target and where it could stop is replaced by one in which each axis goes as fast as it can.
+Ruckig finds profiles of a given duration by root finding with a precision of 1e-8. An axis that
+stands at its target with rounding noise (a velocity of 1e-16), while another axis takes long, can
+get a profile that leaves at full jerk and comes back. So values that Ruckig cannot tell from zero
+are set to zero before planning, and a plan in which an axis leaves the range between its start, its
+target and its stop is replaced by one in which each axis moves as fast as it can.
 
 Ruckig: Berscheid and Kroeger, "Jerk-limited real-time trajectory generation with arbitrary target
 states", RSS 2021.
@@ -44,23 +43,26 @@ from vla_zenoh.types import FloatArray
 AXES = 6
 TRANSLATION, ROTATION = slice(0, 3), slice(3, 6)
 REST_VELOCITY = 1e-6
-"""m/s and rad/s: slower counts as standing."""
+"""m/s and rad/s: slower counts as at rest."""
 REST_OFFSET = 1e-6
-"""m and rad: nearer to the target counts as there. Ruckig may end some 1e-9 beside it."""
+"""m and rad: nearer to the target counts as reached. Ruckig may end some 1e-9 off."""
 
 QUIET = (1e-8, 1e-8, 1e-6)
-"""m or rad, per s, per s^2: smaller is noise, and taken for zero. The first two are the precision
-of Ruckig's solver; such an acceleration changes a velocity by less than that within a tick."""
-ASTRAY = 1e-6
-"""m and rad: a plan may leave the range between start, target and stop by this much: rounding."""
+"""m or rad, per s, per s^2: smaller values are noise and set to zero. The first two are the
+precision of Ruckig's solver; such an acceleration changes a velocity by less in a tick."""
+OVERSHOOT = 1e-6
+"""m and rad: rounding by which a plan may leave the range between start, target and stop."""
 
 BESIDE = 0.01
-"""Part of the limits that motion beside the way may have: a goal is a float32, and 30 nm aside."""
+"""Part of the limits for motion beside the line: goals are float32, 30 nm off the line."""
+ON_LINE = 2e-7
+"""m and rad: a goal nearer to the line of the motion is on it. The direction of such a goal means
+nothing where the arm is about to pass it."""
 TINY, MOST = 1e-12, 1e9
 
 ROTATION_BOX = 0.55
-"""Share of a rotation limit given to each axis, so that the norm over three axes (sqrt 3 of it) and
-the small terms of a moving chart (5 %) stay below the limit whatever the direction."""
+"""Share of a rotation limit per axis, so that the norm over three axes (sqrt 3 of it) and the small
+terms of a moving chart (5 %) stay below the limit in any direction."""
 
 
 class MotionLimits(NamedTuple):
@@ -71,7 +73,7 @@ class MotionLimits(NamedTuple):
 
 
 def motion_limits(limits: Limits) -> MotionLimits:
-    """The profile's limits of the smoothed motion."""
+    """The motion limits of a profile."""
     translation, rotation = limits.translation, limits.rotation
     return MotionLimits(
         (translation.velocity_m_s, translation.acceleration_m_s2, translation.jerk_m_s3),
@@ -80,7 +82,7 @@ def motion_limits(limits: Limits) -> MotionLimits:
 
 
 class Shares(NamedTuple):
-    """Parts of the limits of velocity, acceleration and jerk, each above 0 and at most 1."""
+    """Shares of the limits of velocity, acceleration and jerk, each above 0 and at most 1."""
 
     velocity: float = 1.0
     acceleration: float = 1.0
@@ -116,19 +118,19 @@ class _Plan:
     """A planned motion: a path in k coordinates along the columns of a basis.
 
     Args:
-        start: (6,) where it begins.
+        start: (6,) its start.
         basis: (6, k).
-        path: of the k coordinates, which begin at zero.
+        path: of the k coordinates, which start at zero.
     """
 
     def __init__(self, start: FloatArray, basis: FloatArray, path: Trajectory) -> None:
         self._start, self._basis, self._path = start, basis, path
         self.duration_s: float = path.duration
         self.end = start + basis @ path.at_time(path.duration)[0]
-        """(6,) where it ends."""
+        """(6,) its end."""
 
     def range_m(self) -> tuple[FloatArray, FloatArray]:
-        """(3,) at most as low and as high as this every axis of the translation goes."""
+        """Bounds (3,) below and above the translation along each axis."""
         low, high = _extrema(self._path)
         basis = self._basis[:3]
         reached = np.stack([basis * low, basis * high])
@@ -136,7 +138,7 @@ class _Plan:
         return start + reached.min(axis=0).sum(axis=1), start + reached.max(axis=0).sum(axis=1)
 
     def at(self, time_s: float) -> _State:
-        """State at `time_s` after its beginning."""
+        """State `time_s` after the start."""
         if time_s >= self.duration_s:
             return _State(self.end, np.zeros(AXES), np.zeros(AXES))
         position, velocity, acceleration = self._path.at_time(time_s)
@@ -145,13 +147,13 @@ class _Plan:
 
 
 class Smoother:
-    """Follows targets within velocity, acceleration and jerk limits, or brakes.
+    """Trajectory generator: moves to targets within motion limits, or brakes.
 
     Args:
-        pose: where it stands at first.
+        pose: initial pose.
         dt_s: duration of a tick.
         limits: of the motion.
-        bounds_m: lower and upper corner (3,) of the box that it has to stay in; None: none.
+        bounds_m: lower and upper corner (3,) of the box to stay in; None: none.
     """
 
     def __init__(
@@ -173,14 +175,14 @@ class Smoother:
         return [limits.translation[order]] * 3 + [limits.rotation[order] * ROTATION_BOX] * 3
 
     def reset(self, pose: Pose) -> None:
-        """Stand still at `pose`, forgetting all motion. Only for an arm that is not streamed to."""
+        """Stand at `pose` without any motion; only while nothing is streamed."""
         self._anchor = orthonormal(pose.rotation)
         zeros = np.zeros(AXES)
         self._state = _State(np.array([*pose.position_m, 0.0, 0.0, 0.0]), zeros, zeros)
         self._target = self._state.position
         self._plan: _Plan | None = None
         self._elapsed_s = 0.0
-        self.braking = False
+        self.braking = self._slowing = False
         self.motion = Motion(
             Pose(np.array(pose.position_m, dtype=np.float64), self._anchor),
             np.zeros(6),
@@ -188,48 +190,57 @@ class Smoother:
         )
 
     def target(self, pose: Pose, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
-        """Head for `pose` from the present state, without a step in velocity or acceleration.
+        """Move to `pose` from the present state, without a step in velocity or acceleration.
 
         Args:
-            pose: where to.
-            shares: of the limits; a faster motion slows down within them. More of the jerk is used
-                where the arm would get too fast first, or turn round.
-            all_to_stop: where these do not let it stop at `pose`, though all of acceleration and
-                jerk would, those are taken. Not to leave the box they are taken in any case.
+            pose: the target.
+            shares: of the limits; a faster motion slows down within them. More jerk is used if the
+                arm would otherwise exceed the velocity limit first, or reverse.
+            all_to_stop: use all of acceleration and jerk if the shares do not suffice to stop at
+                `pose`. To stay in the box they are used in any case.
 
         Returns:
-            whether the shares are enough.
+            whether the shares suffice.
         """
         self._anchor_here()
         self.braking = False
         self._target = np.array([*pose.position_m, *log3(self._anchor.T @ pose.rotation)])
-        limits = self.box * np.array(shares._replace(jerk=self._enough_jerk(shares)))[:, None]
+        limits = self.box * np.array(shares._replace(jerk=self._least_jerk(shares)))[:, None]
         way = self._target - self._state.position
         way[np.abs(way) < QUIET[0]] = 0.0
+        _, velocity, acceleration = self._state
+        slows = velocity * acceleration < 0
+        self._slowing = bool((slows & (np.abs(velocity) > limits[0])).any())
         plan, enough = self._towards(way, limits, all_to_stop)
         self._begin(plan)
         return enough
+
+    @property
+    def slowed_down(self) -> bool:
+        """It was too fast for the shares of its target, and no longer is: they hold now."""
+        return self._slowing and not (self._state.velocity * self._state.acceleration < 0).any()
 
     def brake(self, shares: Shares | None = None) -> None:
         """Come to rest as fast as the limits allow, each axis by itself.
 
         Args:
-            shares: of the limits, where not all can be had; all axes then stop together, for what
-                bounds them is bound to the direction. More of the jerk is used where the arm would
-                get too fast otherwise. Not looked at while it brakes already.
+            shares: of the limits; all axes then stop together, because the shares hold for the
+                present direction. More jerk is used if the arm would otherwise exceed the velocity
+                limit. Ignored while it brakes already.
         """
         if self.braking:
             return
         self._anchor_here()
         limits = self.box
         if shares is not None:
-            limits = limits * np.array(shares._replace(jerk=self._enough_jerk(shares)))[:, None]
+            jerk = self._least_jerk(shares._replace(velocity=1.0))
+            limits = limits * np.array(shares._replace(jerk=jerk))[:, None]
         self.braking = True
         self._begin(self._stop(limits, together=shares is not None))
 
     # -- planning -----------------------------------------------------------------------------
     def _begin(self, plan: _Plan | None) -> None:
-        """Go on with `plan`; where there is none brake, and where that cannot be planned stand."""
+        """Execute `plan`; without one brake, and if that cannot be planned, stand."""
         self._elapsed_s = 0.0
         if plan is None:
             self.failures += 1
@@ -243,17 +254,17 @@ class Smoother:
     def _towards(
         self, way: FloatArray, limits: FloatArray, all_to_stop: bool
     ) -> tuple[_Plan | None, bool]:
-        """The plan of a motion by `way` (6,) without detours, and whether these limits do."""
+        """The plan of a motion by `way` (6,) without detours, and whether `limits` suffice."""
         if not np.isfinite(way).all():
             return None, False
         basis, parts = self._coordinates(way, limits)
         plan: _Plan | None = None
         hardest = np.concatenate([limits[:1], self.box[1:]])
         for most in (limits, hardest) if (limits < hardest).any() else (limits,):
-            ask = self._ask(basis, most, parts)
+            ask = self._input(basis, most, parts)
             ask.target_position = (basis.T @ way).tolist()
             for synchronization in (Synchronization.Time, Synchronization.No):
-                # What is beside the way ends as soon as it can, whatever the others do.
+                # Motion beside the line ends as soon as it can, independent of the others.
                 ask.per_dof_synchronization = [
                     Synchronization.No if part == BESIDE else synchronization for part in parts
                 ]
@@ -262,34 +273,38 @@ class Smoother:
                     continue
                 plan = _Plan(self._state.position, basis, path)
                 may_take = hardest if all_to_stop else most
-                # As fast as it can, and with all it may take: it goes no further than it has to.
+                # The fastest plan with all limits available: it goes no further than necessary.
                 shortest = most is may_take and (
                     synchronization is Synchronization.No or len(parts) == 1
                 )
-                astray = not shortest and self._goes_astray(
-                    path, basis.T @ way, self._ask(basis, may_take, parts)
+                overshoots = not shortest and self._overshoots(
+                    path, basis.T @ way, self._input(basis, may_take, parts)
                 )
-                if not astray and not self._leaves(plan):
+                if not overshoots and not self._leaves(plan):
                     return plan, most is limits
         return plan, False
 
     def _leaves(self, plan: _Plan) -> bool:
-        """Whether a planned motion leaves the box; from outside it may come in."""
+        """Whether a planned motion leaves the box; from outside it may enter."""
         if self.bounds_m is None:
             return False
         low, high = self.bounds_m
         start, end = self._state.position[:3], plan.end[:3]
-        inside = np.minimum(start, end) >= low - ASTRAY, np.maximum(start, end) <= high + ASTRAY
+        inside = (
+            np.minimum(start, end) >= low - OVERSHOOT,
+            np.maximum(start, end) <= high + OVERSHOOT,
+        )
         least, most = plan.range_m()
         return bool(
-            (inside[0] & (least < low - ASTRAY)).any() or (inside[1] & (most > high + ASTRAY)).any()
+            (inside[0] & (least < low - OVERSHOOT)).any()
+            or (inside[1] & (most > high + OVERSHOOT)).any()
         )
 
     def _coordinates(self, way: FloatArray, limits: FloatArray) -> tuple[FloatArray, list[float]]:
-        """(6, k) the fewest directions that a motion by `way` needs, and of the limits their parts.
+        """Basis (6, k) with the fewest directions for a motion by `way`, and their limit shares.
 
-        One, where all goes along the way already. Else those of translation and rotation: the way,
-        and what is left beside it where that is little; or the axes.
+        One, if the motion is already along `way`. Otherwise those of translation and rotation: the
+        line and two directions beside it if the motion there is small, or the axes.
         """
         velocity, acceleration = self._state[1:]
         whole = way / max(math.sqrt(float(way @ way)), TINY)
@@ -310,38 +325,43 @@ class Smoother:
     def _directions(
         self, way: FloatArray, limits: FloatArray, axes: slice
     ) -> tuple[FloatArray, list[float]]:
-        """The same of three axes: (3, k), with `way` (3,) and `limits` (3, 3) of those."""
+        """The same for three axes: (3, k), with `way` (3,) and `limits` (3, 3)."""
         motion = np.array([self._state.velocity[axes], self._state.acceleration[axes]])
-        length = norm3(way)
-        if length == 0.0:
-            return (np.eye(3), [1.0] * 3) if motion.any() else (np.zeros((3, 0)), [])
-        along = way / length
+        length, speed = norm3(way), norm3(motion[0])
+        if length == 0.0 and not motion.any():
+            return np.zeros((3, 0)), []
+        along = way / max(length, TINY)
         beside = motion - np.outer(motion @ along, along)
-        if (np.abs(beside) <= np.array(QUIET[1:])[:, None]).all():
+        if length > 0.0 and (np.abs(beside) <= np.array(QUIET[1:])[:, None]).all():
             return along[:, None], [1.0]
+        ahead = motion[0] / max(speed, TINY)
+        if speed > 0.0 and norm3(way - (way @ ahead) * ahead) < ON_LINE:
+            along, beside = ahead, motion - np.outer(motion @ ahead, ahead)
+        elif length == 0.0:
+            return np.eye(3), [1.0] * 3
         least = np.eye(3)[int(np.argmin(np.abs(along)))]
         across = cross3(along, least)
         across /= norm3(across)
         others = np.stack([across, cross3(along, across)])
         with np.errstate(divide="ignore"):
             most = BESIDE * (limits[:, None, :] / np.abs(others)).min(axis=2)
-        # It may be this fast once its acceleration has ended, and goes this far until it stops.
+        # Its greatest speed once its acceleration has ended, and its distance until it stops.
         fast, change = np.abs(beside @ others.T)
         fast = fast + change**2 / (2 * most[2])
         goes = fast * np.sqrt(fast / most[2]) + fast**2 / most[1]
-        if (goes < ASTRAY).all() and (fast < most[0]).all() and (change < most[1]).all():
+        if (goes < OVERSHOOT).all() and (fast < most[0]).all() and (change < most[1]).all():
             return np.stack([along, *others], axis=1), [1.0 - 2 * BESIDE, BESIDE, BESIDE]
         return np.eye(3), [1.0] * 3
 
-    def _goes_astray(self, path: Trajectory, target: FloatArray, ask: InputParameter) -> bool:
-        """Whether a coordinate leaves the range between its start, its target and where it stops.
+    def _overshoots(self, path: Trajectory, target: FloatArray, ask: InputParameter) -> bool:
+        """Whether a coordinate leaves the range between its start, its target and its stop.
 
         Args:
-            path: planned.
+            path: the plan.
             target: (k,).
-            ask: for a brake, with the limits that it may take.
+            ask: input for the stop, with its limits.
         """
-        least, most = np.minimum(target, 0.0) - ASTRAY, np.maximum(target, 0.0) + ASTRAY
+        least, most = np.minimum(target, 0.0) - OVERSHOOT, np.maximum(target, 0.0) + OVERSHOOT
         low, high = _extrema(path)
         if (low >= least).all() and (high <= most).all():
             return False
@@ -352,13 +372,13 @@ class Smoother:
             return True
         stop_low, stop_high = _extrema(stop)
         return bool(
-            (low < np.minimum(least, stop_low - ASTRAY)).any()
-            or (high > np.maximum(most, stop_high + ASTRAY)).any()
+            (low < np.minimum(least, stop_low - OVERSHOOT)).any()
+            or (high > np.maximum(most, stop_high + OVERSHOOT)).any()
         )
 
     def _stop(self, limits: FloatArray, *, together: bool) -> _Plan | None:
         basis = np.eye(AXES)
-        ask = self._ask(basis, limits, [1.0] * AXES)
+        ask = self._input(basis, limits, [1.0] * AXES)
         ask.control_interface = ControlInterface.Velocity
         for synchronization in [Synchronization.Phase] * together + [Synchronization.No]:
             ask.synchronization = synchronization
@@ -367,13 +387,13 @@ class Smoother:
                 return _Plan(self._state.position, basis, path)
         return None
 
-    def _ask(self, basis: FloatArray, limits: FloatArray, parts: list[float]) -> InputParameter:
-        """What Ruckig is asked along the columns of `basis` (6, k), each by its part of limits."""
+    def _input(self, basis: FloatArray, limits: FloatArray, parts: list[float]) -> InputParameter:
+        """Ruckig's input along the columns of `basis` (6, k), each with its part of the limits."""
         _, velocity, acceleration = self._state
         with np.errstate(divide="ignore"):
             along = (limits[:, :, None] / np.abs(basis)).min(axis=1) * np.array(parts)
         velocity, acceleration = velocity @ basis, acceleration @ basis
-        # Slowing down, and slow enough once that ends: to slow down harder would turn round.
+        # Slowing down, and slow enough once that ends: braking harder would reverse the motion.
         speed = np.abs(velocity)
         slows = velocity * acceleration < 0
         after = speed - acceleration**2 / (2 * along[2])
@@ -385,7 +405,7 @@ class Smoother:
         return ask
 
     def _calculated(self, ask: InputParameter) -> Trajectory | None:
-        """The trajectory of `ask`, None where Ruckig finds none."""
+        """The trajectory for `ask`, None if Ruckig finds none."""
         size = ask.degrees_of_freedom
         path = Trajectory(size)
         ruckig = self._ruckigs.setdefault(size, Ruckig(size))
@@ -395,20 +415,20 @@ class Smoother:
             return None
         return path if done else None
 
-    def _enough_jerk(self, shares: Shares) -> float:
-        """At least that part of the jerk limits that an acceleration needs to end in time.
+    def _least_jerk(self, shares: Shares) -> float:
+        """The share of the jerk limits that lets every acceleration end in time.
 
-        Before its axis is faster than its limit where it speeds up, before that turns round where
-        it slows down. With less of it the arm would go on speeding up for a while, to any speed.
+        In time is before an axis exceeds its share of the velocity limit, or reverses while it
+        slows down. With less jerk the arm would continue to accelerate, to any speed.
         """
         _, velocity, acceleration = self._state
         speed = np.abs(velocity)
-        room = np.where(velocity * acceleration < 0, speed, self.box[0] - speed)
+        room = np.where(velocity * acceleration < 0, speed, shares.velocity * self.box[0] - speed)
         needed = acceleration**2 / (2 * np.maximum(room, REST_VELOCITY)) / self.box[2]
         return max(shares.jerk, min(float(needed.max()), 1.0))
 
     def resting_pose(self) -> Pose:
-        """Brake, and foretell where that ends."""
+        """Brake, and return where the brake will end."""
         if self.at_rest:
             return self.motion.pose
         self.brake()
@@ -418,7 +438,7 @@ class Smoother:
         return Pose(end[:3], orthonormal(self._anchor @ exp3(end[3:])))
 
     def brake_from(self, motion: Motion) -> None:
-        """Take over a motion that somebody else made, and brake."""
+        """Brake from the state of another motion."""
         self.reset(motion.pose)
         body = motion.pose.rotation.T
         (velocity, spin), (change, spin_change) = (
@@ -436,8 +456,8 @@ class Smoother:
         """Advance by one tick.
 
         Args:
-            pace: part of the tick by which the motion goes on: who follows it may be slow. Twist
-                and acceleration are those of the motion at its own pace.
+            pace: part of the tick by which the motion advances, for a slow follower. Twist and
+                acceleration are those at full pace.
         """
         if self._plan is None:
             return self.motion
@@ -454,7 +474,7 @@ class Smoother:
 
     @property
     def at_rest(self) -> bool:
-        """Standing, and not about to start."""
+        """The motion stands, and is not about to start."""
         if self._plan is None:
             return True
         if float(np.abs(self.motion.twist).max()) > REST_VELOCITY:
@@ -464,7 +484,7 @@ class Smoother:
         return float(np.abs(self._target - self._state.position).max()) < REST_OFFSET
 
     def _anchor_here(self) -> None:
-        """Move the anchor to the present rotation, and take noise for zero."""
+        """Move the anchor to the present rotation, and set noise to zero."""
         position, velocity, acceleration = self._state
         spin, spin_change = body_rates(position[3:], velocity[3:], acceleration[3:])
         self._anchor = orthonormal(self._anchor @ exp3(position[3:]))

@@ -1,10 +1,10 @@
-"""The command node's state machine, as a table. Everything that changes the state is in this file.
+"""The state machine of the command node, as a table of all transitions.
 
-INACTIVE   stands, obeys nobody
-ACTIVE     carries out chunks
-HOLDING    nothing fresh came: brakes, stands, goes on with the next fresh chunk
+INACTIVE   stands and executes nothing
+ACTIVE     executes chunks
+HOLDING    no fresh chunk: brakes, stands, resumes with the next fresh chunk
 STOPPED    emergency stop, latched until reset
-FAULT      the robot or the command node itself reports a fault, latched until reset
+FAULT      fault of the robot or the command node, latched until reset
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from enum import StrEnum
 
 
 class State(StrEnum):
-    """See the module."""
+    """State of the command node; the values are wire names."""
 
     INACTIVE = "inactive"
     ACTIVE = "active"
@@ -23,16 +23,16 @@ class State(StrEnum):
 
 
 class Trigger(StrEnum):
-    """What can happen."""
+    """Events that may change the state."""
 
-    ACTIVATE = "activate"  # asked for, and preflight found nothing
+    ACTIVATE = "activate"  # requested, and preflight found no reason against it
     DEACTIVATE = "deactivate"
-    FRESH = "fresh"  # a chunk was accepted
+    FRESH = "fresh"  # a chunk came into force
     STARVE = "starve"  # no fresh chunk within the watchdog
     LOSE = "lose"  # robot, worker or camera gone, or the arm is blocked
     STOP = "stop"
     FAULT = "fault"
-    RESET = "reset"  # asked for, and no fault is left
+    RESET = "reset"  # requested, and no fault is left
 
 
 TABLE: dict[tuple[State, Trigger], State] = {
@@ -55,13 +55,13 @@ TABLE: dict[tuple[State, Trigger], State] = {
 }
 
 OBEYING = frozenset({State.ACTIVE, State.HOLDING})
-"""States in which a chunk of the leased worker is carried out."""
+"""States in which chunks of the leased worker are executed."""
 
 
 DEACTIVATED = "deactivated"
-"""Why it is inactive when somebody said so."""
+"""The reason of an INACTIVE state that a client requested."""
 
 
 def after(state: State, trigger: Trigger) -> State:
-    """The state after `trigger`; unchanged where the table has no edge."""
+    """The state after `trigger`; unchanged if the table has no such transition."""
     return TABLE.get((state, trigger), state)

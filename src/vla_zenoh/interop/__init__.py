@@ -1,1 +1,1 @@
-"""Other people's wires: what it takes to speak them, without a session."""
+"""Protocols of other systems, without I/O: policy servers and ROS 2."""

@@ -1,26 +1,26 @@
-"""What the numbers of a policy mean that was not made for this package, as a person says it.
+"""Meaning of a foreign policy's output, by options of the user.
 
-One set of options for policy servers, LeRobot's directories and OpenVLA's::
+The same options serve policy servers, LeRobot checkpoints and OpenVLA checkpoints::
 
     action     delta, absolute (of the TCP); joint_delta, joint_position (become absolute poses
                by the arm's forward kinematics)
     frame      base, tcp: axes of a delta
     rotation   rpy, rotvec, quat_xyzw, quat_wxyz
-    clip       numbers of the arm are clipped to [-clip, clip] first; empty: not
+    clip       numbers of the arm are clipped to [-clip, clip] first; empty: never
     position_scale_m, rotation_scale_rad, joint_scale_rad   one unit of the numbers
     gripper    none, delta_m, absolute_m, open_fraction, binary
     gripper_open       high, low: which end of binary and open_fraction is open
     gripper_threshold  of binary
     dt_s       duration of a step
-    horizon    steps taken from an answer, at most
+    horizon    largest number of steps used from an answer
 
-A meaning that nobody said is asked for: a wrong guess moves a robot.
+Missing options are an error, never guessed: a wrong guess moves a robot.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal, cast, get_args
@@ -29,11 +29,53 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from vla_zenoh.errors import SpecError, describe_fault
-from vla_zenoh.interop.joints import Forward, poses_of
+from vla_zenoh.errors import MissingExtraError, SpecError, describe_fault
+from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.policy import ActionSpec, Frame, GripperSemantics, Rotation
 from vla_zenoh.policy.model_options import number, one_of, whole_number
+from vla_zenoh.profile import Profile
 from vla_zenoh.types import JointState
+
+Forward = Callable[[JointState, NDArray[np.float64]], NDArray[np.float64]]
+"""Measured joints and (H, n) joint positions in their order -> (H, 7) position and quat_xyzw."""
+
+
+def make_forward(profile: Profile) -> Forward:
+    """Forward kinematics of the profile's arm.
+
+    Raises:
+        MissingExtraError: Pinocchio is not installed.
+        ResourceError: the robot's description is not there.
+        ProfileError: frames or joints that the description does not have.
+    """
+    try:
+        from vla_zenoh.kinematics.kinematics import make_kinematics
+    except ImportError as error:
+        raise MissingExtraError(error.name or "pinocchio", "control") from error
+    kinematics = make_kinematics(profile)
+
+    def forward(measured: JointState, joints_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+        poses = [kinematics.forward(kinematics.ordered(measured.names, row)) for row in joints_rad]
+        return np.array([[*pose.position_m, *quat_from_rotation(pose.rotation)] for pose in poses])
+
+    return forward
+
+
+def poses_of(
+    rows_rad: NDArray[np.float64], measured: JointState, forward: Forward, *, deltas: bool
+) -> NDArray[np.float64]:
+    """TCP poses (H, 7) of joint positions: position and quat_xyzw.
+
+    Args:
+        rows_rad: (H, n) joints of each step, in the order of the measured ones.
+        measured: joints of the observation.
+        forward: kinematics of the arm.
+        deltas: each row is added to the previous one, the first to the measured joints.
+    """
+    if deltas:
+        rows_rad = measured.position_rad + np.cumsum(rows_rad, axis=0)
+    return forward(measured, rows_rad)
+
 
 Action = Literal["delta", "absolute", "joint_delta", "joint_position"]
 ForeignRotation = Literal["rpy", "rotvec", "quat_xyzw", "quat_wxyz"]
@@ -52,10 +94,10 @@ ACTION_OPTIONS: Mapping[str, str] = {
     "dt_s": "",
     "horizon": "",
 }
-"""Every option with its default; empty: none, but for `clip`."""
+"""Every option with its default; empty: no default, except for `clip`."""
 OPEN = ("high", "low")
 QUATERNION_SLACK = 0.1
-"""A network's quaternion this far from unit length is brought to it; further is something else."""
+"""A quaternion this far from unit length is normalised; further off it is rejected."""
 _ASKED: Mapping[str, str] = {
     "action": " or ".join(get_args(Action)),
     "rotation": " or ".join(get_args(ForeignRotation)),
@@ -68,12 +110,12 @@ _ASKED: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class ActionSemantics:
-    """See the module. Made by `read_action_semantics`.
+    """Converts a foreign policy's output to action steps; made by `read_action_semantics`.
 
     Args:
-        spec: what our side is told: metres and radians.
-        action: what the arm's numbers are.
-        rotation: in which form they have it, where they are poses.
+        spec: of the converted steps, in metres and radians.
+        action: kind of the arm's numbers.
+        rotation: their representation of rotations, if they are poses.
         clip: bound of the arm's raw numbers; 0: none.
         scales: (position, rotation, joint) one unit in m, rad, rad.
     """
@@ -86,11 +128,11 @@ class ActionSemantics:
 
     @property
     def needs_joints(self) -> bool:
-        """Its numbers are joints, so forward kinematics are needed."""
+        """Whether its numbers are joints, which need forward kinematics."""
         return _of_joints(self.action)
 
     def parts(self, joints: int) -> dict[str, int]:
-        """What a row holds, in order, and how many numbers that is, of an arm with `joints`."""
+        """Parts of a row in order, with their sizes, for an arm with `joints`."""
         turns = 4 if self.rotation.startswith("quat") else 3
         arm = {"joints": joints} if self.needs_joints else {"position": 3, self.rotation: turns}
         return arm if self.spec.gripper == "none" else {**arm, "gripper": 1}
@@ -101,15 +143,15 @@ class ActionSemantics:
         joint: JointState | None = None,
         forward: Forward | None = None,
     ) -> NDArray[np.float64]:
-        """(H, D) in the meaning of `spec`.
+        """Action steps (H, D) as `spec` declares them.
 
         Args:
-            rows: (H, C) as `parts` says.
-            joint: where the arm was when it was looked at; for joints.
-            forward: kinematics of the arm; likewise.
+            rows: (H, C), laid out as in `parts`.
+            joint: measured joints of the observation; for joints.
+            forward: kinematics of the arm; for joints.
 
         Raises:
-            SpecError: another number of columns, or a quaternion that is none.
+            SpecError: wrong number of columns, or a quaternion without unit length.
         """
         parts = self.parts(0 if joint is None else len(joint.names))
         if rows.shape[1] != sum(parts.values()):
@@ -144,35 +186,35 @@ def _of_joints(action: str) -> bool:
 
 
 def read_action_semantics(
-    told: Mapping[str, str],
+    given: Mapping[str, str],
     known: Mapping[str, str] | None = None,
     whose: str = "",
     *,
     normalisation: str | None = None,
 ) -> ActionSemantics:
-    """The meaning that options give.
+    """The semantics that options define.
 
     Args:
-        told: by a person, any of `ACTION_OPTIONS`.
-        known: options that a preset or the name of a data set stands for; `told` overrides them.
-            Another `action` is another meaning: then nothing but `horizon` is left of them.
-        whose: they are, for messages.
+        given: options of the user, any of `ACTION_OPTIONS`.
+        known: options of a preset or data set; `given` overrides them. If `given` has another
+            `action`, only the `horizon` of them is kept.
+        whose: owner of `known`, for messages.
         normalisation: for the spec.
 
     Raises:
-        SpecError: an option is not known, cannot be, or is missing; names what is allowed.
+        SpecError: unknown, invalid or missing option; names what is allowed.
     """
-    unknown = [name for name in told if name not in ACTION_OPTIONS]
+    unknown = [name for name in given if name not in ACTION_OPTIONS]
     if unknown:
         raise SpecError(
             f"no option {', '.join(map(repr, unknown))}; known: {', '.join(ACTION_OPTIONS)}"
         )
     known = {name: value for name, value in (known or {}).items() if name in ACTION_OPTIONS}
-    action = told.get("action") or known.get("action", "")
+    action = given.get("action") or known.get("action", "")
     other = bool(known.get("action")) and action != known["action"]
     if other:
         known = {name: value for name, value in known.items() if name == "horizon"}
-    chosen = {**ACTION_OPTIONS, **known, **told, "action": action}
+    chosen = {**ACTION_OPTIONS, **known, **given, "action": action}
     for name, allowed in (
         ("action", get_args(Action)),
         ("rotation", get_args(ForeignRotation)),
@@ -207,7 +249,7 @@ def _ask_for_missing(chosen: Mapping[str, str], why: str) -> None:
     missing = [name for name in _ASKED if name in wanted and not chosen[name]]
     if missing:
         raise SpecError(
-            f"{why}nobody says what the numbers mean: "
+            f"{why}the meaning of the numbers is missing: "
             + ", ".join(f"--set {name}=({_ASKED[name]})" for name in missing)
         )
 
@@ -233,10 +275,10 @@ def _spec(chosen: Mapping[str, str], rotation: str, normalisation: str | None) -
 
 @contextmanager
 def as_spec_error() -> Iterator[None]:
-    """What a spec refuses, as a sentence that names each option.
+    """Turn pydantic's error of an invalid spec into one sentence that names each option.
 
     Raises:
-        SpecError: a spec was not valid.
+        SpecError: a spec was invalid.
     """
     try:
         yield

@@ -1,8 +1,8 @@
-"""What all adapters are: workers that ask a policy server, each over a wire of its own.
+"""Base class of the adapters: models that query a foreign policy server.
 
-An adapter connects, asks, and takes the answer for what its options say. An answer is waited for no
-longer than `timeout_s`. A connection on which anything went wrong is thrown away, so that no answer
-is taken for that of a later question, and a lost server is tried again as `Backoff` says.
+An adapter sends an observation and converts the answer by its options. It waits for an answer for
+at most `timeout_s`. A connection on which anything failed is closed, so that no answer is mistaken
+for that of a later request; a lost server is retried with `Backoff`.
 """
 
 from __future__ import annotations
@@ -12,43 +12,69 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop.backoff import Backoff
-from vla_zenoh.interop.joints import Forward, make_forward
-from vla_zenoh.interop.options import read_field_mapping, read_timeout
+from vla_zenoh.interop.action_semantics import Forward, make_forward
+from vla_zenoh.interop.field_mapping import read_field_mapping, read_timeout
 from vla_zenoh.interop.presets import Presets
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
 from vla_zenoh.profile import load_profile
 
+FIRST_S = 0.25
+LONGEST_S = 2.0
+"""The robot holds meanwhile: retry soon, but not in a tight loop."""
+
+
+class Backoff:
+    """Exponential backoff: retries at once, then after `FIRST_S`, doubling up to `LONGEST_S`."""
+
+    def __init__(self) -> None:
+        self.failures = 0
+        self._next_s = 0.0
+
+    def wait_s(self, now_s: float) -> float:
+        """Time until the next try, 0 if it is due."""
+        return max(self._next_s - now_s, 0.0)
+
+    def failed(self, now_s: float) -> None:
+        """A try failed at `now_s`."""
+        pause_s = min(FIRST_S * 2.0 ** min(self.failures, 16), LONGEST_S)
+        self.failures += 1
+        self._next_s = now_s + pause_s
+
+    def succeeded(self) -> None:
+        """The server answered: the next loss is retried at once."""
+        self.failures, self._next_s = 0, 0.0
+
+
 ANSWERED = ("peer_error", "peer_reply")
-"""Whoever says so is there, and is asked again soon."""
+"""Reasons of a server that is alive, and is retried soon."""
 
 
 class Adapter(ABC):
-    """See the module. A file in models/ has one subclass, with the options of its server.
+    """A model that queries a policy server; each subclass in models/ speaks one protocol.
 
     Args:
         name: of the model, for its spec.
         where: the server, for messages.
         presets: name -> options.
-        preset: which of them.
-        layout: options that override it, see `vla_zenoh.interop.options`.
+        preset: name of the preset.
+        layout: options that override it, see `vla_zenoh.interop.field_mapping`.
         timeout_s: for connecting, and for each answer.
-        profile: of the robot: its gripper and, where answers are joints, its arm.
+        profile: of the robot: its gripper and, if answers are joints, its arm.
         clock_s: seconds that only go forwards.
         normalisation: for the spec.
 
     Attributes:
-        spec: what the options say.
+        spec: of the model.
 
     Raises:
-        SpecError: an option is not known or cannot be; names what is allowed.
-        ProfileError: the profile cannot be read.
+        SpecError: unknown or invalid option; names what is allowed.
+        ProfileError: invalid profile.
     """
 
     joints: ClassVar[bool] = False
     """Whether its server may answer with joints."""
     lost: ClassVar[tuple[type[Exception], ...]] = (OSError,)
-    """What its library raises when a connection cannot be had or was lost."""
+    """Exceptions of its library for a connection that failed or was lost."""
 
     def __init__(
         self,
@@ -80,64 +106,64 @@ class Adapter(ABC):
         self._clock_s, self._backoff = clock_s, Backoff()
         self._begins = True
 
-    # -- what a subclass has to know ----------------------------------------------------------
+    # -- implemented by subclasses ------------------------------------------------------------
     @abstractmethod
     def _connect(self) -> Sequence[str]:
-        """Make a connection where there is none, and say what does not fit in what it says.
+        """Connect if necessary; returns contradictions between server and mapping.
 
         Raises:
-            PeerError, or one of `lost`: there is no connection; `TimeoutError`: none in time.
+            PeerError, or one of `lost`: no connection; `TimeoutError`: none in time.
         """
 
     @abstractmethod
     def _ask(self, fields: dict[str, Any], *, begins: bool) -> Any:
-        """The answer to one question.
+        """The server's answer to one request.
 
         Args:
-            fields: the server's names with pictures, numbers and text.
+            fields: of the request: images, numbers and text.
             begins: it is the first of an episode.
 
         Raises:
-            PeerError, or one of `lost`: there is none; `TimeoutError`: none in time.
+            PeerError, or one of `lost`: no answer; `TimeoutError`: none in time.
         """
 
     def _lose(self) -> None:
-        """Throw away a connection on which something went wrong."""
+        """Close a connection on which something failed."""
         self.close()
 
     def close(self) -> None:
-        """Let go of the connection, if there is one."""
-        self.reset()  # the next one knows nothing of the episode
+        """Close the connection, if there is one."""
+        self.reset()  # the next connection starts an episode
 
-    # -- what a worker asks -------------------------------------------------------------------
+    # -- called by the worker -----------------------------------------------------------------
     def load(self) -> None:
-        """Kinematics, where they are needed; the server is asked with the first observation."""
+        """Load the kinematics if needed; the first observation connects to the server."""
         if self.mapping.semantics.needs_joints:
             self._forward = make_forward(self._profile)
 
     def reset(self) -> None:
-        """An episode begins: the server is told with the next question, where it listens."""
+        """Start an episode; a server that supports it gets the reset with the next request."""
         self._begins = True
 
     def infer(self, observation: Observation) -> ActionSteps:
-        """One question, one answer.
+        """Query the server.
 
         Raises:
-            PeerError: there is no answer that can be used; says why.
+            PeerError: no usable answer; says why.
         """
         wait_s = self._backoff.wait_s(self._clock_s())
         if wait_s > 0:
-            raise PeerError("peer_gone", f"{self.where} was lost; tried again in {wait_s:.1f} s")
+            raise PeerError("peer_gone", f"{self.where} was lost; retrying in {wait_s:.1f} s")
         try:
             return self.mapping.read(self._answer(observation), observation, self._forward)
-        except Exception as error:  # whatever it was: what is left on the wire is never read
+        except Exception as error:  # after any failure, nothing left on the wire may be read
             self._drop(answers=isinstance(error, PeerError) and error.reason in ANSWERED)
-            told = self._told(error)
-            if told is error:
+            reported = self._as_peer_error(error)
+            if reported is error:
                 raise
-            raise told from error
+            raise reported from error
 
-    def _told(self, error: Exception) -> Exception:
+    def _as_peer_error(self, error: Exception) -> Exception:
         if isinstance(error, TimeoutError):
             why = f"{self.where} did not answer within {self.timeout_s:g} s"
             return PeerError("peer_timeout", why)
@@ -149,7 +175,7 @@ class Adapter(ABC):
     def _answer(self, observation: Observation) -> Any:
         wrong = self._connect()
         if wrong:
-            raise PeerError("peer_mismatch", f"{self.where} does not fit: {'; '.join(wrong)}")
+            raise PeerError("peer_mismatch", f"{self.where} does not match: {'; '.join(wrong)}")
         answer = self._ask(self.mapping.request(observation), begins=self._begins)
         self._begins = False
         self._backoff.succeeded()

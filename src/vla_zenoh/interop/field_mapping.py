@@ -1,31 +1,60 @@
-"""How a policy server's names and numbers stand to ours: what it is sent, what its answer means."""
+"""Maps our observations to the fields of a foreign policy server, and its answers to action steps.
+
+The mapping is made of text options (``--set name=value``). A preset is a set of such options for a
+known robot, each of which can be overridden; the preset ``none`` is empty::
+
+    map        observation/image=camera:front, observation/state=position+rotvec+fingers_m,
+               prompt=prompt; also NAME=blank:HxW (black), NAME= (leave it out of the preset)
+    size       WIDTHxHEIGHT of every image, empty: as the camera gives it
+    resize     none, stretch, pad, crop
+    colour     rgb, bgr
+    keys       names in the answer, concatenated column-wise (groot: x,y,z,...)
+    columns    which of its columns, as 0:7 or 0,1,2,6
+
+For the meaning of the numbers see `vla_zenoh.interop.action_semantics`.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop.action_semantics import ActionSemantics
-from vla_zenoh.interop.joints import Forward
-from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
-from vla_zenoh.policy.state_vector import state_vector
+from vla_zenoh.interop.action_semantics import (
+    ACTION_OPTIONS,
+    ActionSemantics,
+    Forward,
+    as_spec_error,
+    read_action_semantics,
+)
+from vla_zenoh.policy import (
+    ActionSteps,
+    CameraSpec,
+    ModelSpec,
+    Observation,
+    ObservationSpec,
+    Resize,
+    StatePart,
+)
+from vla_zenoh.policy.model_options import number
+from vla_zenoh.policy.state_vector import parts_of, read_parts, state_vector
 from vla_zenoh.types import shown
 
 
 @dataclass(frozen=True, slots=True)
 class FieldSource:
-    """What one of the server's names is filled with.
+    """Content of one field of a request.
 
     Args:
-        camera: a picture of this camera, or empty.
-        parts: of the state, may be none.
+        camera: image of this camera, or empty.
+        parts: of the robot state, see `vla_zenoh.policy.state_vector`.
         prompt: the prompt.
-        blank: height and width of a black picture.
+        blank: height and width of a black image.
     """
 
     camera: str = ""
@@ -36,14 +65,14 @@ class FieldSource:
 
 @dataclass(frozen=True, slots=True)
 class FieldMapping:
-    """See the module. Made by `read_field_mapping`.
+    """Mapping between our records and one server, made by `read_field_mapping`.
 
     Args:
-        fields: the server's name -> what it is filled with.
-        spec: what our side is told.
+        fields: field of the request -> its content.
+        spec: of the model, on our side.
         keys: names in the answer.
-        columns: of the answer, None: all.
-        meaning: of its numbers.
+        columns: of the answer; None: all.
+        semantics: of its numbers.
         max_width_m: of our gripper.
     """
 
@@ -56,14 +85,14 @@ class FieldMapping:
 
     @property
     def width(self) -> int | None:
-        """Columns of an answer, None where only the arm knows how many joints it has."""
+        """Columns of an answer; None if they depend on the number of joints."""
         if self.columns is not None:
             return len(self.columns)
         return None if self.semantics.needs_joints else sum(self.semantics.parts(0).values())
 
     # -- out ----------------------------------------------------------------------------------
     def request(self, observation: Observation) -> dict[str, Any]:
-        """The server's names with pictures (H, W, 3) uint8, numbers (n,) float32 and text."""
+        """Fields of a request: images (H, W, 3) uint8, numbers (n,) float32 and text."""
         out: dict[str, Any] = {}
         for theirs, source in self.fields.items():
             if source.camera:
@@ -78,10 +107,10 @@ class FieldMapping:
 
     # -- in -----------------------------------------------------------------------------------
     def gather(self, answer: Any) -> NDArray[np.float64]:
-        """(H, C) of an answer: an array, or a map of arrays under `keys`.
+        """Numbers of an answer (H, C); the answer is an array, or a map of arrays under `keys`.
 
         Raises:
-            PeerError: names are missing, shapes do not go together, or a number is not finite.
+            PeerError: missing names, incompatible shapes, or a number that is not finite.
         """
         if isinstance(answer, Mapping):
             missing = [key for key in self.keys if key not in answer]
@@ -114,22 +143,22 @@ class FieldMapping:
     def read(
         self, answer: Any, observation: Observation, forward: Forward | None = None
     ) -> ActionSteps:
-        """`steps`, and what the server said for people who look at it."""
-        said = self.gather(answer)[0].tolist()
-        return ActionSteps(self.steps(answer, observation, forward), raw={"first_step": said})
+        """Action steps of an answer, with its first row as raw output for debugging."""
+        first = self.gather(answer)[0].tolist()
+        return ActionSteps(self.steps(answer, observation, forward), raw={"first_step": first})
 
     def steps(
         self, answer: Any, observation: Observation, forward: Forward | None = None
     ) -> NDArray[np.float64]:
-        """(H, D) in the meaning of `spec`.
+        """Action steps (H, D) as `spec` declares them.
 
         Args:
             answer: see `gather`.
-            observation: what was asked about: where joint deltas begin.
-            forward: kinematics, where the answers are joints.
+            observation: of the request; joint deltas start from its joints.
+            forward: kinematics, if the answers are joints.
 
         Raises:
-            PeerError: see `gather`; also another number of columns.
+            PeerError: see `gather`; also a wrong number of columns.
         """
         rows = self.gather(answer)
         try:
@@ -140,7 +169,7 @@ class FieldMapping:
 
 
 def _matrix(name: str, value: Any, named: bool) -> NDArray[np.float64]:
-    """(H, C); a batch of one is unpacked. One row of numbers is H single ones if it is `named`."""
+    """(H, C); a batch of one is unpacked. A vector is a column if it is `named`, else a row."""
     try:
         array = np.asarray(value)
     except (ValueError, OverflowError, TypeError) as error:
@@ -154,3 +183,171 @@ def _matrix(name: str, value: Any, named: bool) -> NDArray[np.float64]:
     if array.ndim != 2:
         raise PeerError("peer_reply", f"{name} has shape {array.shape}, wanted (H, D)")
     return array.astype(np.float64)
+
+
+DEFAULTS: Mapping[str, str] = {
+    "map": "",
+    "size": "224x224",
+    "resize": "pad",
+    "colour": "rgb",
+    "keys": "actions",
+    "columns": "",
+    **ACTION_OPTIONS,
+}
+NONE = "none"
+"""The empty preset."""
+_SIZE = re.compile(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})")
+_SLICE = re.compile(r"([0-9]{1,4}):([0-9]{1,4})")
+MAX_KEYS = 256
+
+
+def read_field_mapping(
+    name: str,
+    presets: Mapping[str, Mapping[str, str]],
+    preset: str,
+    options: Mapping[str, str],
+    *,
+    max_width_m: float,
+    normalisation: str | None = None,
+) -> FieldMapping:
+    """The mapping that a preset and options define.
+
+    Args:
+        name: of the model, for its spec.
+        presets: name -> options.
+        preset: name of the preset.
+        options: of the user; they override the preset.
+        max_width_m: of our gripper.
+        normalisation: for the spec.
+
+    Raises:
+        SpecError: unknown or invalid option; names what is allowed.
+    """
+    presets = {**presets, NONE: {}}
+    if preset not in presets:
+        raise SpecError(
+            f"preset is {preset!r}, allowed: {', '.join(presets)} (--set preset=...); "
+            f"{NONE}: for a server of your own, with every option given"
+        )
+    unknown = [option for option in options if option not in DEFAULTS]
+    if unknown:
+        raise SpecError(f"no option {', '.join(map(repr, unknown))}; known: {', '.join(DEFAULTS)}")
+    chosen = {**DEFAULTS, **presets[preset], **options}
+    entries = {**read_map(presets[preset].get("map", "")), **read_map(options.get("map", ""))}
+    fields = {theirs: source for theirs, source in entries.items() if source is not None}
+    if not fields:
+        raise SpecError("map is empty: give the content of each field of a request, as NAME=SOURCE")
+    given = {name: value for name, value in options.items() if name in ACTION_OPTIONS}
+    whose = f"preset {preset}"
+    semantics = read_action_semantics(given, presets[preset], whose, normalisation=normalisation)
+    with as_spec_error():
+        observation = _observation(fields, chosen, semantics.needs_joints)
+    return FieldMapping(
+        fields=fields,
+        spec=ModelSpec(name=name, observation=observation, action=semantics.spec),
+        keys=_keys(chosen["keys"]),
+        columns=read_columns(chosen["columns"]),
+        semantics=semantics,
+        max_width_m=max_width_m,
+    )
+
+
+def _observation(
+    fields: Mapping[str, FieldSource], chosen: Mapping[str, str], joints: bool
+) -> ObservationSpec:
+    size = read_size(chosen["size"])
+    parts = {part for source in fields.values() for part in parts_of(source.parts)}
+    parts |= {"joint"} if joints else set()
+    order: tuple[StatePart, ...] = ("joint", "pose", "gripper")
+    cameras = dict.fromkeys(source.camera for source in fields.values() if source.camera)
+    return ObservationSpec(
+        cameras=tuple(
+            CameraSpec(
+                camera=camera,
+                width=size[0] if size else None,
+                height=size[1] if size else None,
+                resize=cast(Resize, chosen["resize"] if size else "none"),
+                colour=cast(Literal["rgb", "bgr"], chosen["colour"]),
+            )
+            for camera in cameras
+        ),
+        state=tuple(part for part in order if part in parts),
+        prompt=any(source.prompt for source in fields.values()),
+    )
+
+
+def read_timeout(text: str) -> float:
+    """Value of the option ``timeout_s``.
+
+    Raises:
+        SpecError: not between 0.01 and 60 s.
+    """
+    value = number("timeout_s", text)
+    if not 0.01 <= value <= 60:
+        raise SpecError(f"timeout_s is {text!r}, wanted 0.01 to 60: a late answer is useless")
+    return value
+
+
+def _keys(text: str) -> tuple[str, ...]:
+    keys = tuple(key.strip() for key in text.split(","))
+    if not all(keys) or len(set(keys)) != len(keys) or len(keys) > MAX_KEYS:
+        raise SpecError(f"keys is {text!r}, wanted different names with a comma between them")
+    return keys
+
+
+def read_size(text: str) -> tuple[int, int] | None:
+    """Width and height of the option ``size``; None: as the camera gives it.
+
+    Raises:
+        SpecError: not of the form 224x224.
+    """
+    size = _SIZE.fullmatch(text)
+    if text and size is None:
+        raise SpecError(f"size is {text!r}, wanted WIDTHxHEIGHT, or nothing")
+    return (int(size[1]), int(size[2])) if size else None
+
+
+def read_columns(text: str) -> tuple[int, ...] | None:
+    """Columns of the option ``columns``; None: all of them.
+
+    Raises:
+        SpecError: not of the form 0:7 or 0,1,2.
+    """
+    if not text:
+        return None
+    if (found := _SLICE.fullmatch(text)) and int(found[1]) < int(found[2]):
+        return tuple(range(int(found[1]), int(found[2])))
+    entries = text.split(",")
+    if all(re.fullmatch(r"[0-9]{1,4}", entry) for entry in entries):
+        return tuple(map(int, entries))
+    raise SpecError(f"columns is {text!r}, wanted 0:7 or 0,1,2,6")
+
+
+def read_map(text: str) -> dict[str, FieldSource | None]:
+    """Fields of the option ``map``; None: the field is left out.
+
+    Raises:
+        SpecError: invalid; says what is allowed.
+    """
+    out: dict[str, FieldSource | None] = {}
+    for entry in filter(None, (part.strip() for part in text.split(","))):
+        theirs, equals, ours = (part.strip() for part in entry.partition("="))
+        if not equals or not theirs:
+            raise SpecError(f"map wants NAME=SOURCE, not {entry!r}")
+        if theirs in out:
+            raise SpecError(f"map names {theirs!r} twice")
+        out[theirs] = _source(ours) if ours else None
+    return out
+
+
+def _source(text: str) -> FieldSource:
+    kind, colon, rest = text.partition(":")
+    if kind == "camera" and rest:
+        return FieldSource(camera=rest)
+    if kind == "blank" and (size := _SIZE.fullmatch(rest)):
+        return FieldSource(blank=(int(size[1]), int(size[2])))
+    if text == "prompt":
+        return FieldSource(prompt=True)
+    if colon:
+        raise SpecError(f"a source is camera:NAME, blank:HxW, prompt or parts, not {text!r}")
+    return FieldSource(parts=read_parts(text))

@@ -13,7 +13,7 @@ n1.6     ``{observation: {video: {NAME: (B,T,H,W,3)}, state:      ``[{NAME: (B,H
 =======  =======================================================  ===========================
 
 Early servers, and some derived ones, send torch's files instead, which are pickles and run code
-when read; they are refused.
+when read; they are rejected.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def unpack(payload: bytes) -> Any:
     if payload.startswith(_PICKLES):
         raise PeerError(
             "peer_reply",
-            "the server speaks in torch's or Python's pickles, which run code when they are read; "
-            "they are never read: use a server that speaks msgpack (GR00T N1.5 or later)",
+            "the server sends torch's or Python's pickles, which run code when they are read; they "
+            "are never read: use a server that speaks msgpack (GR00T N1.5 or later)",
         )
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise PeerError("peer_reply", f"an answer of {len(payload)} bytes")
@@ -72,7 +72,7 @@ def unpack(payload: bytes) -> Any:
             payload,
             object_hook=lambda found: _from_map(count(found)),
             list_hook=count,
-            ext_hook=_refuse_extension,
+            ext_hook=_reject_extension,
             raw=False,
             strict_map_key=True,
             max_array_len=MAX_ITEMS,
@@ -86,7 +86,7 @@ def unpack(payload: bytes) -> Any:
         raise PeerError("peer_reply", f"the answer is not msgpack: {error}") from error
 
 
-def _refuse_extension(code: int, data: bytes) -> Any:
+def _reject_extension(code: int, data: bytes) -> Any:
     raise PeerError("peer_reply", f"msgpack extension {code} ({len(data)} bytes) in the answer")
 
 

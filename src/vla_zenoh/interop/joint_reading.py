@@ -1,7 +1,7 @@
-"""Of joint states as robots tell them: our joint, pose and gripper states.
+"""Converts a robot's joint states to our joint, pose and gripper states.
 
-Positions have to be finite, new, and such as a joint of this arm can have. What an arm does not
-tell (velocities, efforts) is made up for: velocities by differences, efforts by zero.
+Positions have to be finite, new, and possible for this arm. Missing velocities are differentiated,
+missing efforts are zero.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
 MOVING_M_S = 0.002
 """Fingers faster than this move."""
 BEYOND = 10.0
-"""A joint may be told to be, and to move, this many times as far as its description allows: zero
-points are set in many ways, garbage is further off."""
+"""A joint may report this multiple of the range and speed of its description: zero points are set
+in many ways, garbage is further off."""
 FURTHEST = 10.0
-"""Finger joints told to be further, m or rad, or to move so far within a second, are garbage."""
+"""Larger positions (m or rad) and speeds of finger joints are garbage."""
 RESTARTED_NS = 1_000_000_000
-"""A stamp this much older than the last one is a robot that was started anew, or a clock that was
-set; a smaller step back is a message that was overtaken."""
+"""A stamp this much older than the last one means a restarted robot or a clock that was set; a
+smaller step back is a message that was overtaken."""
 
 
 class StampFilter:
-    """Refuses what came before: a stamp that stands still is a robot, or camera, that does."""
+    """Rejects stamps that do not advance: the robot or camera is frozen."""
 
     def __init__(self) -> None:
         self._stamp_ns = -1
 
     def check(self, stamp_ns: int) -> None:
-        """Take a stamp.
+        """Validate a stamp.
 
         Raises:
             CodecError: ``frozen`` (the same again) or ``out_of_order``.
@@ -49,7 +49,7 @@ class StampFilter:
 
 
 class JointReading:
-    """The newest of one arm and its gripper.
+    """Newest state of one arm and its gripper, from its joint states.
 
     Args:
         profile: whose robot it is.
@@ -75,7 +75,6 @@ class JointReading:
         self._finger_speed_m_s = 0.0
         self.efforts_missing = 0
 
-    # -- taking -------------------------------------------------------------------------------
     def take(self, joints: Joints, stamp_ns: int) -> JointState | None:
         """Take a message; the arm's joints of it, None where it says nothing of the arm.
 
@@ -112,20 +111,19 @@ class JointReading:
         self._joints, self.stamp_ns = state, stamp_ns
         return state
 
-    def _check(self, off: FloatArray, most: FloatArray, told: FloatArray, unit: str) -> None:
-        """That no joint is told to be `off` by more than `most`, both (n,)."""
+    def _check(self, off: FloatArray, most: FloatArray, values: FloatArray, unit: str) -> None:
+        """Reject `values` whose `off` exceeds `most`, all (n,)."""
         wrong = np.flatnonzero(np.abs(off) > most)
         if wrong.size:
             joint = int(wrong[0])
             raise CodecError(
                 "invalid",
-                f"{self._arm[joint]} at {told[joint]:.4g} {unit}: more than {BEYOND:g} times what "
-                "its description allows",
+                f"{self._arm[joint]} at {values[joint]:.4g} {unit}: more than "
+                f"{BEYOND:g} times what its description allows",
             )
 
     def _velocity(self, position: FloatArray, stamp_ns: int) -> FloatArray:
-        """By the difference to the message before; two that were stamped at nearly one time say
-        nothing of velocity, hence the bound."""
+        """Difference to the previous message, bounded as two close stamps say little."""
         elapsed_s = (stamp_ns - self.stamp_ns) / 1e9
         if self._joints is None or not 0 < elapsed_s < 1:
             return np.zeros(len(position))
@@ -133,7 +131,7 @@ class JointReading:
         return np.clip(velocity, -self._fastest_rad_s, self._fastest_rad_s)
 
     def _effort(self, joints: Joints, at: list[int]) -> FloatArray:
-        """Nothing here is controlled by efforts, and ros2_control writes NaN where it has none."""
+        """Efforts are not used for control, and ros2_control publishes NaN if it has none."""
         effort = None if joints.effort is None else joints.effort[at]
         if effort is not None and np.isfinite(effort).all():
             return effort
@@ -157,7 +155,7 @@ class JointReading:
             self._finger_speed_m_s = abs(width_m - self.width_m) / elapsed_s
         self.width_m, self.width_stamp_ns = width_m, stamp_ns
 
-    # -- telling ------------------------------------------------------------------------------
+    # -- state --------------------------------------------------------------------------------
     @property
     def joints(self) -> JointState | None:
         """The newest, None before the first."""
@@ -177,7 +175,7 @@ class JointReading:
         Args:
             busy: a goal is in flight.
             wanted_m: width asked for last; where no finger joints are described, it is believed.
-            held: the gripper said that it holds something.
+            held: the gripper reports that it holds an object.
         """
         if not self._finger_names:
             width_m = self._max_width_m if wanted_m is None else wanted_m

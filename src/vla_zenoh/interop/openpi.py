@@ -111,7 +111,7 @@ def mismatches(metadata: Mapping[str, Any], mapping: FieldMapping) -> list[str]:
         for camera in mapping.spec.observation.cameras:
             if camera.height is not None and [camera.height, camera.width] != size:
                 out.append(
-                    f"it wants pictures of {size[1]}x{size[0]}, size="
+                    f"it wants images of {size[1]}x{size[0]}, size="
                     f"{camera.width}x{camera.height} is set"
                 )
                 break
@@ -135,7 +135,7 @@ def metadata(action: ActionSpec, names: Mapping[str, str]) -> bytes:
 
     Args:
         action: what its actions mean.
-        names: name of an observation -> what it is, for people.
+        names: name of an observation -> its content, as text.
     """
     return message.pack(
         {

@@ -1,7 +1,7 @@
 """Options for the robots and data sets that published policies were trained on.
 
-What is not converted: where the model's world has its origin (LIBERO's is not the robot's base),
-how its tool frame is turned against ours, how its pictures were framed, and that the controllers of
+Not converted: the origin of the model's world (LIBERO's is not the robot's base), the rotation of
+its tool frame against ours, the framing of its images, and that the controllers of
 LIBERO and DROID put a step on where the arm is measured, of which it then covers a part: here a
 step is put on the goal, and all of it is carried out.
 
@@ -127,5 +127,5 @@ ORIGAMI: Presets = {
         "horizon": "25",
     },
 }
-"""The right arm of the competition's two-armed robot; all else of it is said to be at zero. Its
-rate is not published: set dt_s."""
+"""The right arm of the competition's two-armed robot; everything else is sent as zero. Its rate is
+not published: set dt_s."""

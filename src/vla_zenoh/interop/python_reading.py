@@ -1,4 +1,4 @@
-"""Of what a robot in a Python file says: our records, checked before any of them is used."""
+"""Validates the readings of a Python robot, and converts them to our records."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
 
 MAX_WORDS = 300
 FAULT_NS = 200_000_000
-"""A fault counts for so long at least: of states the newest is looked at, and one of them alone
-could be passed over."""
+"""A fault lasts at least this long: only the newest state is used, and a single one could be
+missed."""
 
 
 class ValidReading(NamedTuple):
-    """A reading that holds.
+    """A validated reading.
 
     Args:
         stamp_ns: when it was measured, wall clock.
@@ -38,7 +38,7 @@ class ValidReading(NamedTuple):
 
 
 class PythonReading:
-    """Takes readings of one arm.
+    """Validates the readings of one arm.
 
     Args:
         profile: whose robot it is.

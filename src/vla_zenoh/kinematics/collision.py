@@ -45,7 +45,7 @@ class CollisionPair(NamedTuple):
 
 
 class CollisionModel:
-    """See the module.
+    """Distances between the links of an arm, and to the table.
 
     Args:
         kinematics: of the arm; other joints are where it locked them.

@@ -14,7 +14,7 @@ from vla_zenoh.profile import GripperProfile
 
 
 class Fingers:
-    """See the module.
+    """Converts between the opening of a gripper and the positions of its finger joints.
 
     Args:
         gripper: its section of the profile.

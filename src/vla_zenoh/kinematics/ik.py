@@ -38,7 +38,7 @@ class IkSettings:
 
     Args:
         position_tolerance_m: a solution is at most this far off.
-        rotation_tolerance_rad: likewise.
+        rotation_tolerance_rad: the same for rotation.
         joint_margin_rad: kept from both ends of every joint's range.
         posture_gain: part of the way to the posture taken in a first iteration, 0 to 1.
         max_posture_step_rad: and at most this far: a posture is drifted to, not leapt at.
@@ -63,7 +63,7 @@ class Approach(NamedTuple):
     Args:
         joints_rad: (n,).
         error_m: distance left.
-        error_rad: likewise.
+        error_rad: the same for rotation.
         solved: within the tolerances.
         wanted_rad: (n,) the last iteration's joints before they were put on their bounds.
         jacobian: (6, n) at `joints_rad`.
@@ -88,7 +88,7 @@ def pose_error(goal: Pose, here: Pose) -> FloatArray:
 
 
 class InverseKinematics:
-    """See the module.
+    """Damped least-squares inverse kinematics within joint limits.
 
     Args:
         kinematics: of the arm.

@@ -1,13 +1,12 @@
-"""What of a worker's last chunk will be carried out while it thinks about the next one.
+"""Real-time chunking: the part of a worker's last chunk that is executed during inference.
 
-A model that plans afresh at every look may change its mind between two chunks, and the arm would
-jump from one plan to the other. Real-time chunking gives it the steps that are under way: the first
-ones cannot be changed any more and come back as they are (frozen), the later ones pull less and
-less. See K. Black, M. Y. Galliker, S. Levine, "Real-Time Execution of Action Chunking Flow
-Policies", NeurIPS 2025.
+A model that plans from scratch may choose another motion in each chunk, and the arm would jump from
+one to the other. Real-time chunking conditions it on the steps in execution: the first ones can no
+longer change (frozen), the later ones weigh less and less. See K. Black, M. Y. Galliker, S. Levine,
+"Real-Time Execution of Action Chunking Flow Policies", NeurIPS 2025.
 
-Models that say ``takes_committed = True`` are called as ``infer(observation, committed=...)``. For
-all others the command node's alignment by observation time and its blend have to do.
+Models with ``takes_committed = True`` are called as ``infer(observation, committed=...)``. For all
+others the command node aligns chunks by observation time and blends them.
 """
 
 from __future__ import annotations
@@ -23,25 +22,25 @@ from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ActionSteps, Observation
 
 REMEMBERED_LATENCIES = 10
 ALIGNED = 1e-3
-"""An observation this near to a step's end (in steps) is taken to be there."""
+"""An observation this close to a step's end (in steps) counts as at its end."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Committed:
-    """Steps under way at the time of an observation, in the form the spec declares.
+    """Steps in execution at the time of an observation, as the spec declares them.
 
     Args:
-        steps: (K, D) float32; the first one begins at the observation, K less than the horizon.
-        frozen: so many of them will have begun when the next chunk arrives, K at most.
+        steps: (K, D) float32; the first one starts at the observation, K < horizon.
+        frozen: number of them that will have started when the next chunk arrives, at most K.
     """
 
     steps: NDArray[np.float32]
     frozen: int
 
     def weights(self, horizon: int) -> NDArray[np.float64]:
-        """(horizon,) how much each step is to be as committed: the soft mask of equation 5 there.
+        """Weight (horizon,) of each committed step: the soft mask of equation 5 there.
 
-        1 for those that are frozen, then falling, 0 where nothing is committed.
+        1 for frozen steps, then falling, 0 where nothing is committed.
         """
         index, overlap = np.arange(horizon), len(self.steps)
         falling = np.clip((overlap - index) / (overlap - self.frozen + 1), 0.0, 1.0)
@@ -49,14 +48,14 @@ class Committed:
         return np.where(index < self.frozen, 1.0, np.where(index < overlap, soft, 0.0))
 
     def padded(self, horizon: int) -> NDArray[np.float32]:
-        """(horizon, D) the steps, zeros behind them where their weight is 0 anyway."""
+        """The steps padded with zeros to (horizon, D); the padding has weight 0."""
         out = np.zeros((horizon, self.steps.shape[1]), np.float32)
         out[: len(self.steps)] = self.steps[:horizon]
         return out
 
 
 class ChunkPrefix:
-    """Knows a worker's last chunk, and how long its chunks are on their way.
+    """Calls a model with the prefix of its next chunk, from its last chunk and its latency.
 
     Args:
         policy: the model.
@@ -69,7 +68,7 @@ class ChunkPrefix:
         self._last: tuple[int, int, NDArray[np.float32]] | None = None
 
     def infer(self, observation: Observation) -> ActionSteps:
-        """What the model answers, told what is under way where it takes that."""
+        """Infer, with the committed steps if the model takes them."""
         if self._takes:
             committed = self.committed(observation)
             result = self._policy.infer(observation, committed=committed)  # pyright: ignore
@@ -85,13 +84,13 @@ class ChunkPrefix:
         *,
         obeyed: bool,
     ) -> None:
-        """A chunk is out.
+        """Remember a published chunk.
 
         Args:
-            observation: it was made of.
+            observation: it was inferred from.
             steps: (H, D).
             published_ns: wall clock.
-            obeyed: the arm follows this worker; what nobody carries out commits to nothing.
+            obeyed: the arm follows this worker; otherwise nothing is committed.
         """
         self._latencies_s.append((published_ns - observation.stamp_wall_ns) / 1e9)
         self._last = (
@@ -99,11 +98,11 @@ class ChunkPrefix:
         )
 
     def committed(self, observation: Observation) -> Committed | None:
-        """What is under way at this observation; None: nothing."""
+        """Steps in execution at this observation; None: none."""
         if self._last is None or self._last[0] != observation.task.episode:
             return None
         _, stamp_ns, steps = self._last
-        # The command node counts the first step as asked for at once; see control/plan_timeline.py.
+        # The command node starts the first step at once; see control/plan_timeline.py.
         passed_s = observation.task.speed * (observation.stamp_wall_ns - stamp_ns) / 1e9
         had = max(passed_s / self._action.dt_s, 1.0)
         left = rest_of(self._action, steps, had)
@@ -114,11 +113,11 @@ class ChunkPrefix:
 
 
 def rest_of(spec: ActionSpec, steps: NDArray[np.float32], had: float) -> NDArray[np.float32]:
-    """The steps of a chunk that are left after `had` of them, part of one included.
+    """The steps of a chunk that remain after `had` of them, which may be fractional.
 
-    They lie on the same path, cut anew where the observation cuts it: deltas are shares of two
-    neighbours, absolute poses lie between two. Rotations are mixed as numbers, which holds for
-    neighbours that are near each other. Gripper numbers that are no deltas are those in force.
+    They follow the same path, resampled from the observation on: deltas are weighted sums of two
+    neighbours, absolute poses interpolate between two. Rotations are interpolated as numbers, which
+    is accurate for close neighbours. Absolute gripper numbers keep their current value.
     """
     whole = math.floor(had + ALIGNED)
     share = max(had - whole, 0.0)

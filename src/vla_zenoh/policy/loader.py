@@ -1,4 +1,4 @@
-"""Turns a file into a model or an arm: finds it, reads its PEP 723 header, makes its class."""
+"""Loads models and robot drivers from Python files with a PEP 723 header."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class ModelFile:
     """A model on disk.
 
     Args:
-        name: what its keys are called by.
+        name: part of its keys.
         path: the file to run.
-        dependencies: what its PEP 723 header asks for.
-        requires_python: likewise, or None.
+        dependencies: of its PEP 723 header.
+        requires_python: of its PEP 723 header, or None.
     """
 
     name: str
@@ -41,7 +41,7 @@ class ModelFile:
     requires_python: str | None = None
 
     def missing(self) -> list[str]:
-        """Dependencies that this environment does not have (by name; uv checks versions)."""
+        """Dependencies that this environment lacks (by name; uv checks versions)."""
         absent: list[str] = []
         for requirement in self.dependencies:
             name = re.split(r"[\s<>=!~;\[@(]", requirement, maxsplit=1)[0]
@@ -53,11 +53,11 @@ class ModelFile:
 
 
 def find_model(name: str) -> ModelFile:
-    """The model called `name`, which may be a path to a file or a folder with a model.py.
+    """The model `name`, which may be a path to a file or a folder with a model.py.
 
     Raises:
-        ResourceError: nothing of that name.
-        WorkerError: its header cannot be read.
+        ResourceError: not found.
+        WorkerError: invalid header.
     """
     path = resources.find("models", name)
     if path.is_dir():
@@ -76,15 +76,15 @@ def find_model(name: str) -> ModelFile:
 
 
 def find_worker(word: str, models: Mapping[str, str]) -> tuple[str, ModelFile]:
-    """What the worker that `word` means is called, and the model it runs.
+    """Name of a worker, and its model.
 
     Args:
-        word: a worker in `models`, else the name of a model or its path.
+        word: a worker in `models`, or the name or path of a model.
         models: of the profile: worker -> path or name of its model.
 
     Raises:
-        ResourceError: there is no such model.
-        WorkerError: its header cannot be read.
+        ResourceError: no such model.
+        WorkerError: invalid header.
     """
     if word in models:
         return word, find_model(models[word])
@@ -112,12 +112,12 @@ def _read_header(path: Path) -> Mapping[str, Any]:
 
 
 def module_name(name: str) -> str:
-    """What the module of the model called `name` is imported as."""
+    """Module name under which the model `name` is imported."""
     return "vla_zenoh_model_" + re.sub(r"\W", "_", name)
 
 
 def import_model(model: ModelFile) -> ModuleType:
-    """Import the file, without making its model.
+    """Import the file of a model.
 
     A model that is a folder is imported as a package, so that its `model.py` can have files beside
     it: models/NAME/part.py is ``vla_zenoh_model_NAME.part``.
@@ -152,14 +152,14 @@ def import_model(model: ModelFile) -> ModuleType:
 def make_policy(
     model: ModelFile, options: Mapping[str, str] | None = None, *, profile: str | None = None
 ) -> Policy:
-    """Import the file and make its model, without loading weights.
+    """Construct the model of a file, without loading weights.
 
-    The model is the one class in the file that has ``infer``; where there are several, the name
-    ``MODEL`` says which. `options` are given to its constructor by name, as text; one that takes a
-    `profile` is given the name or path of the robot's, where the options have none.
+    The model is the only class in the file with ``infer``; of several, the name ``MODEL`` chooses.
+    `options` are keyword arguments of its constructor, as text; a parameter `profile` defaults to
+    the name or path of the robot's.
 
     Raises:
-        WorkerError: the file does not import, has no such class, or refuses the options.
+        WorkerError: the file fails to import, has no such class, or rejects the options.
     """
     module = import_model(model)
     maker = _maker(module, model.path, "MODEL", "infer")
@@ -183,13 +183,13 @@ def make_policy(
 
 
 def make_robot(path: Path, options: Mapping[str, str] | None = None) -> Robot:
-    """Import the file and make its arm, without connecting to it.
+    """Construct the robot of a file, without connecting to it.
 
-    The arm is the one class in the file that has ``move``; where there are several, the name
-    ``ROBOT`` says which. `options` are given to its constructor by name, as text.
+    The robot is the only class in the file with ``move``; of several, the name ``ROBOT`` chooses.
+    `options` are keyword arguments of its constructor, as text.
 
     Raises:
-        WorkerError: the file does not import, has no such class, or refuses the options.
+        WorkerError: the file fails to import, has no such class, or rejects the options.
     """
     if not path.is_file():
         raise WorkerError(f"{path} is not a file; arm.file of the profile names it")

@@ -57,7 +57,7 @@ def number(name: str, text: str, *, least: float = 0.0) -> float:
 
 
 def whole_number(name: str, text: str, *, least: int = 0) -> int:
-    """Likewise a whole one.
+    """An option that is a whole number.
 
     Raises:
         SpecError: it is none, or smaller.

@@ -16,18 +16,18 @@ from vla_zenoh.policy import ActionSteps, CameraSpec, ModelSpec, Observation
 from vla_zenoh.types import ActionChunk, Image, Stamped, Task
 
 CLOCK_TOLERANCE_S = 0.05
-"""A picture may seem to come from the future by this much before clocks are said to differ."""
+"""An image may lie this far in the future before its clock counts as wrong."""
 
 
 @dataclass(slots=True)
 class History:
-    """The last states of one kind, oldest first, to find the one nearest to a picture."""
+    """The last states of one kind, oldest first, to find the one nearest to an image."""
 
     size: int = 128
     entries: list[Stamped[Any]] = field(default_factory=list)
 
     def add(self, entry: Stamped[Any]) -> None:
-        """Take one; one that is older than the newest starts the history anew (its writer did)."""
+        """Add a state; one older than the newest clears the history, as its writer restarted."""
         if self.entries and entry.header.stamp_wall_ns < self.entries[-1].header.stamp_wall_ns:
             self.entries.clear()
         self.entries.append(entry)
@@ -67,7 +67,7 @@ def assemble(
     Args:
         spec: what the model needs.
         task: prompt and episode.
-        images: newest picture of each camera.
+        images: newest image of each camera.
         states: part (``joint``, ``pose``, ``gripper``) -> its history.
         not_before_ns: an observation from before this time is not wanted: it cannot show what the
             last chunk did.
@@ -75,7 +75,7 @@ def assemble(
         robot: whose observation it is.
 
     Raises:
-        SpecError: a picture does not have the size the spec wants, see `prepare_image`.
+        SpecError: an image does not have the size of the spec, see `prepare_image`.
     """
     wanted = spec.observation
     if wanted.prompt and not task.prompt:
@@ -83,7 +83,7 @@ def assemble(
     missing = [f"camera {c.camera!r}" for c in wanted.cameras if c.camera not in images]
     missing += [f"state/{p}" for p in wanted.state if p not in states or not states[p].entries]
     if missing:
-        return NotReady(f"nothing heard yet of {', '.join(missing)}")
+        return NotReady(f"nothing received yet of {', '.join(missing)}")
     oldest = _oldest([images[camera.camera] for camera in wanted.cameras])
     if oldest is None and wanted.state:
         oldest = _oldest([states[part].entries[-1] for part in wanted.state])
@@ -107,7 +107,7 @@ def assemble(
         assert near is not None
         skew_s = abs(near.header.stamp_wall_ns - stamp_ns) / 1e9
         if skew_s > wanted.max_skew_s:
-            return NotReady(f"state/{part} is {skew_s:.3f} s apart from the pictures")
+            return NotReady(f"state/{part} is {skew_s:.3f} s apart from the images")
         parts[part] = near.record
     for camera in wanted.cameras:
         skew_s = (images[camera.camera].header.stamp_wall_ns - stamp_ns) / 1e9
@@ -140,7 +140,7 @@ def host_variant(host: str, form: str | None = None) -> str:
 
 
 def prepare_image(image: Image, spec: CameraSpec) -> NDArray[np.uint8]:
-    """A picture in the size and channel order the model declared.
+    """An image in the size and channel order of the spec.
 
     Raises:
         SpecError: it has another size and the spec does not say how to resize it.

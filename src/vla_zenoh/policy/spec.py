@@ -58,12 +58,12 @@ class _Spec(BaseModel):
 
 
 class CameraSpec(_Spec):
-    """One picture the model needs.
+    """One camera image in the model's observation.
 
     Args:
         camera: name of the camera in the profile.
         width: pixels the model is given; None: as they come.
-        height: likewise.
+        height: pixels the model is given; None: as they come.
         resize: how other sizes become this one. ``stretch`` ignores the aspect ratio, ``pad`` keeps
             it and fills with black, ``crop`` keeps it and cuts the longer side.
         colour: channel order the model is given.
@@ -88,7 +88,7 @@ class ObservationSpec(_Spec):
     """What the model has to see.
 
     Args:
-        cameras: pictures, may be empty.
+        cameras: may be empty.
         state: which parts of the robot's state.
         prompt: the model needs a prompt that is not empty.
         max_skew_s: the parts of one observation may lie this far apart in time.
@@ -128,7 +128,7 @@ class ActionSpec(_Spec):
         gripper_threshold: where ``binary`` switches.
         pace: ``steady``: a step lasts `dt_s`, and the arm neither stops nor rushes between steps
             that come in time; ``soonest``: it goes to each goal as fast as its limits allow.
-        normalisation: the key of the statistics the model's output was scaled with, for people.
+        normalisation: key of the statistics that the output was scaled with, for information.
     """
 
     horizon: int = Field(ge=1, le=1000)
@@ -202,9 +202,9 @@ class ActionSteps(NamedTuple):
     Args:
         steps: (H, D), H at most the declared horizon; anything numpy can read.
         done: the task is finished with these steps, as far as the model can tell.
-        raw: what stood before `steps`, for people: tokens, normalised actions, whatever the model
-            has, as text and numbers. Shown by ``vla-zenoh lab inspect``, used by nobody.
-        pictures: camera -> (H, W, 3) RGB uint8 as it went into the network, where the model itself
+        raw: intermediate output for debugging, as text and numbers: tokens, normalised actions.
+            Shown by ``vla-zenoh lab inspect``, otherwise unused.
+        pictures: camera -> (H, W, 3) RGB uint8 as it went into the network, if the model itself
             changes what it is given (a crop).
     """
 
@@ -219,7 +219,7 @@ class Observation:
     """One coherent look at the world, in the form the spec asks for.
 
     Args:
-        stamp_wall_ns: capture time of its oldest picture (of its state, without pictures).
+        stamp_wall_ns: capture time of its oldest image (of its state, without images).
         seq: number of that part.
         images: camera -> (H, W, 3) uint8 in the declared order and size.
         joint: arm joints, where asked for.
@@ -255,9 +255,9 @@ class Policy(Protocol):
     ``reset()`` runs at the start of every episode, ``close()`` when the worker ends.
     ``normalisation_keys``, where a model has it, names the statistics its weights came with:
     `ActionSpec.normalisation` must be one of them.
-    ``example_prompts`` likewise names prompts it knows, the first of which makes it move.
-    ``takes_committed = True``: it is called as ``infer(observation, committed=...)`` and told what
-    of its last chunk is under way, see `vla_zenoh.policy.chunk_prefix`.
+    ``example_prompts``, if present, names known prompts; the first one makes it move.
+    ``takes_committed = True``: it is called as ``infer(observation, committed=...)`` with the
+    steps of its last chunk in execution, see `vla_zenoh.policy.chunk_prefix`.
     ``infer_batch(observations)`` answers several robots at once, one answer for each in their
     order, at most ``max_batch`` of them where that is given. `Observation.robot` says whose each
     is; ``reset`` takes that name then. With ``takes_committed`` it is called as
@@ -317,7 +317,7 @@ def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
 def example_observation(
     spec: ModelSpec, *, prompt: str = "put the red brick in the box"
 ) -> Observation:
-    """A valid observation of the declared form, gray pictures and an arm at rest: for dry runs.
+    """A valid observation of the declared form, gray images and an arm at rest: for dry runs.
 
     It has the parts of the state that the spec asks for, and no others.
     """

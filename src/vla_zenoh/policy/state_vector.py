@@ -5,8 +5,8 @@ For model environments: numpy alone. Parts are joined by ``+``, as in ``position
     joint, joint_deg                positions of the arm's joints, rad or degrees: as many as it has
     position, x y z                 TCP in the base frame, m
     rpy, roll pitch yaw             its rotation: extrinsic x, y, z, rad
-    rotvec, rx ry rz                likewise axis times angle, rad
-    quat_xyzw, quat_wxyz            likewise a unit quaternion whose w is not negative
+    rotvec, rx ry rz                its rotation: axis times angle, rad
+    quat_xyzw, quat_wxyz            its rotation: unit quaternion with w >= 0
     gripper_m, fingers_m            opening, m; both fingers, +half and -half of it, m
     gripper_open, gripper_closed    0 shut to 1 open, and 0 open to 1 shut
     zero, zero*N                    N zeros, for what this robot does not have
@@ -93,13 +93,13 @@ def read_state(text: str, size: int, joints: int) -> tuple[str, ...]:
 
 
 def size_of(name: str, joints: int) -> int:
-    """How many numbers a part has, of an arm with so many `joints`."""
+    """Size of a part, for an arm with `joints`."""
     count = PARTS[name][1]
     return joints if count is None else count
 
 
 def known_parts(joints: int | None = None) -> str:
-    """All names with their counts, for people; `joints`: of the arm, where it is known."""
+    """All names with their sizes, as text; `joints`: of the arm, if known."""
     counts = {name: count for name, (_, count) in PARTS.items()}
     of_arm = "one for each of the arm's" if joints is None else joints
     return ", ".join(
@@ -148,7 +148,7 @@ def quat_xyzw(quaternion: Numbers) -> list[float]:
 
 
 def quat_wxyz(quaternion: Numbers) -> list[float]:
-    """Likewise w, x, y, z."""
+    """The same rotation, w, x, y, z with w >= 0."""
     *axis, w = quat_xyzw(quaternion)
     return [w, *axis]
 

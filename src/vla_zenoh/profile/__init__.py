@@ -1,4 +1,4 @@
-"""Profiles: one YAML file says everything about a robot, its lab and its limits."""
+"""Profiles: one YAML file describes a robot, its computers and its limits."""
 
 from vla_zenoh.profile.limits import (
     REACH_M,

@@ -1,4 +1,4 @@
-"""What is allowed in a profile and yet worth a second look."""
+"""Warnings about a valid profile."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vla_zenoh.profile.session import ANYWHERE, address_of, is_loopback
 
 
 def advice(profile: Profile) -> list[str]:
-    """Sentences, each beginning with the path it is about."""
+    """One warning a line, each beginning with the path that it is about."""
     return [
         *_network(profile),
         *_placement(profile),
@@ -29,7 +29,7 @@ def _network(profile: Profile) -> Iterator[str]:
     if session.insecure:
         where = "any network" if any(map(_is_anywhere, session.listen)) else "the network"
         yield (
-            f"session.insecure: everybody on {where} of the router's computer can command this "
+            f"session.insecure: anyone on {where} of the router's computer can command this "
             "robot; make certificates with `vla-zenoh secure init`"
         )
     if len(profile.hosts) < 2:
@@ -37,7 +37,7 @@ def _network(profile: Profile) -> Iterator[str]:
     routers = [name for name, host in profile.hosts.items() if "router" in host.nodes]
     if routers and all(is_loopback(endpoint) for endpoint in session.listen):
         yield (
-            f"session.listen: the router on {routers[0]} is heard on that computer only; "
+            f"session.listen: the router on {routers[0]} is reachable on that computer only; "
             "give its address on the network"
         )
     for name, host in profile.hosts.items():
@@ -87,9 +87,9 @@ def _joints(profile: Profile) -> Iterator[str]:
     joints = len(profile.robot.arm_joints)
     if joints < POSE_JOINTS:
         yield (
-            f"robot.arm_joints: with {joints} of them the TCP cannot have any pose around it, as "
-            "with six: models with absolute poses or joint positions are refused, and delta steps "
-            "are shortened to what the arm can do"
+            f"robot.arm_joints: with {joints} of them the TCP cannot reach every pose, as with "
+            "six: models with absolute poses or joint positions are rejected, and delta steps are "
+            "shortened to what the arm can do"
         )
 
 

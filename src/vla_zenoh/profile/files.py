@@ -1,7 +1,7 @@
-"""Every file that a profile needs beside what the package ships: what another computer has to have.
+"""Files that a profile needs on another computer, beside those of the package.
 
-What is named relative to the profile keeps its place beside it, what was found on the search path
-keeps its place below a folder of that path, and what is named whole has to be where it is here.
+Files named relative to the profile stay beside it, files on the search path stay below a folder of
+that path, and files with an absolute path need the same path there.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ BESIDE, HOME, WHOLE = "beside the profile", "~", "/"
 
 @dataclass(frozen=True, slots=True)
 class FileUse:
-    """Files and folders that belong together.
+    """Files and folders below a common folder.
 
     Args:
-        base: the folder that they are named from.
-        names: below it.
+        base: the folder.
+        names: paths relative to it.
     """
 
     base: Path
@@ -38,15 +38,15 @@ class FileUse:
 
 @dataclass(frozen=True, slots=True)
 class NeededFiles:
-    """What another computer has to have.
+    """Files that another computer needs.
 
     Args:
-        profile: its own file, below `beside.base`.
-        beside: that file, and what is named relative to it.
-        searched: what is found by its name; for each folder of ``VLA_ZENOH_PATH``.
-        home: what is named from ``~``.
-        whole: what is named by its whole path.
-        missing: what is not on this computer, in words.
+        profile: file of the profile, below `beside.base`.
+        beside: that file, and files named relative to it.
+        searched: files found by name, for each folder of ``VLA_ZENOH_PATH``.
+        home: files named from ``~``.
+        whole: files with an absolute path.
+        missing: what this computer lacks, as text.
     """
 
     profile: str
@@ -58,10 +58,10 @@ class NeededFiles:
 
 
 def needed_files(name: str) -> NeededFiles:
-    """What has to be copied with the profile called `name`, or at that path.
+    """Files to copy for the profile `name`, which may be a path.
 
     Raises:
-        ProfileError: it is wrong.
+        ProfileError: the profile is invalid.
     """
     profile, found = load_profile(name), _Found()
     own = found.profiles(name)
@@ -73,7 +73,7 @@ def needed_files(name: str) -> NeededFiles:
 
 
 def _by_name(profile: Profile) -> Iterator[tuple[str, str]]:
-    """(kind, name) of what hosts of the profile look for by its name."""
+    """(kind, name) of scenes and models that the profile's hosts find by name."""
     for host in profile.hosts.values():
         if {"sim", "camera"} & set(host.nodes):
             yield "sim", profile.sim.scene
@@ -85,11 +85,11 @@ def _by_name(profile: Profile) -> Iterator[tuple[str, str]]:
 
 @dataclass
 class _Found:
-    """Files by where they have to be: `BESIDE`, `HOME`, `WHOLE`, or a folder of the search path."""
+    """Files by their location: `BESIDE`, `HOME`, `WHOLE`, or a folder of the search path."""
 
     files: dict[str, dict[Path, None]] = field(default_factory=dict)
     relative: dict[str, str] = field(default_factory=dict)
-    """What profiles name relative to themselves -> where it has to be."""
+    """Path relative to a profile -> its location."""
     missing: dict[str, None] = field(default_factory=dict)
 
     def add(self, where: str, file: Path) -> None:
@@ -99,12 +99,12 @@ class _Found:
             self.missing[str(file)] = None
 
     def profiles(self, name: str) -> Path:
-        """The files of the profile and of those it extends; returns its own."""
+        """Add the files of the profile and of those it extends; returns its own."""
         before, where = None, BESIDE
         for path, named in followed(name):
             if before is not None:
                 if path.parent == resources.shipped("profiles"):
-                    break  # the package is there as well, with all that this one extends
+                    break  # the package on the other computer has the rest
                 where = _place(before, path, named, where)
             file = Path(os.path.normpath(path.absolute()))
             self.add(where, file)
@@ -117,7 +117,7 @@ class _Found:
         return next(iter(self.files[BESIDE]))
 
     def path(self, text: str) -> None:
-        """A file that the profile in force names."""
+        """Add a file that the effective profile names."""
         where = self.relative.get(text, HOME if text.startswith("~") else WHOLE)
         file = Path(text).expanduser()
         self.add(where, file)
@@ -132,14 +132,14 @@ class _Found:
             absent += mesh is None
             if mesh is not None:
                 whole = text.startswith((FILE, "/"))
-                # A folder of meshes has what they name in turn. That of the URDF has anything.
+                # A folder of meshes also has the files that they name; that of the URDF has more.
                 folder = mesh.parent not in urdf.parents
                 self.add(WHOLE if whole else where, mesh.parent if folder else mesh)
         if absent:
             self.missing[f"{absent} of {len(named)} meshes that {urdf} names"] = None
 
     def search(self, kind: str, name: str) -> None:
-        """Something that is found by its name, in a folder that people have told us of."""
+        """Add a scene or model that is found by name."""
         try:
             path = resources.find(kind, name)
         except ResourceError:
@@ -149,7 +149,7 @@ class _Found:
             self.add(str(path.parent.parent.absolute()), path.absolute())
 
     def needed(self, own: Path) -> NeededFiles:
-        """All of it. What lies outside of the folder that it is looked for in counts as missing."""
+        """The result; files outside the folder in which they are looked for count as missing."""
         beside = list(self.files.pop(BESIDE))
         base = Path(os.path.commonpath([file.parent for file in beside]))
         home, whole = (list(self.files.pop(where, ())) for where in (HOME, WHOLE))
@@ -173,7 +173,7 @@ class _Found:
 
 
 def _place(before: Path, path: Path, named: str, where: str) -> str:
-    """Where a profile has to be that the one `before`, which has to be at `where`, extends."""
+    """Location of a profile that the one `before`, located at `where`, extends."""
     if named.startswith("/"):
         return WHOLE
     if path in [before.parent / f"{named}{suffix}" for suffix in ("", *SUFFIXES)]:
@@ -182,7 +182,7 @@ def _place(before: Path, path: Path, named: str, where: str) -> str:
 
 
 def _mesh(urdf: Path, text: str) -> Path | None:
-    """The file that a URDF names; ``package://`` is looked for in every folder above it."""
+    """The file that a URDF names; ``package://`` is resolved in every folder above it."""
     if text.startswith(PACKAGE):
         rest = text.removeprefix(PACKAGE)
         found = [folder / rest for folder in urdf.parents if (folder / rest).is_file()]

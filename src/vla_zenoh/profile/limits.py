@@ -1,4 +1,4 @@
-"""The part of a profile that bounds every motion. The defaults are the safe choice."""
+"""Section ``limits`` of a profile: bounds of every motion. The defaults are conservative."""
 
 from __future__ import annotations
 
@@ -32,12 +32,23 @@ Jerk = Annotated[float, Field(gt=0, le=10_000)]
 
 
 class JointLimits(Section):
-    """One number for all joints, or one for each in the order of ``robot.arm_joints``.
+    """One number for all joints, or one per joint in the order of ``robot.arm_joints``.
+
+    Franka publishes for the Panda, joint 1 to 7 ("Robot and interface specifications" of the Franka
+    Control Interface documentation):
+
+        velocity      2.175  2.175  2.175  2.175  2.61   2.61   2.61   rad/s
+        acceleration  15     7.5    10     12.5   15     20     20     rad/s^2
+        jerk          7500   3750   5000   6250   7500   10000  10000  rad/s^3
+
+    The largest of each row is the upper bound. The defaults are half the velocity, 30 % of the
+    acceleration and 5 % of the jerk of the row's smallest, for every joint; the Panda's own profile
+    has the same shares joint by joint.
 
     Args:
         velocity_rad_s: of the commanded motion.
-        acceleration_rad_s2: likewise.
-        jerk_rad_s3: likewise, and of the robot's own stop.
+        acceleration_rad_s2: of the commanded motion.
+        jerk_rad_s3: of the commanded motion, and of the robot's own stop.
     """
 
     velocity_rad_s: Annotated[tuple[Velocity, ...], *_PerJoint] = (1.0875,)
@@ -45,20 +56,20 @@ class JointLimits(Section):
     jerk_rad_s3: Annotated[tuple[Jerk, ...], *_PerJoint] = (187.5,)
 
     def of(self, name: str, joints: int) -> tuple[float, ...]:
-        """The limit called `name`, one number for each of so many joints."""
+        """The limit `name` as one number per joint."""
         values: tuple[float, ...] = getattr(self, name)
         return values * joints if len(values) == 1 else values
 
 
 REACH_M = 3.0
-"""No arm that fits a table reaches further: a workspace beyond it is in other units."""
+"""No table-top arm reaches further: a larger workspace is in other units."""
 REJECT_FACTOR = 4.0
-"""A step this many times over its limit is a mistake (a wrong unit), not a motion: refused."""
+"""A step this many times over its limit has the wrong unit, and is rejected."""
 
 
 def _within_reach(pair: tuple[float, float]) -> tuple[float, float]:
     if max(map(abs, pair)) > REACH_M:
-        raise ValueError(f"[{pair[0]:g}, {pair[1]:g}] is further than {REACH_M:g} m; give metres")
+        raise ValueError(f"[{pair[0]:g}, {pair[1]:g}] is beyond {REACH_M:g} m; give metres")
     return pair
 
 
@@ -66,7 +77,7 @@ Reach = Annotated[Range, AfterValidator(_within_reach)]
 
 
 class Workspace(Section):
-    """Box in the base frame that the TCP must not leave, in m."""
+    """Workspace box of the TCP in the base frame, m."""
 
     x_m: Reach = (0.2, 0.75)
     y_m: Reach = (-0.45, 0.45)
@@ -74,7 +85,7 @@ class Workspace(Section):
 
 
 class TranslationLimits(Section):
-    """Per axis of the base frame."""
+    """Limits per axis of the base frame."""
 
     velocity_m_s: float = Field(default=0.5, gt=0, le=1.7)
     acceleration_m_s2: float = Field(default=2.0, gt=0, le=13)
@@ -82,7 +93,7 @@ class TranslationLimits(Section):
 
 
 class RotationLimits(Section):
-    """Per axis of the rotation vector."""
+    """Limits per axis of the rotation vector."""
 
     velocity_rad_s: float = Field(default=1.5, gt=0, le=2.5)
     acceleration_rad_s2: float = Field(default=6.0, gt=0, le=25)
@@ -90,18 +101,20 @@ class RotationLimits(Section):
 
 
 class ReachLimits(Section):
-    """What the arm's kinematics allow a goal to be; see `vla_zenoh.control.reachability`.
+    """Limits of goals by the arm's kinematics; see `vla_zenoh.control.reachability`.
 
     Args:
         joint_margin_rad: kept from both ends of every joint's range.
-        singularity_slow: smallest singular value of the Jacobian below which the arm gets slower
-            and steps shorter.
-        singularity_stop: it gets no smaller than this.
-        collision_slow_m: distance of the arm to itself below which likewise.
-        collision_stop_m: it comes no nearer; also the arm, without its hand, to the table.
-        table_z_m: height of the table in the base frame; null: there is none.
-        table_slow_m: likewise for hand and fingers, which have work to do there.
-        table_stop_m: they come no nearer.
+        singularity_slow: smallest singular value of the Jacobian below which the arm slows down and
+            shortens steps.
+        singularity_stop: lower bound of that singular value.
+        collision_slow_m: distance of the arm to itself below which the arm slows down.
+        collision_stop_m: lower bound of that distance, and of the arm without its hand to the
+            table.
+        table_z_m: height of the table in the base frame; null: no table.
+        table_slow_m: distance of hand and fingers to the table below which the arm slows down; they
+            work close to it.
+        table_stop_m: lower bound of that distance.
     """
 
     joint_margin_rad: float = Field(default=0.05, ge=0, le=0.5)
@@ -140,20 +153,20 @@ class ReachLimits(Section):
 
 
 class ContactLimits(Section):
-    """What the arm may press with before it gives up; see `vla_zenoh.control.contact`.
+    """Contact forces at which the arm slows down and gives up; see `vla_zenoh.control.contact`.
 
-    What the robot says of forces is looked at without what was there when it was activated.
+    Forces are measured relative to those at activation.
 
     Args:
-        force_slow_n: external force at the TCP above which the arm gets slower.
-        force_stop_n: above it the activation ends, and the arm goes back a little.
-        torque_slow_nm: likewise the external torque about the TCP.
-        torque_stop_nm: likewise.
-        effort_slow_nm: likewise the greatest external torque of a joint. For a robot whose
-            `JointState.effort_nm` tells that; ROS 2's and the simulator's is all that the motors
-            apply, the arm's own weight included. null: not looked at.
-        effort_stop_nm: likewise.
-        retreat_m_s: how fast an arm that was blocked is led back to where it is, at most.
+        force_slow_n: external force at the TCP above which the arm slows down.
+        force_stop_n: force above which the activation ends, and the arm retreats a little.
+        torque_slow_nm: external torque about the TCP above which the arm slows down.
+        torque_stop_nm: torque above which the activation ends.
+        effort_slow_nm: largest external torque of a joint above which the arm slows down, for a
+            robot whose `JointState.effort_nm` is external. That of ROS 2 and of the simulator
+            includes the arm's own weight. null: not checked.
+        effort_stop_nm: joint torque above which the activation ends.
+        retreat_m_s: largest speed at which a blocked arm's goal returns to its measured pose.
     """
 
     force_slow_n: float = Field(default=15.0, gt=0, le=200)
@@ -181,27 +194,28 @@ class ContactLimits(Section):
 
 
 class Limits(Section):
-    """Bounds of every motion; upper bounds are Franka's published ones for the Panda.
+    """Limits of every motion; the upper bounds are Franka's published ones for the Panda.
 
     Args:
         workspace: box of the TCP.
         translation: of the smoothed motion.
-        rotation: likewise.
+        rotation: of the smoothed motion.
         joint: of a motion commanded by joint positions.
-        reach: what joints, singularities, the arm itself and the table allow.
-        contact: what may press against the arm.
-        step_m: largest translation of one model step.
-        step_rad: largest rotation of one model step.
-        approach_m_s: an absolute target further away than a step is gone to at this speed.
-        approach_rad_s: likewise.
-        out_of_bounds: ``clamp`` shortens to the bound and tells, ``reject`` drops the whole chunk.
-        lead_m: leash: the goal may run ahead of the commanded pose by this much.
-        lead_rad: likewise.
-        tracking_m: leash: commanded minus measured pose; more brakes the arm (it is blocked), and
-            leads it back to where it is.
-        tracking_rad: likewise.
-        elbow_rad: a measured joint may be so far from where the arm is believed to have it at the
-            same TCP pose; beyond it gets slower, at twice that it brakes.
+        reach: by joint ranges, singularities, the arm itself and the table.
+        contact: of forces and torques.
+        step_m: largest translation of one action step.
+        step_rad: largest rotation of one action step.
+        approach_m_s: speed towards an absolute target that is further away than a step.
+        approach_rad_s: angular speed towards it.
+        out_of_bounds: ``clamp`` shortens to the limit and emits an event, ``refuse`` rejects the
+            whole chunk.
+        lead_m: leash: largest distance of the goal from the commanded pose.
+        lead_rad: leash: largest angle between the two.
+        tracking_m: leash: largest distance of commanded and measured pose; beyond it the arm is
+            blocked: it brakes, and the goal returns to the measured pose.
+        tracking_rad: leash: largest angle between the two.
+        elbow_rad: largest deviation of a measured joint from where it is expected at the same TCP
+            pose; beyond it the arm slows down, at twice that it brakes.
     """
 
     workspace: Workspace = Workspace()

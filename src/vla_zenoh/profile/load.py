@@ -1,4 +1,4 @@
-"""Finds profile files, follows ``extends``, and makes one checked profile of them."""
+"""Loads profiles: finds their files, resolves ``extends``, and validates the result."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("models",), ("serves",), (
 
 
 def profile_names() -> list[str]:
-    """Names of all profiles that can be found."""
+    """Names of all profiles on the search path."""
     return resources.names("profiles")
 
 
 def profile_file(name: str) -> Path:
-    """The file of the profile called `name`, which may be a path.
+    """File of the profile `name`, which may be a path.
 
     Raises:
-        ProfileError: there is none; lists those there are.
+        ProfileError: not found; lists the profiles that exist.
     """
     try:
         return resources.find("profiles", name)
@@ -42,7 +42,7 @@ def profile_file(name: str) -> Path:
 
 
 def load_profile(name: str) -> Profile:
-    """The effective profile called `name` (or at that path).
+    """The effective profile `name`, which may be a path.
 
     Raises:
         ProfileError: every fault, each with file, line, path and what is allowed.
@@ -54,10 +54,10 @@ def load_profile(name: str) -> Profile:
 
 
 def followed(name: str) -> list[tuple[Path, str]]:
-    """The files that the profile called `name` is made of, each with how the one before names it.
+    """Files of a profile along ``extends``, each with its name in the previous one.
 
     Args:
-        name: of a profile that can be loaded, or its path.
+        name: of a valid profile, or its path.
     """
     out = [(profile_file(name), name)]
     while True:
@@ -69,11 +69,11 @@ def followed(name: str) -> list[tuple[Path, str]]:
 
 
 def read_profile(text: str, where: str) -> Profile:
-    """The profile that `to_yaml` wrote.
+    """Parse a profile that `to_yaml` wrote.
 
     Args:
-        text: YAML, whole: it extends none.
-        where: it is from, for messages.
+        text: YAML without ``extends``.
+        where: origin, for messages.
 
     Raises:
         ProfileError: every fault, each with `where`, line, path and what is allowed.
@@ -83,33 +83,33 @@ def read_profile(text: str, where: str) -> Profile:
 
 
 def override(profile: Profile, changes: Mapping[str, Any]) -> Profile:
-    """`profile` with some values replaced, checked as a whole again.
+    """A copy of `profile` with some values replaced, validated.
 
     Args:
-        profile: stays as it is.
-        changes: in the form of a profile file, as ``{"session": {"connect": [...]}}``.
+        profile: the original.
+        changes: as in a profile file: ``{"session": {"connect": [...]}}``.
 
     Raises:
-        ProfileError: the result is wrong.
+        ProfileError: the result is invalid.
     """
     data, _ = _merge(profile.model_dump(), {}, changes, {}, ())
     return _checked(data, {})
 
 
 def as_robot(profile: Profile, name: str) -> Profile:
-    """The profile of a robot that is like this one and called otherwise.
+    """The profile of another robot of the same kind.
 
-    A worker that serves several robots serves that one only where its list names it.
+    A worker of several robots serves it only if its list in ``serves`` contains it.
 
     Raises:
-        ProfileError: the name cannot be one.
+        ProfileError: invalid name.
     """
     others = [worker for worker, robots in profile.serves.items() if name not in robots]
     return override(profile, {"robot": {"name": name}, "serves": dict.fromkeys(others)})
 
 
 def to_yaml(profile: Profile) -> str:
-    """The profile with every default written out; `load_profile` makes the same of it."""
+    """The profile with every default written out; `read_profile` restores it."""
     return yaml_text.write(profile.model_dump(mode="json", exclude_none=True))
 
 
@@ -151,9 +151,9 @@ def _bytes(path: Path) -> bytes:
 
 
 def _parent(path: Path, parent: str) -> Path:
-    """The file that `path` extends: beside it, or the first of that name in the search order.
+    """File that the profile at `path` extends: beside it, or first on the search path.
 
-    Who extends its own name means the next one: the profile that it stands before.
+    A profile that extends its own name means the next one on the search path.
     """
     if parent == path.stem:
         return _next(path, parent)
@@ -186,7 +186,7 @@ def _next(path: Path, name: str) -> Path:
 def _merge(
     base: Mapping[str, Any], base_lines: Lines, over: Mapping[str, Any], lines: Lines, at: Place
 ) -> tuple[dict[str, Any], Lines]:
-    """`over` wins. Sections are merged, lists and hosts replaced whole; null takes away."""
+    """Merge sections; `over` wins. Lists and hosts are replaced as a whole, null removes."""
     out, out_lines = dict(base), {**base_lines}
     if at in lines:
         out_lines[at] = lines[at]
@@ -205,7 +205,7 @@ def _merge(
 
 
 def _move(place: Place, lines: Lines, out: Lines) -> None:
-    """Lines at and below `place` are now those of the file that replaced it."""
+    """Take the lines at and below `place` from the file that replaced it."""
     depth = len(place)
     for known in [known for known in out if known[:depth] == place]:
         del out[known]
@@ -216,21 +216,21 @@ FILE_SOURCE = "file:"
 
 
 def anchor(data: dict[str, Any], folder: Path) -> None:
-    """Make the relative paths in `data` absolute, in place; what is no text is left to the schema.
+    """Make relative paths in `data` absolute, in place.
 
     Args:
-        data: as a profile file has it.
-        folder: where that file is.
+        data: of a profile file, not validated yet.
+        folder: of that file.
     """
     for section, name, prefix in list(paths_in(data)):
         section[name] = prefix + below(folder, section[name].removeprefix(prefix))
 
 
 def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
-    """Where `data` names files: (section, name in it, what stands before the path there).
+    """Paths of files in `data`: (section, key, prefix of the path in the value).
 
-    These are ``robot.description``, ``arm.file``, ``ros2.messages.*``, those of ``models.*`` that
-    are no names, and ``cameras.*.source`` of the form ``file:PATH``.
+    These are ``robot.description``, ``arm.file``, ``ros2.messages.*``, paths in ``models.*``, and
+    ``cameras.*.source`` of the form ``file:PATH``.
     """
     robot, arm, ros2 = (_map(data.get(name)) for name in ("robot", "arm", "ros2"))
     description = robot.get("description")
@@ -252,8 +252,8 @@ def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
 
 
 def below(folder: Path, path: str) -> str:
-    """`path` as a profile in `folder` means it."""
-    # An empty one is refused later, and ~ is the home of whoever reads the file.
+    """`path` relative to `folder`, absolute."""
+    # An empty path is rejected later; ~ is the home of the user who loads the profile.
     if not path or path.startswith("~"):
         return path
     return os.path.normpath(folder.absolute() / path)

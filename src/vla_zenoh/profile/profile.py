@@ -205,7 +205,7 @@ def _ros2(profile: Profile) -> Iterator[Fault]:
 
 
 def _gripper_position(gripper: Ros2Gripper, has_ends: bool) -> Iterator[Fault]:
-    """A number that the gripper takes for another one opens it where it should close."""
+    """A number with the wrong meaning opens the gripper where it should close."""
     place = ("ros2", "gripper", "position")
     ends = "joint_open_rad and joint_shut_rad (_m where it slides) in robot.gripper"
     if gripper.says_width and gripper.position is not None:
@@ -221,7 +221,7 @@ def _gripper_position(gripper: Ros2Gripper, has_ends: bool) -> Iterator[Fault]:
 
 
 def _way_to_ros2(profile: Profile) -> Iterator[Fault]:
-    """Whoever speaks to the bridge moves the robot past our command node."""
+    """A client of the bridge can move the robot without our command node."""
     assert profile.ros2 is not None
     places, secured = profile.ros2.connect, profile.session.security is not None
     used = any("ros2" in host.nodes for host in profile.hosts.values())
@@ -238,7 +238,7 @@ def _way_to_ros2(profile: Profile) -> Iterator[Fault]:
         if trusted[index] and not secured:
             why = "needs certificates: make them with `vla-zenoh secure init`"
         elif secured and not trusted[index] and (any(trusted) or not is_loopback(endpoint)):
-            why = "lets everybody on the way command the robot: write tls/, or tcp/127.0.0.1:7450"
+            why = "lets anyone on the network command the robot: write tls/, or tcp/127.0.0.1:7450"
         if why:
             yield ("ros2", "connect", str(index)), why
 
@@ -260,7 +260,7 @@ def _serves(profile: Profile) -> Iterator[Fault]:
             yield (
                 ("serves", worker),
                 f"lacks {profile.robot.name}, the robot of this profile: name all that the worker "
-                "serves, or leave it out",
+                "serves, or remove the entry",
             )
 
 
@@ -293,7 +293,7 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
     for (what, name), hosts in runs.items():
         if len(hosts) > 1:
             why = ONLY_ONE.get(name) if what == "nodes" else "each key has one writer"
-            hint = "" if what == "nodes" else f". Say on each host which {what} it runs"
+            hint = "" if what == "nodes" else f". List on each host which {what} it runs"
             yield (
                 ("hosts", hosts[-1], what),
                 f"{name} runs on {' and '.join(hosts)}: {why}{hint}",
@@ -312,13 +312,13 @@ def _endpoints(profile: Profile, name: str, host: HostProfile) -> Iterator[Fault
 
 
 def _routers(profile: Profile) -> Iterator[Fault]:
-    """Every router but one has to be told of another: they do not find each other."""
+    """Every router but one needs a link to another: they do not discover each other."""
     alone = [n for n, host in profile.hosts.items() if "router" in host.nodes and not host.link]
     for name in alone[1:]:
         yield (
             ("hosts", name, "link"),
-            f"is missing: routers do not find each other, and {alone[0]} runs one as well. Name "
-            "its address, as link: [tcp/10.0.0.2:7447]",
+            f"is missing: routers do not discover each other, and {alone[0]} runs one as well. "
+            "Give its address, as link: [tcp/10.0.0.2:7447]",
         )
 
 

@@ -1,4 +1,4 @@
-"""The part of a profile that says which robot it is, and how it is commanded."""
+"""Section ``robot`` of a profile: kinematics, driver and gripper."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pydantic import AfterValidator, Field, model_validator
 from vla_zenoh.profile.section import Name, Section, Text, Word, Words, reject
 
 POSE_JOINTS = 6
-"""So many joints, at least, has an arm whose TCP can take any pose around it."""
+"""Joints that an arm needs at least to reach every pose in its workspace."""
 
 
 class JointEnds(NamedTuple):
-    """Where a finger joint is when the gripper is open, and when it is shut; ``rad`` or ``m``."""
+    """Positions of a finger joint with the gripper open and shut, in ``rad`` or ``m``."""
 
     open: float
     shut: float
@@ -25,17 +25,17 @@ class GripperProfile(Section):
     """The gripper.
 
     Args:
-        max_width_m: widest opening between the fingers.
+        max_width_m: largest opening between the fingers.
         speed_m_s: of a command.
-        force_n: likewise.
-        dead_band_m: a command is sent when the width differs by more.
-        command_timeout_s: a gripper that has not said for so long that it stands is taken as
+        force_n: of a command.
+        dead_band_m: smaller changes of the width are not commanded.
+        command_timeout_s: a gripper that has not reported standstill for this long counts as
             standing.
-        joint_open_rad: angle of a finger joint that turns when the gripper is open by max_width_m.
-        joint_shut_rad: its angle when the fingers meet. In between both go in a straight line.
-        joint_open_m: likewise of one that slides, where finger joints are not such as add up to
-            the width.
-        joint_shut_m: likewise.
+        joint_open_rad: angle of a revolute finger joint when the gripper is open by max_width_m.
+        joint_shut_rad: its angle when the fingers meet; linear in between.
+        joint_open_m: position of a prismatic finger joint when the gripper is open, if finger
+            joints do not add up to the width.
+        joint_shut_m: its position when the fingers meet.
     """
 
     max_width_m: float = Field(default=0.08, gt=0, le=1)
@@ -50,7 +50,7 @@ class GripperProfile(Section):
 
     @property
     def joint_ends(self) -> JointEnds | None:
-        """What the profile says of the finger joint, None where fingers add up to the width."""
+        """Ends of the finger joint; None if finger joints add up to the width."""
         if self.joint_open_rad is not None and self.joint_shut_rad is not None:
             return JointEnds(self.joint_open_rad, self.joint_shut_rad, "rad")
         if self.joint_open_m is not None and self.joint_shut_m is not None:
@@ -81,23 +81,22 @@ class GripperProfile(Section):
 
 
 class RobotProfile(Section):
-    """The robot and its description (URDF), which serves the simulator and the kinematics.
+    """The robot and its description (URDF), shared by simulator and kinematics.
 
     Args:
         name: part of every key.
-        driver: who moves it: the simulator, a ROS 2 robot's controllers, or a Python file.
-        command: what it is commanded by: ``pose`` of the TCP, for a Cartesian impedance
-            controller, or ``joint`` positions, for an arm without one.
+        driver: ``sim``: simulator; ``ros2``: controllers of a ROS 2 robot; ``arm``: Python file.
+        command: set-points of the arm: ``pose`` of the TCP, for a Cartesian impedance controller,
+            or ``joint`` positions.
         description: path of the URDF, or ``example-robot-data:`` and a path in that package.
-        base_frame: link all poses are given in.
-        tcp_frame: link whose pose is meant.
-        arm_joints: in the order in which every list of joint values in the profile is.
-        finger_joints: of the gripper, whose joint states tell its width. Those that slide add up to
-            it; of those that turn `gripper` has to say where they are open and shut.
-        home_rad: where a reset puts the simulated arm.
-        posture: joints that a redundant arm keeps its elbow near to: ``start``, those it is
-            activated in, or ``home``, to which the elbow then moves at once where joints are
-            commanded.
+        base_frame: link in which all poses are expressed.
+        tcp_frame: link whose pose is controlled.
+        arm_joints: in the order of every list of joint values in the profile.
+        finger_joints: of the gripper; their states give its width. Prismatic ones add up to it; for
+            revolute ones `gripper` defines where they are open and shut.
+        home_rad: joint positions of the simulated arm after a reset.
+        posture: joint positions that a redundant arm keeps its elbow close to: ``start``, those at
+            activation, or ``home``, to which the elbow then moves at once if joints are commanded.
         gripper: its own section.
     """
 
@@ -143,15 +142,15 @@ def _option(value: str) -> str:
 
 
 Options = dict[Annotated[str, AfterValidator(_option)], Text]
-"""Given by name, as text, to the constructor of a class in a file."""
+"""Keyword arguments of a class in a Python file, as text."""
 
 
 class ArmProfile(Section):
-    """A robot that is moved by a class of one's own, see `vla_zenoh.robot`.
+    """A robot that is driven by a Python class, see `vla_zenoh.robot`.
 
     Args:
         file: the Python file.
-        options: for its constructor.
+        options: of its constructor.
     """
 
     file: Word

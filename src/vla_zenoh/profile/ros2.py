@@ -1,4 +1,4 @@
-"""The part of a profile that describes a ROS 2 robot: topics, types and the way in."""
+"""Section ``ros2`` of a profile: transport, topics and types of a ROS 2 robot."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Ros2Camera(Section):
     Args:
         topic: its name.
         type: raw or compressed.
-        frame: frame_id its pictures must have; None: any.
+        frame: required frame_id of its images; None: any.
     """
 
     topic: Topic
@@ -57,12 +57,12 @@ class Ros2Camera(Section):
 
 
 class Ros2Output(Section):
-    """A topic the arm is commanded by.
+    """A topic that commands the arm.
 
     Args:
         topic: its name.
         type: for poses geometry_msgs/msg/PoseStamped,
-            multi_mode_control_msgs/msg/CartesianImpedanceGoal, or any other with a pose in it; for
+            multi_mode_control_msgs/msg/CartesianImpedanceGoal, or any other type with a pose; for
             joints one of `JOINT_COMMANDS`.
         frame: frame_id of its header; None: robot.base_frame.
     """
@@ -77,7 +77,7 @@ class Ros2Wrench(Section):
 
     Args:
         topic: its name.
-        frame: frame_id it must have, whose axes are those of robot.base_frame; None: that one.
+        frame: required frame_id; its axes are those of robot.base_frame. None: that frame.
     """
 
     topic: Topic
@@ -85,16 +85,16 @@ class Ros2Wrench(Section):
 
 
 class Ros2Gripper(Section):
-    """What the gripper is commanded by: an action, or a topic of numbers.
+    """The action or topic that commands the gripper.
 
     Args:
         topic: name of the action or topic.
         type: one of `GRIPPER_ACTIONS`, or a topic of plain numbers.
-        grasp: action of franka_msgs/action/Grasp that closes, where ``topic`` only moves.
-        position: what the number means that is sent, where the type does not say it: ``width``, the
-            m between the fingers; ``finger``, the m of one of them, half of that; ``joint``, the m
-            or rad of the finger joint, by the ``joint_open`` and ``joint_shut`` of robot.gripper.
-            None: ``joint`` where robot.gripper has those; else it has to be said.
+        grasp: action of franka_msgs/action/Grasp that closes, if ``topic`` only moves.
+        position: meaning of the number that is sent, if the type leaves it open: ``width``, m
+            between the fingers; ``finger``, m of one finger, half of that; ``joint``, m or rad of
+            the finger joint, by ``joint_open`` and ``joint_shut`` of robot.gripper. None: ``joint``
+            if robot.gripper has those; otherwise it is required.
     """
 
     topic: Topic
@@ -111,29 +111,29 @@ class Ros2Gripper(Section):
 
     @property
     def says_width(self) -> bool:
-        """The type itself means the width."""
+        """Whether the type itself defines the number as the width."""
         return self.type.startswith("franka_msgs/")
 
 
 class Ros2Profile(Section):
-    """Topics of a ROS 2 robot.
+    """Transport and topics of a ROS 2 robot.
 
     Args:
         bridge: ``ros2dds``: zenoh-bridge-ros2dds; ``rmw_zenoh``: the robot runs rmw_zenoh.
-        connect: where bridge or router are; None: as session.connect says.
-        distribution: of the robot; its type hashes are part of names.
+        connect: endpoints of bridge or router; None: those of session.connect.
+        distribution: of the robot; type hashes are part of names.
         domain: ROS domain id.
         joint_states: topic of sensor_msgs/JointState with the arm's joints.
-        finger_states: likewise with those of the fingers, where they come on another topic.
-        tcp: ``kinematics``: the TCP is where our own kinematics put it; ``tf``: where /tf says.
-        wrench: external wrench at the TCP; without it ``limits.contact`` has nothing to look at.
+        finger_states: topic with the finger joints, if they are on another one.
+        tcp: source of the TCP pose: ``kinematics``: our own; ``tf``: the topic /tf.
+        wrench: external wrench at the TCP; ``limits.contact`` has no effect without it.
         cameras: camera of the profile -> topic.
-        pose_command: where poses go.
-        joint_command: where joint positions go.
-        gripper: where gripper commands go.
-        messages: type -> file with its definition, for types that ROS and we do not have; a path
-            beside the profile.
-        services: what our own services and topics begin with; null: there are none.
+        pose_command: topic for poses.
+        joint_command: topic for joint positions.
+        gripper: action or topic for the gripper.
+        messages: type -> file with its definition, relative to the profile, for types that neither
+            ROS nor this package has.
+        services: prefix of our own services and topics; null: none.
     """
 
     bridge: Literal["ros2dds", "rmw_zenoh"] = "ros2dds"

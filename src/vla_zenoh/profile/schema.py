@@ -1,7 +1,4 @@
-"""What a profile may say. Frozen records; every field has its unit in its name.
-
-Defaults are the safe choice, so a profile that says nothing about limits has limits.
-"""
+"""Sections of a profile: timing, cameras, simulator, task and hosts."""
 
 from __future__ import annotations
 
@@ -31,35 +28,46 @@ NODE_KINDS: tuple[NodeKind, ...] = (
     "worker",
 )
 SIMULATED: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")
-CAMERA_SOURCES = ("sim:CAMERA", "v4l2:DEVICE", "rtsp://...", "file:PATH", "ros2:TOPIC")
+CAMERA_SOURCES = {
+    "sim": "sim:CAMERA",
+    "v4l2": "v4l2:DEVICE",
+    "rtsp": "rtsp://HOST/PATH",
+    "rtsps": "rtsps://HOST/PATH",
+    "file": "file:PATH",
+    "ros2": "ros2:TOPIC",
+}
+"""Kind of a camera's source -> how it is written. `nodes.camera.grabber.make_source` opens them."""
 MIN_PERIODS = 3
-"""A silence shorter than this many periods happens on a healthy link."""
+"""A healthy link may be silent for up to this many periods."""
 
 
 def _source(value: str) -> str:
     kind, colon, rest = value.partition(":")
-    if not colon or not rest or kind not in ("sim", "v4l2", "rtsp", "rtsps", "file", "ros2"):
-        raise ValueError(f"{value!r} is not a camera: write one of {', '.join(CAMERA_SOURCES)}")
+    if not colon or not rest or kind not in CAMERA_SOURCES:
+        known = ", ".join(CAMERA_SOURCES.values())
+        raise ValueError(f"{value!r} is not a camera: write one of {known}")
     if kind in ("rtsp", "rtsps") and not rest.removeprefix("//"):
         raise ValueError(f"{value!r} lacks the host: write rtsp://HOST/PATH")
     return value
 
 
 class Timing(Section):
-    """Rates and patience.
+    """Rates and timeouts.
 
     Args:
-        command_hz: of the pose stream.
-        state_hz: of the robot's state (the simulator's; a real robot has its own).
-        watchdog_s: no fresh chunk for this long after the last one ran out: brake and hold.
-        max_hold_s: an arm that held for so long needs activation again.
-        state_timeout_s: robot state older than this: brake, and activation is needed again.
-        command_timeout_s: pose stream silent for this long: the robot side brakes by itself.
-        max_observation_age_s: a chunk made from an older observation is refused.
-        max_open_loop_s: of a chunk no more is followed; then it counts as run out.
-        max_clock_step_s: the wall clock jumped by more: brake, and activation is needed again.
-        max_clock_offset_s: another host's clock may differ by this much, which is then reckoned
-            with; beyond it activation is refused.
+        command_hz: rate of the command stream.
+        state_hz: rate of the simulated robot's state; a real robot has its own.
+        watchdog_s: the arm brakes and holds if no new chunk arrives for this long after the last
+            one ran out.
+        max_hold_s: after holding for this long the arm needs a new activation.
+        state_timeout_s: older robot state brakes the arm, which then needs a new activation.
+        command_timeout_s: the robot brakes by itself if the command stream is silent for this long.
+        max_observation_age_s: a chunk inferred from an older observation is rejected.
+        max_open_loop_s: longest part of a chunk that is followed; then it counts as run out.
+        max_clock_step_s: a larger jump of the wall clock brakes the arm, which then needs a new
+            activation.
+        max_clock_offset_s: largest offset of another host's clock that is compensated; with a
+            larger one activation is rejected.
     """
 
     command_hz: float = Field(default=250.0, ge=50, le=1000)
@@ -74,7 +82,7 @@ class Timing(Section):
     max_clock_offset_s: float = Field(default=0.1, gt=0, le=1)
 
     @model_validator(mode="after")
-    def _patience_outlasts_the_rate(self) -> Timing:
+    def _timeouts_span_periods(self) -> Timing:
         reject(
             [
                 ((name,), f"is {wait_s:g}, less than {MIN_PERIODS} periods of {rate} ({rate_hz:g})")
@@ -90,15 +98,15 @@ class Timing(Section):
 
 
 class Composition(Section):
-    """What is followed where chunks overlap; see `vla_zenoh.control.aggregate`.
+    """How overlapping chunks are combined; see `vla_zenoh.control.aggregate`.
 
     Args:
-        mode: ``replace``: the newest chunk alone; ``blend``: it takes over from the one before
-            within a window; ``ensemble``: the weighted mean of all that still run.
-        blend_s: the window of ``blend``.
+        mode: ``replace``: only the newest chunk; ``blend``: it takes over from the previous one
+            within a window; ``ensemble``: the weighted mean of all chunks in force.
+        blend_s: window of ``blend``.
         ensemble_decay: m of ``ensemble``: chunk i, 0 the oldest, has the weight exp(-m i).
-        ensemble_plans: the newest so many chunks have a say at most.
-        pace: ``spec``: as the model's spec says; ``steady`` or ``soonest``: whatever it says, see
+        ensemble_plans: largest number of chunks in the mean, the newest ones.
+        pace: ``spec``: as the model's spec says; ``steady`` or ``soonest`` overrides it, see
             `vla_zenoh.policy.ActionSpec`.
     """
 
@@ -110,20 +118,20 @@ class Composition(Section):
 
 
 class CameraCheck(Section):
-    """When a camera's own pictures say that it must not be believed; `nodes.camera.image_check`.
+    """When a camera's own images show that it cannot be trusted; see `nodes.camera.image_check`.
 
-    A limit of 0, of a share 1, switches that check off.
+    A duration or contrast of 0 or a share of 1 disables that check.
 
     Args:
-        same_s: the very same picture for so long: it is frozen, as a sensor has noise. null: by its
-            source: 1 of ``v4l2:``, 2 of ``ros2:``, 5 of ``rtsp:``, whose compression may repeat a
-            still scene; 0 of ``sim:``, ``file:`` and virtual devices, which have no noise.
-        stamp_s: the driver's time stamp does not go forward for so long.
-        clipped_share: share of the picture that may be black, or white.
-        contrast_levels: between its brightest and darkest parts, of 255: fewer is a covered lens.
-        uniform_share: share of the picture that may be one even area. Off by default: a table top
-            and a hand before the lens look alike.
-        after_s: black, white, without contrast or even for so long.
+        same_s: an identical image for this long: frozen, as every sensor has noise. null: depends
+            on the source: 1 for ``v4l2:``, 2 for ``ros2:``, 5 for ``rtsp:``, whose compression may
+            repeat a still scene; 0 for ``sim:``, ``file:`` and virtual devices without noise.
+        stamp_s: the driver's time stamp does not advance for this long.
+        clipped_share: largest share of the image that may be black, or white.
+        contrast_levels: between the brightest and darkest parts, of 255; less is a covered lens.
+        uniform_share: largest share of the image that may be one even area. Off by default: a
+            table top looks like a hand in front of the lens.
+        after_s: black, white, low contrast or evenness is a fault after this long.
     """
 
     same_s: float | None = Field(default=None, ge=0, le=3600)
@@ -139,18 +147,18 @@ class CameraProfile(Section):
 
     Args:
         source: ``sim:<camera of the scene>``, ``v4l2:<device>`` (``v4l2:/dev/video0``),
-            ``rtsp://...``, ``file:<video or folder of pictures>`` (a path beside the profile), or
+            ``rtsp://...``, ``file:<video or folder of images>`` (relative to the profile), or
             ``ros2:<topic>``.
-        width: pixels published.
-        height: likewise.
-        rate_hz: pictures per second, at most.
-        jpeg_quality: of pictures as JPEG, which is how they travel between hosts, 1 to 100.
-        jpeg_rate_hz: of those at most; null: as many as there are.
-        jpeg_width: wider ones are made smaller for the jpeg key; null: as they are.
-        fit_for_workers: a worker on another host gets them in the very size of its spec, made
-            where the camera is. Of the sources all but ``ros2:`` can.
+        width: of published images, pixels.
+        height: of published images, pixels.
+        rate_hz: largest rate of images.
+        jpeg_quality: of the JPEG stream, which hosts exchange, 1 to 100.
+        jpeg_rate_hz: largest rate of the JPEG stream; null: every image.
+        jpeg_width: wider images are scaled down for the JPEG stream; null: never.
+        fit_for_workers: also publish images in the exact size of each model's spec, for workers on
+            other hosts. Every source except ``ros2:`` supports it.
         loop: a file starts again at its end.
-        check: when its pictures say that it must not be believed.
+        check: when its images show that it cannot be trusted.
     """
 
     source: Annotated[Word, AfterValidator(_source)]
@@ -173,8 +181,8 @@ class SimProfile(Section):
         gains: preset of the impedance controller.
         joint_friction_nm: Coulomb friction in every arm joint.
         seed: of the first placement of the objects.
-        vary: what else a seed changes, beside places; the scene has to have it.
-        renderer: ``auto`` takes OpenGL where it works, else ray casting.
+        vary: what else a seed randomizes beside the placement; the scene has to support it.
+        renderer: ``auto`` uses OpenGL if it works, else ray casting.
     """
 
     scene: Word = "table"
@@ -190,13 +198,13 @@ class SimProfile(Section):
 
 
 class TaskProfile(Section):
-    """What the settings are until somebody puts others.
+    """Initial values of the settings.
 
     Args:
-        prompt: what the model is asked to do.
-        rate_hz: chunks per second asked of the workers.
-        worker: whose chunks are obeyed.
-        speed_percent: of the speed that is planned, so much is driven.
+        prompt: instruction for the model.
+        rate_hz: requested rate of chunks.
+        worker: whose chunks move the arm.
+        speed_percent: share of the planned speed.
     """
 
     prompt: Text = "hold"
@@ -206,13 +214,13 @@ class TaskProfile(Section):
 
 
 class HostImagesProfile(Section):
-    """What of every camera travels to the workers of a host that has no cameras.
+    """Camera streams for the workers of a host that has no cameras of its own.
 
     Args:
         quality: of JPEG, 1 to 100.
-        rate_hz: of each camera at most; None: as many as there are.
-        width: wider ones are made smaller; None: as they are. With ``fit_for_workers`` of a camera
-            a model that declares a size gets that instead.
+        rate_hz: largest rate of each camera; None: every image.
+        width: wider images are scaled down; None: never. Models that declare a size get that
+            instead, if the camera has ``fit_for_workers``.
     """
 
     quality: int = Field(default=80, ge=1, le=100)
@@ -221,18 +229,18 @@ class HostImagesProfile(Section):
 
 
 class HostProfile(Section):
-    """One computer: which nodes run there, and how it reaches the router from there.
+    """One computer: which nodes run there, and how they reach the router.
 
     Args:
         nodes: kinds of nodes.
-        connect: where the router is seen from there; None: as session.connect says.
-        listen: where the router of this host listens; None: as session.listen says.
-        link: routers of other hosts that this one connects to. With two routers in ``connect`` a
-            host goes on with the second one when the first is gone.
-        cameras: those of its camera node; None: all.
-        workers: those it runs; None: all.
-        pictures: what its workers get of cameras elsewhere; None: what the cameras' own settings
-            for JPEG say.
+        connect: endpoints of the router as seen from there; None: those of session.connect. With
+            two routers the host switches to the second one when the first is lost.
+        listen: endpoints of this host's router; None: those of session.listen.
+        link: routers of other hosts that this host's router connects to.
+        cameras: served by its camera node; None: all.
+        workers: that it runs; None: all.
+        pictures: streams of cameras elsewhere for its workers; None: the JPEG streams of the
+            cameras.
     """
 
     nodes: Annotated[tuple[NodeKind, ...], Field(strict=False, min_length=1), Distinct]

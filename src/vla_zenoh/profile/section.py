@@ -1,4 +1,4 @@
-"""What all sections of a profile are made of."""
+"""Base class and types of profile sections, and the messages of invalid ones."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ Lines = dict[Place, str]
 
 
 class Section(BaseModel):
-    """A part of a profile: frozen, unknown keys refused, finite numbers only.
+    """A section of a profile: frozen, without unknown keys, with finite numbers only.
 
-    Strict, so that neither ``"5"`` nor ``true`` is a number. Lists become tuples.
+    Strict: neither ``"5"`` nor ``true`` is a number. Lists become tuples.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
 
 class InconsistentSections(ValueError):
-    """Values that are right each for itself and do not fit each other.
+    """Values that are valid by themselves but contradict each other.
 
     Args:
         faults: (place below the section that raises this, sentence).
@@ -43,7 +43,7 @@ class InconsistentSections(ValueError):
 
 
 def reject(faults: Sequence[Fault]) -> None:
-    """Raise `InconsistentSections` where there are faults."""
+    """Raise `InconsistentSections` if there are faults."""
     if faults:
         raise InconsistentSections(faults)
 
@@ -81,16 +81,16 @@ _NO_VALUE_SHOWN = {"missing", "extra_forbidden", "too_long", "too_short", "value
 
 
 def explain(error: ValidationError, lines: Lines, model: type[Section]) -> list[str]:
-    """One line for each fault."""
-    said: list[str] = []
+    """One line for each fault: file, line, path, what is wrong and what is allowed."""
+    lines_out: list[str] = []
     for fault in error.errors(include_url=False):
         place = tuple(str(part) for part in fault["loc"] if part != "[key]")
         cause = fault.get("ctx", {}).get("error")
         if isinstance(cause, InconsistentSections):
-            said += [_line((*place, *below), why, lines) for below, why in cause.faults]
+            lines_out += [_line((*place, *below), why, lines) for below, why in cause.faults]
         else:
-            said.append(_line(place, _why(fault, place, model), lines))
-    return said
+            lines_out.append(_line(place, _why(fault, place, model), lines))
+    return lines_out
 
 
 def _line(place: Place, why: str, lines: Lines) -> str:
@@ -108,7 +108,7 @@ def _why(fault: Any, place: Place, model: type[Section]) -> str:
         allowed = field_names(model, place[:-1])
         return f"unknown key{nearest(place[-1], allowed)} Known here: {', '.join(allowed)}"
     if fault["type"] == "missing" and place == ("robot",):
-        return "is missing: describe the robot, or begin with another profile: extends: NAME"
+        return "is missing: describe the robot, or start from another profile: extends: NAME"
     if fault["type"] == "missing" and place[-1].isdigit():
         return "is missing: the list is too short"
     if fault["type"] in ("dict_type", "model_type"):
@@ -122,7 +122,7 @@ def _why(fault: Any, place: Place, model: type[Section]) -> str:
 
 
 def field_names(model: Any, place: Place) -> list[str]:
-    """What the section at `place` may hold; empty where that is free or not a section."""
+    """Fields of the section at `place`; empty if its keys are free, or it is no section."""
     for part in place:
         if _is_section(model):
             field = model.model_fields.get(part)

@@ -1,4 +1,4 @@
-"""The part of a profile that says how nodes reach each other."""
+"""Section ``session`` of a profile: endpoints, links and security."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vla_zenoh.profile.section import Distinct, Name, Section, Word, reject
 IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
 FILE_PROTOCOLS = ("unixsock-stream",)
 TRUSTED_PROTOCOLS = ("tls", "quic")
-"""What certificates are checked on."""
+"""Protocols that verify certificates."""
 DEFAULT_FOLDER = "~/.config/vla-zenoh/lab"
 ANYWHERE = ("0.0.0.0", "[::]")
 
@@ -52,34 +52,34 @@ Endpoints = Annotated[tuple[Endpoint, ...], Field(strict=False, max_length=16), 
 
 
 def address_of(endpoint: str) -> str:
-    """What stands behind the protocol: ``127.0.0.1:7447`` of ``tcp/127.0.0.1:7447``."""
+    """The address of an endpoint: ``127.0.0.1:7447`` of ``tcp/127.0.0.1:7447``."""
     return re.split(r"[?#]", endpoint.partition("/")[2], maxsplit=1)[0]
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether only this computer can be meant: a file, ``localhost``, or an address of loopback."""
+    """Whether an endpoint is on this computer: a file, ``localhost``, or a loopback address."""
     if endpoint.startswith(FILE_PROTOCOLS):
         return True
     return is_loopback_address(host_of(endpoint))
 
 
 def is_loopback_address(address: str) -> bool:
-    """Likewise for an address without protocol and port."""
+    """`is_loopback` for an address without protocol and port."""
     host = address.partition("%")[0]
     try:
         return ipaddress.ip_address(host).is_loopback
-    except ValueError:  # a name, which leads wherever its resolver says
+    except ValueError:  # a name, which may resolve to anything
         return host == "localhost"
 
 
 def host_of(endpoint: str) -> str:
-    """Name or IP address in an endpoint, without brackets; empty for a file."""
+    """Host name or IP address of an endpoint, without brackets; empty for a file."""
     match = _HOST_AND_PORT.fullmatch(address_of(endpoint))
     return match["host"].strip("[]") if match else ""
 
 
 def second_link(endpoint: str) -> str:
-    """The same endpoint at the next port: where pictures go when links are separate."""
+    """The same endpoint at the next port, for images on a link of their own."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
     return f"{protocol}/{host}:{int(port) + 1}"
@@ -88,27 +88,27 @@ def second_link(endpoint: str) -> str:
 def endpoint_faults(
     endpoints: Sequence[str], session: SessionProfile, *, listen: bool
 ) -> list[tuple[int, str]]:
-    """(index, sentence) of endpoints that do not fit what the session says of security and links.
+    """(index, sentence) for endpoints that contradict the session's security or links.
 
     Args:
         endpoints: of the session or of one host.
         session: the session section.
-        listen: a router listens there; else somebody connects to them.
+        listen: a router listens on them; otherwise nodes connect to them.
     """
     out: list[tuple[int, str]] = []
     for index, endpoint in enumerate(endpoints):
         protocol = endpoint.partition("/")[0]
         trusted = protocol in TRUSTED_PROTOCOLS
         if session.security is not None and not trusted:
-            why = f"{protocol} checks no certificate, and there is a section security: write tls/"
+            why = f"{protocol} verifies no certificate, but there is a section security: write tls/"
             out.append((index, why))
         elif session.security is None and trusted:
             why = f"{protocol} needs certificates: make them with `vla-zenoh secure init`"
             out.append((index, why))
         elif listen and not (trusted or session.insecure or is_loopback(endpoint)):
             why = (
-                "lets everybody on that network command the robot. Make certificates with "
-                "`vla-zenoh secure init`, or listen on 127.0.0.1, or say insecure: true"
+                "lets anyone on that network command the robot. Make certificates with "
+                "`vla-zenoh secure init`, or listen on 127.0.0.1, or set insecure: true"
             )
             out.append((index, why))
         if session.separate_links and not _has_a_second(endpoint):
@@ -122,15 +122,15 @@ def _has_a_second(endpoint: str) -> bool:
 
 
 class SecurityProfile(Section):
-    """Mutual TLS and access control. Written by ``vla-zenoh secure init``.
+    """Mutual TLS and access control, written by ``vla-zenoh secure init``.
 
     Args:
-        folder: a folder for each host in it, with its certificates: ``HOST/ca.pem``,
-            ``HOST/NODE.pem`` and ``HOST/NODE.key``.
-        host: which host this computer is; None: as noted in the folder, or the only one there.
-        people: computer -> what a person there may do. A host that runs the command node may
-            drive the robot, the others of the profile may look. Who may replay may say all that
-            a recording holds, commands too.
+        folder: has a folder with certificates for each host: ``HOST/ca.pem``, ``HOST/NODE.pem`` and
+            ``HOST/NODE.key``.
+        host: of the profile that this computer is; None: as noted in the folder, or its only one.
+        people: computer -> permission of its users. Users of the host with the command node may
+            operate the robot, those of other hosts of the profile may view. ``replay`` may publish
+            everything that a recording contains, commands included.
     """
 
     folder: Word = DEFAULT_FOLDER
@@ -139,21 +139,21 @@ class SecurityProfile(Section):
 
 
 class SessionProfile(Section):
-    """How nodes of this profile reach each other.
+    """How the nodes of a robot reach each other.
 
     Args:
-        connect: where nodes look for the router, the first that answers is taken; when it is
-            gone, the next.
-        listen: where the router listens.
-        router: ``own``: in a Python process of ours; ``zenohd``: the program of that name, with
-            the same configuration.
-        separate_links: pictures travel over connections of their own, to the router's next port.
-            A reader that is stuck in a picture then does not hold up the arm.
-        shared_memory: move large payloads through shared memory between processes of one host.
-        lease_ms: a silent link is given up after this.
-        security: certificates and who may do what; null: there are none, and the router listens
-            on this computer only.
-        insecure: listen on a network without certificates all the same.
+        connect: endpoints of the router; nodes use the first that answers, and the next one when it
+            is lost.
+        listen: endpoints on which the router listens.
+        router: ``own``: a Python process of ours; ``zenohd``: that program, with the same
+            configuration.
+        separate_links: images use connections of their own, to the router's next port, so that a
+            reader that is stuck in an image does not delay the arm.
+        shared_memory: processes of one host exchange large payloads through shared memory.
+        lease_ms: a silent link is closed after this.
+        security: certificates and permissions; null: none, and the router listens on this computer
+            only.
+        insecure: listen on a network without certificates.
     """
 
     connect: Endpoints = ("tcp/127.0.0.1:7447",)
@@ -166,7 +166,7 @@ class SessionProfile(Section):
     insecure: bool = False
 
     @model_validator(mode="after")
-    def _somewhere_to_meet(self) -> SessionProfile:
+    def _endpoints_are_usable(self) -> SessionProfile:
         faults = []
         if not self.connect:
             faults.append((("connect",), "is empty: nodes need a router, as tcp/10.0.0.2:7447"))

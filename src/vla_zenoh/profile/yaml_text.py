@@ -1,7 +1,7 @@
-"""YAML to plain data, with the line of everything.
+"""YAML to plain data with line numbers.
 
-The scalars of YAML 1.2's core schema: only ``true`` and ``false`` are truth values, ``1e3`` is a
-number, ``12:30`` is text. Aliases are followed within a budget, tags and merge keys are refused.
+Scalars follow YAML 1.2's core schema: only ``true`` and ``false`` are booleans, ``1e3`` is a
+number, ``12:30`` is text. Aliases are expanded within a budget, tags and merge keys are rejected.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from vla_zenoh.types import shown
 
 MAX_PROFILE_BYTES = 100_000
 MAX_NODES = 5_000
-"""What a file may hold once its aliases are followed."""
+"""Values in a file after the expansion of aliases."""
 MAX_DEPTH = 32
 
 _PREFIX = "tag:yaml.org,2002:"
@@ -38,11 +38,11 @@ class _Reader(yaml.SafeLoader):
 
 
 class _Writer(yaml.SafeDumper):
-    """Quotes whatever text this reader or one of YAML 1.1 would take for something else."""
+    """Quotes text that this reader or a YAML 1.1 one would parse as another type."""
 
 
 def _text(writer: _Writer, text: str) -> yaml.ScalarNode:
-    # Line ends of other alphabets are lost unless they are written as escapes.
+    # Unicode line ends are lost unless they are escaped.
     style = '"' if _SPECIAL.search(text) else None
     return writer.represent_scalar(f"{_PREFIX}str", text, style)
 
@@ -55,7 +55,7 @@ for _tag, _form in _SCALARS.items():
 
 
 def write(data: Any) -> str:
-    """`data` as YAML that `read` and other readers take back as it is."""
+    """`data` as YAML that `read` and other parsers restore exactly."""
     return yaml.dump(data, Dumper=_Writer, sort_keys=False, allow_unicode=True, width=100)
 
 
@@ -63,7 +63,7 @@ def read(raw: bytes, file: str) -> tuple[dict[str, Any], Lines]:
     """The map in a file, and place -> ``file:line``.
 
     Raises:
-        ProfileError: not such YAML; names `file` and line.
+        ProfileError: invalid YAML; names `file` and line.
     """
     if len(raw) > MAX_PROFILE_BYTES:
         raise ProfileError(f"{file}: {len(raw)} bytes, a profile has at most {MAX_PROFILE_BYTES}")
@@ -89,8 +89,8 @@ def _compose(raw: bytes, file: str) -> yaml.Node | None:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"{file}:{mark.line + 1}" if mark else file
-        said = ", ".join(part for part in (error.context, error.problem) if part)
-        raise ProfileError(f"{where}: not valid YAML: {said}") from error
+        why = ", ".join(part for part in (error.context, error.problem) if part)
+        raise ProfileError(f"{where}: not valid YAML: {why}") from error
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         raise ProfileError(f"{file}:{line}: a character that YAML does not allow") from error
@@ -99,7 +99,7 @@ def _compose(raw: bytes, file: str) -> yaml.Node | None:
 
 
 class _Plain:
-    """Nodes to plain data; counts what it makes, for an alias can name a thing again and again."""
+    """Converts nodes to plain data, and counts them: aliases can multiply a small file."""
 
     def __init__(self, file: str, lines: Lines) -> None:
         self._file, self._lines, self._made = file, lines, 0

@@ -1,7 +1,6 @@
-"""What is wrong with this computer's certificates, and how long they last, while nodes run.
+"""Warns of certificates of this computer that expire or are faulty, while nodes run.
 
-A lab is up for months, and a certificate ends at some night. Zenoh closes the link then, and the
-arm stands.
+A lab may be up for months. When a certificate expires Zenoh closes the link, and the arm stands.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ TELL_PERIOD_S = 24 * 3600.0
 
 @dataclass(frozen=True, slots=True)
 class ExpiryOutlook:
-    """What a look at the certificates came to.
+    """Result of checking the certificates.
 
     Args:
-        days: until the first of them ends, negative when it has; None: not known.
-        wrong: the file of each that is of no use, or soon is, and why.
-        unknown: why they could not be looked at; empty: they could.
+        days: until the first expires, negative if it has; None: unknown.
+        wrong: files that are invalid, or soon will be, and why.
+        unknown: why they could not be checked; empty: they were.
     """
 
     days: int | None = None
@@ -35,7 +34,7 @@ class ExpiryOutlook:
 
 
 def outlook(security: SecurityProfile, now: dt.datetime) -> ExpiryOutlook:
-    """Looks at the certificates of this computer.
+    """Check the certificates of this computer.
 
     Args:
         security: of the profile; its host says which computer this is.
@@ -44,8 +43,8 @@ def outlook(security: SecurityProfile, now: dt.datetime) -> ExpiryOutlook:
     store = Store(security.folder)
     try:
         entries = store.entries(now, store.this_host(security.host))
-    except MissingExtraError as error:  # who only uses certificates need not be able to read them
-        return ExpiryOutlook(unknown=f"nobody looks here when certificates end: {error}")
+    except MissingExtraError as error:  # using certificates needs no library to read them
+        return ExpiryOutlook(unknown=f"the expiry of certificates cannot be checked here: {error}")
     except SecurityError as error:
         return ExpiryOutlook(unknown=str(error))
     wrong = tuple(
@@ -59,11 +58,11 @@ def outlook(security: SecurityProfile, now: dt.datetime) -> ExpiryOutlook:
 
 
 class CertificateExpiry:
-    """Looks once an hour; what is wrong is due when it is new, and once a day.
+    """Checks certificates once an hour; faults are reported when they are new, and once a day.
 
     Args:
-        security: of the profile; None: there are no certificates, and nothing is wrong with them.
-        clock: seconds that only go up.
+        security: of the profile; None: there are no certificates.
+        clock: seconds that never go back.
         now: UTC.
     """
 
@@ -79,14 +78,14 @@ class CertificateExpiry:
 
     @property
     def outlook(self) -> ExpiryOutlook:
-        """Not older than an hour."""
+        """The last result, at most an hour old."""
         if self._security is not None and self._clock() - self._looked_s >= LOOK_PERIOD_S:
             self._looked_s = self._clock()
             self._outlook = outlook(self._security, self._now())
         return self._outlook
 
     def due(self) -> tuple[str, ...]:
-        """Sentences to be told now."""
+        """Sentences to report now."""
         found = self.outlook
         new = (found.wrong, found.unknown) != (self._told.wrong, self._told.unknown)
         again = bool(found.wrong) and self._clock() - self._told_s >= TELL_PERIOD_S

@@ -1,7 +1,7 @@
-"""Which nodes of a host hang: they run, and have said nothing for long.
+"""Detects hung nodes of a host: they run, but their heartbeat (the status) has stopped.
 
-A node that hangs does no harm, since the arm brakes without it, but nothing goes on either, and at
-night nobody is there to end it. Workers are left alone: a large model may load or think long.
+A hung node does no harm, since the arm brakes without it, but it has to be ended so that a new one
+can start. Workers are exempt: a large model may take long to load or to infer.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 HANG_S = 10.0
-"""Nodes speak twice a second; what holds all of a computer up for so long is not their fault."""
+"""Nodes publish their status twice a second; a stall of the whole computer is not their fault."""
 HEARD_S = 2.0
 
 
 class LastStatus(NamedTuple):
-    """The newest status of a node.
+    """Last status of a node.
 
     Args:
-        pid: of the process that said it.
-        age_s: since then.
+        pid: of its process.
+        age_s: age of the status.
     """
 
     pid: int
@@ -30,8 +30,8 @@ def hung_nodes(running: Mapping[str, tuple[str, int]], said: Mapping[str, LastSt
     """Names of the nodes to end.
 
     Args:
-        running: node -> (kind, pid) of those that this host has started and that run.
-        said: node -> its newest status, of all hosts.
+        running: node -> (kind, pid) of the running nodes that this host started.
+        said: node -> its last status, of all hosts.
     """
     silent = {
         name: kind
@@ -43,5 +43,5 @@ def hung_nodes(running: Mapping[str, tuple[str, int]], said: Mapping[str, LastSt
     }
     if any(status.age_s < HEARD_S for status in said.values()):
         return sorted(silent)
-    # Nobody is heard: the fault is the router's, or the network's, which no restart helps.
+    # No status at all: the fault is the router's, or the network's, which no restart repairs.
     return sorted(name for name, kind in silent.items() if kind == "router")

@@ -1,4 +1,4 @@
-"""Which nodes of a profile run on which host, and how a whole host is brought up and down."""
+"""Brings up and down the nodes that a profile assigns to a host."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ROUTER_PATIENCE_S = 10.0
 BRAKE_PATIENCE_S = 1.0
 STOP_BUDGET_S = 2.9
 STRANGERS_PERIOD_S = 600.0
-"""What strangers write is told of no more often."""
+"""Foreign statuses and tokens are reported at most this often."""
 
 
 def choose_host(profile: Profile, host: str | None) -> tuple[str, HostProfile]:
@@ -284,11 +284,11 @@ class Host:
             self._tell("command", f"cannot be told to brake ({error}); ending it brakes too")
 
     def serve(self, stop: threading.Event) -> None:
-        """Watch over the nodes until `stop` is set: what dies or hangs is started again.
+        """Run the nodes until `stop` is set; nodes that crash or hang are restarted.
 
         Tells once a day what is wrong with the certificates of this host, or is soon.
 
-        A worker that dies again and again is left alone: somebody's broken model must not end the
+        A worker that keeps crashing is not restarted: a broken model must not end the
         robot's nodes beside it.
 
         Raises:
@@ -302,7 +302,7 @@ class Host:
             self.poll(spare=EXPENDABLE)
 
     def poll(self, spare: Sequence[str] = ()) -> None:
-        """Start again what died.
+        """Restart nodes that crashed.
 
         Args:
             spare: kinds without which the others go on.

@@ -1,4 +1,4 @@
-"""Not outliving the supervisor. Imports next to nothing: a node does this before all else."""
+"""Ends a child when its supervisor dies (PR_SET_PDEATHSIG). Imports little: it runs first."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import time
 from pathlib import Path
 
 PARENT_VARIABLE = "VLA_ZENOH_PARENT"
-"""Process number of the supervisor; a child whose supervisor is gone ends itself."""
+"""Process id of the supervisor; a child ends itself when that is gone."""
 RUN_FOLDER_VARIABLE = "VLA_ZENOH_RUN_FOLDER"
-"""Where a node may leave what it has to know when it is started again."""
+"""Folder where a node may leave what it has to know after a restart."""
 PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 WATCH = "watch over the supervisor"
 LOOK_PERIOD_S = 0.25
@@ -49,7 +49,7 @@ def _watch(parent: int) -> None:
 
 
 def is_running(pid: int) -> bool:
-    """Whether there is such a process, and it is not a dead one that nobody has waited for."""
+    """Whether a process of this id runs; a zombie does not."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

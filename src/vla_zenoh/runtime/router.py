@@ -1,4 +1,4 @@
-"""A Zenoh router: what every client session of the profile connects to."""
+"""Runs the Zenoh router that the sessions of a profile connect to."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def run_zenohd(
         profile: as in `run_router`.
         folder: where the configuration is left for it.
         host: as in `run_router`.
-        also: likewise.
+        also: further profiles, see `run_router`.
 
     Raises:
         NodeError: there is no such program.
@@ -116,7 +116,7 @@ def router_config(
 
 
 def security_summary(profile: Profile) -> str:
-    """``tls``: only who has a certificate; ``loopback``: only this computer; ``insecure``: all."""
+    """``tls``: certificates are required; ``loopback``: this computer only; ``insecure``: open."""
     if profile.session.security is not None:
         return "tls"
     return "loopback" if all(map(is_loopback, profile.session.listen)) else "insecure"

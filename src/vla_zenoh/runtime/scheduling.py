@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 LOOP_PRIORITY, LINK_PRIORITY = 40, 30
-"""Of SCHED_FIFO: a loop is never put aside for what arrives."""
+"""SCHED_FIFO priorities: no link thread may preempt a control loop."""
 NICENESS = -10
 SET_TIMER_SLACK, GET_TIMER_SLACK = 29, 30  # PR_SET_TIMERSLACK and PR_GET_TIMERSLACK of prctl(2)
 
@@ -70,7 +70,7 @@ def _scheduled(priority: int, *, inherited: bool) -> Iterator[bool]:
 
 
 def _give_back(policy: int, parameter: os.sched_param) -> None:
-    """As it was before; whoever is not privileged cannot take back what is not inherited."""
+    """Restore the policy; without privilege what is not inherited cannot be restored."""
     try:
         os.sched_setscheduler(0, policy, parameter)
     except PermissionError:
@@ -78,7 +78,7 @@ def _give_back(policy: int, parameter: os.sched_param) -> None:
 
 
 def _timer_slack(slack_ns: int) -> int:
-    """Set by how much the calling thread may be woken late; returns what was set before."""
+    """Set the timer slack of the calling thread; returns the previous one."""
     if sys.platform != "linux" or (library := ctypes.util.find_library("c")) is None:
         return 0
     control = ctypes.CDLL(library, use_errno=True).prctl

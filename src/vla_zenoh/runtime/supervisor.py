@@ -1,4 +1,4 @@
-"""Starts a host's nodes, restarts those that die, and ends them all in an order that is safe."""
+"""Starts the nodes of a host, restarts those that crash, and stops them all in a safe order."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from vla_zenoh.runtime.parent_watch import PARENT_VARIABLE, RUN_FOLDER_VARIABLE
 
 BACKOFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 STABLE_S = 60.0
-"""A node that ran this long starts with the shortest backoff again. Longer than one takes to start
-and find, on a busy machine, that it cannot."""
+"""After this time a node starts with the shortest backoff again. It is longer than a node takes, on
+a busy machine, to find that it cannot run."""
 GIVE_UP_AFTER = 6
-"""Deaths in a row, each before `STABLE_S`."""
+"""Crashes in a row, each before `STABLE_S`."""
 STOP_ORDER = (
     (("worker", "camera", "command"), 0.8),
     (("sim", "ros2", "arm"), 0.4),
     (("router",), 0.1),
 )
-"""What is ended one after the other, and how long before the deadline the next one has its turn."""
+"""Kinds in the order they are stopped, and how long before the deadline the next follow."""
 POLL_S = 0.05
 
 
@@ -60,13 +60,15 @@ class Child:
 
 
 class Supervisor:
-    """See the module. Start and stop from one thread that lives as long as the nodes.
+    """Starts, restarts and stops the nodes of a host.
+
+    Start and stop from one thread that lives as long as the nodes.
 
     Args:
         commands: in the order to start them.
         log: called with (node name, line) for every line a node writes.
         tell: called with (node name, sentence) for what the supervisor does.
-        folder: where nodes may leave what one that is started again has to know.
+        folder: where nodes may leave what they have to know after a restart.
         variables: of the nodes' environment, beside ours.
     """
 
@@ -91,11 +93,14 @@ class Supervisor:
                 self._spawn(child)
 
     def poll(self, spare: Sequence[str] = ()) -> bool:
-        """Restart what died. False: a node dies again and again, and it makes no sense to go on.
+        """Restart nodes that crashed.
 
         Args:
-            spare: kinds without which the others go on: one of them that dies again and again is
-                left alone, as long as there are others.
+            spare: kinds without which the others go on: if one of them keeps crashing, it is not
+                restarted any more, as long as others run.
+
+        Returns:
+            False if a node that the others need keeps crashing.
         """
         now = time.monotonic()
         for child in self.children:
@@ -106,7 +111,7 @@ class Supervisor:
                 self._spawn(child)
             if child.deaths_in_a_row < GIVE_UP_AFTER or child.left_alone:
                 continue
-            said = f"died {GIVE_UP_AFTER} times in a row"
+            said = f"crashed {GIVE_UP_AFTER} times in a row"
             child.left_alone = child.command.kind in spare
             if not child.left_alone or all(each.left_alone for each in self.children):
                 self.given_up = child
@@ -115,16 +120,15 @@ class Supervisor:
             child.start_again_s = 0.0
             self._tell(
                 child.command.name,
-                f"{said}; it is left alone until all are started anew, the others go on. Its last "
-                "lines above say why",
+                f"{said}; not restarting it. The other nodes keep running; see its output above",
             )
         return True
 
     def stop(self, deadline_s: float) -> None:
-        """End all nodes, commanding ones before the robot, the router last, by `deadline_s`.
+        """Stop all nodes by `deadline_s`: commanding ones first, the router last.
 
         Args:
-            deadline_s: on the monotonic clock; what still runs then is killed.
+            deadline_s: monotonic clock; nodes that still run then are killed.
         """
         for kinds, left_s in STOP_ORDER:
             self._signal(kinds, signal.SIGTERM)

@@ -40,7 +40,7 @@ class KeyPair:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What a certificate says.
+    """Contents of a certificate.
 
     Args:
         common_name: who it is about.
@@ -71,7 +71,7 @@ class Certificate:
         return ""
 
     def warning(self, now: dt.datetime) -> str:
-        """What is to be done soon, empty when nothing is."""
+        """What has to be done soon; empty if nothing."""
         left = self.days_left(now)
         if self.fault(now) or left >= WARN_DAYS:
             return ""

@@ -1,6 +1,6 @@
 """The bridge of a ROS 2 robot that is reached over a network: its certificate, and who may use it.
 
-It is a router of its own, and whoever speaks to it moves the arm past our command node. So it takes
+It is a router of its own: a client that talks to it bypasses our command node. So it takes
 certificates of this lab only, and of those the one of the node ``ros2`` alone.
 """
 

@@ -1,4 +1,4 @@
-"""Who there is in a lab: one identity for each node of each host, and one for the people there.
+"""Identities of a lab: one for each node of each host, and one for the people there.
 
 An identity is the common name of a certificate, ``NODE@HOST``, and what the router goes by.
 """
@@ -14,7 +14,7 @@ from vla_zenoh.profile import Profile
 
 
 class Role(Enum):
-    """What somebody is for. What each may do is in `vla_zenoh.security.roles`."""
+    """Role of an identity. What each may do is in `vla_zenoh.security.roles`."""
 
     ROUTER = "router"  # carries everything, for all others
     ROBOT = "robot"
@@ -39,12 +39,12 @@ ROLE_OF_KIND = {
 """Kind of node in a profile -> its role."""
 PEOPLE = (Role.OPERATOR, Role.VIEWER, Role.REPLAY)
 TELEOP = "teleop"
-"""The worker that an operator is, who drives by hand."""
+"""Worker name of an operator who drives by hand."""
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Somebody with a certificate.
+    """Holder of a certificate.
 
     Args:
         role: what for.
@@ -87,7 +87,7 @@ def operator_role(profile: Profile, host: str) -> Role | None:
 
 
 def identities_of(profile: Profile, host: str) -> list[Identity]:
-    """Everybody at `host`: its nodes and its people.
+    """All identities at `host`: its nodes and its people.
 
     Raises:
         ProfileError: neither hosts nor session.security.people know it.
@@ -106,7 +106,7 @@ def identities_of(profile: Profile, host: str) -> list[Identity]:
 
 
 def operator_identities(host: str, role: Role) -> list[Identity]:
-    """Who people at a computer are: themselves, and an operator the worker that drives by hand."""
+    """Identities of the people at a computer; an operator is also a worker, to drive by hand."""
     people = Identity(role, role.value, host)
     if role is not Role.OPERATOR:
         return [people]

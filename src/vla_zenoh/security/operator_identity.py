@@ -12,11 +12,11 @@ from vla_zenoh.security.identity import PEOPLE, Role, operator_role
 from vla_zenoh.security.store import Store
 
 RANK = {Role.OPERATOR: 0, Role.VIEWER: 1}
-"""Who plays recordings is chosen by name alone: that role may say everything."""
+"""The role that replays recordings is chosen by name only: it may publish on every key."""
 
 
 def operator_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
-    """Hosts whose people's certificates lie here, the one to show first.
+    """Hosts whose operator certificates lie here, the one to use first.
 
     Args:
         profile: secured. Hosts that it does not know are left out: the router would drop what they
@@ -27,7 +27,7 @@ def operator_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
         This computer's own host first where it is known, then operators before viewers, in the
         order of the profile, where hosts stand before people, who are sooner taken out of it. But
         for a stop, only that which ``session.security.host`` names, if it names one. Empty where
-        nobody's certificate for people lies here.
+        no operator certificate lies here.
     """
     security = profile.session.security
     if security is None:
@@ -49,7 +49,7 @@ def operator_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
 
 
 def local_role(profile: Profile) -> Role | None:
-    """What the people of this computer may do; None: everything, or nobody knows."""
+    """Role of the people at this computer; None: unrestricted, or unknown."""
     security = profile.session.security
     if security is None:
         return None

@@ -1,6 +1,6 @@
-"""Which role may do what on which key: the one table, and what it means for one identity.
+"""Table of rights: which role may do what on which key, and the rights of one identity.
 
-A key of `keys.py` without a row here is allowed to nobody, and a test says so.
+A key of `keys.py` without a row here is allowed to no role; a test checks that there is none.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NODES = frozenset({ROBOT, CAMERA, WORKER, COMMAND})
 LOOKERS = frozenset({OPERATOR, VIEWER})
 SPEAKERS = NODES | {OPERATOR, REPLAY}
 RECORDER = "recorder"
-"""The node that an operator may run: it only reads, and says how it goes."""
+"""Nodes that an operator may run: they only subscribe, and publish their status."""
 NOBODY: frozenset[Role] = frozenset()
 
 _ANY = "any"
@@ -38,7 +38,7 @@ class Act(Enum):
     """What is done on a key."""
 
     PUT = "put"
-    DELETE = "delete"  # says that there is nothing: nobody may, and nodes refuse it
+    DELETE = "delete"  # no role may, and nodes reject it
     SUBSCRIBE = "subscribe"
     ANSWER = "answer"  # be asked by queries
     ASK = "ask"
@@ -48,7 +48,7 @@ class Act(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Who may do what on one member of `Keys`.
+    """Rights on one member of `Keys`.
 
     Where a key has parameters, a node that writes fills in itself: its own name, worker, cameras.
     Who reads may read all of them, and a replay writes what others wrote.
@@ -69,7 +69,7 @@ class Row:
 
 
 def _setting(member: str) -> Row:
-    """Said by the operator, kept by the command node, which tells those who look."""
+    """A setting: published by the operator, received by the command node, visible to viewers."""
     return Row(
         member,
         put=frozenset({OPERATOR, REPLAY}),
@@ -84,7 +84,7 @@ def _stream(member: str, writers: set[Role], readers: set[Role]) -> Row:
 
 
 TABLE = (
-    # Pictures show people: whoever may only look on does not see them.
+    # Images show people, so a viewer does not see them.
     _stream("camera_raw", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
     _stream("camera_jpeg", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
     _stream("camera_fitted", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
@@ -99,7 +99,7 @@ TABLE = (
     _setting("worker"),
     _setting("rate"),
     _setting("speed"),
-    # Who may stop the arm may slow it down, whoever may activate it.
+    # Every role that may stop the arm may slow it down.
     _stream("slower", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
     _stream("stop", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
     _stream("reset", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
@@ -209,7 +209,7 @@ class Right:
 
 
 def rights(keys: Keys, identity: Identity) -> list[Right]:
-    """Everything `identity` may do; of a router nothing is listed, as it carries all."""
+    """All rights of `identity`; none are listed for a router, which forwards everything."""
     return [
         Right(identity, act, key)
         for row in TABLE

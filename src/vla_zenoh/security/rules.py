@@ -1,7 +1,7 @@
 """Rights as Zenoh's access control, and what such a configuration allows.
 
 Zenoh looks at messages where they enter and leave the router, so one right takes several rules. A
-writer must be let in with its samples, and must be *told* that somebody listens, else it never
+writer must be let in with its samples, and must *learn* that there are subscribers, else it never
 sends; a reader must be let in with its wish, and be handed the samples. Whatever lacks a rule is
 dropped without a word, which is why `missing` exists.
 """
@@ -30,7 +30,7 @@ EVERY_MESSAGE = (
     "declare_liveliness_subscriber",
 )
 WISHES = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
-"""Leave the router with the key of whoever asks, which may be wider than what it is answered on."""
+"""Leave the router with the key of the query, which may be wider than that of the reply."""
 
 MESSAGES: Mapping[Act, Sequence[tuple[str, str]]] = {
     # what is done: (way through the router, message)
@@ -54,7 +54,7 @@ MESSAGES: Mapping[Act, Sequence[tuple[str, str]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Passage:
-    """A message of somebody on its way through the router."""
+    """A message of one identity on its way through the router."""
 
     flow: str
     message: str
@@ -122,7 +122,7 @@ def _rules(identity: Identity, keys: Keys) -> list[dict[str, Any]]:
 
 
 def wide(keys: Keys, identity: Identity) -> list[str]:
-    """Expressions by which people may subscribe to many keys at once.
+    """Key expressions with which an operator may subscribe to many keys at once.
 
     Zenoh allows a subscription only as a whole. An operator reads everything. A viewer may ask for
     all of a group, as ``state/*``, where it may read each of its keys.
@@ -198,7 +198,7 @@ def _applying(
 
 
 def missing(config: Mapping[str, Any], identity: Identity, act: Act, key: str) -> list[Passage]:
-    """What `config` drops of what `identity` needs for `act` on `key`."""
+    """Messages that `identity` needs for `act` on `key` and `config` drops."""
     return [
         passage
         for passage in passages(act, key)

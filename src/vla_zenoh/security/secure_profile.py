@@ -1,21 +1,19 @@
-"""The part of a profile that says how a lab is secured, as YAML text."""
+"""Profile text that secures another profile with TLS and certificates."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.profile import HostProfile, Profile
+from vla_zenoh.profile import HostProfile, Profile, yaml_text
 from vla_zenoh.profile.session import ANYWHERE, address_of, host_of, is_loopback
 from vla_zenoh.security.identity import Role
 
 HEAD = """\
-# {name}, secured: only who has a certificate of this lab is heard. Written by `vla-zenoh secure`.
+# {name}, secured: only clients with a certificate of this lab are let in.
+# Written by `vla-zenoh secure`.
 # Every host of the lab uses this file, with its own folder of certificates:
 #   {folder}/HOST
 """
@@ -23,11 +21,11 @@ PEOPLE = "    people:"
 
 
 def tls_endpoint(endpoint: str, places: Mapping[str, str] | None = None) -> str:
-    """The endpoint with TLS in place of a plain protocol.
+    """An endpoint with TLS in place of a plain protocol.
 
     Args:
         endpoint: as in a profile.
-        places: ``HOST:PORT`` -> where that is now, see `moved`.
+        places: ``HOST:PORT`` -> where that is now, see `moved_hosts`.
     """
     protocol, _, rest = endpoint.partition("/")
     address = address_of(endpoint)
@@ -36,7 +34,7 @@ def tls_endpoint(endpoint: str, places: Mapping[str, str] | None = None) -> str:
 
 
 def moved_hosts(profile: Profile, at: Mapping[str, str]) -> dict[str, str]:
-    """Where the routers are: ``HOST:PORT`` of the profile -> the same port at another address.
+    """New addresses of routers: ``HOST:PORT`` of the profile -> the same port elsewhere.
 
     Args:
         profile: as it is.
@@ -59,7 +57,7 @@ def moved_hosts(profile: Profile, at: Mapping[str, str]) -> dict[str, str]:
 
 
 def serving_addresses(profile: Profile, more: Iterable[str] = ()) -> list[str]:
-    """Names and addresses under which the routers of a profile are looked for."""
+    """Names and addresses at which clients look for the routers of a profile."""
     session = profile.session
     endpoints = [*session.connect, *session.listen]
     for host in profile.hosts.values():
@@ -77,7 +75,7 @@ def profile_text(
         profile: what `extends` leads to.
         extends: name of a profile, or a path.
         folder: of the certificates.
-        places: see `moved`.
+        places: see `moved_hosts`.
     """
     shown = _with_tilde(folder)
 
@@ -101,40 +99,26 @@ def profile_text(
     if any(host.connect or host.listen or host.link for host in profile.hosts.values()):
         # A profile's hosts are replaced whole, so all of them are written.
         body["hosts"] = {name: _host(host, secure) for name, host in profile.hosts.items()}
-    text = yaml.safe_dump(body, sort_keys=False, width=100, default_flow_style=None)
-    return HEAD.format(name=profile.name, folder=shown) + _people_on_lines(text)
+    return HEAD.format(name=profile.name, folder=shown) + yaml_text.write(body)
 
 
 def with_operator(text: str, host: str, role: Role) -> str:
-    """The text of a profile, with what a person at `host` may do.
+    """The text of a profile with the role of the people at `host`; comments stay.
 
     Raises:
-        SecurityError: it has no such list, in the form in which `profile_text` writes it.
+        SecurityError: it has no such list in the form that `profile_text` writes.
     """
-    lines = text.splitlines(keepends=True)
-    for at, line in enumerate(lines):
-        if line.rstrip() in (PEOPLE, f"{PEOPLE} {{}}"):
-            lines[at] = f"{PEOPLE}\n"
-            kept = [
-                other
-                for number, other in enumerate(lines)
-                if number <= at or not re.fullmatch(rf"\s{{6}}{re.escape(host)}:.*\s*", other)
-            ]
-            kept.insert(at + 1, f"      {host}: {role.value}\n")
-            return "".join(kept)
-    raise SecurityError(
-        f"has no list of people to add to. Write it by hand:\nsession:\n  security:\n{PEOPLE}\n"
-        f"      {host}: {role.value}"
+    lines, entry = text.splitlines(keepends=True), f"      {host}: {role.value}\n"
+    at = next(
+        (n for n, line in enumerate(lines) if line.rstrip() in (PEOPLE, f"{PEOPLE} {{}}")), None
     )
-
-
-def _people_on_lines(text: str) -> str:
-    """The security section in block style, so that lines can be added to it."""
-    found = re.search(r"^  security: \{folder: (?P<folder>.*), people: \{\}\}\n", text, re.M)
-    if found is None:
-        return text.replace("    people: {}\n", f"{PEOPLE} {{}}\n")
-    block = f"  security:\n    folder: {found['folder']}\n{PEOPLE} {{}}\n"
-    return text[: found.start()] + block + text[found.end() :]
+    if at is None:
+        raise SecurityError(
+            "has no list of people to add to. Write it by hand:\nsession:\n  security:\n"
+            f"{PEOPLE}\n{entry.rstrip()}"
+        )
+    rest = [line for line in lines[at + 1 :] if not line.startswith(f"      {host}:")]
+    return "".join([*lines[:at], f"{PEOPLE}\n", entry, *rest])
 
 
 def _host(host: HostProfile, secure: Callable[[Sequence[str]], list[str]]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Where a lab's certificates lie, and what is wrong with them.
+"""Folder of a lab's certificates, and checks of them.
 
 ::
 
@@ -61,7 +61,7 @@ class Entry:
 
 
 class Store:
-    """See the module.
+    """Folder of a lab's certificates and keys.
 
     Args:
         folder: may begin with ``~``.
@@ -141,11 +141,11 @@ class Store:
                 "`vla-zenoh secure init` was run"
             )
         if fault := open_to_others(key):
-            raise SecurityError(f"{fault}. Whoever read it can make certificates of this lab")
+            raise SecurityError(f"{fault}. Anyone who read it can issue certificates of this lab")
         return KeyPair(_get(certificate), _get(key))
 
     def _served(self, identity: Identity) -> tuple[str, ...]:
-        """What the certificate that is there says it serves as: only there it was ever written."""
+        """Addresses in the existing certificate; they are recorded nowhere else."""
         try:
             return ca.read(_get(self.files(identity.host, identity.node).certificate)).addresses
         except SecurityError:
@@ -232,7 +232,7 @@ class Store:
     def identity_files(
         self, host: str | None, node: str | None, people: Mapping[str, str] | None = None
     ) -> Files:
-        """The files of a node of this computer, or, without a node, of its people.
+        """Files of a node of this computer or, without a node, of its operator.
 
         Args:
             host: which host this computer is; None: what is known of it.
@@ -306,7 +306,7 @@ class Store:
 
 
 def open_to_others(key: Path) -> str:
-    """Who else can read a private key, empty when nobody can."""
+    """Who else can read a private key; empty if no other user can."""
     mode = stat.S_IMODE(key.stat().st_mode)
     if mode & 0o077:
         return f"{key} can be read by others (mode {mode:o}): chmod 600 {key}"

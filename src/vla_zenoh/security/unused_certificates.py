@@ -1,4 +1,4 @@
-"""Certificates that are good, and of no use: the profile does not know whose they are."""
+"""Valid certificates that the profile no longer authorises."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from vla_zenoh.security.store import Entry
 
 
 def unused_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path, str]:
-    """Those whose owner says what he likes: the router drops it. File -> what to do.
+    """Certificates whose traffic the router drops: file -> what to do.
 
-    So it is after people at a computer were given less, or a node was taken away.
+    There are some after a role was reduced or a node was removed from the profile.
 
     Args:
         profile: secured.

@@ -1,4 +1,4 @@
-"""Checks of a record's fields: each gives the value in its final form or names what is wrong."""
+"""Checks of record fields: each returns the value in its final form, or raises a `RecordError`."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def joint_names(value: Any) -> tuple[str, ...]:
 
 
 def boolean(name: str, value: Any) -> bool:
-    """A bool, and nothing that merely looks like one."""
+    """A bool; 0 and 1 are rejected."""
     if not isinstance(value, (bool, np.bool_)):
         raise RecordError(f"{name} is not true or false: {shown(value)}")
     return bool(value)

@@ -131,7 +131,7 @@ class InferenceDebug:
 
 
 def plain_values(raw: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What a model tells of itself as text, numbers and lists, whatever it gave.
+    """Raw output of a model as plain text, numbers and lists.
 
     Arrays of any library become lists; what is too large or has no such form is described.
     """

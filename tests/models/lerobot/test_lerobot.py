@@ -22,7 +22,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.interop.joints import make_forward
+from vla_zenoh.interop.action_semantics import make_forward
 from vla_zenoh.policy import check_steps, example_observation
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile

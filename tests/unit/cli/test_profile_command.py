@@ -166,7 +166,8 @@ def test_what_is_questionable_is_advice_and_no_failure() -> None:
     assert result.exit_code == 0
     assert result.stdout == "ok panda_sim_two_hosts\n"
     assert (
-        "advice session.listen: the router on robot is heard on that computer only" in result.stderr
+        "advice session.listen: the router on robot is reachable "
+        "on that computer only" in result.stderr
     )
 
 

@@ -22,8 +22,9 @@ from command_rig import (
 
 from vla_zenoh.control.commander import Commander, Inputs, Setting
 from vla_zenoh.control.motion_pipeline import LINGER_NS
+from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.kinematics.so3 import norm3
-from vla_zenoh.profile import load_profile
+from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import GripperState, PoseState
 
 UP = [0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.0]
@@ -553,6 +554,68 @@ def test_a_blocked_arm_ends_the_activation() -> None:
     limits = rig.profile.limits
     assert norm3(last_m - rig.position_m) < limits.tracking_m + 0.1
     rig.assert_smooth()
+
+
+def test_why_an_arm_stopped_by_itself_is_said_when_it_is_activated_again() -> None:
+    rig = moving_rig()
+    rig.blocked = True
+    while rig.state == "active":
+        rig.send([[0.04, 0, 0, 0, 0, 0, 0]])
+        rig.run(0.096)
+    ended = f"the last activation ended: {rig.commander.why}"
+    rig.blocked = False
+    rig.run(2.0)
+    rig.peers = replace(rig.peers, alive=rig.peers.alive - {"camera"})
+    told = rig.put("active", True).events
+    assert [event.why for event in told][-1] == ended
+    assert ended in rig.commander.why  # in status, too, until something is different
+    rig.peers = replace(rig.peers, alive=rig.peers.alive | {"camera"})
+    rig.activate()
+    assert ended in rig.commander.why
+    rig.put("active", False)  # this time a person ended it
+    rig.run(2.0)
+    rig.activate()
+    assert "ended" not in rig.commander.why
+
+
+def test_an_arm_whose_joints_cannot_follow_stops_and_says_what_holds_them() -> None:
+    of = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})
+    kinematics, rng = make_reachability_filter(of).kinematics, np.random.default_rng(0)
+    rig = Rig(of, reach=make_reachability_filter(of))
+    rig.stand_at(kinematics, np.array(of.robot.home_rad))
+    rig.activate()
+    step = rng.normal(size=6)
+    for _ in range(60):
+        if rig.state != "active":
+            break
+        step = step + 0.5 * rng.normal(size=6)
+        way = np.clip(step, -1, 1) * [0.03, 0.03, 0.03, 0.15, 0.15, 0.15]
+        rig.send([[*way, 0.0]] * 8)
+        for _ in range(50):
+            out = rig.tick()
+            if out.joint is not None:
+                rig.stand_at(kinematics, out.joint.position_rad)
+    why = "the joints cannot follow the pose: it has waited for them for 0.5 s; they are held by"
+    assert rig.state == "inactive"
+    assert f"{why} joint_limit panda_joint5" in rig.commander.why
+    assert why in [event for event in rig.events if event.kind == "transition"][-1].why
+    rig.run(2.0)
+    rig.activate()
+    assert f"the last activation ended: {why}" in rig.commander.why
+
+
+@pytest.mark.parametrize(("name", "value"), [("prompt", "go down"), ("worker", OTHER)])
+def test_why_an_arm_stopped_before_it_was_told_something_else_is_not_said(
+    name: str, value: str
+) -> None:
+    rig = moving_rig()
+    rig.peers = replace(rig.peers, alive=rig.peers.alive - {"camera"})
+    rig.run(2.0)
+    rig.put(name, value)
+    assert all(
+        "the last activation ended" not in event.why for event in rig.put("active", True).events
+    )
+    assert rig.state == "inactive"
 
 
 def test_an_arm_activated_again_while_blocked_is_led_back_to_where_it_is() -> None:

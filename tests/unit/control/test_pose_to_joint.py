@@ -128,3 +128,19 @@ def test_a_pose_that_the_joints_cannot_have_is_said_and_not_waited_for_for_ever(
     assert stream.at_rest
     stage.keep_elbow()
     assert stage.stuck == ""
+
+
+def test_joints_that_are_held_stop_with_a_pose_that_stands() -> None:
+    stage = PoseToJoint(PROFILE, KINEMATICS)
+    at_end, margin_rad = ELBOW_OUT_RAD.copy(), PROFILE.limits.reach.joint_margin_rad
+    at_end[3] = KINEMATICS.lower_rad[3] + margin_rad + 1e-3
+    stage.restart(at_end)
+    pose = KINEMATICS.forward(at_end)
+    stream = Smoother(pose, TICK_S, motion_limits(PROFILE.limits))
+    stream.target(Pose(pose.position_m, pose.rotation @ exp3(np.array([0.0, 0.01, 0.0]))))
+    for _ in range(150):
+        stage.tick(stream)
+    stage.brake(stream)
+    for _ in range(125):
+        stage.tick(stream, braking=True, elbow=False)
+    assert stage.at_rest

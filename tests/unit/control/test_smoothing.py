@@ -348,5 +348,60 @@ def test_a_motion_along_a_line_stays_on_it_whatever_the_limits_become(
         for _ in range(ticks):
             motion.tick()
             away = Ends(motion).away()
-            same_host = away - (away @ way) / max(length, 1e-9) ** 2 * way
-            assert np.abs(same_host).max() < AT_GOAL[0]
+            beside = away - (away @ way) / max(length, 1e-9) ** 2 * way
+            assert np.abs(beside).max() < AT_GOAL[0]
+
+
+def test_an_arm_that_goes_back_over_its_start_slowly_stays_on_its_line() -> None:
+    motion, slow = smoother(), Shares(0.02, 0.01, 0.001)
+    line = np.array([-0.39, 0.9, 0.156]) / norm3(np.array([-0.39, 0.9, 0.156]))
+
+    def towards(part_m: float) -> None:
+        # As a model says it.
+        way_m = (part_m * line).astype(np.float32).astype(np.float64)
+        motion.target(Pose(START.position_m + way_m, START.rotation), slow)
+
+    def here_m() -> float:
+        return float((motion.motion.pose.position_m - START.position_m) @ line)
+
+    towards(0.03)
+    for _ in range(600):
+        motion.tick()
+    towards(here_m() + 2e-7)  # about to be passed
+    motion.tick()
+    beside_m = 0.0
+    for _ in range(800):
+        towards(here_m() - 2e-3)
+        motion.tick()
+        apart = motion.motion.pose.position_m - START.position_m
+        beside_m = max(beside_m, norm3(apart - (apart @ line) * line))
+    assert beside_m < 1e-6
+
+
+def test_an_arm_that_speeds_up_gets_no_faster_than_it_is_told_to_by_more_than_it_has_to() -> None:
+    motion = smoother()
+    far = Pose(START.position_m + [0.15, 0.0, 0.0], START.rotation)
+    motion.target(far)
+    for _ in range(20):
+        motion.tick()
+    _, twist, acceleration = motion.motion
+    needed = twist[0] + acceleration[0] ** 2 / (2 * LIMITS.translation[2])
+    motion.target(far, Shares(0.1, 0.25, 0.125))
+    fastest = max(motion.tick().twist[0] for _ in range(200))
+    assert fastest < needed * 1.02
+
+
+def test_an_arm_that_was_told_again_while_it_slowed_down_keeps_to_what_it_was_told() -> None:
+    slow, most = Shares(0.01, 1.0, 1.0), 0.01 * LIMITS.rotation[0]
+    for again in range(10, 80):
+        motion = smoother()
+        far = Pose(START.position_m, START.rotation @ exp3(np.array([0.03, -0.015, 0.2])))
+        motion.target(far, Shares(0.4))
+        for _ in range(60):
+            motion.tick()
+        motion.target(far, slow, all_to_stop=True)
+        for tick in range(250):
+            if tick == again or motion.slowed_down:
+                motion.target(far, slow, all_to_stop=True)
+            motion.tick()
+        assert norm3(motion.motion.twist[3:]) <= most * (1 + LIMIT_RTOL)

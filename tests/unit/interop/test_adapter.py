@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop.adapter import Adapter
-from vla_zenoh.interop.backoff import FIRST_S, LONGEST_S
+from vla_zenoh.interop.adapter import FIRST_S, LONGEST_S, Adapter
 from vla_zenoh.interop.presets import OPENPI
 from vla_zenoh.policy import example_observation
 
@@ -97,7 +96,7 @@ def test_a_fault_is_named_and_its_connection_is_never_used_again(
     with pytest.raises(PeerError, match=why) as raised:
         adapter.ask()
     assert raised.value.reason == reason
-    with pytest.raises(PeerError, match="the wire was lost; tried again in"):
+    with pytest.raises(PeerError, match="the wire was lost; retrying in"):
         adapter.ask()
     adapter.wire, adapter.now_s = (lambda: STEP), FIRST_S
     assert adapter.ask().shape == (1, 7)
@@ -127,7 +126,9 @@ def test_a_server_that_answers_is_asked_again_soon_and_a_silent_one_ever_less_of
 def test_what_does_not_fit_is_named_and_nothing_is_asked() -> None:
     adapter = Wired(lambda: STEP)
     adapter.wrong = ["it gives 8 columns", "its gripper is another"]
-    with pytest.raises(PeerError, match="does not fit: it gives 8 columns; its gripper") as raised:
+    with pytest.raises(
+        PeerError, match="does not match: it gives 8 columns; its gripper"
+    ) as raised:
         adapter.ask()
     assert raised.value.reason == "peer_mismatch"
     assert adapter.begun == []

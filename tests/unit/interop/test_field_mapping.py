@@ -10,11 +10,10 @@ import pytest
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop import action_semantics as meaning
-from vla_zenoh.interop import groot, openpi, options, origami
-from vla_zenoh.interop.backoff import FIRST_S, LONGEST_S, Backoff
-from vla_zenoh.interop.field_mapping import FieldMapping
-from vla_zenoh.interop.joints import make_forward
-from vla_zenoh.interop.options import DEFAULTS, read_columns, read_field_mapping
+from vla_zenoh.interop import field_mapping, groot, openpi, origami
+from vla_zenoh.interop.action_semantics import make_forward
+from vla_zenoh.interop.adapter import FIRST_S, LONGEST_S, Backoff
+from vla_zenoh.interop.field_mapping import DEFAULTS, FieldMapping, read_columns, read_field_mapping
 from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, ORIGAMI, Presets
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
 from vla_zenoh.policy import Observation, example_observation
@@ -246,7 +245,7 @@ def test_a_server_of_ones_own_is_told_with_every_option_and_no_name_of_a_preset(
 
 @pytest.mark.parametrize("name", ["action", "gripper", "gripper_open", "dt_s", "horizon"])
 def test_of_a_server_of_ones_own_no_meaning_is_guessed(name: str) -> None:
-    with pytest.raises(SpecError, match=rf"nobody says what the numbers mean: --set {name}=\("):
+    with pytest.raises(SpecError, match=rf"the meaning of the numbers is missing: --set {name}=\("):
         layout(preset="none", **{k: v for k, v in MINE.items() if k != name})
     with pytest.raises(SpecError, match=r"--set rotation=\(rpy or rotvec"):
         layout(preset="none", **{**MINE, "action": "delta"})
@@ -265,7 +264,9 @@ def test_another_action_than_the_presets_keeps_nothing_of_what_it_says_of_number
     of = layout(action="absolute", rotation="rpy", **told)
     steps = of.steps(np.array([[0.5, 0, 0.3, 0, 0, 2.0]]), seen(of))
     np.testing.assert_allclose(steps, [[0.5, 0, 0.3, 0, 0, 2.0]], atol=ATOL)
-    with pytest.raises(SpecError, match="joint_position is not that of preset droid, so nobody"):
+    with pytest.raises(
+        SpecError, match="joint_position is not that of preset droid, so the meaning"
+    ):
         layout(preset="droid", action="joint_position")
 
 
@@ -291,7 +292,7 @@ def test_columns() -> None:
 
 
 def test_the_spec_of_every_option_has_its_default_documented() -> None:
-    told = f"{options.__doc__}{meaning.__doc__}"
+    told = f"{field_mapping.__doc__}{meaning.__doc__}"
     assert all(name in told for name in DEFAULTS)
 
 
@@ -308,7 +309,7 @@ def test_a_server_that_says_what_is_set_fits() -> None:
     [
         ({"action_dim": 8}, "8 columns, 7 are wanted"),
         ({"action_space": "joint_position"}, "action=delta is set"),
-        ({"image_resolution": [180, 320]}, "pictures of 320x180, size=224x224"),
+        ({"image_resolution": [180, 320]}, "images of 320x180, size=224x224"),
         ({"vla_zenoh_action": {"gripper_open_is_high": True}}, "gripper_open_is_high"),
         ({"vla_zenoh_action": {"dt_s": 0.1}}, "dt_s is 0.1, 0.05 is set"),
     ],

@@ -48,7 +48,7 @@ def test_an_arm_that_does_not_say_its_width_is_believed_to_be_where_it_was_asked
         ({"position_rad": HOME_RAD + float("nan")}, "position"),
         ({"position_rad": HOME_RAD[:6]}, "position_rad has shape"),
         ({"velocity_rad_s": HOME_RAD + float("inf")}, "velocity"),
-        ({"effort_nm": "none"}, "effort_nm is no list"),
+        ({"effort_nm": "none"}, "effort_nm is not a list"),
     ],
 )
 def test_what_does_not_hold_is_refused_by_name(nonsense: dict[str, Any], why: str) -> None:

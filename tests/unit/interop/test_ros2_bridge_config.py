@@ -172,7 +172,7 @@ def test_a_bridge_that_everybody_could_use_is_refused_unless_the_profile_says_so
     tmp_path: Path,
 ) -> None:
     places = "ros2: {connect: [tcp/robot.lan:7447]}\n"
-    with pytest.raises(ProfileError, match=r"at tcp/robot\.lan:7447 lets everybody on that"):
+    with pytest.raises(ProfileError, match=r"at tcp/robot\.lan:7447 lets anyone on that"):
         bridge_config(lab(tmp_path, places))
     profile = lab(tmp_path, f"{places}session: {{insecure: true}}\n")
     # A name often leads to 127.0.1.1 on the computer that bears it.
@@ -199,10 +199,10 @@ def test_who_needs_no_bridge_is_told(tmp_path: Path) -> None:
     ("places", "told"),
     [
         ("null", "ros2.connect: is missing: in a secured lab the bridge has a router of its own"),
-        ("[tcp/10.0.0.5:7450]", "ros2.connect.0: lets everybody on the way command the robot"),
+        ("[tcp/10.0.0.5:7450]", "ros2.connect.0: lets anyone on the network command the robot"),
         (
             "[tls/10.0.0.5:7450, tcp/127.0.0.1:7450]",
-            "ros2.connect.1: lets everybody on the way command the robot",
+            "ros2.connect.1: lets anyone on the network command the robot",
         ),
     ],
 )

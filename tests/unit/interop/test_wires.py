@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 
 from vla_zenoh.errors import PeerError
 from vla_zenoh.interop import groot, npy, openpi, openvla_rest, origami
-from vla_zenoh.interop.options import read_field_mapping
+from vla_zenoh.interop.field_mapping import read_field_mapping
 from vla_zenoh.interop.presets import GROOT, OPENPI
 from vla_zenoh.policy import ActionSpec
 

@@ -84,7 +84,7 @@ def test_without_pictures_the_oldest_of_the_newest_states_stamps_it() -> None:
 
 def test_what_was_never_heard_is_named() -> None:
     answer = refused(assemble(spec("front"), TASK, {}, {}, not_before_ns=0, now_ns=NOW_NS))
-    assert answer.why == "nothing heard yet of camera 'front', state/pose, state/gripper"
+    assert answer.why == "nothing received yet of camera 'front', state/pose, state/gripper"
     assert not answer.waiting
 
 
@@ -122,7 +122,7 @@ def test_pictures_too_far_apart_make_no_observation() -> None:
 
 def test_a_state_too_far_from_the_picture_makes_no_observation() -> None:
     why = refused(look(spec("front"), {"front": picture(10)}, 200, 61)).why
-    assert why == "state/pose is 0.051 s apart from the pictures"
+    assert why == "state/pose is 0.051 s apart from the images"
 
 
 def test_a_history_forgets_the_oldest_and_begins_anew_with_its_writer() -> None:

@@ -33,13 +33,16 @@ def test_two_hosts_with_real_addresses_need_no_advice() -> None:
     [
         (
             {"session": {"listen": ["tcp/0.0.0.0:7447"], "insecure": True}},
-            "session.insecure: everybody on any network of the router's computer can command",
+            "session.insecure: anyone on any network of the router's computer can command",
         ),
         (
             {"session": {"listen": ["tcp/10.0.0.2:7447"], "insecure": True}},
-            "session.insecure: everybody on the network of the router's computer can command",
+            "session.insecure: anyone on the network of the router's computer can command",
         ),
-        ({"hosts": gpu()}, "session.listen: the router on robot is heard on that computer only"),
+        (
+            {"hosts": gpu()},
+            "session.listen: the router on robot is reachable on that",
+        ),
         ({"hosts": gpu()}, "hosts.gpu: looks for the router on itself, and it runs on robot"),
         ({"hosts": {"a": {"nodes": ["command"]}}}, "hosts: none runs the router"),
         ({"hosts": {"a": {"nodes": ["router"]}}}, "hosts: none runs the command node"),
@@ -71,7 +74,7 @@ def test_two_hosts_with_real_addresses_need_no_advice() -> None:
                 "robot": {"arm_joints": ["a", "b", "c", "d", "e"], "home_rad": [0.0] * 5},
                 "limits": {"joint": ONE_FOR_ALL},
             },
-            "robot.arm_joints: with 5 of them the TCP cannot have any pose around it",
+            "robot.arm_joints: with 5 of them the TCP cannot reach every pose, as with six",
         ),
         (
             {"robot": {"description": "absent.urdf"}},

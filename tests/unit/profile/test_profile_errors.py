@@ -139,7 +139,7 @@ def told(path: str) -> list[str]:
         ("root: lab/*", "lab.yaml:2: root: root '*' cannot be part of a key"),
         (
             "limits:\n  workspace:\n    x_m: [200, 750]",
-            "lab.yaml:4: limits.workspace.x_m: [200, 750] is further than 3 m; give metres",
+            "lab.yaml:4: limits.workspace.x_m: [200, 750] is beyond 3 m; give metres",
         ),
         (
             "limits: {workspace: {z_m: [0.9, 0.1]}}",
@@ -264,11 +264,11 @@ def told(path: str) -> list[str]:
         ),
         (
             "hosts: {a: {nodes: [router]}, b: {nodes: [router]}}",
-            "hosts.b.link: is missing: routers do not find each other, and a runs one as well",
+            "hosts.b.link: is missing: routers do not discover each other, and a runs one as well",
         ),
         (
             "hosts: {a: {nodes: [worker]}, b: {nodes: [worker]}}",
-            "hosts.b.workers: scripted runs on a and b: each key has one writer. Say on each host",
+            "hosts.b.workers: scripted runs on a and b: each key has one writer. List on each host",
         ),
         (
             "hosts: {a: {nodes: [camera], cameras: [wrist]}, b: {nodes: [camera]}}",
@@ -276,7 +276,7 @@ def told(path: str) -> list[str]:
         ),
         (
             "session: {listen: [tcp/10.0.0.2:7447]}",
-            "session.listen.0: lets everybody on that network command the robot. Make certificates",
+            "session.listen.0: lets anyone on that network command the robot. Make certificates",
         ),
         (
             "session: {listen: [tls/10.0.0.2:7447]}",
@@ -284,7 +284,7 @@ def told(path: str) -> list[str]:
         ),
         (
             "session: {security: {}, listen: [tls/a:1], connect: [tcp/a:1]}",
-            "session.connect.0: tcp checks no certificate, and there is a section security",
+            "session.connect.0: tcp verifies no certificate, but there is a section security",
         ),
         (
             "session: {security: {}, listen: [tls/a:1], connect: [tls/a:1], insecure: true}",
@@ -308,7 +308,7 @@ def told(path: str) -> list[str]:
         ),
         (
             "hosts: {a: {nodes: [router], listen: [tcp/10.0.0.3:7447]}}",
-            "hosts.a.listen.0: lets everybody on that network command the robot",
+            "hosts.a.listen.0: lets anyone on that network command the robot",
         ),
         (
             "hosts: {a: {nodes: [command], link: [tcp/127.0.0.1:7447]}}",
@@ -386,7 +386,7 @@ def test_a_replaced_section_does_not_keep_the_lines_of_the_old_one(write: Write)
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", r"lab.yaml:1: robot: is missing: describe the robot, or begin with another profile"),
+        ("", r"lab.yaml:1: robot: is missing: describe the robot, or start from another profile"),
         ("# only a remark\n", "lab.yaml:1: robot: is missing"),
         ("- a\n", "lab.yaml:1: a profile is a map of sections, this is a list"),
         ("robot: {name: a}\n", "lab.yaml:1: robot.description: is missing"),
@@ -566,7 +566,7 @@ def test_only_what_cannot_be_another_computer_is_loopback(endpoint: str, here: b
     if here:
         assert SessionProfile(listen=(endpoint,)).listen == (endpoint,)
     else:
-        with pytest.raises(ValueError, match="lets everybody on that network command the robot"):
+        with pytest.raises(ValueError, match="lets anyone on that network command the robot"):
             SessionProfile(listen=(endpoint,))
 
 

@@ -1,8 +1,8 @@
-"""One goal of an action at a time, and the newest wish wins.
+"""Sequences the goals of a ROS 2 action: one at a time, the newest request wins.
 
-A wish that comes while a goal runs cancels it, and is sent when the robot says that it has ended:
-never two goals at once, never a stop that overtakes the move it was meant for. A wish that waits
-is forgotten when whoever asked for it leads the arm no more.
+A request during a goal cancels it, and is sent once the robot has ended it: never two goals at
+once, never a stop that overtakes its move. A waiting request is dropped when its writer no longer
+controls the arm.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class GoalStep(Enum):
 
 
 class ActionGoal(NamedTuple):
-    """A goal in flight, told apart by its number."""
+    """A goal in flight, identified by its number."""
 
     number: int
     command: GripperCommand
@@ -31,8 +31,8 @@ class GoalSequencer:
     """Decides when a goal is sent or cancelled. Time is given in ns of any clock.
 
     Args:
-        timeout_s: a goal of which nothing is heard for so long is given up; one that the robot
-            took has in addition the time that its fingers may need.
+        timeout_s: a goal without any response is abandoned after this; an accepted one has in
+            addition the travel time of the fingers.
         stroke_m: the longest way of the fingers, which they go at the speed of the goal.
     """
 
@@ -46,11 +46,11 @@ class GoalSequencer:
         self.timeouts = 0
 
     def want(self, command: GripperCommand) -> None:
-        """Ask for an opening; replaces every wish that was not sent."""
+        """Request an opening; replaces a request that was not sent."""
         self._wish = command
 
     def forget(self) -> GripperCommand | None:
-        """Let the wish go that was not sent, and say which it was."""
+        """Drop and return the request that was not sent."""
         wish, self._wish = self._wish, None
         return wish
 
@@ -60,7 +60,7 @@ class GoalSequencer:
             self._accepted, self._since_ns = True, now_ns
 
     def ended(self, number: int) -> bool:
-        """The goal was refused, or has ended in any way; False where it is an old one's end."""
+        """The goal was rejected or has ended; False if it is an older one."""
         if self.goal is None or number != self.goal.number:
             return False
         self.goal = None

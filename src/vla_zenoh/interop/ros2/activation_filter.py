@@ -1,22 +1,22 @@
-"""Which words of a topic of booleans are a person's: programs say the same again and again."""
+"""Distinguishes operators from repeating programs on the boolean activation topic."""
 
 from __future__ import annotations
 
 QUIET_S = 2.0
-"""A word that comes again sooner is a program's: ``ros2 topic pub`` repeats once a second unless it
-is told otherwise, people press more slowly."""
+"""A faster repetition comes from a program: ``ros2 topic pub`` repeats once a second by default,
+operators are slower."""
 
 
 class ActivationFilter:
-    """What may be switched off by every ``false``, and on by a person's ``true`` alone.
+    """Lets every ``false`` deactivate, and only an operator's ``true`` activate.
 
-    An arm that was lost or stopped must not begin anew because some program has gone on saying
-    ``true``, nor because that program is heard again after a link was gone or we were started anew.
-    So ``true`` counts when none was heard for `QUIET_S`, the time before the first word included;
-    and once a program has repeated it, ``false`` has to come first, however long the silence.
+    An arm that was lost or stopped must not restart because a program keeps publishing ``true``,
+    nor because that program is received again after a lost link or a restart of this node. ``true``
+    counts after `QUIET_S` without any, the time before the first message included; once a program
+    has repeated it, a ``false`` has to come first, however long the silence.
 
     Args:
-        mono_ns: when it is first listened to; monotonic, as all times here.
+        mono_ns: start of the subscription; monotonic, as all times here.
     """
 
     def __init__(self, mono_ns: int) -> None:
@@ -24,7 +24,7 @@ class ActivationFilter:
         self._repeated = False
 
     def take(self, word: bool, mono_ns: int) -> bool:
-        """Whether this word, which arrived then, is to be obeyed."""
+        """Whether to apply this message, received at `mono_ns`."""
         if not word:
             self._repeated = False
             return True

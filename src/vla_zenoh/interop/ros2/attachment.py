@@ -18,7 +18,7 @@ ATTACHMENT_BYTES = _LAYOUT.size
 
 
 class Attachment(NamedTuple):
-    """See the module."""
+    """Sequence number, source time and writer of a sample, request or reply."""
 
     seq: int
     stamp_ns: int
@@ -49,5 +49,5 @@ def decode(payload: bytes | None) -> Attachment:
 
 
 def gid_of(token: str) -> bytes:
-    """Who writes: 16 bytes made of the liveliness token, which no two endpoints share."""
+    """GID of a writer: 16 bytes derived from its liveliness token, which is unique."""
     return blake2b(token.encode(), digest_size=GID_BYTES).digest()

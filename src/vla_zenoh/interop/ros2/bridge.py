@@ -53,7 +53,7 @@ def bridge_config(
             looks for it: ``ros2.connect``, or ``session.connect``.
 
     Raises:
-        ProfileError: there is no such bridge, or it would listen to everybody.
+        ProfileError: there is no such bridge, or it would be open to the network.
     """
     ros2 = _section(profile)
     if beside and ros2.connect is not None:
@@ -148,7 +148,7 @@ def _listening(profile: Profile, endpoint: str) -> str:
         raise ProfileError(f"profile {profile.name}: a bridge that listens at {endpoint} {why}")
     if is_loopback(endpoint) or _is_number(host_of(endpoint)):
         return endpoint
-    # A computer often knows its own name as an address that nobody else reaches.
+    # A computer often resolves its own name to an address that others cannot reach.
     port = endpoint.rpartition(":")[2]
     return f"{endpoint.partition('/')[0]}/[::]:{port}"
 

@@ -1,4 +1,4 @@
-"""Which topics, services and actions of a ROS graph a profile uses: no more of it is anybody's."""
+"""Topics, services and actions of a ROS graph that a profile uses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Camera, Ros2Gripper, Ros2Profile
 
 SOURCE = "ros2:"
-"""What the source of a camera begins with whose pictures come from a ROS topic."""
+"""Prefix of a camera source that is a ROS topic."""
 TF, TF_STATIC = "/tf", "/tf_static"
 
 
@@ -42,7 +42,7 @@ def endpoints(profile: Profile) -> tuple[Endpoint, ...]:
         found += _arm(ros2, profile.robot.command)
         found += [] if ros2.gripper is None else _gripper(ros2.gripper)
     if ros2.services is not None:
-        found += _people(ros2.services)
+        found += _services(ros2.services)
     return tuple(dict.fromkeys(found))
 
 
@@ -68,7 +68,7 @@ def _gripper(gripper: Ros2Gripper) -> Iterator[Endpoint]:
         yield Endpoint(EntityRole.ACTION_CLIENT, gripper.grasp, GRASP)
 
 
-def _people(prefix: str) -> Iterator[Endpoint]:
+def _services(prefix: str) -> Iterator[Endpoint]:
     for service in SERVICES:
         yield Endpoint(EntityRole.SERVER, f"{prefix}/{service.name}", service.type)
     yield Endpoint(EntityRole.SUBSCRIBER, f"{prefix}/{PROMPT_TOPIC}", plain.TEXT)

@@ -21,11 +21,11 @@ SUCCEEDED = 4
 
 
 class GripperOutcome(NamedTuple):
-    """How a goal ended: as asked, with something between the fingers, and what was said."""
+    """Result of a goal: reached, holding an object, and the driver's message."""
 
     reached: bool
     holding: bool
-    said: str
+    message: str
 
 
 def position(ros2: Ros2Gripper, gripper: GripperProfile, width_m: float) -> float:

@@ -38,7 +38,7 @@ _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 
 
 class Messages:
-    """See the module.
+    """Message types of one ROS 2 distribution.
 
     Args:
         distribution: one of `STORES`.

@@ -1,4 +1,4 @@
-"""Names of ROS 2 types, as people write them and as they stand on the wire."""
+"""Names of ROS 2 types, in source form and on the wire."""
 
 from __future__ import annotations
 

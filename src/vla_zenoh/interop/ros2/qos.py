@@ -1,4 +1,4 @@
-"""Quality of service as ROS 2 people expect it, and its text in liveliness tokens."""
+"""ROS 2 quality of service, and its text in liveliness tokens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Services and topics for ROS people, on which they do what our own setting keys do."""
+"""Our ROS 2 services and topics, which mirror the setting keys."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from vla_zenoh.lab.bench.cpu_time import cpu_s
 from vla_zenoh.lab.demo.runner import DemoRunner
 from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.recording.stream_listener import StreamListener
-from vla_zenoh.nodes.command.status import SPREAD_S
+from vla_zenoh.nodes.command.node import SPREAD_S
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.runtime.launch import Host
 

@@ -19,7 +19,7 @@ from vla_zenoh.cli.options import (
 )
 from vla_zenoh.cli.output import console
 from vla_zenoh.interop.openpi import PORT
-from vla_zenoh.interop.served_policy import make_served_policy
+from vla_zenoh.lab.serve.served_policy import make_served_policy
 from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.runtime.environments import run_in_own_environment
 from vla_zenoh.runtime.process import stop_on_signals
@@ -59,7 +59,7 @@ def serve_openpi(
         )
     robot, chosen = loaded.robot, model.choose(loaded, worker)
     run_in_own_environment(chosen.model, model.python, extra="serve")
-    from vla_zenoh.nodes.openpi_server import OpenPiServer
+    from vla_zenoh.lab.serve.openpi_server import OpenPiServer
 
     policy = make_policy(chosen.model, chosen.options, profile=profile)
     offer = make_served_policy(policy.spec, names, robot.arm_joints, robot.gripper.max_width_m)

@@ -1,1 +1,5 @@
-"""Where pictures come from, and the way they go out. One kind of source a file."""
+"""Camera sources, one kind a file, and the publisher of their images.
+
+A new kind needs a file here, a branch in `grabber.make_source`, and its scheme in
+`vla_zenoh.profile.schema.CAMERA_SOURCES`.
+"""

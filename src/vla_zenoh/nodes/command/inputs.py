@@ -1,4 +1,4 @@
-"""What the command node takes in at every tick: settings, chunks, states, and its own clock."""
+"""Inputs of the command node at every tick: settings, chunks, states, and steps of its clock."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, St
 from vla_zenoh.types.stream import SingleWriterFilter
 
 STATES = 16
-"""States kept between two looks; room for the robot's own beside a stranger's."""
+"""States buffered between two ticks: those of the robot, and room for a foreign source."""
 CHUNKS = 64
 ANYTHING = MAX_MESSAGE_BYTES
-"""A stop is obeyed whatever it says, and never read."""
+"""Payload of a stop: any; it is not decoded."""
 WORDS = settings.MAX_SETTING_BYTES
 CLOCK_PERIOD_S = 0.1
 JOINT_PERIOD_S = 0.025
-"""Joints are looked at so often while nobody asks for the arm."""
+"""Period of decoding joints, except when an activation is requested."""
 
 
 class CommandInputs:
-    """Listens to the robot, the workers and the people.
+    """Subscriptions to the robot, the workers and the clients' settings.
 
     Args:
-        node: the command node; it counts and tells what is refused.
+        node: the command node; it counts and reports rejected samples.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         keys = node.keys
-        self._neighbours = PeerMonitor(node)
+        self._peer_monitor = PeerMonitor(node)
         self._chunks = node.subscribe(keys.all_deltas, CallbackRing(CHUNKS))
         self._pose_slot = node.subscribe(keys.state_pose, CallbackRing(STATES, SMALL_BYTES))
         self._gripper_slot = node.subscribe(keys.state_gripper, CallbackRing(STATES, SMALL_BYTES))
@@ -58,7 +58,7 @@ class CommandInputs:
                 settings.decode_activation,
             ),
         ]
-        self._speakers = {
+        self._writers = {
             kind: SingleWriterFilter(node.profile.timing.state_timeout_s)
             for kind in (PoseState, JointState, GripperState)
         }
@@ -66,38 +66,38 @@ class CommandInputs:
 
     @property
     def chunks_dropped(self) -> int:
-        """Chunks that came faster than they were looked at."""
+        """Chunks dropped because they arrived faster than they were processed."""
         return self._chunks.dropped
 
-    def take(self, now_ns: int) -> Inputs:
-        """What arrived since the last call.
+    def poll(self, now_ns: int) -> Inputs:
+        """Everything received since the last call.
 
         Args:
             now_ns: nominal time of this tick on the node's wall clock.
         """
-        put = self._settings_put()
-        peers = self._neighbours.look(now_ns)
+        settings_put = self._poll_settings()
+        peers = self._peer_monitor.update(now_ns)
         chunks = [self._chunk(arrival) for arrival in self._chunks.drain()]
         clock = self._check_clock()
         return Inputs(
-            settings=[*put, *clock],
+            settings=[*settings_put, *clock],
             chunks=[chunk for chunk in chunks if chunk is not None],
             pose=self._state(PoseState, self._pose_slot),
-            joint=self._joints(put),
+            joint=self._joints(settings_put),
             gripper=self._state(GripperState, self._gripper_slot),
             peers=peers,
         )
 
-    def _settings_put(self) -> list[Setting]:
-        """What was put since the last tick, in the order in which the router saw it.
+    def _poll_settings(self) -> list[Setting]:
+        """Settings put since the last tick, in the order of the router's timestamps.
 
-        Each setting has a mailbox of its own, so that a flood of one does not push out another.
-        Where the router does not stamp samples, each key's own order is kept then.
+        Each setting has a buffer of its own, so that a flood of one does not push out another.
+        Without timestamps only the order on each key is kept.
         """
         arrivals = [
             (name, decode, arrival)
-            for name, inbox, decode in self._settings
-            for arrival in inbox.drain()
+            for name, buffer, decode in self._settings
+            for arrival in buffer.drain()
         ]
         stamps = [
             stamp.get_time() for *_, arrival in arrivals if (stamp := arrival.sample.timestamp)
@@ -116,39 +116,41 @@ class CommandInputs:
         return put
 
     def _chunk(self, arrival: ReceivedSample) -> Stamped[ActionChunk] | None:
-        """A chunk by the worker whose key it came on, None for any other."""
+        """A chunk from the source of the worker whose key it came on, None for any other."""
         worker = key_names.last_chunk(str(arrival.sample.key_expr))
-        owner = self._neighbours.owner(worker)
+        owner = self._peer_monitor.owner(worker)
         try:
-            source = self._node.header(arrival).source
+            header = self._node.header(arrival)
         except CodecError as error:
             self._node.reject(error.reason, f"delta/{worker}: {error}")
             return None
-        if owner is not None and source != owner:  # before its payload is looked at: it may be many
+        source = header.source
+        if owner is not None and source != owner:  # before decoding: there may be a flood of them
             self._node.reject(
-                "foreign", f"delta/{worker} by {source[:60]!r}, the worker is {owner[:60]!r}"
+                "foreign",
+                f"delta/{worker} by {source[:60]!r}; the source of this worker is {owner[:60]!r}",
             )
             return None
-        chunk = self._node.decode(ActionChunk, arrival)
+        chunk = self._node.decode(ActionChunk, arrival, header=header)
         if chunk is not None and chunk.record.worker != worker:
-            self._node.reject("foreign", "a chunk on another worker's delta key")
+            self._node.reject("foreign", "chunk on the delta key of another worker")
             return None
         return chunk
 
     def _state(self, kind: type[Any], slot: CallbackRing) -> Stamped[Any] | None:
-        """The newest state by the writer that speaks for the robot, whoever else writes."""
+        """The newest state from the robot's source, whatever other sources publish."""
         newest: Stamped[Any] | None = None
         for arrival in slot.drain():
-            newest = self._node.decode(kind, arrival, self._speakers[kind]) or newest
+            newest = self._node.decode(kind, arrival, self._writers[kind]) or newest
         return newest
 
-    def _joints(self, put: list[Setting]) -> Stamped[JointState] | None:
-        """The newest joints, where it is time to look at some: decoding them costs."""
-        given = any(setting.name in ("active", "worker") for setting in put)
-        if not given and time.monotonic() - self._last_joint < JOINT_PERIOD_S:
+    def _joints(self, settings_put: list[Setting]) -> Stamped[JointState] | None:
+        """The newest joints, at `JOINT_PERIOD_S`: decoding them is expensive."""
+        requested = any(setting.name in ("active", "worker") for setting in settings_put)
+        if not requested and time.monotonic() - self._last_joint < JOINT_PERIOD_S:
             return None
         for arrival in reversed(self._joint_slot.drain()):
-            found = self._node.decode(JointState, arrival, self._speakers[JointState])
+            found = self._node.decode(JointState, arrival, self._writers[JointState])
             if found is not None:
                 self._last_joint = time.monotonic()
                 return found

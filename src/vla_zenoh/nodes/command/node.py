@@ -1,44 +1,52 @@
-"""The command node: owns clock and session around `vla_zenoh.control.commander`."""
+"""The command node: clock, session, publishers and status of a `Commander`."""
 
 from __future__ import annotations
 
 import gc
+import math
 import sys
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
 from vla_zenoh.bus.clock import FixedRate, Tick
+from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import records
 from vla_zenoh.control.commander import Commander, Outputs, Setting
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.control.states import State
 from vla_zenoh.keys import Kind
+from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.nodes.command.inputs import CommandInputs
-from vla_zenoh.nodes.command.status import CommandStatus
 from vla_zenoh.profile import Profile
 from vla_zenoh.runtime.estop_latch import EstopLatch
 from vla_zenoh.runtime.scheduling import realtime_thread
-from vla_zenoh.types import Event
+from vla_zenoh.types import LATENCY_STAGES, Cause, Event
 
 TASK_PERIOD_S = 0.2
 BRAKE_BEFORE_EXIT_S = 1.0
 SWITCH_INTERVAL_S = 5e-4
+MAX_WHY = 2000
+SPREAD_S = 8.0
+"""Window of the distributions of tick cost and lateness in status."""
+CHUNKS = 128
+"""Chunks in the latencies of status: at 10 Hz those of the last 13 s."""
 
 
 class CommandNode:
-    """See the module.
+    """Runs a `Commander` at ``timing.command_hz`` between its subscriptions and publishers.
 
     Args:
-        profile: limits, timing, first settings.
+        profile: limits, timing, initial settings.
         session: open session.
         dry_run: compute everything, publish no command.
-        latch: file that stands while an emergency stop or a fault is latched, so that a command
-            node that is started again is stopped as well.
+        latch: file that exists while an emergency stop or a fault is latched, so that a restarted
+            command node is stopped as well.
     """
 
     def __init__(
@@ -65,20 +73,21 @@ class CommandNode:
         self._gripper_out = node.declare_publisher(keys.command_gripper, Kind.ORDER)
         self._task_out = node.declare_publisher(keys.task, Kind.CONTROL)
         self._last_task = 0.0
-        self._answer_settings()
+        self._serve_settings()
 
-    def _answer_settings(self) -> None:
-        task = self.commander
-        keys = self.node.keys
+    def _serve_settings(self) -> None:
+        commander, keys = self.commander, self.node.keys
         for key, value in (
-            (keys.prompt, lambda: task.task.prompt),
-            (keys.worker, lambda: task.task.worker),
-            (keys.rate, lambda: f"{task.task.rate_hz:g}"),
-            (keys.speed, lambda: f"{task.task.speed_percent:g}"),
-            (keys.active, lambda: "true" if task.task.active else "false"),
+            (keys.prompt, lambda: commander.task.prompt),
+            (keys.worker, lambda: commander.task.worker),
+            (keys.rate, lambda: f"{commander.task.rate_hz:g}"),
+            (keys.speed, lambda: f"{commander.task.speed_percent:g}"),
+            (keys.active, lambda: "true" if commander.task.active else "false"),
         ):
             self.node.serve(key, self._text_reply(key, value))
-        self.node.serve(keys.task, lambda query: query.reply(keys.task, records.encode(task.task)))
+        self.node.serve(
+            keys.task, lambda query: query.reply(keys.task, records.encode(commander.task))
+        )
 
     @staticmethod
     def _text_reply(key: str, value: Callable[[], str]) -> Callable[[zenoh.Query], None]:
@@ -86,7 +95,7 @@ class CommandNode:
 
     # -- running ------------------------------------------------------------------------------
     def run(self, stop: threading.Event) -> None:
-        """Command until `stop` is set, then brake, then end."""
+        """Run until `stop` is set, then brake and end."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.collect()
         gc.freeze()
@@ -104,41 +113,41 @@ class CommandNode:
             tick = loop.wait()
             if tick.periods > 1:
                 self.node.counters["command.missed_ticks"] += tick.periods - 1
-            extra = self._after_a_stall(tick)
+            extra = self._stall_settings(tick)
             if stop.is_set():
                 give_up = give_up or time.monotonic() + BRAKE_BEFORE_EXIT_S
                 extra.append(Setting("active", False))
                 if not self.commander.streaming or time.monotonic() > give_up:
                     break
-            self._turn(extra, tick)
+            self._on_tick(extra, tick)
 
-    def _after_a_stall(self, tick: Tick) -> list[Setting]:
+    def _stall_settings(self, tick: Tick) -> list[Setting]:
         if tick.stall_s <= self.node.profile.timing.command_timeout_s:
             return []
         why = f"the command loop stood still for {tick.stall_s:.3f} s"
-        return [Setting("lose", f"{why}, {tick.computed_s:.3f} s of it at work")]
+        return [Setting("lose", f"{why}, {tick.computed_s:.3f} s of it computing")]
 
-    def _turn(self, extra: list[Setting], tick: Tick) -> None:
+    def _on_tick(self, extra: list[Setting], tick: Tick) -> None:
         began = time.perf_counter()
         now_ns = self.node.clock.wall_at(tick.nominal_ns)
-        inputs = self._inputs.take(now_ns)
+        inputs = self._inputs.poll(now_ns)
         inputs.settings = [*inputs.settings, *extra]
         limit = max(1, int(self.node.profile.timing.command_timeout_s * self._hz))
         out = self.commander.step(inputs, now_ns, min(tick.periods, limit))
         self._publish(out, now_ns)
         if any(event.kind == "transition" for event in out.events):
-            self._keep_latch()
-        self._tell_of_the_latch()
-        self._status.ticked(now_ns, tick.stall_s, time.perf_counter() - began)
-        self._status.report(out, self._inputs.chunks_dropped)
+            self._update_latch()
+        self._report_latch_failure()
+        self._status.add_tick(now_ns, tick.stall_s, time.perf_counter() - began)
+        self._status.publish(out, self._inputs.chunks_dropped)
 
-    def _keep_latch(self) -> None:
+    def _update_latch(self) -> None:
         if self._latch is None:
             return
         latched = self.commander.state in (State.STOPPED, State.FAULT)
         self._latch.set(self.commander.why if latched else None)
 
-    def _tell_of_the_latch(self) -> None:
+    def _report_latch_failure(self) -> None:
         why = None if self._latch is None else self._latch.failure()
         if why is not None:
             self.node.counters["command.latch_failed"] += 1
@@ -155,14 +164,133 @@ class CommandNode:
             self._joint_out.publish(out.joint, stamp_wall_ns=now_ns)
         if out.gripper is not None:
             self._gripper_out.publish(out.gripper)
-        for refusal in out.rejections:
-            kind = "skipped" if refusal.quiet else "refused"
-            self.node.counters[f"{kind}.{refusal.reason}"] += 1
+        for rejection in out.rejections:
+            kind = "skipped" if rejection.quiet else "refused"
+            self.node.counters[f"{kind}.{rejection.reason}"] += 1
         for event in out.events:
             self.node.emit(event)
         if out.accepted is not None:
-            self._status.measure(out.accepted)
+            self._status.add_chunk(out.accepted)
         due = time.monotonic() - self._last_task >= TASK_PERIOD_S
         if out.task_changed or due:
             self._last_task = time.monotonic()
             self._task_out.publish(self.commander.task)
+
+
+class CommandStatus:
+    """Collects tick costs and chunk latencies, and publishes the status of the command node.
+
+    Args:
+        node: the command node.
+        commander: its commander.
+    """
+
+    def __init__(self, node: Node, commander: Commander) -> None:
+        self._node, self._commander = node, commander
+        ticks = round(SPREAD_S * node.profile.timing.command_hz)
+        self._latency = {stage: Percentiles(CHUNKS) for stage in LATENCY_STAGES}
+        self._cost_us, self._late_us = Percentiles(ticks), Percentiles(ticks)
+        self._pose_age_ms = Percentiles(ticks)
+        self._rate = RateMeter()
+        self._was_at_rest = True
+        self.realtime = False
+
+    def add_tick(self, now_ns: int, late_s: float, cost_s: float) -> None:
+        """Add a tick for `now_ns` that started `late_s` late and took `cost_s`."""
+        pose = self._commander.pose
+        if pose is not None:
+            self._pose_age_ms.add((now_ns - pose.header.stamp_wall_ns) / 1e6)
+        self._late_us.add(late_s * 1e6)
+        self._rate.tick()
+        self._cost_us.add(cost_s * 1e6)
+
+    def add_chunk(self, cause: Cause) -> None:
+        """Add the latencies of a chunk that came into force."""
+        published_ns = self._node.clock.wall_ns()
+        for stage, duration_ms in cause.latency_ms(published_ns).items():
+            self._latency[stage].add(duration_ms)
+
+    def publish(self, out: Outputs, chunks_dropped: int) -> None:
+        """Publish status when it is due, and at once after a change."""
+        commander = self._commander
+        now = any(event.kind == "transition" for event in out.events) or out.task_changed
+        now = now or commander.at_rest != self._was_at_rest
+        self._was_at_rest = commander.at_rest
+        if not now and not self._node.status_due(commander.state.value):
+            return
+        task = commander.task
+        wall_ns = self._node.clock.wall_ns()
+        ages_s = {
+            name: (wall_ns - stamped.received_ns) / 1e9
+            for name, stamped in (("pose", commander.pose), ("gripper", commander.gripper_state))
+            if stamped is not None
+        }
+        latency = {name: meter.summary() for name, meter in self._latency.items()}
+        self._node.counters["command.smoothing_failures"] = commander.smoothing_failures
+        self._node.counters["command.gripper_timeouts"] = commander.gripper.timeouts
+        self._node.counters["command.chunks_dropped"] = chunks_dropped
+        self._node.publish_status(
+            commander.state.value,
+            detail={
+                "why": commander.why[:MAX_WHY],
+                "prompt": task.prompt,
+                "worker": task.worker,
+                "rate_hz": task.rate_hz,
+                "speed_percent": task.speed_percent,
+                "episode": task.episode,
+                "accepted_chunks": commander.progress.chunks,
+                "accepted_steps": commander.progress.steps,
+                "policy_done": commander.progress.done,
+                "held_by": commander.deadman.name if task.active else "",
+                "at_rest": commander.at_rest,
+                "streaming": commander.streaming,
+                "speed_share": round(commander.speed, 3),
+                "tracking_mm": round(commander.tracking_m * 1e3, 3),
+                "tracking_mrad": round(commander.tracking_rad * 1e3, 3),
+                "elbow_mrad": round(commander.elbow_rad * 1e3, 3),
+                "tick_us": self._cost_us.spread(),
+                "late_us": self._late_us.spread(),
+                "pose_age_ms": self._pose_age_ms.spread(),
+                "realtime": self.realtime,
+                "dry_run": commander.dry_run,
+                **self._goal(),
+                **self._margins(),
+                **self._contact(),
+            },
+            ages_s=ages_s,
+            rates_hz={"loop": self._rate.rate_hz},
+            latency_ms={name: values for name, values in latency.items() if values},
+            now=now,
+        )
+
+    def _goal(self) -> dict[str, Any]:
+        goal = self._commander.goal
+        if goal is None:
+            return {}
+        return {
+            "goal_m": [round(float(value), 6) for value in goal.pose.position_m],
+            "goal_quat_xyzw": [round(float(v), 6) for v in quat_from_rotation(goal.pose.rotation)],
+            "goal_width_m": round(goal.width_m, 5),
+        }
+
+    def _contact(self) -> dict[str, Any]:
+        """External load on the arm; None where it is not measured."""
+        force_n, torque_nm = self._commander.contact.force_n, self._commander.contact.torque_nm
+        return {
+            "external_force_n": None if force_n is None else round(force_n, 2),
+            "external_torque_nm": None if torque_nm is None else round(torque_nm, 2),
+        }
+
+    def _margins(self) -> dict[str, Any]:
+        """Margins of the arm at its goal."""
+        reach = self._commander.reach
+        if reach is None or self._commander.goal is None:
+            return {}
+        room = reach.margins
+        return {
+            "joint_margin_rad": round(room.joint_rad, 4),
+            "joint_margin_of": room.joint,
+            "singular_value": round(room.singular_value, 4),
+            "self_distance_m": round(room.self_m, 4) if math.isfinite(room.self_m) else None,
+            "table_distance_m": round(room.table_m, 4) if math.isfinite(room.table_m) else None,
+        }

@@ -1,4 +1,4 @@
-"""What the command node hears of the other nodes: who is alive, specs, camera ages."""
+"""Monitoring of the other nodes: liveliness, status, specs of workers, ages of cameras."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.policy import ModelSpec
-from vla_zenoh.types import NodeStatus
+from vla_zenoh.types import Header, NodeStatus
 
 MAX_WORKERS, MAX_HOLDERS = 32, 32
 MAX_WHY = 300
 CLOCKS_PERIOD_S = 0.25
 STATUSES_A_TICK, SPECS_A_TICK = 8, 4
-"""What is more was not sent by any node of ours: each says something twice a second."""
+"""More than our nodes publish: each does so twice a second."""
 
 
 class PeerMonitor:
@@ -35,12 +35,12 @@ class PeerMonitor:
         self._changed = True
         self._specs: dict[str, ModelSpec] = {}
         self._spec_sources: dict[str, str] = {}
-        self._voices: dict[str, str] = {}
+        self._status_sources: dict[str, str] = {}
         self._complaints: dict[str, str] = {}
         self._servers = node.profile.camera_servers()
         self._cameras: dict[str, tuple[float, int]] = {}
         self._camera_faults: dict[str, str] = {}
-        self._places: dict[str, HostId] = {}
+        self._hosts: dict[str, HostId] = {}
         self._next_clocks_s = 0.0
         self._statuses = node.subscribe(node.keys.all_status, ZenohRing(STATUSES_A_TICK))
         self._new_specs = node.subscribe(node.keys.all_specs, ZenohRing(SPECS_A_TICK))
@@ -53,31 +53,31 @@ class PeerMonitor:
             (self._alive.add if alive else self._alive.discard)(name)
             self._changed = True
             if not alive:
-                self._voices.pop(name, None)
-                self._places.pop(name, None)
+                self._status_sources.pop(name, None)
+                self._hosts.pop(name, None)
             if not alive and name.startswith("worker-"):
                 worker = name.removeprefix("worker-")
                 self._specs.pop(worker, None)
                 self._spec_sources.pop(worker, None)
                 self._complaints.pop(worker, None)
 
-    def _on_holding(self, name: str, there: bool) -> None:
+    def _on_holding(self, name: str, present: bool) -> None:
         with self._lock:
             self._changed = True
-            if not there:
+            if not present:
                 self._holders.discard(name)
             elif len(self._holders) < MAX_HOLDERS:
                 self._holders.add(name)
             else:
                 self._node.counters["refused.holder"] += 1
 
-    def look(self, now_ns: int) -> PeerSnapshot | None:
-        """The surroundings now, or None when nothing changed."""
+    def update(self, now_ns: int) -> PeerSnapshot | None:
+        """A new snapshot, or None if nothing changed."""
         for arrival in self._statuses.drain():
-            self._hear_status(arrival, now_ns)
+            self._receive_status(arrival, now_ns)
         for arrival in self._new_specs.drain():
-            self._hear_spec(arrival)
-        self._follow_clocks()
+            self._receive_spec(arrival)
+        self._track_clocks()
         with self._lock:
             if not self._changed:
                 return None
@@ -89,14 +89,14 @@ class PeerMonitor:
                 dict(self._spec_sources),
                 dict(self._complaints),
                 {
-                    camera: age_s + (now_ns - heard_ns) / 1e9
-                    for camera, (age_s, heard_ns) in self._cameras.items()
+                    camera: age_s + (now_ns - received_ns) / 1e9
+                    for camera, (age_s, received_ns) in self._cameras.items()
                 },
                 {camera: self._servers[camera] for camera in self._cameras},
-                {name: place.host for name, place in self._places.items()},
+                {name: place.host for name, place in self._hosts.items()},
                 frozenset(
                     name
-                    for name, place in self._places.items()
+                    for name, place in self._hosts.items()
                     if place.shares_clock(self._node.host_id)
                 ),
                 self._node.clocks.offsets(),
@@ -104,8 +104,8 @@ class PeerMonitor:
                 dict(self._camera_faults),
             )
 
-    def _follow_clocks(self) -> None:
-        """Measure the clocks of all nodes, and look at them now and then."""
+    def _track_clocks(self) -> None:
+        """Keep measuring the clock offsets of all nodes."""
         if time.monotonic() < self._next_clocks_s:
             return
         self._next_clocks_s = time.monotonic() + CLOCKS_PERIOD_S
@@ -115,41 +115,43 @@ class PeerMonitor:
             self._changed = True
 
     def owner(self, worker: str) -> str | None:
-        """The source that speaks for a worker: who published its spec."""
+        """The source of a worker: the one that published its spec."""
         with self._lock:
             return self._spec_sources.get(worker)
 
-    # Who speaks is looked at before what is said: a stranger's words are not decoded, and nobody
-    # is asked for the clock of a name that he made up.
-    def _hear_status(self, arrival: ReceivedSample, now_ns: int) -> None:
-        """A node's status counts on its own key, while it is alive, by the first who wrote it."""
-        name, source = self._said(arrival)
-        if source is None:
+    # The source is checked before the payload: messages of foreign sources are not decoded, and no
+    # clock is measured for a made-up name.
+    def _receive_status(self, arrival: ReceivedSample, now_ns: int) -> None:
+        """Accept a node's status on its own key, while it is alive, from the first source of it."""
+        name, header = self._name_and_header(arrival)
+        if header is None:
             return
+        source = header.source
         with self._lock:
-            ours = name in self._alive and self._voices.get(name, source) == source
-        stamped = self._node.decode(NodeStatus, arrival) if ours else None
+            ours = name in self._alive and self._status_sources.get(name, source) == source
+        stamped = self._node.decode(NodeStatus, arrival, header=header) if ours else None
         if ours and stamped is None:
-            return  # refused for what it is
+            return  # rejected and counted already
         status = stamped.record if stamped is not None and stamped.record.node == name else None
         with self._lock:
-            # Who has left meanwhile does not keep the place of who comes back in his name.
+            # A node that is gone must not block a restarted one of the same name.
             if status is not None and name in self._alive:
-                self._voices[name] = source
-                self._take_status(status)
+                self._status_sources[name] = source
+                self._update_from_status(status)
             else:
                 self._node.counters["refused.foreign_status"] += 1
                 return
         cameras = status.detail.get("cameras")
         for camera, fields in cameras.items() if isinstance(cameras, dict) else ():
             if camera in self._servers and isinstance(fields, dict):
-                self._take_camera(name, camera, fields, now_ns)
+                self._update_camera(name, camera, fields, now_ns)
 
-    def _hear_spec(self, arrival: ReceivedSample) -> None:
-        """Likewise for the spec of a worker."""
-        worker, source = self._said(arrival)
-        if source is None:
+    def _receive_spec(self, arrival: ReceivedSample) -> None:
+        """Accept a worker's spec on its own key, while it is alive, from the first source of it."""
+        worker, header = self._name_and_header(arrival)
+        if header is None:
             return
+        source = header.source
         node = worker_node(worker)
         with self._lock:
             known = self._spec_sources.get(worker)
@@ -157,7 +159,7 @@ class PeerMonitor:
             if ours and known is None and len(self._specs) >= MAX_WORKERS:
                 self._node.counters["refused.more_workers"] += 1
                 return
-        stamped = self._node.decode(ModelSpec, arrival) if ours else None
+        stamped = self._node.decode(ModelSpec, arrival, header=header) if ours else None
         if ours and stamped is None:
             return
         with self._lock:
@@ -169,38 +171,40 @@ class PeerMonitor:
                 return
         self._node.counters["refused.foreign_spec"] += 1
 
-    def _said(self, arrival: ReceivedSample) -> tuple[str, str | None]:
-        """Whom it is about, by its key, and its source where it has one."""
+    def _name_and_header(self, arrival: ReceivedSample) -> tuple[str, Header | None]:
+        """The node or worker by the sample's key, and the header; None: it is rejected."""
         key = str(arrival.sample.key_expr)
         try:
-            return key_names.last_chunk(key), self._node.header(arrival).source
+            return key_names.last_chunk(key), self._node.header(arrival)
         except CodecError as error:
             short = self._node.keys.short(key)
             self._node.reject(error.reason, f"{short}: {error}", short)
             return key_names.last_chunk(key), None
 
-    def _take_status(self, status: NodeStatus) -> None:
-        self._places[status.node] = HostId(status.host, status.boot)
+    def _update_from_status(self, status: NodeStatus) -> None:
+        self._hosts[status.node] = HostId(status.host, status.boot)
         if status.node.startswith("worker-"):
             complaint = status.detail.get("complaint", "")
             worker = status.node.removeprefix("worker-")
             if not isinstance(complaint, str):
                 return
             known, self._changed = self._complaints, True
-            if not complaint:  # who has none takes no room
+            if not complaint:
                 known.pop(worker, None)
             elif worker in known or len(known) < MAX_WORKERS:
                 known[worker] = complaint[:MAX_WHY]
             else:
                 self._node.counters["refused.more_workers"] += 1
 
-    def _take_camera(self, node: str, camera: str, fields: Mapping[Any, Any], now_ns: int) -> None:
-        """How a camera is, as the node says that serves it by the profile."""
+    def _update_camera(
+        self, node: str, camera: str, fields: Mapping[Any, Any], now_ns: int
+    ) -> None:
+        """Update a camera from the status of the node that serves it by the profile."""
         server = self._servers[camera]
         if node != server:
             self._node.reject(
                 "foreign_camera",
-                f"node {node!r} speaks for camera {camera!r}, which node {server!r} serves by the "
+                f"node {node!r} reports camera {camera!r}, which node {server!r} serves by the "
                 "profile (hosts.HOST.cameras; --name of `vla-zenoh node camera`)",
                 node,
             )

@@ -207,7 +207,7 @@ class Gripper:
         outcome = gripper_actions.outcome(self._action, response)
         self._held = outcome.holding
         if not (outcome.reached or outcome.holding):
-            self._emit_failure(f"did not get there (status {response.status}) {outcome.said}")
+            self._emit_failure(f"did not get there (status {response.status}) {outcome.message}")
 
     def _cancel(self) -> None:
         self._node.counters["ros2.gripper_cancelled"] += 1

@@ -1,7 +1,7 @@
-"""Serves one of our models to openpi's clients, over WebSocket, without any Zenoh.
+"""Serves one of our models to openpi clients over WebSocket, without Zenoh.
 
-One client at a time: a model remembers what it was shown, so a second one is told to come later. A
-new connection and a new prompt begin an episode.
+It serves one client at a time, as a model may keep state; a second client is rejected. A new
+connection or a new prompt starts an episode.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 from vla_zenoh.errors import MissingExtraError, PeerError, SpecError
 from vla_zenoh.interop import openpi
-from vla_zenoh.interop.served_policy import ServedPolicy
+from vla_zenoh.lab.serve.served_policy import ServedPolicy
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
 
 try:
@@ -31,14 +31,14 @@ MAX_ERROR = 1000
 
 
 class OpenPiServer:
-    """See the module.
+    """WebSocket server with openpi's protocol.
 
     Args:
-        policy: a model that is loaded.
-        offer: its names.
+        policy: a loaded model.
+        offer: names of its observations.
         host: address to listen on.
-        port: likewise; 0: any.
-        api_key: what clients have to bring, empty: nothing.
+        port: to listen on; 0: any.
+        api_key: required of clients; empty: none.
     """
 
     def __init__(
@@ -59,11 +59,11 @@ class OpenPiServer:
         self.port: int = self._server.socket.getsockname()[1]
 
     def serve_forever(self) -> None:
-        """Answer until `stop`."""
+        """Serve until `stop`."""
         self._server.serve_forever()
 
     def stop(self) -> None:
-        """Let nobody in any more."""
+        """Stop accepting clients."""
         self._server.shutdown()
 
     # -- connections --------------------------------------------------------------------------
@@ -106,9 +106,9 @@ class OpenPiServer:
                 result: Any = self._policy.infer(observation)
                 steps = result.steps if isinstance(result, ActionSteps) else result
                 actions = check_steps(self._policy.spec.action, steps)
-            except Exception as error:  # the client is told, as openpi tells it, and may come again
-                told = error if isinstance(error, (PeerError, SpecError)) else repr(error)
-                self._log.warning("a question was refused: %s", told)
+            except Exception as error:  # sent to the client as openpi does; it may reconnect
+                why = error if isinstance(error, (PeerError, SpecError)) else repr(error)
+                self._log.warning("request rejected: %s", why)
                 connection.send(f"{type(error).__name__}: {error}"[:MAX_ERROR])
                 connection.close(INTERNAL_ERROR, "the reason is in the frame before")
                 return

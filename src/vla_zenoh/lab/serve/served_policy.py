@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.errors import PeerError, RecordError, SpecError
-from vla_zenoh.interop.field_mapping import FieldSource
-from vla_zenoh.interop.options import read_map
+from vla_zenoh.interop.field_mapping import FieldSource, read_map
 from vla_zenoh.policy import ModelSpec, Observation
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.policy.state_vector import ROTATIONS, parts_of, read_parts, state_of
@@ -36,11 +35,11 @@ class ServedPolicy:
     max_width_m: float
 
     def described(self) -> dict[str, str]:
-        """Name -> what it has to be, for people."""
+        """Name -> its content, as text."""
         out: dict[str, str] = {}
         for name, source in self.fields.items():
             if source.camera:
-                out[name] = f"picture of camera {source.camera}, (H, W, 3) RGB uint8"
+                out[name] = f"image of camera {source.camera}, (H, W, 3) RGB uint8"
             else:
                 out[name] = "text" if source.prompt else "+".join(source.parts)
         return out

@@ -1,0 +1,1 @@
+"""Serves our models to the clients of other policy servers."""
