@@ -122,7 +122,7 @@ def drive_by_hand(chain: Chain, screen: Screen) -> None:
     """Takes the arm, goes up, stops it; all of it by keys."""
     screen.type(b"\t")
     chain.until("it is obeyed", lambda: obeyed(chain) == "teleop")
-    until("the person sees it", lambda: b"obeys you" in screen.shown)
+    until("the person sees it", lambda: b"follows you" in screen.shown)
 
     def active() -> bool:
         if chain.client.task is None or not chain.client.task.active:
