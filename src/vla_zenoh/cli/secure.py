@@ -95,10 +95,16 @@ def init(
     except VlaZenohError:
         file.unlink()
         raise
+    _print_next(written, file, store, made, here)
+
+
+def _print_next(
+    written: Profile, file: Path, store: Store, made: Sequence[Path], here: str | None
+) -> None:
+    """Print the files that `init` made, and what to do with them."""
     out = console()
-    for path in made:
+    for path in (*made, file):
         out.print(f"made {path}", highlight=False, soft_wrap=True)
-    out.print(f"made {file}", highlight=False, soft_wrap=True)
     others = [name for name in written.hosts if name != here]
     if others:
         which = "each of the others" if here is not None else "each host but this one"

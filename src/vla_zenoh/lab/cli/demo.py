@@ -2,18 +2,48 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import DEFAULT_PROFILE
+from vla_zenoh.cli.options import DEFAULT_PROFILE, options
 
 DEFAULT_STEPS = 50
 TASK_PROFILE = "panda_bricks"
 
 
+@dataclass(frozen=True)
+class DemoOptions:
+    """Options of both kinds of demo."""
+
+    rate_hz: Annotated[
+        float, typer.Option("--rate", help="Chunks per second.", min=0.2, max=50)
+    ] = 5.0
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            "--seconds",
+            help="Duration of a fixed motion; time limit of a task.",
+            min=0.5,
+            max=3600,
+        ),
+    ] = None
+    profile: Annotated[
+        str | None, typer.Option("--profile", "-p", help="Name or path of a simulated profile.")
+    ] = None
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the summary to this file.")
+    ] = None
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Run folder; default: runs/demo-<time>.")
+    ] = None
+
+
+@options
 def demo(
+    given: DemoOptions,
     prompt: Annotated[
         str | None,
         typer.Option(
@@ -25,32 +55,11 @@ def demo(
     tour: Annotated[
         bool, typer.Option("--tour", help="All fixed motions in place of tasks.")
     ] = False,
-    rate: Annotated[
-        float, typer.Option("--rate", help="Chunks per second.", min=0.2, max=50)
-    ] = 5.0,
     steps: Annotated[
         int, typer.Option("--steps", help="Steps of a fixed motion.", min=1, max=10_000)
     ] = DEFAULT_STEPS,
-    seconds: Annotated[
-        float | None,
-        typer.Option(
-            "--seconds",
-            help="Duration of a fixed motion; time limit of a task.",
-            min=0.5,
-            max=3600,
-        ),
-    ] = None,
     seed: Annotated[
         int | None, typer.Option("--seed", help="Of the layout of the tasks.", min=0)
-    ] = None,
-    profile: Annotated[
-        str | None, typer.Option("--profile", "-p", help="Name or path of a simulated profile.")
-    ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the summary to this file.")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Run folder; default: runs/demo-<time>.")
     ] = None,
 ) -> None:
     """Start a simulated robot, let prompts move it, and show what it did.
@@ -66,20 +75,13 @@ def demo(
         from vla_zenoh.lab.demo.segments import tour as all_motions
 
         segments = all_motions() if prompt is None else [make_segment(prompt, steps)]
-        run_demo(segments, rate, seconds, profile or DEFAULT_PROFILE, json_file, out)
+        run_demo(segments, given.profile or DEFAULT_PROFILE, given)
         return
     from vla_zenoh.lab.bench.task import FIRST_SEED
     from vla_zenoh.lab.cli.demo_tasks import run_task_demo
 
-    run_task_demo(
-        [prompt] if prompt else [],
-        FIRST_SEED if seed is None else seed,
-        rate,
-        seconds,
-        profile or TASK_PROFILE,
-        json_file,
-        out,
-    )
+    prompts, first_seed = [prompt] if prompt else [], FIRST_SEED if seed is None else seed
+    run_task_demo(prompts, first_seed, given.profile or TASK_PROFILE, given)
 
 
 def _is_fixed_motion(prompt: str) -> bool:

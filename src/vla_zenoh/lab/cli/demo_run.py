@@ -8,6 +8,7 @@ from typing import Any
 import typer
 
 from vla_zenoh.cli.output import console, new_table, progress_bars, styled
+from vla_zenoh.lab.cli.demo import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, prepare, refusals
 from vla_zenoh.lab.demo.plot import plot_run
 from vla_zenoh.lab.demo.runner import DemoResult, DemoRunner
@@ -23,20 +24,13 @@ KEPT = 400
 """States that the demo keeps."""
 
 
-def run_demo(
-    segments: list[DemoSegment],
-    rate: float,
-    seconds: float | None,
-    profile: str,
-    json_file: Path | None,
-    out: Path | None,
-) -> None:
+def run_demo(segments: list[DemoSegment], profile: str, given: DemoOptions) -> None:
     """Run fixed motions and show how far each came."""
-    stage = prepare(profile, out)
-    result = _run(stage, segments, rate, seconds)
+    stage = prepare(profile, given.out)
+    result = _run(stage, segments, given.rate_hz, given.seconds)
     run = stage.recorded()
-    summary = _summary(stage.profile, rate, result, run)
-    stage.write(summary, json_file)
+    summary = _summary(stage.profile, given.rate_hz, result, run)
+    stage.write(summary, given.json_file)
     _write_tables(stage, run)
     _show(summary, result, stage.folder)
     if not summary["ok"]:

@@ -13,6 +13,7 @@ from vla_zenoh.cli.output import console, new_table, styled
 from vla_zenoh.lab.bench.task import DemoPlan, TaskOutcome, is_judged
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
+from vla_zenoh.lab.cli.demo import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, prepare, refusals
 from vla_zenoh.lab.demo.segments import latencies
 from vla_zenoh.lab.episode import Interrupted
@@ -23,25 +24,17 @@ ROUNDS = 3
 """Tasks without a prompt: one of every family."""
 
 
-def run_task_demo(
-    prompts: list[str],
-    seed: int,
-    rate: float,
-    seconds: float | None,
-    profile: str,
-    json_file: Path | None,
-    out: Path | None,
-) -> None:
+def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOptions) -> None:
     """Run tasks and show the verdict on each."""
-    stage = prepare(profile, out)
+    stage = prepare(profile, given.out)
     loaded, folder = stage.profile, stage.folder
     plan = DemoPlan(
         loaded.task.worker,
         len(prompts) or ROUNDS,
         seed,
-        rate_hz=rate,
+        rate_hz=given.rate_hz,
         prompts=tuple(prompts),
-        limit_s=seconds or LIMIT_S,
+        limit_s=given.seconds or LIMIT_S,
     )
     began_ns = time.time_ns()
     ended, refused = _run(stage, plan)
@@ -50,13 +43,13 @@ def run_task_demo(
         "ok": len(ended) == plan.episodes and all(_well(each) is not False for each in ended),
         "profile": loaded.name,
         "model": plan.model,
-        "rate_hz": rate,
+        "rate_hz": given.rate_hz,
         "seed": seed,
         "tasks": [each.to_dict() | {"judged": is_judged(each.prompt)} for each in ended],
         "latency_ms": latencies(run.first_commands()),
         "refusals": refused,
     }
-    stage.write(summary, json_file)
+    stage.write(summary, given.json_file)
     picture = sheet(ended)
     if picture is not None:
         (folder / "tasks.jpg").write_bytes(picture)

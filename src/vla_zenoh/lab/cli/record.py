@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +12,9 @@ from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.runtime.process import run_node
+
+if TYPE_CHECKING:
+    from vla_zenoh.lab.recording.recorder import RecordingResult
 
 
 @options
@@ -43,7 +46,7 @@ def record(
     Foxglove, Rerun and `ros2 bag` open it. The file is valid at any time, also when the recorder is
     killed or the disk is full.
     """
-    from vla_zenoh.lab.recording.recorder import Recorder, RecordingResult, recorded_keys
+    from vla_zenoh.lab.recording.recorder import Recorder, recorded_keys
 
     loaded = target.load()
     path = out or Path("runs") / time.strftime("record-%Y%m%d-%H%M%S.mcap")
@@ -58,7 +61,10 @@ def record(
     run_node(loaded, run, identity=None)
     if not done:  # interrupted before it began
         raise typer.Exit(130)
-    recorded = done[0]
+    _show(done[0], as_json)
+
+
+def _show(recorded: RecordingResult, as_json: bool) -> None:
     if as_json:
         print_json(
             {
