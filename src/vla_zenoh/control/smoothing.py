@@ -55,9 +55,9 @@ OVERSHOOT = 1e-6
 
 BESIDE = 0.01
 """Part of the limits for motion beside the line: goals are float32, 30 nm off the line."""
-ON_LINE = 2e-7
-"""m and rad: a goal nearer to the line of the motion is on it. The direction of such a goal means
-nothing where the arm is about to pass it."""
+ON_LINE, SLOW = 2e-7, 0.02
+"""m and rad, and their speeds: a slow arm that is about to pass its goal is on its line if the goal
+is this near to it. The direction to the goal means nothing there. A fast arm passes no goal."""
 TINY, MOST = 1e-12, 1e9
 
 ROTATION_BOX = 0.55
@@ -335,7 +335,7 @@ class Smoother:
         if length > 0.0 and (np.abs(beside) <= np.array(QUIET[1:])[:, None]).all():
             return along[:, None], [1.0]
         ahead = motion[0] / max(speed, TINY)
-        if speed > 0.0 and norm3(way - (way @ ahead) * ahead) < ON_LINE:
+        if 0.0 < speed < SLOW and norm3(way - (way @ ahead) * ahead) < ON_LINE:
             along, beside = ahead, motion - np.outer(motion @ ahead, ahead)
         elif length == 0.0:
             return np.eye(3), [1.0] * 3
