@@ -122,7 +122,7 @@ def drive_by_hand(chain: Chain, screen: Screen) -> None:
     """Takes the arm, goes up, stops it; all of it by keys."""
     screen.type(b"\t")
     chain.until("it is obeyed", lambda: obeyed(chain) == "teleop")
-    until("the person sees it", lambda: b"obeys you" in screen.shown)
+    until("the person sees it", lambda: b"follows you" in screen.shown)
 
     def active() -> bool:
         if chain.client.task is None or not chain.client.task.active:
@@ -232,7 +232,7 @@ def test_who_has_not_the_role_is_told_and_nothing_is_heard_of_him(
     heard = Heard(lab.chain.session, Keys(GHOST))
     done = replay(lab, run_file, place, GHOST)
     assert done.returncode == 1
-    assert f"the certificate of the role {PLACES[place]}" in done.stderr
+    assert f"the certificate of this computer has the role {PLACES[place]}" in done.stderr
     assert heard.counts == {}
 
 
