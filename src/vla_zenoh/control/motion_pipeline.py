@@ -321,7 +321,7 @@ class MotionPipeline:
         if self._override == 0.0:
             self._pause(smoother)
             return events
-        slowed = smoother.slowed_down or (self._slowing and _within(smoother, self._override))
+        slowed = self._slowing and _within(smoother, self._override)
         # The leash starts at the pose of this tick: the arm may be moving away from the last one.
         pose, hits = leash(self._limits, goal.pose, _ahead(smoother.motion, ticks * self._dt_s))
         slower = slowest(goal.slowdown, self.contact_slowdown, self.joint_slowdown)

@@ -176,7 +176,7 @@ def test_a_layout_without_room_says_so() -> None:
         "green": (0.40, -0.08, REST_M),
         "yellow": (0.40, -0.22, REST_M),
     }
-    with pytest.raises(ResourceError, match="take another seed"):
+    with pytest.raises(ResourceError, match="use another seed"):
         draw_episode(0, objects(**around), family="push", target="red")
 
 
