@@ -8,7 +8,7 @@ from typing import Any
 import typer
 
 from vla_zenoh.cli.output import console, new_table, progress_bars, styled
-from vla_zenoh.lab.cli.demo import DemoOptions
+from vla_zenoh.lab.cli.demo_options import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, prepare, refusals
 from vla_zenoh.lab.demo.plot import plot_run
 from vla_zenoh.lab.demo.runner import DemoResult, DemoRunner

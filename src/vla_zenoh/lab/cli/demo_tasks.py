@@ -13,7 +13,7 @@ from vla_zenoh.cli.output import console, new_table, styled
 from vla_zenoh.lab.bench.task import DemoPlan, TaskOutcome, is_judged
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
-from vla_zenoh.lab.cli.demo import DemoOptions
+from vla_zenoh.lab.cli.demo_options import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, prepare, refusals
 from vla_zenoh.lab.demo.segments import latencies
 from vla_zenoh.lab.episode import Interrupted

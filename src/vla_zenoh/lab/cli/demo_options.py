@@ -1,0 +1,36 @@
+"""Options of both kinds of demo; needs no optional library."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """Options of both kinds of demo."""
+
+    rate_hz: Annotated[
+        float, typer.Option("--rate", help="Chunks per second.", min=0.2, max=50)
+    ] = 5.0
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            "--seconds",
+            help="Duration of a fixed motion; time limit of a task.",
+            min=0.5,
+            max=3600,
+        ),
+    ] = None
+    profile: Annotated[
+        str | None, typer.Option("--profile", "-p", help="Name or path of a simulated profile.")
+    ] = None
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the summary to this file.")
+    ] = None
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Run folder; default: runs/demo-<time>.")
+    ] = None
