@@ -43,7 +43,7 @@ def test_a_session_from_prompt_to_reset(chain: Chain) -> None:
     assert "worker: nobody" in ok(chain, "use", "nobody")
     refused = run(chain, "activate")
     assert refused.returncode == REFUSED
-    assert "activate refused:" in refused.stderr
+    assert "activate rejected:" in refused.stderr
     assert "- worker 'nobody' is not alive; alive are: scripted" in refused.stderr
     ok(chain, "use", "scripted")
 
