@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,6 +23,10 @@ from vla_zenoh.cli.options import (
 )
 from vla_zenoh.runtime.parent_watch import RUN_FOLDER_VARIABLE
 from vla_zenoh.runtime.process import die_with_parent, run_node, stop_on_signals
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile import Profile
+    from vla_zenoh.robots.driver import RobotDriver
 
 # Each node is imported in its command: MuJoCo and Pinocchio take long to load.
 
@@ -55,6 +60,20 @@ def router(
         run_router(loaded, stop, host=host, also=others)
 
 
+def _run_robot(
+    node: NodeOptions, identity: str, make_driver: Callable[[Profile], RobotDriver]
+) -> None:
+    from vla_zenoh.robots.node import RobotNode
+
+    profile = node.load()
+    run_node(
+        profile,
+        lambda session, stop: RobotNode(make_driver(profile), session).run(stop),
+        identity=identity,
+        preferred=True,
+    )
+
+
 @options
 def sim(
     node: NodeOptions,
@@ -63,46 +82,25 @@ def sim(
     ] = False,
 ) -> None:
     """Run the simulated robot: receives commands, publishes its state."""
-    from vla_zenoh.robots.node import RobotNode
     from vla_zenoh.robots.sim_driver import SimDriver
 
-    profile = node.load()
-    run_node(
-        profile,
-        lambda session, stop: RobotNode(SimDriver(profile, lockstep=lockstep), session).run(stop),
-        identity="sim",
-        preferred=True,
-    )
+    _run_robot(node, "sim", lambda profile: SimDriver(profile, lockstep=lockstep))
 
 
 @options
 def ros2(node: NodeOptions) -> None:
     """Drive a ROS 2 robot and serve its cameras, through a bridge or rmw_zenoh."""
-    from vla_zenoh.robots.node import RobotNode
     from vla_zenoh.robots.ros2.driver import Ros2Driver
 
-    profile = node.load()
-    run_node(
-        profile,
-        lambda session, stop: RobotNode(Ros2Driver(profile), session).run(stop),
-        identity="ros2",
-        preferred=True,
-    )
+    _run_robot(node, "ros2", Ros2Driver)
 
 
 @options
 def arm(node: NodeOptions) -> None:
     """Drive an arm with the Python driver that the profile names in `arm.file`."""
-    from vla_zenoh.robots.node import RobotNode
     from vla_zenoh.robots.python_driver import PythonDriver
 
-    profile = node.load()
-    run_node(
-        profile,
-        lambda session, stop: RobotNode(PythonDriver(profile), session).run(stop),
-        identity="arm",
-        preferred=True,
-    )
+    _run_robot(node, "arm", PythonDriver)
 
 
 @options

@@ -7,6 +7,7 @@ the arm does between two of them, and how it brakes when the stream falls silent
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
@@ -201,7 +202,7 @@ def _on(way: GovernedPath, jerk: FloatArray | float, time_s: FloatArray | float)
     )
 
 
-class StreamGuard(Generic[Reference]):
+class StreamGuard(ABC, Generic[Reference]):
     """Follows a command stream, and brakes by itself when that falls silent in motion.
 
     A subclass says how a measured place becomes a reference at rest, and which commands it admits.
@@ -233,13 +234,13 @@ class StreamGuard(Generic[Reference]):
         self.braking = False
         self.silences = 0
 
+    @abstractmethod
     def _standing(self, here: Any) -> Reference:
         """The reference of a robot that stands at a measured place."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _admit(self, record: Any) -> Reference | str:
         """The reference of a command, or the reason against it."""
-        raise NotImplementedError
 
     @property
     def motion(self) -> Reference:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from vla_zenoh.bus.clock import FixedRate, Tick
 from vla_zenoh.bus.node import Node
+from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.arm_guard import Measured
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
 from vla_zenoh.profile import Profile
@@ -82,7 +84,7 @@ class Pace(Protocol):
         ...
 
 
-class RobotDriver:
+class RobotDriver(ABC):
     """One kind of robot as `RobotNode` drives it; a subclass needs `read` and `move`.
 
     One thread, the node's loop, calls everything. A call must return within a fraction of
@@ -125,17 +127,17 @@ class RobotDriver:
         self.modes: tuple[str, ...] = (profile.robot.command,)
 
     # -- required -----------------------------------------------------------------------------
+    @abstractmethod
     def read(self, mono_ns: int) -> Measurement | None:
         """The newest state; None: nothing new, or nothing valid.
 
         Args:
             mono_ns: time of this tick on the monotonic clock.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Set the set-point of the robot's controller; `now_ns` is its time on the wall clock."""
-        raise NotImplementedError
 
     # -- optional -----------------------------------------------------------------------------
     def attach(self, node: Node, follower: CommandFollower | None) -> None:
@@ -160,7 +162,7 @@ class RobotDriver:
 
     def serve_lockstep(self, node: SteppedNode, stop: threading.Event) -> None:
         """Run the node's ticks when simulated time advances, until `stop` is set."""
-        raise NotImplementedError
+        raise NodeError("this driver has no simulated time")
 
     def close(self) -> None:
         """Disconnect; the arm stands."""

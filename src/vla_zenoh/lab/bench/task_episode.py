@@ -14,7 +14,7 @@ DONE_S = 1.5
 """An episode ends when the policy has been done, and the arm at rest, for this long."""
 
 
-class Scene(NamedTuple):
+class SceneSnapshot(NamedTuple):
     """State of the simulated scene.
 
     Args:
@@ -49,7 +49,7 @@ class TaskStage(Protocol):
         """A clock that never goes back."""
         ...
 
-    def scene(self) -> Scene:
+    def scene(self) -> SceneSnapshot:
         """The newest state of the scene."""
         ...
 

@@ -27,7 +27,7 @@ from vla_zenoh.lab.bench.task import (
     TaskPlan,
     TaskRequest,
 )
-from vla_zenoh.lab.bench.task_episode import Scene, run_task
+from vla_zenoh.lab.bench.task_episode import SceneSnapshot, run_task
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_of
 from vla_zenoh.policy.loader import find_worker, make_policy
@@ -142,10 +142,10 @@ class _LockstepStage:
         """Virtual time."""
         return self._running.now_ns / 1e9
 
-    def scene(self) -> Scene:
+    def scene(self) -> SceneSnapshot:
         """The world now."""
         width_m = self.world.gripper_state().width_m
-        return Scene(self._running.now_ns, self._objects(), width_m, self.world.tcp()[0])
+        return SceneSnapshot(self._running.now_ns, self._objects(), width_m, self.world.tcp()[0])
 
     def failure(self) -> tuple[str, str] | None:
         """The arm is inactive."""

@@ -15,7 +15,7 @@ from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.bench.task import ARM_LOST, NO_STATE, TaskOutcome, TaskPlan
-from vla_zenoh.lab.bench.task_episode import Scene, run_task
+from vla_zenoh.lab.bench.task_episode import SceneSnapshot, run_task
 from vla_zenoh.lab.episode import COMMAND, EpisodeRunner
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.types import GripperState, Header, ObjectPoses, PoseState
@@ -118,11 +118,13 @@ class TaskRunner:
         """Monotonic clock."""
         return time.monotonic()
 
-    def scene(self) -> Scene:
+    def scene(self) -> SceneSnapshot:
         """The newest states."""
         header, objects = self._newest(ObjectPoses)
         width_m = self._newest(GripperState)[1].width_m
-        return Scene(header.stamp_wall_ns, objects, width_m, self._newest(PoseState)[1].position_m)
+        return SceneSnapshot(
+            header.stamp_wall_ns, objects, width_m, self._newest(PoseState)[1].position_m
+        )
 
     def failure(self) -> tuple[str, str] | None:
         """The arm is inactive, or the simulator's objects are silent."""

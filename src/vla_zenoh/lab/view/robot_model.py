@@ -33,7 +33,7 @@ MEDIA_TYPES = {
 }
 
 
-class RobotModel:
+class RobotMeshes:
     """Shapes of the profile's robot, and the poses of their links in the base frame.
 
     Args:
@@ -154,10 +154,12 @@ def archetype_of(shape: Any) -> Any:
     )
 
 
-def load_robot_model(profile: Profile, stream: rr.RecordingStream) -> tuple[RobotModel | None, str]:
+def load_robot_model(
+    profile: Profile, stream: rr.RecordingStream
+) -> tuple[RobotMeshes | None, str]:
     """The robot with its shapes logged, or None and the reason: all else is shown without it."""
     try:
-        model = RobotModel(profile)
+        model = RobotMeshes(profile)
         model.log_shapes(stream)
         return model, ""
     except VlaZenohError as error:

@@ -13,7 +13,7 @@ from vla_zenoh.control.plan_timeline import Goal, Plan
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
 from vla_zenoh.lab.view import paths
-from vla_zenoh.lab.view.robot_model import RobotModel
+from vla_zenoh.lab.view.robot_model import RobotMeshes
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, FloatArray, ObjectPoses
@@ -69,7 +69,7 @@ class Scene:
     """
 
     def __init__(
-        self, stream: rr.RecordingStream, profile: Profile, robot: RobotModel | None
+        self, stream: rr.RecordingStream, profile: Profile, robot: RobotMeshes | None
     ) -> None:
         self._stream, self._robot = stream, robot
         self._trails = {name: PoseTrail(stream, name) for name in paths.COLOURS}
