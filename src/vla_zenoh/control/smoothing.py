@@ -53,8 +53,11 @@ precision of Ruckig's solver; such an acceleration changes a velocity by less in
 OVERSHOOT = 1e-6
 """m and rad: rounding by which a plan may leave the range between start, target and stop."""
 
+ASIDE = 2e-7
+"""m and rad: a target nearer to the line of the motion is on it; goals are float32, 30 nm off."""
 BESIDE = 0.01
-"""Part of the limits for motion beside the line: goals are float32, 30 nm off the line."""
+"""Part of the limits for motion beside the line."""
+_ASIDE = np.array([[ASIDE], *([quiet] for quiet in QUIET[1:])])
 TINY, MOST = 1e-12, 1e9
 
 ROTATION_BOX = 0.55
@@ -294,12 +297,8 @@ class Smoother:
         One, if the motion is already along `way`. Otherwise those of translation and rotation: the
         line and two directions beside it if the motion there is small, or the axes.
         """
-        velocity, acceleration = self._state[1:]
-        whole = way / max(math.sqrt(float(way @ way)), TINY)
-        if all(
-            (np.abs(value - float(whole @ value) * whole) <= quiet).all()
-            for value, quiet in ((velocity, QUIET[1]), (acceleration, QUIET[2]))
-        ):
+        whole = _line(way, *self._state[1:])
+        if whole is not None:
             return whole[:, None], [1.0]
         columns: list[FloatArray] = []
         parts: list[float] = []
@@ -315,13 +314,14 @@ class Smoother:
     ) -> tuple[FloatArray, list[float]]:
         """The same for three axes: (3, k), with `way` (3,) and `limits` (3, 3)."""
         motion = np.array([self._state.velocity[axes], self._state.acceleration[axes]])
+        line = _line(way, *motion)
+        if line is not None:
+            return (line[:, None], [1.0]) if line.any() else (np.zeros((3, 0)), [])
         length = norm3(way)
         if length == 0.0:
-            return (np.eye(3), [1.0] * 3) if motion.any() else (np.zeros((3, 0)), [])
+            return np.eye(3), [1.0] * 3
         along = way / length
         beside = motion - np.outer(motion @ along, along)
-        if (np.abs(beside) <= np.array(QUIET[1:])[:, None]).all():
-            return along[:, None], [1.0]
         least = np.eye(3)[int(np.argmin(np.abs(along)))]
         across = cross3(along, least)
         across /= norm3(across)
@@ -476,6 +476,25 @@ class Smoother:
         velocity[np.abs(velocity) < QUIET[1]] = 0.0
         acceleration[np.abs(acceleration) < QUIET[2]] = 0.0
         self._state = _State(np.concatenate([position[:3], np.zeros(3)]), velocity, acceleration)
+
+
+def _line(way: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray | None:
+    """The direction of a motion on a straight line through its target, None if it is on none.
+
+    That of the way if there is one; the motion's own where the target is about to be passed, and
+    so near that its direction is rounding. Zero where there is neither way nor motion.
+    """
+    all_ = np.stack([way, velocity, acceleration])
+    lengths = np.sqrt((all_ * all_).sum(axis=1))
+    if not lengths.any():
+        return way
+    for value, length in zip(all_, lengths.tolist(), strict=True):
+        if length > 0.0:
+            line = value / length
+            beside = np.abs(all_ - np.outer(all_ @ line, line))
+            if (beside <= _ASIDE).all():
+                return line
+    return None
 
 
 def _extrema(path: Trajectory) -> tuple[FloatArray, FloatArray]:
