@@ -182,6 +182,7 @@ class Smoother:
         self._target = self._state.position
         self._plan: _Plan | None = None
         self._elapsed_s = 0.0
+        self._jerk, self._sign = zeros, zeros
         self.braking = False
         self.motion = Motion(
             Pose(np.array(pose.position_m, dtype=np.float64), self._anchor),
@@ -205,7 +206,7 @@ class Smoother:
         self._anchor_here()
         self.braking = False
         self._target = np.array([*pose.position_m, *log3(self._anchor.T @ pose.rotation)])
-        limits = self.box * np.array(shares._replace(jerk=self._least_jerk(shares)))[:, None]
+        limits = self._limits(shares)
         way = self._target - self._state.position
         way[np.abs(way) < QUIET[0]] = 0.0
         plan, enough = self._towards(way, limits, all_to_stop)
@@ -225,7 +226,7 @@ class Smoother:
         self._anchor_here()
         limits = self.box
         if shares is not None:
-            limits = limits * np.array(shares._replace(jerk=self._least_jerk(shares)))[:, None]
+            limits = self._limits(shares)
         self.braking = True
         self._begin(self._stop(limits, together=shares is not None))
 
@@ -398,17 +399,23 @@ class Smoother:
             return None
         return path if done else None
 
-    def _least_jerk(self, shares: Shares) -> float:
-        """The share of the jerk limits that lets every acceleration end in time.
+    def _limits(self, shares: Shares) -> FloatArray:
+        """(3, 6) limits of every axis: `shares` of them, and as much jerk as the axis needs.
 
-        In time is before an axis exceeds its velocity limit, or reverses while it slows down. With
-        less jerk the arm would continue to accelerate, to any speed.
+        It needs what ends its acceleration before it exceeds its velocity limit, or reverses while
+        it slows down. With less the arm would continue to accelerate, to any speed. What an axis
+        once needed it keeps until its acceleration ends, or it would pass its target.
         """
         _, velocity, acceleration = self._state
         speed = np.abs(velocity)
         room = np.where(velocity * acceleration < 0, speed, self.box[0] - speed)
         needed = acceleration**2 / (2 * np.maximum(room, REST_VELOCITY)) / self.box[2]
-        return max(shares.jerk, min(float(needed.max()), 1.0))
+        ended = acceleration * self._sign <= 0.0
+        self._jerk = np.minimum(np.maximum(needed, np.where(ended, 0.0, self._jerk)), 1.0)
+        self._sign = np.sign(acceleration)
+        limits = self.box * np.array(shares)[:, None]
+        limits[2] = self.box[2] * np.maximum(self._jerk, shares.jerk)
+        return limits
 
     def resting_pose(self) -> Pose:
         """Brake, and return where the brake will end."""
