@@ -556,7 +556,7 @@ def ends_of(v: Array, a: Array, ahead: Array, limits: Array) -> tuple[Array, Arr
         straight = np.ones(len(v), bool)
         for order, (part, length) in enumerate(zip(parts, scale, strict=True)):
             off = part - (part * along).sum(axis=1, keepdims=True) * along
-            little = beside * limits[order, axes].min() if order < 2 else beside * length
+            little = beside * limits[order, axes].min() if order < 2 else beside * length + SAME
             straight &= np.linalg.norm(off, axis=1) <= 1e-6 * length + 1e-9 + little
         ratio = np.abs(along) / limits[1, axes]
         together = ratio / np.maximum(ratio.max(axis=1, keepdims=True), 1e-300) * (1 - beside)

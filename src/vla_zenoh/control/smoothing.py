@@ -183,6 +183,7 @@ class Smoother:
         self._plan: _Plan | None = None
         self._elapsed_s = 0.0
         self._jerk, self._sign = zeros, zeros
+        self._slowing_to: tuple[Pose, Shares, bool] | None = None
         self.braking = False
         self.motion = Motion(
             Pose(np.array(pose.position_m, dtype=np.float64), self._anchor),
@@ -211,6 +212,9 @@ class Smoother:
         way[np.abs(way) < QUIET[0]] = 0.0
         plan, enough = self._towards(way, limits, all_to_stop)
         self._begin(plan)
+        _, velocity, acceleration = self._state
+        slows = (velocity * acceleration < 0) & (np.abs(velocity) > limits[0])
+        self._slowing_to = (pose, shares, all_to_stop) if slows.any() and not self.braking else None
         return enough
 
     def brake(self, shares: Shares | None = None) -> None:
@@ -223,6 +227,7 @@ class Smoother:
         """
         if self.braking:
             return
+        self._slowing_to = None
         self._anchor_here()
         limits = self.box
         if shares is not None:
@@ -449,6 +454,10 @@ class Smoother:
             pace: part of the tick by which the motion advances, for a slow follower. Twist and
                 acceleration are those at full pace.
         """
+        if self._slowing_to is not None and not (self._state[1] * self._state[2] < 0).any():
+            # It was too fast for its shares. Its plan may go as fast again; with a new one it won't.
+            pose, shares, all_to_stop = self._slowing_to
+            self.target(pose, shares, all_to_stop=all_to_stop)
         if self._plan is None:
             return self.motion
         self._elapsed_s += pace * self._dt_s
