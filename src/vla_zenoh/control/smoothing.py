@@ -207,10 +207,10 @@ class Smoother:
         self._anchor_here()
         self.braking = False
         self._target = np.array([*pose.position_m, *log3(self._anchor.T @ pose.rotation)])
-        limits = self._limits(shares)
+        limits, unreversed = self._limits(shares)
         way = self._target - self._state.position
         way[np.abs(way) < QUIET[0]] = 0.0
-        plan, enough = self._towards(way, limits, all_to_stop)
+        plan, enough = self._towards(way, limits, unreversed, all_to_stop)
         self._begin(plan)
         _, velocity, acceleration = self._state
         slows = (velocity * acceleration < 0) & (np.abs(velocity) > limits[0])
@@ -231,7 +231,7 @@ class Smoother:
         self._anchor_here()
         limits = self.box
         if shares is not None:
-            limits = self._limits(shares)
+            _, limits = self._limits(shares)
         self.braking = True
         self._begin(self._stop(limits, together=shares is not None))
 
@@ -249,15 +249,25 @@ class Smoother:
         self._plan = plan
 
     def _towards(
-        self, way: FloatArray, limits: FloatArray, all_to_stop: bool
+        self, way: FloatArray, limits: FloatArray, unreversed: FloatArray, all_to_stop: bool
     ) -> tuple[_Plan | None, bool]:
-        """The plan of a motion by `way` (6,) without detours, and whether `limits` suffice."""
+        """The plan of a motion by `way` (6,) without detours, and whether `limits` suffice.
+
+        Args:
+            way: of the motion.
+            limits: (3, 6) to keep to.
+            unreversed: (3, 6) to keep to where an axis would else reverse for nothing.
+            all_to_stop: see `target`.
+        """
         if not np.isfinite(way).all():
             return None, False
         basis, parts = self._coordinates(way, limits)
         plan: _Plan | None = None
         hardest = np.concatenate([limits[:1], self.box[1:]])
-        for most in (limits, hardest) if (limits < hardest).any() else (limits,):
+        attempts = [limits]
+        attempts += [unreversed] * bool((limits < unreversed).any())
+        attempts += [hardest] * bool((unreversed < hardest).any())
+        for most in attempts:
             ask = self._input(basis, most, parts)
             ask.target_position = (basis.T @ way).tolist()
             for synchronization in (Synchronization.Time, Synchronization.No):
@@ -269,16 +279,18 @@ class Smoother:
                 if path is None:
                     continue
                 plan = _Plan(self._state.position, basis, path)
-                may_take = hardest if all_to_stop else most
+                may_take = hardest if all_to_stop else np.maximum(most, unreversed)
                 # The fastest plan with all limits available: it goes no further than necessary.
-                shortest = most is may_take and (
+                shortest = bool((most >= may_take).all()) and (
                     synchronization is Synchronization.No or len(parts) == 1
                 )
                 overshoots = not shortest and self._overshoots(
                     path, basis.T @ way, self._input(basis, may_take, parts)
                 )
                 if not overshoots and not self._leaves(plan):
-                    return plan, most is limits
+                    if most is not limits:
+                        self._jerk = most[2] / self.box[2]
+                    return plan, most is not hardest
         return plan, False
 
     def _leaves(self, plan: _Plan) -> bool:
@@ -404,23 +416,26 @@ class Smoother:
             return None
         return path if done else None
 
-    def _limits(self, shares: Shares) -> FloatArray:
-        """(3, 6) limits of every axis: `shares` of them, and as much jerk as the axis needs.
+    def _limits(self, shares: Shares) -> tuple[FloatArray, FloatArray]:
+        """Limits (3, 6) of every axis: `shares` of them and as much jerk as an axis needs, twice.
 
-        It needs what ends its acceleration before it exceeds its velocity limit, or reverses while
-        it slows down. With less the arm would continue to accelerate, to any speed. What an axis
-        once needed it keeps until its acceleration ends, or it would pass its target.
+        The first ends every acceleration before its axis exceeds the velocity limit; with less
+        jerk it would continue, to any speed. The second ends it before an axis that slows down
+        reverses, too. An axis keeps what it needed until its acceleration ends: with less again it
+        would pass its target.
         """
         _, velocity, acceleration = self._state
         speed = np.abs(velocity)
-        room = np.where(velocity * acceleration < 0, speed, self.box[0] - speed)
-        needed = acceleration**2 / (2 * np.maximum(room, REST_VELOCITY)) / self.box[2]
-        ended = acceleration * self._sign <= 0.0
-        self._jerk = np.minimum(np.maximum(needed, np.where(ended, 0.0, self._jerk)), 1.0)
-        self._sign = np.sign(acceleration)
+        slows = velocity * acceleration < 0
+        room = np.maximum(np.where(slows, speed, self.box[0] - speed), REST_VELOCITY)
+        needed = np.minimum(acceleration**2 / (2 * room) / self.box[2], 1.0)
+        kept = np.where(acceleration * self._sign > 0.0, self._jerk, 0.0)
+        self._jerk, self._sign = np.maximum(np.where(slows, 0.0, needed), kept), np.sign(acceleration)
         limits = self.box * np.array(shares)[:, None]
-        limits[2] = self.box[2] * np.maximum(self._jerk, shares.jerk)
-        return limits
+        limits[2] = np.maximum(limits[2], self.box[2] * self._jerk)
+        unreversed = limits.copy()
+        unreversed[2] = np.maximum(limits[2], self.box[2] * needed)
+        return limits, unreversed
 
     def resting_pose(self) -> Pose:
         """Brake, and return where the brake will end."""
