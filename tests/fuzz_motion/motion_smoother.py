@@ -21,6 +21,7 @@ from motion_judge import (
     ends_of,
     log_of,
     norms,
+    unreversed,
 )
 
 from vla_zenoh.control.smoothing import ROTATION_BOX, Motion, MotionLimits, Shares, Smoother
@@ -182,13 +183,14 @@ class _Way(NamedTuple):
         ahead = np.hstack([wanted - place[at], turned])
         low, high = ends_of(v, a, ahead, box)
         if any(min(part) < 1.0 for part in parts):
-            # With less of them it may go as far as a brake would with that much, and with any jerk
-            # from that up: more is taken where an axis would get too fast, or turn round.
+            # With less of them it may go as far as a brake would with that much, and with what
+            # jerk it takes where an axis would get too fast, or turn round.
             for n, part in enumerate(parts):
                 one = slice(n, n + 1)
-                for most in (part, part._replace(jerk=1.0)):
-                    scaled = box * np.array(most)[:, None]
-                    down, up = ends_of(v[one], a[one], ahead[one], scaled)
+                moved, scaled = (v[one], a[one], ahead[one]), box * np.array(part)[:, None]
+                whole_jerk = np.full((1, 6), 1.0 / part.jerk)
+                for more in (None, unreversed(*moved[:2], scaled, box), whole_jerk):
+                    down, up = ends_of(*moved, scaled, more)
                     low[one], high[one] = np.minimum(low[one], down), np.maximum(high[one], up)
         beyond = np.zeros(6)
         for n, begin in enumerate(begins):
