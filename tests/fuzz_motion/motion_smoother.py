@@ -200,11 +200,9 @@ class _Way(NamedTuple):
             )
             over = np.maximum(low[n] - moved, moved - high[n]).max(axis=0)
             beyond = np.maximum(beyond, over)
-        # Where the jerk that is taken changes on the way, a little more than with either.
-        more = 5 if any(min(part) < 1.0 for part in parts) else 1
         for name, over, limit, unit in (
-            ("way", float(beyond[:3].max()), more * WANDER_M, "mm"),
-            ("turn", float(beyond[3:].max()), more * WANDER_RAD, "mrad"),
+            ("way", float(beyond[:3].max()), WANDER_M, "mm"),
+            ("turn", float(beyond[3:].max()), WANDER_RAD, "mrad"),
         ):
             if over > limit:
                 bad.append((f"smoother: a {name} leaves its ends", over * 1e3, unit, shape))
