@@ -22,7 +22,6 @@ states", RSS 2021.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -430,7 +429,10 @@ class Smoother:
         room = np.maximum(np.where(slows, speed, self.box[0] - speed), REST_VELOCITY)
         needed = np.minimum(acceleration**2 / (2 * room) / self.box[2], 1.0)
         kept = np.where(acceleration * self._sign > 0.0, self._jerk, 0.0)
-        self._jerk, self._sign = np.maximum(np.where(slows, 0.0, needed), kept), np.sign(acceleration)
+        self._jerk, self._sign = (
+            np.maximum(np.where(slows, 0.0, needed), kept),
+            np.sign(acceleration),
+        )
         limits = self.box * np.array(shares)[:, None]
         limits[2] = np.maximum(limits[2], self.box[2] * self._jerk)
         unreversed = limits.copy()
@@ -470,7 +472,7 @@ class Smoother:
                 acceleration are those at full pace.
         """
         if self._slowing_to is not None and not (self._state[1] * self._state[2] < 0).any():
-            # It was too fast for its shares. Its plan may go as fast again; with a new one it won't.
+            # It was too fast for its shares, and may go as fast again by the plan it has.
             pose, shares, all_to_stop = self._slowing_to
             self.target(pose, shares, all_to_stop=all_to_stop)
         if self._plan is None:
