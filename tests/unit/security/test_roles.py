@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import Keys, covers
+from vla_zenoh.lab.doctor.access_rules import Passage, allows, missing, passages
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.profile.schema import NODE_KINDS
 from vla_zenoh.security.identity import (
@@ -20,7 +21,7 @@ from vla_zenoh.security.identity import (
     identities_of,
 )
 from vla_zenoh.security.roles import TABLE, Act, Right, expressions, key_members, rights
-from vla_zenoh.security.rules import Passage, access_control, allows, missing, passages, wide
+from vla_zenoh.security.rules import access_control, wide
 
 KEYS = Keys("panda")
 LAB = {
