@@ -48,6 +48,17 @@ def check_size(sample: zenoh.Sample, limit: int) -> None:
         raise CodecError("oversize", f"{size} bytes, at most {limit} are accepted")
 
 
+def payload_and_attachment(sample: zenoh.Sample, limit: int) -> tuple[bytes, bytes | None]:
+    """Payload and attachment of a sample.
+
+    Raises:
+        CodecError: see `check_size`.
+    """
+    check_size(sample, limit)
+    attachment = sample.attachment
+    return sample.payload.to_bytes(), attachment.to_bytes() if attachment is not None else None
+
+
 def header_of(sample: zenoh.Sample) -> Header:
     """Header of a sample.
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import zenoh
 
-from vla_zenoh.bus.buffers import check_size
+from vla_zenoh.bus.buffers import payload_and_attachment
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.errors import CodecError, RecordingError
 from vla_zenoh.lab.recording.sample import Sample, received_sample
@@ -61,9 +61,7 @@ class SampleQueue:
         """Add a sample from Zenoh, also from the reply to a query."""
         key = str(sample.key_expr)
         try:
-            check_size(sample, self._max_bytes)
-            payload, given = sample.payload.to_bytes(), sample.attachment
-            attachment = given.to_bytes() if given is not None else None
+            payload, attachment = payload_and_attachment(sample, self._max_bytes)
         except CodecError as error:  # copying an oversized one costs as much as keeping it
             with self._lock:
                 if error.reason == "oversize":
