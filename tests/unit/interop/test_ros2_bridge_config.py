@@ -69,7 +69,6 @@ def test_the_shipped_profile_lets_through_what_it_names_and_nothing_else() -> No
             "/camera/realsense2_camera/color/image_raw",
             "/camera/wrist_camera/color/image_raw",
             "/joint_states",
-            "/vla/active",
             "/vla/prompt",
         ],
         "subscribers": [
