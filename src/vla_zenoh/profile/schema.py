@@ -36,7 +36,7 @@ CAMERA_SOURCES = {
     "file": "file:PATH",
     "ros2": "ros2:TOPIC",
 }
-"""Kind of a camera's source -> how it is written. `nodes.camera.grabber.make_source` opens them."""
+"""Kind of a camera's source -> how it is written. `nodes.camera.node.make_source` opens them."""
 MIN_PERIODS = 3
 """A healthy link may be silent for up to this many periods."""
 

@@ -15,7 +15,7 @@ from typing import Any
 import zenoh
 
 from vla_zenoh.bus.client import DROPPED_HINT, Client
-from vla_zenoh.bus.host_id import HOST_VARIABLE, own_boot_id
+from vla_zenoh.bus.clock import HOST_VARIABLE, own_boot_id
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import NodeError, ProfileError, SessionError
 from vla_zenoh.keys import worker_node

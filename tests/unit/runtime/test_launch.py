@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.host_id import own_boot_id
+from vla_zenoh.bus.clock import own_boot_id
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.schema import NODE_KINDS

@@ -13,7 +13,7 @@ import typer
 import zenoh
 from rich.table import Table
 
-from vla_zenoh.bus.host_id import HOST_VARIABLE
+from vla_zenoh.bus.clock import HOST_VARIABLE
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import (
     PROFILE_VARIABLE,
