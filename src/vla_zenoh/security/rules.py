@@ -55,9 +55,6 @@ def access_control(profiles: Iterable[Profile]) -> dict[str, Any]:
     """Zenoh's section ``access_control`` for a router that serves the robots of these profiles.
 
     Whatever is not named is denied.
-
-    Raises:
-        SecurityError: a kind of node has no role.
     """
     rules: dict[str, dict[str, Any]] = {}
     subjects: dict[str, dict[str, Any]] = {}

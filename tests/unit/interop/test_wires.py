@@ -112,12 +112,13 @@ def test_an_array_of_openpi_has_byte_keys_and_one_of_groot_is_an_npy_file() -> N
 
 
 # -- whatever comes in ----------------------------------------------------------------------------
+SERVED = ActionSpec(horizon=1, dt_s=0.1)
 ACTIONS = np.linspace(-1, 1, 14, dtype=np.float32).reshape(2, 7)
 MODALITY = {"__ModalityConfig_class__": True, "as_json": '{"modality_keys": ["x"]}'}
 ANSWERS: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
     "openpi": (openpi_frames.answer(ACTIONS, 1.0, None), openpi.read_answer),
     "openpi metadata": (
-        openpi_frames.metadata(ActionSpec(horizon=1, dt_s=0.1), {"a": "b"}),
+        openpi_frames.metadata(SERVED, {"a": "b"}),
         openpi.read_metadata,
     ),
     "openpi request": (
@@ -142,6 +143,20 @@ ANSWERS: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         lambda payload: origami.read_answer(payload, "infer", "1"),
     ),
 }
+READ: dict[str, Any] = {
+    "openpi": {"actions": ACTIONS, "server_timing": {"infer_ms": 1.0}},
+    "openpi metadata": {
+        "action_dim": SERVED.dimension,
+        "action_horizon": 1,
+        "observation": {"a": "b"},
+        openpi.SPEC: SERVED.model_dump(mode="json"),
+    },
+    "openpi request": {"image": np.zeros((2, 2, 3), np.uint8), "prompt": "up"},
+    "groot": {"x": ACTIONS},
+    "groot modalities": {"video": {"modality_keys": ["x"]}},
+    "openvla": ACTIONS,
+    "origami": ACTIONS,
+}
 
 
 LAYOUT = read_field_mapping("x", OPENPI, "libero", {"keys": "actions"}, max_width_m=0.08)
@@ -162,7 +177,7 @@ def refused(read: Callable[[bytes], Any], payload: bytes) -> PeerError | None:
 @pytest.mark.parametrize("name", ANSWERS)
 def test_an_untouched_answer_is_read(name: str) -> None:
     payload, read = ANSWERS[name]
-    read(payload)
+    assert same(read(payload), READ[name])
 
 
 @pytest.mark.parametrize("name", ANSWERS)
