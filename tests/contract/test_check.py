@@ -390,4 +390,4 @@ def test_a_file_that_is_no_model_is_named() -> None:
     assert done.returncode == 1
     (finding,) = json.loads(done.stdout)["findings"]
     assert finding["name"] == "cannot_be_made"
-    assert "options it takes: file" in finding["why"]
+    assert "Its options: file" in finding["why"]

@@ -7,7 +7,6 @@ One object serves one thread: it keeps Pinocchio's work space. Joint vectors are
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from vla_zenoh import resources
-from vla_zenoh.errors import ProfileError, RecordError
+from vla_zenoh.errors import ProfileError, RecordError, nearest
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import JointEnds, Profile
 from vla_zenoh.types import FloatArray, JointState
@@ -169,17 +168,38 @@ def smallest_singular_value(jacobian: FloatArray) -> float:
     return math.sqrt(max(float(np.linalg.eigvalsh(squared)[0]), 0.0))
 
 
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Directions of a twist in base axes; roll, pitch and yaw are rotations about x, y and z."""
+_LEVER_M = 0.3
+"""A rotation of 1 rad counts as much as a motion of this length."""
+LOST_SHARE = 0.3
+
+
+def lost_motion(jacobian: FloatArray, twist: FloatArray) -> FloatArray:
+    """Part of a twist (6,) m and rad that no velocity of the joints (6, n) gives."""
+    scale = np.array([1.0] * 3 + [_LEVER_M] * 3)
+    scaled = scale[:, None] * jacobian
+    joints = np.linalg.lstsq(scaled, scale * twist, rcond=1e-6)[0]
+    return twist - jacobian @ joints
+
+
+def immovable_axes(jacobian: FloatArray) -> tuple[str, ...]:
+    """Axes along or about which the TCP cannot move without moving otherwise too."""
+    scale = np.array([1.0] * 3 + [_LEVER_M] * 3)
+    return tuple(
+        name
+        for index, name in enumerate(AXES)
+        if float(np.linalg.norm(scale * lost_motion(jacobian, np.eye(6)[index])))
+        > LOST_SHARE * scale[index]
+    )
+
+
 def manipulability(jacobian: FloatArray) -> float:
     """``sqrt(det(J J^T))``: volume of the ellipsoid of TCP velocities; 0 when singular.
 
     Source: Yoshikawa, "Manipulability of robotic mechanisms", Int. J. Robotics Research, 1985.
     """
     return math.sqrt(max(float(np.linalg.det(jacobian @ jacobian.T)), 0.0))
-
-
-def _near(name: str, known: Sequence[str]) -> str:
-    match = difflib.get_close_matches(name, known, 1)
-    return f"; did you mean {match[0]!r}?" if match else ""
 
 
 def _locked(
@@ -194,7 +214,8 @@ def _locked(
     for name in (*arm_joints, *finger_joints):
         if name not in known:
             raise ProfileError(
-                f"{urdf.name} has no joint {name!r}{_near(name, known)}; it has: {', '.join(known)}"
+                f"{urdf.name} has no joint {name!r}{nearest(name, known, '')}; "
+                f"it has: {', '.join(known)}"
             )
     for name in arm_joints:
         joint = model.joints[model.getJointId(name)]
@@ -242,7 +263,8 @@ def _frame(model: Any, urdf: Path, name: str) -> int:
     if not model.existFrame(name):
         known = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
         raise ProfileError(
-            f"{urdf.name} has no link {name!r}{_near(name, known)}; it has: {', '.join(known)}"
+            f"{urdf.name} has no link {name!r}{nearest(name, known, '')}; "
+            f"it has: {', '.join(known)}"
         )
     return model.getFrameId(name)
 
