@@ -156,7 +156,8 @@ def _joints(profile: Profile) -> Iterator[str]:
     if joints >= POSE_JOINTS:
         return
     try:
-        from vla_zenoh.kinematics.kinematics import immovable_axes, make_kinematics
+        from vla_zenoh.control.policy_check import immovable_axes
+        from vla_zenoh.kinematics.kinematics import make_kinematics
 
         kinematics = make_kinematics(profile)
     except (ImportError, ValueError, VlaZenohError):

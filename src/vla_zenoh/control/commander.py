@@ -25,7 +25,11 @@ from vla_zenoh.control.gripper_arbiter import GripperArbiter
 from vla_zenoh.control.joint_monitor import JointMonitor
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.plan_timeline import EpisodeProgress, Goal, Plan
-from vla_zenoh.control.preflight import PeerSnapshot, reasons_not_to_activate
+from vla_zenoh.control.preflight import (
+    PeerSnapshot,
+    reasons_by_joints,
+    reasons_not_to_activate,
+)
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watchdog import Deadman, Watchdog
@@ -314,6 +318,11 @@ class Commander:
             reasons += joint_state_faults(
                 self.profile, self.reach.kinematics, self.joint, self.pose, now_ns
             )
+            spec = self._peers.specs.get(worker)
+            if spec is not None and chunk is not None and self.joint is not None:
+                reasons += reasons_by_joints(
+                    self.profile, worker, spec, chunk.record, self.reach.kinematics, self.joint
+                )
         if self.joint is not None and self.pose is not None:
             writers = {self.joint.header.source, self.pose.header.source}
             if len(writers) > 1:

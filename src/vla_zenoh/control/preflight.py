@@ -9,12 +9,13 @@ from typing import Any
 
 from vla_zenoh.control import policy_check
 from vla_zenoh.control.limits import into_workspace
-from vla_zenoh.errors import SpecError
+from vla_zenoh.errors import RecordError, SpecError
 from vla_zenoh.keys import worker_node
+from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.ntp import ClockOffset
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, GripperState, PoseState, Stamped
+from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped
 
 CHUNK_PATIENCE_S = 2.0
 """Every worker publishes chunks all the time; its newest may be this old, plus one period."""
@@ -90,6 +91,42 @@ def reasons_not_to_activate(
         *_cameras(profile, worker, peers),
         *_clocks(profile, worker, peers),
     ]
+
+
+def reasons_by_joints(
+    profile: Profile,
+    worker: str,
+    spec: ModelSpec,
+    chunk: ActionChunk,
+    kinematics: Kinematics,
+    joint: Stamped[JointState],
+) -> list[str]:
+    """Reasons against a worker whose newest chunk is not for the joints of this arm.
+
+    Args:
+        profile: the effective profile.
+        worker: the worker that gets the lease.
+        spec: its spec.
+        chunk: its newest chunk.
+        kinematics: of the arm.
+        joint: newest joint state.
+    """
+    try:
+        joints_rad = kinematics.joints_of(joint.record)
+        steps = check_steps(spec.action, chunk.steps)
+    except (RecordError, SpecError):
+        return []  # there is a reason for it already
+    found = policy_check.joints_as_pose(spec.action, steps, joints_rad, profile.limits)
+    here, jacobian = kinematics.pose_and_jacobian(joints_rad)
+    axes = policy_check.beyond_joints(spec.action, steps, jacobian, here.rotation)
+    reasons = [f"worker {worker!r}: its newest chunk is not sane: {why}" for _, _, why in found]
+    if axes:
+        reasons.append(
+            f"worker {worker!r} asks for motion that the {len(joints_rad)} joints of robot "
+            f"{profile.robot.name!r} cannot make from here: {', '.join(axes)}; use a model or "
+            "prompt that leaves out these axes, or move the arm"
+        )
+    return reasons
 
 
 def _robot(

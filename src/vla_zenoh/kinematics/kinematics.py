@@ -168,32 +168,6 @@ def smallest_singular_value(jacobian: FloatArray) -> float:
     return math.sqrt(max(float(np.linalg.eigvalsh(squared)[0]), 0.0))
 
 
-AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-"""Directions of a twist in base axes; roll, pitch and yaw are rotations about x, y and z."""
-_LEVER_M = 0.3
-"""A rotation of 1 rad counts as much as a motion of this length."""
-LOST_SHARE = 0.3
-
-
-def lost_motion(jacobian: FloatArray, twist: FloatArray) -> FloatArray:
-    """Part of a twist (6,) m and rad that no velocity of the joints (6, n) gives."""
-    scale = np.array([1.0] * 3 + [_LEVER_M] * 3)
-    scaled = scale[:, None] * jacobian
-    joints = np.linalg.lstsq(scaled, scale * twist, rcond=1e-6)[0]
-    return twist - jacobian @ joints
-
-
-def immovable_axes(jacobian: FloatArray) -> tuple[str, ...]:
-    """Axes along or about which the TCP cannot move without moving otherwise too."""
-    scale = np.array([1.0] * 3 + [_LEVER_M] * 3)
-    return tuple(
-        name
-        for index, name in enumerate(AXES)
-        if float(np.linalg.norm(scale * lost_motion(jacobian, np.eye(6)[index])))
-        > LOST_SHARE * scale[index]
-    )
-
-
 def manipulability(jacobian: FloatArray) -> float:
     """``sqrt(det(J J^T))``: volume of the ellipsoid of TCP velocities; 0 when singular.
 

@@ -93,9 +93,7 @@ def explain(error: ValidationError, lines: Lines, model: type[Section]) -> list[
         place = tuple(str(part) for part in fault["loc"] if part != "[key]")
         cause = fault.get("ctx", {}).get("error")
         if isinstance(cause, InconsistentSections):
-            lines_out += [
-                _located(((*place, *fault[0]), *fault[1:]), lines) for fault in cause.faults
-            ]
+            lines_out += [_located(fault, lines, place) for fault in cause.faults]
         else:
             lines_out.append(located(place, _why(fault, place, model), lines))
     return lines_out
@@ -133,9 +131,10 @@ def unknown_name(place: Place, name: str, section: str, known: Iterable[str]) ->
     )
 
 
-def _located(fault: Fault, lines: Lines) -> str:
+def _located(fault: Fault, lines: Lines, above: Place) -> str:
     """The line of a fault: at the first of its places that the loaded file itself gives."""
-    place, why, *rest = fault
+    below, why, *rest = fault
+    place = (*above, *below)
     own, first = _file(line_of((), lines)), line_of(place, lines)
     if rest and _file(first) != own:
         for other, sentence in rest[0]:

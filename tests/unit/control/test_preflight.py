@@ -198,7 +198,10 @@ def test_a_clock_that_is_measured_need_not_be_our_own() -> None:
 def test_a_camera_the_profile_does_not_have_is_a_reason() -> None:
     ready = Ready()
     ready.profile = ready.profile.model_copy(update={"cameras": {}})
-    assert ready.reasons() == ["worker 'scripted' needs camera 'front', the profile has: none"]
+    assert ready.reasons() == [
+        "worker 'scripted' needs camera 'front', the profile has: none; add it to cameras, or name "
+        "another in the model's options"
+    ]
 
 
 def test_a_slow_rate_gives_the_worker_more_time() -> None:
