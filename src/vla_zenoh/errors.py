@@ -131,9 +131,12 @@ _VALIDATION_WORDS = {
     "missing": "is missing",
     "extra_forbidden": "is not known here",
     "float_type": "wants a number",
+    "float_parsing": "wants a number",
     "int_type": "wants a whole number",
     "int_from_float": "wants a whole number",
+    "int_parsing": "wants a whole number",
     "bool_type": "wants true or false",
+    "bool_parsing": "wants true or false",
     "string_type": "wants text",
     "string_unicode": "holds half a character (a surrogate)",
     "tuple_type": "wants a list",
@@ -161,13 +164,22 @@ def describe_fault(fault: Any) -> str:
     words = _VALIDATION_WORDS.get(fault["type"])
     if words is not None:
         return words.format(**context)
-    return fault["msg"].removeprefix("Value error, ")
+    said = fault["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    if not said.startswith("Input should "):
+        return said
+    wanted = re.sub(r", unable to .*|(?<=a )valid ", "", said.removeprefix("Input should "))
+    return f"wants {wanted.removeprefix('be ')}"
 
 
 def nearest(word: str, known: Iterable[str], otherwise: str = ".") -> str:
     """``; did you mean 'x'?`` if one of `known` is like `word`, else `otherwise`."""
     close = difflib.get_close_matches(word, list(known), 1)
     return f"; did you mean {close[0]!r}?" if close else otherwise
+
+
+def counted(count: int, noun: str) -> str:
+    """``1 error``, ``2 errors``."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 MAX_FOREIGN = 600

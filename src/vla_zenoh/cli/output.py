@@ -108,11 +108,6 @@ def print_json(value: Any) -> None:
     print(json.dumps(plain_types(value), indent=2))
 
 
-def counted(count: int, noun: str) -> str:
-    """``1 error``, ``2 errors``."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
 def complain(message: str) -> None:
     """Print ``error: message`` on stderr."""
     errors().print(Text.assemble(("error: ", "bold red"), printable(message)), soft_wrap=True)

@@ -267,7 +267,11 @@ class Commander:
             return
         if self.state is not State.INACTIVE:
             self._reject_setting(
-                "activate", [f"the state is {self.state.value} ({self.why}); reset it first"]
+                "activate",
+                [
+                    f"the state is {self.state.value} ({self.why}); clear it with `vla-zenoh "
+                    "reset`, or put anything on the key reset"
+                ],
             )
             return
         lease, reasons = self._preflight(self.task.worker, now_ns)

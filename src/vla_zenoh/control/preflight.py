@@ -40,6 +40,7 @@ class PeerSnapshot:
         same_host: nodes that certainly run on the command node's host and share its clock.
         clocks: node -> its clock minus that of the command node, where measured.
         holders: clients present as a deadman.
+        camera_reasons: camera -> why it sends no images, by its node's status.
         camera_faults: camera -> why its images are invalid, by its node's status: the rest of a
             sentence that starts with ``camera NAME``.
     """
@@ -56,6 +57,7 @@ class PeerSnapshot:
     clocks: Mapping[str, ClockOffset] = field(default_factory=dict)
     holders: frozenset[str] = frozenset()
     camera_faults: Mapping[str, str] = field(default_factory=dict)
+    camera_reasons: Mapping[str, str] = field(default_factory=dict)
 
 
 def reasons_not_to_activate(
@@ -263,11 +265,18 @@ def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
         if camera not in profile.cameras:
             continue  # reported already, with the spec
         age_s = peers.camera_ages_s.get(camera, math.inf)
-        node = peers.camera_nodes.get(camera)
-        if node is None or node not in peers.alive:
-            reasons.append(f"no living node serves camera {camera!r}")
+        node = peers.camera_nodes.get(camera) or profile.camera_servers()[camera]
+        why = peers.camera_reasons.get(camera)
+        if node not in peers.alive:
+            reasons.append(
+                f"camera {camera!r}: its node {node!r} is not alive; `vla-zenoh up` on its host "
+                "starts it"
+            )
         elif age_s > CAMERA_PATIENCE_S:
-            reasons.append(f"camera {camera!r} has sent no picture for {age_s:.1f} s")
+            since = "yet" if math.isinf(age_s) else f"for {age_s:.1f} s"
+            reasons.append(
+                f"camera {camera!r} has sent no image {since}: {why or 'it gives no reason'}"
+            )
         elif camera in peers.camera_faults:
             reasons.append(f"camera {camera!r} {peers.camera_faults[camera]}")
     return reasons

@@ -19,9 +19,9 @@ from vla_zenoh.cli.options import (
     WorkerChoice,
     options,
 )
-from vla_zenoh.cli.output import console, counted, print_json, styled
+from vla_zenoh.cli.output import console, print_json, styled
 from vla_zenoh.control.policy_check import Finding, error
-from vla_zenoh.errors import WorkerError
+from vla_zenoh.errors import WorkerError, counted
 from vla_zenoh.lab.check.examination import DEFAULT_RUNS, Examination
 from vla_zenoh.lab.check.model_runner import ModelRunner
 from vla_zenoh.lab.check.report import CheckReport
