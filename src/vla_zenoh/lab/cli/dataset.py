@@ -69,9 +69,8 @@ def export(
             f"Workers there: {known}"
         )
     if failed and not episodes:
-        fail(
-            f"none of {counted(failed, 'episode')} is known to be successful; leave out --successful"
-        )
+        those = counted(failed, "episode")
+        fail(f"none of {those} is known to be successful; leave out --successful")
     written = write(out, episodes, cameras or sorted(seen or ()), parts)
     if as_json:
         print_json(written._asdict())
