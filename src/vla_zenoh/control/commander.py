@@ -276,7 +276,8 @@ class Commander:
             return
         lease, reasons = self._preflight(self.task.worker, now_ns)
         reasons += self.deadman.reasons_against(holder, self._peers.holders)
-        reasons += self._motion.unsettled(now_ns)
+        self._measure()
+        reasons += self._motion.unsettled()
         if lease is None or self.pose is None or self.gripper_state is None or reasons:
             self._reject_setting("activate", reasons + self._ended_before())
             return
@@ -427,10 +428,14 @@ class Commander:
         self._watchdog.expect_next(max(plan.end_ns, now_ns), rate_hz, now_ns, speed)
 
     # -- supervision --------------------------------------------------------------------------
+    def _measure(self) -> None:
+        if self.pose is not None:
+            self._motion.measure(self.pose.record, self.pose.received_ns)
+
     def _supervise(self, now_ns: int) -> None:
         if self.pose is not None:
             self._watchdog.measure(self._motion.commanded, pose_of(self.pose.record))
-            self._motion.measure(self.pose.record, now_ns)
+        self._measure()
         if self._retreat.busy and not self._may_retreat(now_ns):
             self._retreat.end()
         if self.state not in OBEYING:
