@@ -39,7 +39,7 @@ def blueprint(
         above = rrb.Horizontal(above, rrb.Vertical(*views), column_shares=[4, 5])
     below = rrb.Horizontal(_texts(seen), _plots(widest_mm), column_shares=[4, 5])
     return rrb.Blueprint(
-        rrb.Vertical(above, below, row_shares=[3, 2]),
+        rrb.Vertical(above, below, row_shares=[4, 3]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(
@@ -110,14 +110,12 @@ def _plots(widest_mm: float) -> Any:
         _plot("Gripper, mm: commanded orange, measured blue", paths.GRIPPER, span=wide),
         _plot("Commanded to measured, mm", paths.TRACKING),
         _plot("Speed left by limits, %", paths.BOUNDS, span=SHARE_RANGE),
-        _plot("Joints, rad", paths.JOINTS, legend=True),
+        _plot("Joints, rad", paths.JOINTS),
         grid_columns=2,
     )
 
 
-def _plot(
-    name: str, origin: str, *, span: tuple[float, float] | None = None, legend: bool = False
-) -> Any:
+def _plot(name: str, origin: str, *, span: tuple[float, float] | None = None) -> Any:
     window = rrb.VisibleTimeRange(
         paths.TIMELINE,
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-WINDOW_S),
@@ -128,5 +126,5 @@ def _plot(
         name=name,
         time_ranges=[window],
         axis_y=None if span is None else rrb.ScalarAxis(range=span, zoom_lock=True),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+        plot_legend=rrb.PlotLegend(visible=False),
     )
