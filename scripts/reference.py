@@ -270,7 +270,6 @@ REASONS = {
     "peer_reply": "the policy server's answer does not decode",
     "peer_request": "the observation lacks what the policy server asks for",
     "peer_timeout": "the policy server did not answer in time",
-    "repeated": "ROS topic `active`: `true` again by a program",
     "replayed": "a sequence number that was received before",
     "reset_refused": "`sim/reset` that cannot be carried out",
     "robot_failed": "the robot's Python class raised",
@@ -280,7 +279,6 @@ REASONS = {
     "simulation_fault": "the simulation became unstable",
     "spec_mismatch": "chunk: another spec than the one agreed at activation",
     "stale": "older than the limit of its kind",
-    "stopped": "ROS topic `active`: `true` with an emergency stop behind it",
     "superseded": "chunk: a newer one is in force",
     "too_many_models": "camera: more image sizes requested than are made",
     "truncated": "fewer bytes than the size says",
@@ -332,9 +330,8 @@ REJECTING = {
 def counted_in_code() -> tuple[set[str], set[str]]:
     """Reasons of rejections, and names of other counters, that are written in the code."""
     reasons, counters = set(), set()
-    for path in SOURCE.rglob("*.py"):
-        if "cli" in path.relative_to(SOURCE).parts:
-            continue
+    source = [path for path in SOURCE.rglob("*.py") if "cli" not in path.relative_to(SOURCE).parts]
+    for path in (*source, *(ROOT / "models").glob("*/wire.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call) and node.args:
                 called = node.func

@@ -22,15 +22,18 @@ from vla_zenoh.control.commander_io import (
     make_event,
 )
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
-from vla_zenoh.control.joint_monitor import JointMonitor
+from vla_zenoh.control.joint_monitor import JOINT_PATIENCE_S, JointMonitor, joint_state_faults
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.plan_timeline import EpisodeProgress, Goal, Plan
-from vla_zenoh.control.preflight import PeerSnapshot, reasons_not_to_activate
+from vla_zenoh.control.preflight import (
+    PeerSnapshot,
+    reasons_by_joints,
+    reasons_not_to_activate,
+)
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watchdog import Deadman, Watchdog
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.joint_check import JOINT_PATIENCE_S, joint_state_faults
 from vla_zenoh.kinematics.so3 import held_pose, pose_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
@@ -263,7 +266,11 @@ class Commander:
             return
         if self.state is not State.INACTIVE:
             self._reject_setting(
-                "activate", [f"the state is {self.state.value} ({self.why}); reset it first"]
+                "activate",
+                [
+                    f"the state is {self.state.value} ({self.why}); clear it with `vla-zenoh "
+                    "reset`, or put anything on the key reset"
+                ],
             )
             return
         lease, reasons = self._preflight(self.task.worker, now_ns)
@@ -315,6 +322,11 @@ class Commander:
             reasons += joint_state_faults(
                 self.profile, self.reach.kinematics, self.joint, self.pose, now_ns
             )
+            spec = self._peers.specs.get(worker)
+            if spec is not None and chunk is not None and self.joint is not None:
+                reasons += reasons_by_joints(
+                    self.profile, worker, spec, chunk.record, self.reach.kinematics, self.joint
+                )
         if self.joint is not None and self.pose is not None:
             writers = {self.joint.header.source, self.pose.header.source}
             if len(writers) > 1:

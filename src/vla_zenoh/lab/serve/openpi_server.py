@@ -14,7 +14,7 @@ from http import HTTPStatus
 from typing import Any
 
 from vla_zenoh.errors import MissingExtraError, PeerError, SpecError
-from vla_zenoh.interop import openpi
+from vla_zenoh.lab.serve import openpi_frames
 from vla_zenoh.lab.serve.served_policy import ServedPolicy
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
 
@@ -53,7 +53,7 @@ class OpenPiServer:
             host,
             port,
             compression=None,
-            max_size=openpi.MAX_BYTES,
+            max_size=openpi_frames.MAX_BYTES,
             process_request=self._admit,
         )
         self.port: int = self._server.socket.getsockname()[1]
@@ -68,7 +68,7 @@ class OpenPiServer:
 
     # -- connections --------------------------------------------------------------------------
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        if request.path == openpi.HEALTH_PATH:
+        if request.path == openpi_frames.HEALTH_PATH:
             return connection.respond(HTTPStatus.OK, "OK\n")
         if self._key and not _has_key(request.headers, self._key):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "wrong or no API key\n")
@@ -90,7 +90,7 @@ class OpenPiServer:
             self._busy.release()
 
     def _serve(self, connection: ServerConnection) -> None:
-        connection.send(openpi.metadata(self._policy.spec.action, self._offer.described()))
+        connection.send(openpi_frames.metadata(self._policy.spec.action, self._offer.described()))
         prompt: str | None = None
         previous_ms: float | None = None
         while True:
@@ -98,7 +98,7 @@ class OpenPiServer:
             began_s = time.monotonic()
             try:
                 self._seq += 1
-                given = openpi.read_observation(frame)
+                given = openpi_frames.read_observation(frame)
                 observation = self._offer.observe(given, time.time_ns(), self._seq)
                 if observation.prompt != prompt:
                     prompt = observation.prompt
@@ -113,7 +113,7 @@ class OpenPiServer:
                 connection.close(INTERNAL_ERROR, "the reason is in the frame before")
                 return
             infer_ms = (time.monotonic() - began_s) * 1e3
-            connection.send(openpi.answer(actions, infer_ms, previous_ms))
+            connection.send(openpi_frames.answer(actions, infer_ms, previous_ms))
             previous_ms = (time.monotonic() - began_s) * 1e3
 
 
