@@ -1,0 +1,66 @@
+"""Sizes of an install, by what it is for: ``python scripts/install_sizes.py``.
+
+Each row is installed into an empty environment by uv, with the versions of constraints.txt, and
+asked for its version. A model with packages of its own adds its own environment.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from bootstrap import CONSTRAINTS, ROOT, uv_environment
+
+UV = Path(sys.executable).parent / "uv"
+ROWS = {
+    "drive, watch, cameras, own models": "",
+    "model host, shipped policy": "brick,secure",
+    "robot host": "control,record,secure",
+    "robot host, ROS 2": "record,ros2,secure",
+    "simulator and everything in the tutorial": "all",
+    "the same with the viewer": "all,view",
+}
+"""What it is for, and its extras."""
+LARGEST = 3
+
+
+def size_mb(folder: Path) -> float:
+    """Size of a folder, every file once."""
+    sizes = {(s.st_dev, s.st_ino): s.st_size for p in folder.rglob("*") if (s := p.lstat())}
+    return sum(sizes.values()) / 1e6
+
+
+def measure(extras: str, folder: Path) -> tuple[float, str]:
+    """Installs, and returns its size in MB and its largest packages."""
+    name = f"{ROOT}[{extras}]" if extras else str(ROOT)
+    environ = uv_environment(os.environ)
+    python = folder / "bin" / "python"
+    for command in (
+        [UV, "--quiet", "venv", "--python", sys.executable, folder],
+        [UV, "--quiet", "pip", "install", "--python", python, "-c", CONSTRAINTS, name],
+        [folder / "bin" / "vla-zenoh", "--version"],
+    ):
+        subprocess.run(
+            [str(word) for word in command], check=True, env=environ, stdout=subprocess.DEVNULL
+        )
+    packages = next((folder / "lib").glob("python*")) / "site-packages"
+    sizes = sorted(((size_mb(p), p.name) for p in packages.iterdir() if p.is_dir()), reverse=True)
+    largest = ", ".join(f"{name} {size:.0f}" for size, name in sizes[:LARGEST])
+    return size_mb(folder), largest
+
+
+def main() -> None:
+    """Prints the table."""
+    print("| for | extras | MB | largest |\n|---|---|---|---|")
+    for purpose, extras in ROWS.items():
+        with tempfile.TemporaryDirectory(prefix="vla-zenoh-size-") as name:
+            size, largest = measure(extras, Path(name) / "venv")
+        label = f"`{extras}`" if extras else "none"
+        print(f"| {purpose} | {label} | {size:.0f} | {largest} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
