@@ -18,7 +18,9 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.resources import robot_urdf
 from vla_zenoh.types import JointCommand
 
-TEXT = (Path(__file__).parents[2] / "docs" / "how-to" / "robots.md").read_text("utf-8")
+TEXT_FILE = Path(__file__).parents[2] / "docs" / "how-to" / "robots.md"
+TEXT = TEXT_FILE.read_text("utf-8")
+UR5 = "example-robot-data:ur_description/urdf/ur5_robot.urdf"
 HOME_M = (0.49, 0.11, 0.43)
 TEXT_M = 0.005
 """The text rounds to centimetres."""
@@ -125,6 +127,25 @@ def test_its_own_arm_is_right_and_goes_where_it_is_told_to(folder: Path) -> None
     arm = make_robot(Path(profile.arm.file), profile.arm.options)
     target_rad = np.full(6, 0.3)
     still = np.zeros(6)
+    arm.move(JointCommand(profile.robot.arm_joints, target_rad, still, still, "streaming"))
+    reading = arm.read()
+    assert reading is not None
+    np.testing.assert_array_equal(reading.position_rad, target_rad)
+
+
+def test_the_profile_and_the_arm_of_the_page_on_a_ur5e_are_right(tmp_path: Path) -> None:
+    page = TEXT_FILE.with_name("ur5e-without-ros.md").read_text("utf-8")
+    for name, text in re.findall(r"```\w+\n# (\w+\.\w+)\n(.*?)```", page, re.DOTALL):
+        # The maker's description is not in any package; the UR5's has the same joints.
+        text = text.replace("description: ur5e.urdf", f"description: {UR5}")
+        (tmp_path / name).write_text(text, "utf-8")
+    file = tmp_path / "ur5e.yaml"
+    result = CliRunner().invoke(profile_app, ["check", str(file)])
+    assert result.exit_code == 0, result.output
+    profile = load_profile(str(file))
+    assert profile.arm is not None
+    arm = make_robot(Path(profile.arm.file), profile.arm.options)
+    target_rad, still = np.full(6, 0.3), np.zeros(6)
     arm.move(JointCommand(profile.robot.arm_joints, target_rad, still, still, "streaming"))
     reading = arm.read()
     assert reading is not None
