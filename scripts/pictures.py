@@ -78,7 +78,7 @@ def picture_report(runs: list[Path], out: Path) -> None:
         sys.exit("no chromium on PATH")
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / "report.html"
-        words = [sys.executable, "-m", "vla_zenoh", "eval", *map(str, runs), "--html", str(page)]
+        words = [sys.executable, "-m", "vla_zenoh", "eval", *map(str, runs), "--output", str(page)]
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
         subprocess.run(
             [

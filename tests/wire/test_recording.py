@@ -261,7 +261,7 @@ def test_what_the_queue_cannot_take_is_counted_and_said(chain: Chain, tmp_path: 
 @pytest.mark.slow
 def test_a_recorder_that_is_killed_leaves_a_readable_file(chain: Chain, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    with process("record", "--out", str(path), profile=chain.profile_file) as child:
+    with process("record", "--output", str(path), profile=chain.profile_file) as child:
         until(
             "something is recorded",
             lambda: path.exists() and path.stat().st_size > 50_000,
@@ -285,7 +285,7 @@ def test_a_full_disk_ends_the_recording_and_spares_the_file(chain: Chain, tmp_pa
         resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_LIMIT_BYTES, FILE_LIMIT_BYTES))
 
     with process(
-        "record", "--out", str(path), profile=chain.profile_file, preexec_fn=limit
+        "record", "--output", str(path), profile=chain.profile_file, preexec_fn=limit
     ) as child:
         output, _ = child.communicate(timeout=60)
     assert child.returncode == 1
@@ -299,7 +299,7 @@ def test_the_recorder_says_how_it_goes(chain: Chain, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     done = command_line(
         "record",
-        "--out",
+        "--output",
         str(path),
         "--seconds",
         "2",

@@ -14,15 +14,18 @@ from vla_zenoh.cli.options import (
     SimulatedProfileOption,
     effective_profile,
     number_list,
+    options,
 )
-from vla_zenoh.cli.output import console, errors
-from vla_zenoh.lab.cli.bench_file import JsonFileOption, kept_rows
+from vla_zenoh.cli.output import errors
+from vla_zenoh.lab.cli.bench_file import ResultOptions, kept_rows
 
 WIDTH = 160
 SHARES = ("p50", "p95", "p99", "max")
 
 
+@options
 def command(
+    result: ResultOptions,
     rates: Annotated[
         str, typer.Option("--rates", help="Ticks per second, separated by commas.")
     ] = "250,500,1000",
@@ -34,7 +37,6 @@ def command(
         typer.Option("--busy", min=0, max=64, help="Busy processes beside it."),
     ] = 0,
     profile: SimulatedProfileOption = DEFAULT_PROFILE,
-    json_file: JsonFileOption = None,
 ) -> None:
     """Measure the time per tick of the command node while the simulated arm moves.
 
@@ -48,7 +50,7 @@ def command(
     stop = stop_on_signals()
     die_with_parent()
     loaded = own_address(effective_profile(profile))
-    with kept_rows(json_file) as rows:
+    with kept_rows(result) as rows:
         for rate_hz in track(rates_hz, "command node", console=errors()):
             rows.append(measure_command(loaded, rate_hz, seconds, stop, rows.log, busy))
     table = Table(box=SIMPLE, pad_edge=False)
@@ -72,4 +74,4 @@ def command(
     )
     realtime = all(row["realtime"] for row in rows)
     table.caption = text if realtime else f"{text} (no real-time priority here)"
-    console(WIDTH).print(table)
+    result.show(rows, table, width=WIDTH)

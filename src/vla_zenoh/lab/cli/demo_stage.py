@@ -17,6 +17,7 @@ from rich.progress import Progress
 from vla_zenoh.cli.addresses import own_address
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import Screen, errors, progress_bars
+from vla_zenoh.cli.output_path import RUNS, output_folder
 from vla_zenoh.lab.demo.video import write_video
 from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.recording.run import Run, load_run, pictures
@@ -32,11 +33,11 @@ IMAGE_NS = 60_000_000
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A profile at an address of its own, and the run folder. Made by `prepare`.
+    """A profile at an address of its own, and the run folder. Made by `open_stage`.
 
     Args:
         profile: effective.
-        folder: of the run.
+        folder: of the run, under its temporary name.
         stop: set by Ctrl-C.
         screen: for progress; stdout is for the summary.
     """
@@ -100,14 +101,11 @@ class Stage:
         """Load the recording."""
         return load_run(self.recording)
 
-    def write(self, summary: Mapping[str, Any], json_file: Path | None) -> None:
-        """Write profile.yaml and summary.json, the latter also to `json_file`."""
+    def write(self, summary: Mapping[str, Any]) -> None:
+        """Write profile.yaml and summary.json."""
         (self.folder / "profile.yaml").write_text(to_yaml(self.profile), "utf-8")
         text = json.dumps(summary, indent=2) + "\n"
-        for path in (self.folder / "summary.json", json_file):
-            if path is not None:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(text, "utf-8")
+        (self.folder / "summary.json").write_text(text, "utf-8")
 
     def film(self, run: Run, marks: list[tuple[int, str]]) -> None:
         """Write front.mp4 with `marks` (ns, text) in it."""
@@ -131,17 +129,27 @@ class Stage:
         return frames
 
 
-def prepare(profile: str, out: Path | None) -> Stage:
-    """Make a stage for a profile, in the folder `out` or one named by the time."""
-    stop = stop_on_signals()
-    die_with_parent()
+@contextmanager
+def open_stage(profile: str, folder: Path, *, force: bool) -> Iterator[Stage]:
+    """A stage for a profile; `folder` appears when the block has ended without an exception.
+
+    Raises:
+        OutputError: the folder cannot be had; see `output_folder`.
+    """
     loaded = own_address(effective_profile(profile))
-    folder = out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
-    folder.mkdir(parents=True, exist_ok=True)
-    screen, here = errors(), loaded.session.connect[0]
-    screen.print(f"profile {loaded.name}, router at {here}, run folder {folder}")
-    screen.print(f"watch it from another terminal: vla-zenoh status --connect {here}", style="dim")
-    return Stage(loaded, folder, stop, screen)
+    with output_folder(folder, force=force) as part:
+        stop = stop_on_signals()
+        die_with_parent()
+        screen, here = errors(), loaded.session.connect[0]
+        screen.print(f"profile {loaded.name}, router at {here}, run folder {folder}")
+        watch = f"watch it from another terminal: vla-zenoh status --connect {here}"
+        screen.print(watch, style="dim")
+        yield Stage(loaded, part, stop, screen)
+
+
+def run_folder(given: Path | None) -> Path:
+    """`given`, else a folder named by the time."""
+    return given or RUNS / time.strftime("demo-%Y%m%d-%H%M%S")
 
 
 def refusals(statuses: Mapping[str, NodeStatus]) -> dict[str, int]:

@@ -92,7 +92,7 @@ class Recorder:
         queue_bytes: payloads in memory at most.
 
     Raises:
-        RecordingError: the file cannot be created.
+        RecordingError: the file exists or cannot be created.
         NodeError: a node of this name is already alive.
     """
 
