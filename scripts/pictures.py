@@ -72,7 +72,7 @@ def insist(ask: Callable[[], None]) -> None:
 
 
 def picture_report(runs: list[Path], out: Path) -> None:
-    """The page of ``vla-zenoh eval --html``."""
+    """The page of ``vla-zenoh eval -o report.html``."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         sys.exit("no chromium on PATH")

@@ -12,7 +12,6 @@ from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_lis
 from vla_zenoh.cli.output import errors
 from vla_zenoh.lab.cli.bench_file import ResultOptions, kept_rows
 
-WIDTH = 140
 MOST = 64
 
 
@@ -61,7 +60,7 @@ def load(
         chosen = [row for row in rows if row[kind]]
         if chosen:
             tables.append(_table(title, kind, columns, chosen))
-    output.show(rows, *tables, width=WIDTH)
+    output.show(rows, *tables)
 
 
 ROBOT_COLUMNS = {

@@ -85,6 +85,27 @@ def output_folder(
         OutputError: it exists, has an input in it, or cannot be written.
     """
     with _sentence(path):
+        require_free_folder(path, force=force, inputs=inputs)
+        place = path.resolve()
+        part = _new(Path.mkdir, place.with_name(f"{place.name}.part"))
+    with _sentence(path, part), _kept(part):
+        _try_folder(part)
+        yield part
+        if path.exists() and any(path.iterdir()):
+            if not force:
+                raise OutputError(f"{path} was filled by another program meanwhile")
+            older = place.rename(_new(Path.mkdir, place.with_name(f"{place.name}.old")))
+            errors().print(f"the folder that was {path} is now {older}", soft_wrap=True)
+        part.rename(place)
+
+
+def require_free_folder(path: Path, *, force: bool = False, inputs: Iterable[Path] = ()) -> None:
+    """Check that `output_folder` may make `path`.
+
+    Raises:
+        OutputError: it may not.
+    """
+    with _sentence(path):
         place = path.resolve()
         if Path.cwd().is_relative_to(place):
             raise OutputError(f"{path} is the current folder; give --output a new one")
@@ -96,16 +117,6 @@ def output_folder(
             if any(path.iterdir()):
                 _require_force(path, force)
         _require_parent(path)
-        part = _new(Path.mkdir, place.with_name(f"{place.name}.part"))
-    with _sentence(path, part), _kept(part):
-        _try_folder(part)
-        yield part
-        if path.exists() and any(path.iterdir()):
-            if not force:
-                raise OutputError(f"{path} was filled by another program meanwhile")
-            older = place.rename(_new(Path.mkdir, place.with_name(f"{place.name}.old")))
-            errors().print(f"the folder that was {path} is now {older}", soft_wrap=True)
-        part.rename(place)
 
 
 def check_folder(path: Path, *, begun: bool) -> None:

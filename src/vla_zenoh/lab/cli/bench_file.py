@@ -41,13 +41,13 @@ class ResultOptions:
             with output_file(self.output, force=self.force) as part:
                 yield part
 
-    def show(self, result: Any, *tables: RenderableType, width: int = 0) -> None:
+    def show(self, result: Any, *tables: RenderableType) -> None:
         """Print `result` as JSON if that is wanted, else `tables`."""
         if self.as_json:
             print_json(result)
             return
         for table in tables:
-            console(width).print(table)
+            console().print(table)
 
 
 def write_json(file: Path | None, result: Any) -> None:

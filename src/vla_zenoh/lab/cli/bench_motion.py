@@ -26,8 +26,6 @@ from vla_zenoh.lab.bench.motion import PROTOCOL, STEPS, Conditions, MotionCase
 from vla_zenoh.lab.cli.bench_file import up_with_last_lines, write_json
 from vla_zenoh.profile import Profile
 
-WIDTH = 124
-
 
 @dataclass(frozen=True)
 class MotionOptions:
@@ -184,12 +182,12 @@ def motion(
 
     Exits with 0 only when every row passes.
     """
-    from vla_zenoh.lab.bench.motion_report import motion_table, thesis_table
+    from vla_zenoh.lab.cli.bench_motion_tables import motion_table, thesis_table
     from vla_zenoh.runtime.process import stop_on_signals
 
-    stop = stop_on_signals()
     saving = nullcontext() if output is None else output_folder(output, force=force)
     with saving as folder:
+        stop = stop_on_signals()
         run = _Run(effective_profile(profile), measured, folder, stop)
         try:
             with run.bars:
@@ -200,7 +198,7 @@ def motion(
     if as_json:
         print_json(run.rows)
     else:
-        screen = console(WIDTH)
+        screen = console()
         screen.print(motion_table(run.rows))
         thesis = thesis_table(run.rows, virtual=lockstep)
         if thesis.row_count:

@@ -23,7 +23,7 @@ from vla_zenoh.cli.options import (
     options,
 )
 from vla_zenoh.cli.output import console, new_table, print_json, progress_bars
-from vla_zenoh.cli.output_path import ForceOption, output_folder
+from vla_zenoh.cli.output_path import ForceOption, output_folder, require_free_folder
 from vla_zenoh.lab.bench.task import BASELINES, SCENE, TaskPlan, TaskScore
 from vla_zenoh.lab.cli.bench_file import (
     LAST_LINES,
@@ -157,6 +157,8 @@ def task(
     plan = episodes.plan(named)
     loaded = _with_bricks(effective_profile(profile), plan.worker, varied, path)
     chosen = model_options.choose(loaded, plan.worker)
+    if output.output is not None:  # before an environment is made, which may take minutes
+        require_free_folder(output.output, force=output.force)
     if lockstep:  # this process makes the model; returns only where that can be done
         run_in_own_environment(chosen.model, model_options.python, extra="sim")
     stop = stop_on_signals()

@@ -215,6 +215,7 @@ def _profile_of(file: Recording, name: str) -> Profile:
 
 
 def _summarise(logger: RerunLogger) -> None:
+    logger.close()
     screen = errors()
     screen.print(f"{logger.shown.total():,} samples of {len(logger.shown)} keys")
     if logger.rejected:
