@@ -88,7 +88,7 @@ def trial(
         _warn_of_peeking(plan, found)
     else:
         asked = plan_options.asked(target.load().robot.name)
-        check_folder(output, begun=folder.plan() is not None)
+        check_folder(output, begun=folder.begun())
         with folder.lock():
             plan = _plan(folder, asked)
             found = folder.episodes()

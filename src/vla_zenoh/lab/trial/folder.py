@@ -45,6 +45,10 @@ class TrialFolder:
         """The last line that `episodes` read was truncated."""
 
     # -- reading ------------------------------------------------------------------------------
+    def begun(self) -> bool:
+        """The folder has files of a trial."""
+        return any((self.path / name).exists() for name in (PLAN, TRIALS))
+
     def plan(self) -> TrialPlan | None:
         """The plan of the trial; None: the folder has no trial.
 
