@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from vla_zenoh.cli.options import JsonOption
-from vla_zenoh.cli.output import console, errors, print_json
+from vla_zenoh.cli.output import console, errors, print_json, progress
 from vla_zenoh.cli.output_path import ForceOption, output_file, output_folder
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.evaluation.evaluate import MCAP
@@ -53,7 +53,7 @@ def export(
     episodes, seen, screen = [], None, errors()
     with (
         output_folder(output, force=force, inputs=files) as part,
-        screen.status("reading the recordings") as status,
+        progress("reading the recordings") as status,
     ):
         for number, path in enumerate(files, 1):
             status.update(f"reading {path.name} ({number} of {len(files)})")

@@ -14,7 +14,7 @@ import typer
 
 from vla_zenoh.cli.addresses import require_loopback
 from vla_zenoh.cli.options import options
-from vla_zenoh.cli.output import errors, fail
+from vla_zenoh.cli.output import errors, fail, progress
 from vla_zenoh.cli.output_path import ForceOption, output_file
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import MissingExtraError, OutputError, ProfileError
@@ -193,10 +193,11 @@ def _recorded(path: Path, profile_name: str, output: ViewOutput, part: Path | No
     output.check(profile)
     with output.open(path.stem, part) as (stream, viewer):
         logger = RerunLogger(profile, stream, keys=file.keys)
-        for sample in file.entries(lambda key: not key.endswith("/raw")):
-            if stop.is_set() or (viewer is not None and viewer.closed):
-                break
-            logger.log(sample)
+        with progress(f"reading {path.name}"):
+            for sample in file.entries(lambda key: not key.endswith("/raw")):
+                if stop.is_set() or (viewer is not None and viewer.closed):
+                    break
+                logger.log(sample)
         _summarise(logger)
         if file.damage:
             errors().print(f"{path} is {file.damage}", style="yellow")
