@@ -14,7 +14,7 @@ from vla_zenoh.bus.liveliness import alive_robots
 from vla_zenoh.cli.options import options
 from vla_zenoh.cli.output import complain, console, errors, fail, styled
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.codec.settings import decode_percent
+from vla_zenoh.codec.settings import decode_name, decode_percent, decode_rate, decode_text
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import as_robot
@@ -33,6 +33,7 @@ def prompt(
     text: Annotated[str, typer.Argument(help="What the model shall do.")], target: RobotTarget
 ) -> None:
     """Set the prompt. Any Zenoh client can: put the text on <root>/<robot>/prompt."""
+    decode_text(text.encode())  # rejects it before a router is asked
     with target.operator("prompt", text) as client:
         task = client.set_prompt(text)
         _show(
@@ -107,6 +108,7 @@ def use(
     target: RobotTarget,
 ) -> None:
     """Select the worker that moves the arm; the others keep running."""
+    decode_name(worker.encode())
     with target.operator("use", worker) as client:
         _show(target, client, f"worker: {client.set_worker(worker).worker}")
 
@@ -116,6 +118,7 @@ def rate(
     rate_hz: Annotated[float, typer.Argument(help="Chunks per second.")], target: RobotTarget
 ) -> None:
     """Set how often the workers infer."""
+    decode_rate(f"{rate_hz:g}".encode())
     with target.operator("rate", f"{rate_hz:g}") as client:
         _show(target, client, f"rate: {client.set_rate(rate_hz).rate_hz:g} Hz")
 

@@ -12,7 +12,7 @@ import zenoh
 from typer.core import TyperGroup
 
 from vla_zenoh import __version__
-from vla_zenoh.errors import VlaZenohError, how_to_install
+from vla_zenoh.errors import VlaZenohError, describe_fault, how_to_install
 
 EXTRA_OF = {
     "pinocchio": "control",
@@ -172,6 +172,19 @@ def _lazy_group(
                     formatter.write_dl(
                         [(f"{name:<{width}}", self.commands[name].short_help) for name in names]
                     )
+
+        def invoke(self, ctx: Any) -> Any:
+            try:
+                return super().invoke(ctx)
+            except typer.BadParameter as error:
+                faults = getattr(error.__cause__, "errors", None)
+                if callable(faults):  # Typer repeats Pydantic, which leaves out what was given
+                    fault: Any = next(iter(faults(include_url=False)))  # pyright: ignore
+                    given = (
+                        "" if fault["type"] == "value_error" else f" (given: {fault['input']!r})"
+                    )
+                    error.message = describe_fault(fault) + given
+                raise
 
     return LazyGroup
 

@@ -11,6 +11,7 @@ from vla_zenoh.profile.limits import (
 from vla_zenoh.profile.load import (
     as_robot,
     load_profile,
+    load_with_lines,
     override,
     profile_file,
     profile_names,
@@ -41,6 +42,7 @@ __all__ = [
     "Timing",
     "as_robot",
     "load_profile",
+    "load_with_lines",
     "override",
     "profile_file",
     "profile_names",

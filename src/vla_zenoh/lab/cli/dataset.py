@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 import typer
 
 from vla_zenoh.cli.options import JsonOption
-from vla_zenoh.cli.output import console, errors, print_json, progress
+from vla_zenoh.cli.output import console, errors, fail, print_json, progress
 from vla_zenoh.cli.output_path import ForceOption, output_file, output_folder
-from vla_zenoh.errors import RecordingError
+from vla_zenoh.errors import RecordingError, counted, nearest
 from vla_zenoh.lab.evaluation.evaluate import MCAP
 
 dataset_app = typer.Typer(
@@ -50,7 +50,7 @@ def export(
     from vla_zenoh.policy.state_vector import read_parts
 
     parts, files = read_parts(state), _files(runs)
-    episodes, seen, screen = [], None, errors()
+    episodes, seen, workers, failed = [], None, set[str](), 0
     with (
         output_folder(output, force=force, inputs=files) as part,
         progress("reading the recordings") as status,
@@ -59,19 +59,31 @@ def export(
             status.update(f"reading {path.name} ({number} of {len(files)})")
             run = load_run(path)
             for problem in run.problems:
-                screen.print(f"{path.name}: {problem}", style="yellow")
+                errors().print(f"{path.name}: {problem}", style="yellow")
+            workers |= {heard.record.worker for heard in run.chunks}
             found = episodes_of(run, worker)
             for episode in found:
                 episode.success = succeeded(episode)
-            episodes += [each for each in found if each.success or not successful]
+            kept = [each for each in found if each.success or not successful]
+            episodes += kept
+            failed += len(found) - len(kept)
             if found:
                 seen = set(run.picture_counts) if seen is None else seen & set(run.picture_counts)
+        if worker is not None and worker not in workers:
+            known = ", ".join(sorted(workers)) or "none"
+            fail(
+                f"no episode of worker {worker!r} is in the recordings{nearest(worker, workers)} "
+                f"Workers there: {known}"
+            )
+        if failed and not episodes:
+            those = counted(failed, "episode")
+            fail(f"none of {those} is known to be successful; leave out --successful")
         written = write(
             part,
             episodes,
             cameras or sorted(seen or ()),
             parts,
-            lambda doing: status.update(f"writing {doing} ({len(episodes)} episodes)"),
+            lambda doing: status.update(f"writing {doing} ({counted(len(episodes), 'episode')})"),
         )
     written = written._replace(folder=output)
     if as_json:

@@ -40,6 +40,7 @@ class PeerMonitor:
         self._servers = node.profile.camera_servers()
         self._cameras: dict[str, tuple[float, int]] = {}
         self._camera_faults: dict[str, str] = {}
+        self._camera_reasons: dict[str, str] = {}
         self._hosts: dict[str, HostId] = {}
         self._next_clocks_s = 0.0
         self._statuses = node.subscribe(node.keys.all_status, ZenohRing(STATUSES_A_TICK))
@@ -102,6 +103,7 @@ class PeerMonitor:
                 self._node.clocks.offsets(),
                 frozenset(self._holders),
                 dict(self._camera_faults),
+                dict(self._camera_reasons),
             )
 
     def _track_clocks(self) -> None:
@@ -209,7 +211,10 @@ class PeerMonitor:
                 node,
             )
             return
-        age_s, bad = fields.get("age_s"), fields.get("bad")
+        age_s, bad, reason = (fields.get(name) for name in ("age_s", "bad", "why"))
+        reason = reason[:MAX_WHY] if isinstance(reason, str) else ""
+        if self._camera_reasons.get(camera, "") != reason:
+            self._camera_reasons[camera], self._changed = reason, True
         why = bad.get("why") if isinstance(bad, Mapping) else None
         if isinstance(why, str):
             self._camera_faults[camera], self._changed = why[:MAX_WHY], True
