@@ -20,7 +20,7 @@ from vla_zenoh.cli.output_path import ForceOption, output_folder
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
-from vla_zenoh.nodes.worker.inference_debug import InferenceDebugSubscriber, InferenceView
+from vla_zenoh.lab.inference_views import InferenceDebugSubscriber, InferenceView
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.runtime.process import stop_on_signals
 from vla_zenoh.sanitize import one_line
