@@ -19,7 +19,14 @@ EMPTY = "{} holds neither recordings (.mcap) nor the thesis's CSV"
 COMBINED = "ALL"
 """``record_id`` of all runs together."""
 _IDENTITY, _SERIES = {"name", "kind", "path"}, {"request_t_s", "width_m", "width_t_s"}
-_OF_ONE_RUN = _IDENTITY | _SERIES | {"problems", "measured", "commanded", "marks", "views"}
+_OF_ONE_RUN = (
+    _IDENTITY
+    | _SERIES
+    | {
+        *("problems", "measured", "commanded", "marks", "views"),
+        *("about", "film"),
+    }
+)
 
 
 def recordings(paths: Iterable[Path]) -> Iterator[Path]:
