@@ -6,10 +6,12 @@ import os
 import socket
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from vla_zenoh.keys import key_chunk
-from vla_zenoh.profile import SessionProfile
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile import SessionProfile
 
 HOST_VARIABLE = "VLA_ZENOH_HOST"
 """Name of this host in the profile, unless an option gives it."""

@@ -6,14 +6,16 @@ import json
 import threading
 import time
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import zenoh
 
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import Kind
-from vla_zenoh.profile import SessionProfile
-from vla_zenoh.profile.session import SecurityProfile, second_link
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile import SessionProfile
+    from vla_zenoh.profile.session import SecurityProfile
 
 Mode = Literal["client", "router"]
 """No peers: a router does not forward between them."""
@@ -115,6 +117,13 @@ def _listening(profile: SessionProfile) -> list[str]:
     return [link for endpoint in profile.listen for link in (endpoint, second_link(endpoint))]
 
 
+def second_link(endpoint: str) -> str:
+    """The same endpoint at the next port, for images on a link of their own."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.rpartition(":")
+    return f"{protocol}/{host}:{int(port) + 1}"
+
+
 def _tls(security: SecurityProfile, identity: str | None, routes: bool) -> dict[str, Any]:
     from vla_zenoh.security.store import Store
 
@@ -197,3 +206,8 @@ def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
         f"no Zenoh router answers at {where}. Start one with `vla-zenoh node router`, or all "
         "nodes with `vla-zenoh up`; set another address with --connect or session.connect"
     )
+
+
+def put_text(session: zenoh.Session, key: str, text: str) -> None:
+    """Put plain text on a setting's key, as any Zenoh client could."""
+    session.put(key, text, encoding=zenoh.Encoding.TEXT_PLAIN, **QOS[Kind.ORDER])

@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Mapping
 from importlib import import_module
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import typer
 import zenoh
 from typer.core import TyperGroup
 
 from vla_zenoh import __version__
-from vla_zenoh.errors import VlaZenohError, how_to_install
+from vla_zenoh.cli.entry import WORDS
 
-EXTRA_OF = {
-    "pinocchio": "control",
-    "ruckig": "control",
-    "mujoco": "sim",
-    "matplotlib": "sim",
-    "av": "sim",
-    "mcap": "record",
-    "plotly": "record",
-    "jinja2": "record",
-    "rosbags": "record",
-    "rerun": "view",
-}
-"""Module -> extra that brings it, for the error of a missing import."""
 NODES = frozenset({"up", "worker", "node"})
 """Commands that write a log; Zenoh's own log belongs into it."""
 
@@ -140,6 +126,10 @@ def _load(name: str, entry: str | Group, panel: str | None) -> Any:
     else:
         module, _, attribute = entry.partition(":")
         found = getattr(import_module(f"vla_zenoh.{module}"), attribute)
+        if name in WORDS:  # their modules do not load Typer
+            from vla_zenoh.cli.options import options
+
+            found = options(found)
     around = typer.Typer(rich_markup_mode="rich", add_completion=False)
     around.callback()(lambda: None)  # makes it a group even with a single command
     if isinstance(found, typer.Typer):
@@ -186,29 +176,3 @@ def _main(
 ) -> None:
     # Zenoh logs to stdout, where the other commands write what a script reads.
     zenoh.init_log_from_env_or("error" if context.invoked_subcommand in NODES else "off")
-
-
-def app_entry() -> None:
-    """Run the command line. Errors of this package become one line and exit code 1."""
-    try:
-        app()
-    except VlaZenohError as error:
-        _fail(str(error))
-    except ImportError as error:
-        extra = EXTRA_OF.get((error.name or "").partition(".")[0])
-        if extra is None and ".so" not in str(error):
-            raise
-        _fail(
-            f"{error}; install it with: {how_to_install(extra)}"
-            if extra
-            else f"{error}; `vla-zenoh doctor` names the system package"
-        )
-    except KeyboardInterrupt:
-        sys.exit(130)
-
-
-def _fail(message: str) -> NoReturn:
-    from vla_zenoh.cli.output import complain
-
-    complain(message)
-    sys.exit(1)

@@ -12,10 +12,9 @@ import json
 import math
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
-import typer
 from pydantic import BaseModel
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -23,6 +22,8 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from vla_zenoh.cli.plain import complain as complain
+from vla_zenoh.cli.plain import fail as fail
 from vla_zenoh.sanitize import printable
 
 
@@ -106,17 +107,6 @@ def progress_bars(width: int, screen: Screen | None = None, *, counted: bool = T
 def print_json(value: Any) -> None:
     """Print `value` as indented JSON on stdout, without colours; see `plain_types`."""
     print(json.dumps(plain_types(value), indent=2))
-
-
-def complain(message: str) -> None:
-    """Print ``error: message`` on stderr."""
-    errors().print(Text.assemble(("error: ", "bold red"), printable(message)), soft_wrap=True)
-
-
-def fail(message: str, code: int = 1) -> NoReturn:
-    """Print ``error: message`` on stderr and exit with `code`."""
-    complain(message)
-    raise typer.Exit(code)
 
 
 def plain_types(value: Any) -> Any:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from vla_zenoh import resources
 from vla_zenoh.errors import ResourceError
-from vla_zenoh.profile.load import SUFFIXES, below, followed, load_profile, paths_in
+from vla_zenoh.profile.load import below, followed, load_profile, paths_in
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.yaml_text import read
 
@@ -176,7 +176,7 @@ def _place(before: Path, path: Path, named: str, where: str) -> str:
     """Location of a profile that the one `before`, located at `where`, extends."""
     if named.startswith("/"):
         return WHOLE
-    if path in [before.parent / f"{named}{suffix}" for suffix in ("", *SUFFIXES)]:
+    if path in [before.parent / f"{named}{suffix}" for suffix in ("", *resources.PROFILE_SUFFIXES)]:
         return where
     return str(path.parent.parent.absolute())
 

@@ -6,10 +6,14 @@ more than `--host` would. So the choice is made for convenience alone, and never
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.profile import Profile
 from vla_zenoh.security.identity import PEOPLE, Role, operator_role
 from vla_zenoh.security.store import Store
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile import Profile
 
 RANK = {Role.OPERATOR: 0, Role.VIEWER: 1}
 """The role that replays recordings is chosen by name only: it may publish on every key."""
