@@ -23,6 +23,7 @@ from pydantic_core import PydanticUndefined
 from typer.main import get_command
 
 import vla_zenoh
+from vla_zenoh.cli.help import examples
 from vla_zenoh.cli.main import app
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import Profile
@@ -225,6 +226,9 @@ def cli_page() -> str:
         if shown:
             rows = ["| option | default | |", "|---|---|---|", *map(option_row, shown)]
             out.append("\n".join(rows))
+        wanted = path.split()
+        found = [text for words, text in examples() if words[: len(wanted)] == wanted]
+        out.append("```sh\n" + "\n".join(found) + "\n```")
     return "\n\n".join(out) + "\n"
 
 
@@ -254,7 +258,6 @@ REASONS = {
     "no_attachment": "rmw_zenoh: no attachment",
     "no_gripper": "gripper command for an arm without a gripper",
     "no_header": "no header in the attachment",
-    "no_spec": "chunk of a worker whose spec is unknown",
     "no_transform": "ROS: no transform between two frames yet",
     "out_of_order": "older than the one before",
     "outlived": "gripper command from before a stop",

@@ -64,6 +64,7 @@ class Ros2Rig:
     profile: Profile
     node: RobotNode
     session: zenoh.Session
+    ours: zenoh.Session
     peer: Ros2Peer
     robot: KinematicPanda
     states: dict[type, list[tuple[Header, Any]]] = field(default_factory=dict)
@@ -90,6 +91,12 @@ class Ros2Rig:
     def happened(self, what: str) -> list[Event]:
         return [event for event in self.events if event.what == what]
 
+    def wait_for_service(self, name: str, kind: str) -> None:
+        """Wait until the node's session sees a service of the peer."""
+        querier = self.ours.declare_querier(self.peer.key(name, kind))
+        self.wait(f"the node sees {name}", lambda: querier.matching_status.matching)
+        querier.undeclare()
+
     def stream(self, key: str, source: str = "command#1") -> Publisher:
         """A writer of commands; waits until the node hears it."""
         stream = Publisher(self.session, key, Kind.CONTROL, source, Clock())
@@ -110,7 +117,7 @@ def ros2_rig(folder: Path, bridge: str = "ros2dds", more: str = "") -> Iterator[
         peer = Ros2Peer(theirs, bridge)
         node = RobotNode(Ros2Driver(profile), ours)
         robot = KinematicPanda(peer)
-        rig = Ros2Rig(profile, node, watcher, peer, robot)
+        rig = Ros2Rig(profile, node, watcher, ours, peer, robot)
         keys = profile.keys
         subscribers = [
             _keep(watcher, key, kind, rig.states.setdefault(kind, []))

@@ -338,11 +338,14 @@ def test_the_newest_gripper_goal_wins_and_never_two_run_at_once(rig: Ros2Rig) ->
         cancelled[bytes(asked.goal_info.goal_id.uuid)].set()
         return peer.message("action_msgs/srv/CancelGoal_Response")
 
-    peer.serve(f"{MOVE}/send_goal", "franka_msgs/action/Move_SendGoal", accept)
-    peer.serve(f"{MOVE}/get_result", "franka_msgs/action/Move_GetResult", finish)
-    peer.serve(f"{MOVE}/cancel_goal", "action_msgs/srv/CancelGoal", cancel)
+    for name, kind, answer in (
+        ("send_goal", "franka_msgs/action/Move_SendGoal", accept),
+        ("get_result", "franka_msgs/action/Move_GetResult", finish),
+        ("cancel_goal", "action_msgs/srv/CancelGoal", cancel),
+    ):
+        peer.serve(f"{MOVE}/{name}", kind, answer)
+        rig.wait_for_service(f"{MOVE}/{name}", kind)
     stream = rig.stream(rig.profile.keys.command_gripper)
-    time.sleep(0.3)  # the services are declared on their way
     stream.publish(GripperCommand(0.01, 0.1, 20.0))
     rig.wait("the first goal", lambda: widths)
     rig.wait("the gripper moves", lambda: rig.newest(GripperState).moving)

@@ -1,6 +1,6 @@
 """vla-zenoh prompt, activate, deactivate, use, rate, speed, stop, reset: one setting each.
 
-Typer, Rich, numpy and the profile's schema are not loaded here, see ``entry.py``.
+Typer, Rich, numpy and the profile's schema are not loaded here, see ``words.py``.
 """
 
 from __future__ import annotations

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import typer
 import zenoh
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from vla_zenoh import __version__
-from vla_zenoh.cli.entry import WORDS
+from vla_zenoh.cli.words import WORDS
 
 NODES = frozenset({"up", "worker", "node"})
 """Commands that write a log; Zenoh's own log belongs into it."""
@@ -98,17 +100,16 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
 class _LazyCommands(Mapping[str, Any]):
     """Name -> command, imported when it is first looked up."""
 
-    def __init__(self, panels: Mapping[str | None, Mapping[str, str | Group]]) -> None:
-        self._entries = {
-            name: (entry, panel)
-            for panel, entries in panels.items()
-            for name, entry in entries.items()
-        }
+    def __init__(
+        self, panels: Mapping[str, Mapping[str, str | Group]], path: Sequence[str]
+    ) -> None:
+        self._entries = {name: entry for group in panels.values() for name, entry in group.items()}
+        self._path = path
         self._loaded: dict[str, Any] = {}
 
     def __getitem__(self, name: str) -> Any:
         if name not in self._loaded:
-            self._loaded[name] = _load(name, *self._entries[name])
+            self._loaded[name] = _load((*self._path, name), self._entries[name])
         return self._loaded[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -118,11 +119,13 @@ class _LazyCommands(Mapping[str, Any]):
         return len(self._entries)
 
 
-def _load(name: str, entry: str | Group, panel: str | None) -> Any:
+def _load(path: Sequence[str], entry: str | Group) -> Any:
+    from vla_zenoh.cli.help import add_help
+
+    name = path[-1]
     if isinstance(entry, Group):
-        found: Any = typer.Typer(
-            cls=_lazy_group({None: entry.commands}), help=entry.help, no_args_is_help=True
-        )
+        group = _lazy_group({"Commands": entry.commands}, path)
+        found: Any = typer.Typer(cls=group, help=entry.help, no_args_is_help=True)
     else:
         module, _, attribute = entry.partition(":")
         found = getattr(import_module(f"vla_zenoh.{module}"), attribute)
@@ -130,22 +133,56 @@ def _load(name: str, entry: str | Group, panel: str | None) -> Any:
             from vla_zenoh.cli.options import options
 
             found = options(found)
-    around = typer.Typer(rich_markup_mode="rich", add_completion=False)
+    around = typer.Typer(rich_markup_mode=None, add_completion=False)
     around.callback()(lambda: None)  # makes it a group even with a single command
     if isinstance(found, typer.Typer):
-        around.add_typer(found, name=name, rich_help_panel=panel)
+        around.add_typer(found, name=name)
     else:
-        around.command(name, rich_help_panel=panel)(found)
+        around.command(name)(found)
     group = typer.main.get_command(around)
     assert isinstance(group, TyperGroup)
-    return group.commands[name]
+    command = group.commands[name]
+    if isinstance(entry, Group):
+        command.short_help = entry.help
+    else:
+        add_help(command, path)
+    return command
 
 
-def _lazy_group(panels: Mapping[Any, Mapping[str, str | Group]]) -> type[TyperGroup]:
+def _short_help(entry: str) -> str | None:
+    """Line of a command in the help of its group, from its source: importing all takes 0.5 s.
+
+    None: it is not found there.
+    """
+    from vla_zenoh.cli.help import MAX_SHORT
+
+    module, _, name = entry.partition(":")
+    file = Path(__file__).parents[1].joinpath(*module.split(".")).with_suffix(".py")
+    says = rf'(?:def {name}\(.*?^    """|{name} = typer\.Typer\([^)]*?help="\s*)(.*?)"'
+    found = re.search(f"^{says}", file.read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    return TyperCommand(None, help=found[1]).get_short_help_str(MAX_SHORT) if found else None
+
+
+def _lazy_group(
+    panels: Mapping[str, Mapping[str, str | Group]], path: Sequence[str] = ()
+) -> type[TyperGroup]:
     class LazyGroup(TyperGroup):
         def __init__(self, **attributes: Any) -> None:
             super().__init__(**attributes)
-            self.commands = _LazyCommands(panels)  # pyright: ignore[reportAttributeAccessIssue]
+            self.commands = _LazyCommands(panels, path)  # pyright: ignore[reportAttributeAccessIssue]
+
+        def format_commands(self, ctx: Any, formatter: Any) -> None:
+            width = max(len(name) for names in panels.values() for name in names)
+            for title, names in panels.items():
+                with formatter.section(title):
+                    formatter.write_dl(
+                        (f"{name:<{width}}", self._line(name, entry))
+                        for name, entry in names.items()
+                    )
+
+        def _line(self, name: str, entry: str | Group) -> str:
+            line = entry.help if isinstance(entry, Group) else _short_help(entry)
+            return line or self.commands[name].short_help
 
     return LazyGroup
 
@@ -155,7 +192,7 @@ app = typer.Typer(
     cls=_lazy_group(COMMANDS),
     help="Connects vision-language-action models to robots over Zenoh.",
     no_args_is_help=True,
-    rich_markup_mode="rich",
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
     add_completion=True,
 )

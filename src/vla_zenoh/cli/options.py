@@ -13,7 +13,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from vla_zenoh.bus.host_id import HOST_VARIABLE
-from vla_zenoh.cli.target import DEFAULT_PROFILE, PROFILE_VARIABLE
+from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE
 from vla_zenoh.policy.loader import ModelFile, find_worker
 from vla_zenoh.profile import Profile, load_profile, override
 

@@ -10,13 +10,16 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Collection, Iterable, Mapping
+import os
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
-from rich.console import Console, ConsoleOptions, RenderableType
+from rich import box
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.segment import Segment
 from rich.table import Table
@@ -26,12 +29,32 @@ from vla_zenoh.cli.plain import complain as complain
 from vla_zenoh.cli.plain import fail as fail
 from vla_zenoh.sanitize import printable
 
+ENDLESS = 100_000
+"""Width in characters where there is no terminal."""
+LEAST_WORD, BORDER = 6, 2
+"""Width of a column of wrapped words, and between columns."""
+LOOK: Mapping[str, Any] = {
+    "box": box.SIMPLE_HEAD,
+    "padding": (0, 1, 0, 0),
+    "header_style": "bold",
+    "title_justify": "left",
+    "caption_justify": "left",
+}
+
 
 class Screen(Console):
-    """A Rich console for untrusted text. Takes the arguments of Rich's own."""
+    """A Rich console for untrusted text. Takes the arguments of Rich's own.
+
+    With NO_COLOR in the environment it has no styles at all. Where it is no terminal it breaks no
+    lines.
+    """
 
     def __init__(self, **settings: Any) -> None:
+        if os.environ.get("NO_COLOR"):
+            settings["color_system"] = None
         super().__init__(markup=False, emoji=False, highlight=False, **settings)
+        if not self.is_terminal:
+            self.width = ENDLESS
 
     def render_str(self, text: str, **how: Any) -> Text:
         """`text` as it is, also for cells, titles and columns of tables."""
@@ -48,15 +71,9 @@ class Screen(Console):
                 yield Segment(printable(segment.text), segment.style)
 
 
-def console(least_width: int = 0) -> Screen:
-    """A console on stdout.
-
-    Args:
-        least_width: of a wide table, which on a narrow screen wraps rather than lose figures.
-    """
-    screen = Screen()
-    screen.width = max(screen.width, least_width)
-    return screen
+def console() -> Screen:
+    """A console on stdout."""
+    return Screen()
 
 
 def errors() -> Screen:
@@ -69,21 +86,60 @@ def styled(text: object, style: str) -> Text:
     return Text(printable(str(text)), style=style)
 
 
-def new_table(
-    *columns: str, title: str | None = None, left: Collection[str] | None = None
-) -> Table:
+class Grid(Table):
+    """A table that loses nothing.
+
+    On a terminal it has a box; where its figures do not fit even with the other cells wrapped, and
+    where there is no terminal, it is one line for each row, in columns for grep and awk.
+    """
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        if console.is_terminal and self._least_width() <= options.max_width:
+            yield from super().__rich_console__(console, options)
+            return
+        heads = [[column.header] if self.show_header else [] for column in self.columns]
+        columns = [
+            _aligned([*head, *column.cells], right=column.justify == "right")
+            for head, column in zip(heads, self.columns, strict=True)
+        ]
+        rows = ["  ".join(cells).rstrip() for cells in zip(*columns, strict=True)]
+        around = [[str(text)] if text else [] for text in (self.title, self.caption)]
+        yield Text(printable("\n".join([*around[0], *rows, *around[1]])), overflow="fold")
+
+    def _least_width(self) -> int:
+        """Width with all words wrapped and no figure."""
+        figures = [
+            max(map(cell_len, _aligned([column.header, *column.cells], right=True)))
+            for column in self.columns
+            if column.no_wrap
+        ]
+        words = LEAST_WORD * (len(self.columns) - len(figures))
+        return sum(figures) + words + BORDER * (len(self.columns) + 1)
+
+
+def _aligned(cells: Sequence[RenderableType], *, right: bool) -> list[str]:
+    """Cells as text of one line each, padded to one width."""
+    texts = [cell.plain if isinstance(cell, Text) else str(cell) for cell in cells]
+    lines = ["; ".join(printable(text).splitlines()) for text in texts]
+    pads = [" " * (max(map(cell_len, lines)) - cell_len(line)) for line in lines]
+    return [pad + line if right else line + pad for pad, line in zip(pads, lines, strict=True)]
+
+
+def new_table(*columns: str, left: Collection[str] | None = None, **settings: Any) -> Grid:
     """An empty table.
 
     Args:
         columns: their names.
-        title: of the table.
-        left: columns that are aligned left, the others right; None: all left, in which long text
-            wraps.
+        left: columns of words, which are aligned left and wrap; the others hold figures, which do
+            not. None: all hold words.
+        settings: of Rich's tables.
     """
-    table = Table(header_style="bold", title=title, title_justify="left")
+    table = Grid(**{**LOOK, **settings})
     for column in columns:
-        aligned = "left" if left is None or column in left else "right"
-        table.add_column(column, justify=aligned, overflow="fold" if left is None else "ellipsis")
+        words = left is None or column in left
+        table.add_column(
+            column, justify="left" if words else "right", overflow="fold", no_wrap=not words
+        )
     return table
 
 

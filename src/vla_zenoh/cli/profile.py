@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -13,6 +14,7 @@ from vla_zenoh.cli.output import console, errors, fail, new_table, print_json, s
 from vla_zenoh.errors import MissingExtraError, ProfileError, RecordError, ResourceError
 from vla_zenoh.profile import Profile, load_profile, profile_file, profile_names, to_yaml
 from vla_zenoh.profile.advice import advice
+from vla_zenoh.resources import shipped
 
 profile_app = typer.Typer(help="List, show and check profiles.", no_args_is_help=True)
 profile_app.command("bridge-config")(bridge_config)
@@ -32,12 +34,14 @@ def list_profiles(as_json: JsonOption = False) -> None:
     table = new_table("name", "about", "robot", "driver", "hosts", "file")
     table.columns[0].no_wrap = True
     for row in rows:
+        inside = Path(row["file"]).is_relative_to(shipped("profiles"))
+        file = "shipped" if inside else row["file"]
         if "fault" in row:
             wrong = styled(row["fault"], "red")
             table.add_row(row["name"], wrong, "", "", "", row["file"])
         else:
             cells = [row[key] for key in ("name", "about", "robot", "driver")]
-            table.add_row(*cells, ", ".join(row["hosts"]), row["file"])
+            table.add_row(*cells, ", ".join(row["hosts"]), file)
     console().print(table)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from rich.text import Text
 
 from vla_zenoh.cli.addresses import is_own
 from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, ProfileOption
@@ -292,7 +293,8 @@ def _warn_of_loopback(profile: Profile) -> None:
 
 
 def _print(entries: list[Entry], now: dt.datetime) -> None:
-    table = new_table("host", "node", "valid until", "days", "serves as", "what is wrong")
+    table = new_table("host", "node", "valid until", "days", "serves as")
+    wrong: list[Text] = []
     for entry in entries:
         found, colour = entry.certificate, "green"
         if entry.faults:
@@ -305,9 +307,14 @@ def _print(entries: list[Entry], now: dt.datetime) -> None:
             styled(f"{found.not_after:%Y-%m-%d}", colour) if found else "",
             styled(found.days_left(now), colour) if found else "",
             ", ".join(found.addresses) if found else "",
-            styled("; ".join(entry.faults) or entry.warning, colour),
         )
-    console().print(table)
+        named = f"{entry.host or 'the lab'}/{entry.node}"
+        whys = entry.faults or ([entry.warning] if entry.warning else [])
+        wrong += [styled(f"{named}: {why}", colour) for why in whys]
+    screen = console()
+    screen.print(table)
+    for line in wrong:
+        screen.print(line, soft_wrap=True)
 
 
 def _mapping(entry: Entry, now: dt.datetime) -> dict[str, object]:

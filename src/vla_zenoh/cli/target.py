@@ -14,6 +14,7 @@ import zenoh
 from vla_zenoh.bus.session import open_session, put_text
 from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.profile_cache import cached_profile
+from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.security.identity import Role, operator_role
 from vla_zenoh.security.operator_identity import local_role, operator_hosts
@@ -24,9 +25,6 @@ if TYPE_CHECKING:  # Typer and the schema: the words that drive go without them
     from vla_zenoh.bus.client import Client
     from vla_zenoh.cli.options import ConnectOption, HostOption, ProfileOption
     from vla_zenoh.profile import Profile
-
-DEFAULT_PROFILE = "panda_sim"
-PROFILE_VARIABLE = "VLA_ZENOH_PROFILE"
 
 
 @dataclass(frozen=True)

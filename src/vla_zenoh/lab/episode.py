@@ -103,6 +103,7 @@ class EpisodeRunner:
             NodeError: it does not reset.
         """
         client, before = self.client, self._resets()
+        client.wait_for(lambda: not self._sim_follows(), RESET_PERIOD_S)
         give_up_s = time.monotonic() + RESET_PATIENCE_S
         while self._resets() == before:
             client.publish(client.keys.sim_reset, "" if seed is None else str(seed))
@@ -202,6 +203,10 @@ class EpisodeRunner:
     def _resets(self) -> int:
         status = self.client.status(SIM)
         return int(status.counters.get("sim.resets", 0)) if status else 0
+
+    def _sim_follows(self) -> bool:
+        status = self.client.status(SIM)
+        return bool(status and status.detail.get("following"))
 
     def _states(self) -> str:
         states: list[str] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.cli.output import console, errors, fail, print_json
+from vla_zenoh.cli.output import Screen, console, errors, fail, new_table, print_json, styled
 from vla_zenoh.profile import load_profile
 from vla_zenoh.sanitize import printable
 from vla_zenoh.types import GripperState, SceneState
@@ -72,6 +73,64 @@ def test_consoles_follow_the_streams_of_the_moment(capsys: Captured) -> None:
     errors().print("err")
     said = capsys.readouterr()
     assert (said.out, said.err) == ("out\n", "err\n")
+
+
+# -- tables -------------------------------------------------------------------------------------
+INTERVAL = "34.2%..100.0%"
+
+
+def rates() -> Any:
+    table = new_table("worker", "done", "rate", "95 %", title="a trial", left=("worker",))
+    table.add_row("brick_with_a_long_name_of_its_own", "3", "60.0%", INTERVAL)
+    table.add_row("other", "10", "100.0%", "72.2%..100.0%")
+    return table
+
+
+def printed(table: Any, *, width: int, terminal: bool) -> str:
+    screen = Screen(file=io.StringIO(), force_terminal=terminal, width=width, color_system=None)
+    screen.print(table)
+    return screen.file.getvalue()
+
+
+def test_without_a_terminal_a_row_is_a_line_of_columns(capsys: Captured) -> None:
+    console().print(rates())
+    title, head, first, second = capsys.readouterr().out.splitlines()
+    assert title == "a trial"
+    assert head.split() == ["worker", "done", "rate", "95", "%"]
+    assert first.split() == ["brick_with_a_long_name_of_its_own", "3", "60.0%", INTERVAL]
+    assert second.index("other") == first.index("brick")
+    assert second.rstrip().endswith("72.2%..100.0%")
+
+
+def test_without_a_terminal_no_line_is_broken(capsys: Captured) -> None:
+    table = new_table("key", "message")
+    table.add_row("vla/ur5e/" + "delta/" * 40 + "reach", "one\ntwo")
+    console().print(table)
+    console().print("word " * 100)
+    _, row, text = capsys.readouterr().out.splitlines()
+    assert row.endswith("reach  one; two")
+    assert text.count("word") == 100
+
+
+def test_a_narrow_terminal_wraps_words_and_no_figures() -> None:
+    shown = printed(rates(), width=50, terminal=True)
+    assert INTERVAL in shown
+    assert "\u2500" in shown
+    assert "\u2026" not in shown
+
+
+def test_a_terminal_too_narrow_for_the_figures_loses_none() -> None:
+    shown = printed(rates(), width=20, terminal=True)
+    assert INTERVAL in shown.replace("\n", "")
+    assert "\u2500" not in shown
+
+
+def test_no_color_means_no_style_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NO_COLOR", "1")
+    screen = Screen(file=io.StringIO(), force_terminal=True, width=80)
+    screen.print(styled("active", "bold green"))
+    screen.print(rates())
+    assert "\x1b" not in screen.file.getvalue()
 
 
 @given(st.text(st.characters()))

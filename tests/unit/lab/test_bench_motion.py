@@ -14,7 +14,7 @@ from vla_zenoh.lab.bench.motion import (
     make_row,
     path_length,
 )
-from vla_zenoh.lab.bench.motion_report import motion_table, thesis_table
+from vla_zenoh.lab.cli.bench_motion_tables import motion_table, thesis_table
 from vla_zenoh.lab.demo.segments import SegmentOutcome
 from vla_zenoh.profile import load_profile
 

@@ -182,6 +182,7 @@ def heard(tmp_path: Path, *samples: Sample, profile: Profile = BARE) -> tuple[Re
     show = RerunLogger(profile, stream := stream_to(tmp_path / "a.rrd"), live=True)
     for sample in samples:
         show.log(sample)
+    show.close()
     stream.disconnect()
     return show, Shown(tmp_path / "a.rrd")
 
@@ -383,6 +384,20 @@ def test_broken_samples_are_counted_by_key_and_reason_and_shown(tmp_path: Path) 
     }
     assert "**Not shown here:**" in shown.texts("text/now")[-1]
     assert shown.texts("events/command") == ["command: x"]
+
+
+def test_a_chunk_that_comes_before_its_spec_is_drawn_when_that_is_there(tmp_path: Path) -> None:
+    before = put(KEYS.command_pose, command(-SECOND), -SECOND)
+    samples = (before, chunk(0, 1), chunk(200 * MS, 2), put(KEYS.spec("scripted"), SPEC, SECOND))
+    show, shown = heard(tmp_path, *samples)
+    assert show.rejected == {}
+    assert shown.stamps_ns("world/chunk/scripted") == [ZERO_NS, ZERO_NS + 200 * MS]
+
+
+def test_a_reset_of_the_simulator_is_an_event(tmp_path: Path) -> None:
+    show, shown = heard(tmp_path, Sample(KEYS.sim_reset, b"3", TEXT, None, ZERO_NS))
+    assert show.rejected == {}
+    assert shown.texts("events/settings") == ["sim/reset: 3"]
 
 
 def test_what_is_not_of_the_robot_is_passed_over(tmp_path: Path) -> None:

@@ -23,6 +23,9 @@ from vla_zenoh.types import GripperState, Header, ObjectPoses, PoseState
 READY_PATIENCE_S = 60.0
 LOAD_PATIENCE_S = 600.0
 """While the worker reports that it loads; it may be building its environment."""
+SETTLE_PATIENCE_S = 5.0
+"""For cameras and worker to have data; then activation names what is missing."""
+UNSETTLED = {"waiting", "degraded"}
 STATE_PATIENCE_S = 3.0
 STEP_S = 0.02
 FRESH_PICTURES_S = 0.2
@@ -170,13 +173,18 @@ class TaskRunner:
             status = self._client.status(worker)
             loading = status is None or status.detail.get("complaint") == "loading"
             ready = all(slot.mono_s for slot in self._slots.values())
-            if ready and not loading and self._client.status(COMMAND) is not None:
-                return
             waited_s = time.monotonic() - began_s
+            settled = waited_s > SETTLE_PATIENCE_S or self._settled()
+            if ready and not loading and settled and self._client.status(COMMAND) is not None:
+                return
             if waited_s > (LOAD_PATIENCE_S if loading and ready else READY_PATIENCE_S):
                 nodes = {name: found[0].state for name, found in self._client.snapshot().items()}
                 raise NodeError(f"the chain did not come up in {waited_s:.0f} s: {nodes}")
             self._runner.pause(0.1)
+
+    def _settled(self) -> bool:
+        states = {found[0].state for found in self._client.snapshot().values()}
+        return states.isdisjoint(UNSETTLED)
 
     def _newest(self, kind: type[Record]) -> tuple[Header, Record]:
         return self._slots[kind].read(kind)

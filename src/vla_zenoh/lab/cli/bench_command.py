@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.box import SIMPLE
 from rich.progress import track
-from rich.table import Table
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
@@ -15,10 +13,9 @@ from vla_zenoh.cli.options import (
     effective_profile,
     number_list,
 )
-from vla_zenoh.cli.output import console, errors
+from vla_zenoh.cli.output import console, errors, new_table
 from vla_zenoh.lab.cli.bench_file import JsonFileOption, kept_rows
 
-WIDTH = 160
 SHARES = ("p50", "p95", "p99", "max")
 
 
@@ -51,12 +48,9 @@ def command(
     with kept_rows(json_file) as rows:
         for rate_hz in track(rates_hz, "command node", console=errors()):
             rows.append(measure_command(loaded, rate_hz, seconds, stop, rows.log, busy))
-    table = Table(box=SIMPLE, pad_edge=False)
-    for column in ("set Hz", "held Hz", "missed", "core share"):
-        table.add_column(column, justify="right", no_wrap=True)
-    for name in ("tick us", "late us", "pose ms"):
-        for share in SHARES:
-            table.add_column(f"{name}\n{share}", justify="right", no_wrap=True)
+    times = [f"{name} {share}" for name in ("tick us", "late us", "pose ms") for share in SHARES]
+    columns = ("set Hz", "held Hz", "missed", "core share", *times)
+    table = new_table(*columns, left=())
     for row in rows:
         table.add_row(
             f"{row['command_hz']:g}",
@@ -72,4 +66,4 @@ def command(
     )
     realtime = all(row["realtime"] for row in rows)
     table.caption = text if realtime else f"{text} (no real-time priority here)"
-    console(WIDTH).print(table)
+    console().print(table)

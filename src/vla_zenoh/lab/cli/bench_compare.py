@@ -16,7 +16,6 @@ from vla_zenoh.lab.bench.paired_tasks import compare as compare_runs
 
 B_IS_WORSE = 3
 """Exit code; 1 and 2 are those of every command for errors."""
-LEAST_WIDTH = 120
 DISAGREEMENTS = 10
 
 
@@ -61,7 +60,7 @@ def _bytes(path: Path) -> bytes:
 
 def _print(found: Comparison, *, tasks: bool) -> None:
     result = found.to_dict()
-    out = console(LEAST_WIDTH)
+    out = console()
     for name, run in (("A", result["a"]), ("B", result["b"])):
         options = ", ".join(f"{k}={v}" for k, v in run["options"].items())
         given = f" ({options})" if options else ""
@@ -70,8 +69,6 @@ def _print(found: Comparison, *, tasks: bool) -> None:
         out.print(f"{name}: {one} in A, {other} in B", soft_wrap=True)
     columns = ("pairs", "A", "B", "both", "only A", "only B", "neither", "B - A", "95 %", "p")
     table = new_table("", *columns, left=("",))
-    for column in table.columns:
-        column.no_wrap = True
     _row(table, "all", figures(found.counts))
     for part in ("by_family", *(["by_task"] if tasks else [])):
         table.add_section()

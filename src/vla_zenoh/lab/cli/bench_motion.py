@@ -23,8 +23,6 @@ from vla_zenoh.lab.bench.motion import PROTOCOL, STEPS, Conditions, MotionCase
 from vla_zenoh.lab.cli.bench_file import JsonFileOption, up_with_last_lines, write_json
 from vla_zenoh.profile import Profile
 
-WIDTH = 124
-
 
 @dataclass(frozen=True)
 class MotionOptions:
@@ -180,7 +178,7 @@ def motion(
 
     Exits with 0 only when every row passes.
     """
-    from vla_zenoh.lab.bench.motion_report import motion_table, thesis_table
+    from vla_zenoh.lab.cli.bench_motion_tables import motion_table, thesis_table
     from vla_zenoh.runtime.process import stop_on_signals
 
     if lockstep and out is not None:
@@ -193,7 +191,7 @@ def motion(
     finally:
         write_json(json_file, run.rows)
     thesis = thesis_table(run.rows, virtual=lockstep)
-    screen = console(WIDTH)
+    screen = console()
     screen.print(motion_table(run.rows))
     if thesis.row_count:
         screen.print(thesis)

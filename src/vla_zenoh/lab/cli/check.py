@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import typer
-from rich.table import Table
 from rich.text import Text
 
 from vla_zenoh.cli.options import (
@@ -19,7 +18,7 @@ from vla_zenoh.cli.options import (
     WorkerChoice,
     options,
 )
-from vla_zenoh.cli.output import console, print_json, styled
+from vla_zenoh.cli.output import console, new_table, print_json, styled
 from vla_zenoh.control.policy_check import Finding, error
 from vla_zenoh.errors import WorkerError
 from vla_zenoh.lab.check.examination import DEFAULT_RUNS, Examination
@@ -122,7 +121,7 @@ def _of(report: CheckReport, level: str) -> list[Finding]:
 
 def _print(report: CheckReport) -> None:
     out = console()
-    table = Table(show_header=False, title=f"worker {report.worker}", title_justify="left")
+    table = new_table("", "", show_header=False, title=f"worker {report.worker}")
     for name, value in _rows(report):
         table.add_row(name, value)
     if table.row_count:

@@ -11,7 +11,6 @@ from typing import Annotated
 
 import typer
 import zenoh
-from rich.table import Table
 
 from vla_zenoh.bus.host_id import HOST_VARIABLE
 from vla_zenoh.bus.session import open_session
@@ -21,7 +20,7 @@ from vla_zenoh.cli.options import (
     JsonOption,
     effective_profile,
 )
-from vla_zenoh.cli.output import console, errors, print_json, styled
+from vla_zenoh.cli.output import console, errors, new_table, print_json, styled
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
 from vla_zenoh.lab.doctor.access import AccessVerdict, access
@@ -99,10 +98,9 @@ def _rehearse(profile: Profile, rules: Path | None, also: Sequence[str]) -> list
 
 def show(findings: list[HostFinding]) -> None:
     """Print a table of findings and their counts."""
-    table = Table(header_style="bold")
-    table.add_column("what", no_wrap=True)
-    table.add_column("", no_wrap=True)
-    table.add_column("found and what to do", overflow="fold")
+    table = new_table("what", "", "found and what to do")
+    for column in table.columns[:2]:
+        column.no_wrap = True
     for finding in findings:
         text = finding.found if not finding.advice else f"{finding.found}\n-> {finding.advice}"
         table.add_row(finding.name, styled(finding.level, COLOURS[finding.level]), text)

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
-from rich.table import Table
 
 from vla_zenoh.cli.output import console, errors, fail, new_table, plain_types
 from vla_zenoh.lab.evaluation import tables
@@ -95,11 +93,9 @@ def _show(runs: Sequence[Evaluation]) -> None:
     if not runs:
         return
     screen = console()
-    table = Table(header_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     shown_columns = None if screen.width >= WIDE else tables.NARROW
-    for column in tables.SUMMARY_COLUMNS[:shown_columns]:
-        left = column == "run"
-        table.add_column(column, justify="left" if left else "right", overflow="fold")
+    columns = tables.SUMMARY_COLUMNS[:shown_columns]
+    table = new_table(*columns, left=("run",))
     for run in runs:
         row = tables.summary_row(run)[:shown_columns]
         table.add_row(*row)
@@ -120,7 +116,6 @@ def _show_latency(runs: Sequence[Evaluation]) -> None:
     columns = (*(["run"] if several else []), "stage", *tables.LATENCY_COLUMNS)
     columns += ("",) if wide else ()
     table = new_table(*columns, title="latency in ms", left=("run", "stage", ""))
-    table.box, table.padding = box.SIMPLE_HEAD, (0, 1, 0, 0)
     for run in runs:
         name = run.name
         for index, row in enumerate(tables.latency_rows(run)):
@@ -132,8 +127,8 @@ def _show_latency(runs: Sequence[Evaluation]) -> None:
 
 
 def _show_segments(run: Evaluation) -> None:
-    table = new_table(*tables.SEGMENT_COLUMNS, title="asked and reached", left=("prompt",))
-    table.box, table.padding = box.SIMPLE_HEAD, (0, 1, 0, 0)
+    title = "asked and reached"
+    table = new_table(*tables.SEGMENT_COLUMNS, title=title, left=("prompt",))
     for row in tables.segment_rows(run):
         table.add_row(*row)
     console().print(table)

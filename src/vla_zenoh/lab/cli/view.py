@@ -204,6 +204,7 @@ def _profile_of(file: Recording, name: str) -> Profile:
 
 
 def _summarise(logger: RerunLogger, save: Path | None) -> None:
+    logger.close()
     screen = errors()
     where = f" in {save}" if save is not None else ""
     screen.print(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable
 from typing import Any
 
@@ -42,6 +42,9 @@ DRAW_NS = 33_000_000
 """Shortest interval between two drawings of a state or command; every cause is logged."""
 APART_NS = 10_000_000_000
 """A stamp that far from the reception is of another clock: the reception counts."""
+NO_SPEC, UNFIT = "no_spec", "does not fit its spec"
+MAX_WAITING = 100
+"""Chunks kept until their spec is received: workers publish it once a second."""
 JPEG_BEGINS = b"\xff\xd8\xff"
 COMMAND_NODE = "command"
 APPLICATION = "vla-zenoh"
@@ -80,6 +83,7 @@ class RerunLogger:
         self._texts = TextPanels(stream, to_yaml(profile), missing)
         self._drawn_ns: dict[str, int] = {}
         self._specs: dict[str, ModelSpec] = {}
+        self._waiting: deque[tuple[str, int, ActionChunk]] = deque()
         self._obeyed = profile.task.worker
         self._commanded: PoseCommand | None = None
         self._widest_mm = profile.robot.gripper.max_width_m * 1e3
@@ -132,15 +136,21 @@ class RerunLogger:
                 self._setting(sample)
             self.shown[sample.key] += 1
         except CodecError as error:
-            self.rejected[f"{self.keys.short(sample.key)}: {error.reason}"] += 1
+            self._reject(sample.key, error.reason)
         except RecordError:
-            self.rejected[f"{self.keys.short(sample.key)}: does not fit its spec"] += 1
+            self._reject(sample.key, UNFIT)
+
+    def _reject(self, key: str, reason: str) -> None:
+        self.rejected[f"{self.keys.short(key)}: {reason}"] += 1
+
+    def _at(self, stamp_ns: int) -> None:
+        self._stream.set_time(paths.TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
 
     def _stamp_ns(self, sample: Sample) -> int:
         stamp_ns = sample.received_ns
         if sample.header is not None and abs(sample.header.stamp_wall_ns - stamp_ns) < APART_NS:
             stamp_ns = sample.header.stamp_wall_ns
-        self._stream.set_time(paths.TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
+        self._at(stamp_ns)
         return stamp_ns
 
     def _due(self, key: str, stamp_ns: int) -> bool:
@@ -174,7 +184,8 @@ class RerunLogger:
         self._stream.log(path, rr.EncodedImage(contents=sample.payload, media_type=JPEG))
 
     def _setting(self, sample: Sample) -> None:
-        if sample.header is not None or "/" in self.keys.short(sample.key):
+        nested = "/" in self.keys.short(sample.key) and sample.key != self.keys.sim_reset
+        if sample.header is not None or nested:
             raise CodecError("malformed", "neither a record nor a setting")
         self._texts.setting(self.keys.short(sample.key), settings.decode_text(sample.payload))
 
@@ -228,15 +239,37 @@ class RerunLogger:
     # -- models -------------------------------------------------------------------------------
     def _spec(self, _: Sample, stamp_ns: int, spec: ModelSpec) -> None:
         self._specs[spec.hash] = spec
+        waiting, self._waiting = self._waiting, deque()
+        for key, chunk_ns, chunk in waiting:
+            if chunk.spec_hash != spec.hash:
+                self._waiting.append((key, chunk_ns, chunk))
+                continue
+            self._at(chunk_ns)
+            try:
+                self._draw_chunk(chunk_ns, chunk, spec)
+            except RecordError:
+                self._reject(key, UNFIT)
+        self._at(stamp_ns)
 
-    def _chunk(self, _: Sample, stamp_ns: int, chunk: ActionChunk) -> None:
+    def _chunk(self, sample: Sample, stamp_ns: int, chunk: ActionChunk) -> None:
         spec = self._specs.get(chunk.spec_hash)
-        if spec is None:
-            raise CodecError("no_spec", "no spec of this chunk was received")
+        if spec is not None:
+            self._draw_chunk(stamp_ns, chunk, spec)
+            return
+        self._waiting.append((sample.key, stamp_ns, chunk))
+        if len(self._waiting) > MAX_WAITING:
+            self._reject(self._waiting.popleft()[0], NO_SPEC)
+
+    def _draw_chunk(self, stamp_ns: int, chunk: ActionChunk, spec: ModelSpec) -> None:
         obeyed = chunk.worker == self._obeyed
         self._scene.chunk(stamp_ns, chunk, spec, obeyed)
         if not obeyed:
             self._charts.shadow(chunk)
+
+    def close(self) -> None:
+        """Count the chunks whose spec was never received."""
+        while self._waiting:
+            self._reject(self._waiting.popleft()[0], NO_SPEC)
 
     def _on_seen(self, _: Sample, stamp_ns: int, seen: InferenceDebug) -> None:
         if seen.worker not in self._seen:

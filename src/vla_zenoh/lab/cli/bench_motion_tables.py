@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rich.box import SIMPLE
 from rich.table import Table
 from rich.text import Text
+
+from vla_zenoh.cli.output import new_table
 
 Row = dict[str, Any]
 
@@ -106,18 +107,7 @@ def thesis_table(rows: Sequence[Row], *, virtual: bool) -> Table:
 
 
 def _table(title: str, *columns: str) -> Table:
-    table = Table(
-        title=title,
-        title_justify="left",
-        caption_justify="left",
-        box=SIMPLE,
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
-    )
-    for column in columns:
-        left = column in ("prompt", "")
-        table.add_column(column, justify="left" if left else "right", no_wrap=column != "")
-    return table
+    return new_table(*columns, left=("prompt", ""), title=title)
 
 
 def _amounts(row: Row) -> tuple[str, str]:

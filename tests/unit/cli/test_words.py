@@ -11,12 +11,13 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from vla_zenoh.cli import drive, entry, status
+from vla_zenoh.cli import drive, status
+from vla_zenoh.cli import words as table
 from vla_zenoh.cli.main import app
 from vla_zenoh.cli.target import RobotTarget
 
 COMMANDS: Any = typer.main.get_command(app)
-VARIABLES = tuple(entry.VARIABLES)
+VARIABLES = tuple(table.VARIABLES)
 FORBIDDEN = ("typer", "rich", "pydantic", "yaml", "numpy", "cv2", "vla_zenoh.profile.schema")
 
 
@@ -26,25 +27,25 @@ def no_variables(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name, raising=False)
 
 
-@pytest.mark.parametrize("name", entry.WORDS)
+@pytest.mark.parametrize("name", table.WORDS)
 def test_the_table_of_a_word_is_the_signature_of_its_command(name: str) -> None:
-    word, options, arguments = entry.WORDS[name], {}, []
+    word, options, arguments = table.WORDS[name], {}, []
     for parameter in COMMANDS.commands[name].params:
         if parameter.param_type_name == "argument":
             arguments.append(parameter.name + ("" if parameter.required else "?"))
             assert (parameter.type_descriptor.annotation is float) == (
-                parameter.name in entry.NUMBERS
+                parameter.name in table.NUMBERS
             )
             continue
         assert not parameter.required, parameter.name
-        assert parameter.multiple == (parameter.name in entry.REPEATABLE)
+        assert parameter.multiple == (parameter.name in table.REPEATABLE)
         for option in (*parameter.opts, *parameter.secondary_opts):
             options[option] = parameter.name
             assert parameter.is_flag == (option in word.flags), option
-        known = [variable for variable, field in entry.VARIABLES.items() if field == parameter.name]
+        known = [variable for variable, field in table.VARIABLES.items() if field == parameter.name]
         assert ([parameter.envvar] if parameter.envvar else []) == known
     assert tuple(arguments) == word.arguments
-    assert options == {**word.flags, **entry.OPTIONS}
+    assert options == {**word.flags, **table.OPTIONS}
 
 
 LINES = (
@@ -86,7 +87,7 @@ def test_a_line_means_what_it_means_to_typer(
     for variable, value in environment.items():
         monkeypatch.setenv(variable, value)
     words = [word.strip("'") for word in line.split()]
-    parsed = entry.parse(words)
+    parsed = table.parse(words)
     assert parsed is not None
     name, arguments, target = parsed
     context = COMMANDS.commands[name].make_context(name, words[1:])
@@ -102,11 +103,11 @@ def test_a_line_means_what_it_means_to_typer(
 
 @pytest.mark.parametrize("line", MISTAKES)
 def test_help_and_mistakes_are_left_to_typer(line: str) -> None:
-    assert entry.parse(line.split()) is None
+    assert table.parse(line.split()) is None
 
 
 def test_every_word_has_its_function() -> None:
-    for name, word in entry.WORDS.items():
+    for name, word in table.WORDS.items():
         assert callable(
             getattr({drive.__name__: drive, status.__name__: status}[word.module], name)
         )

@@ -1,0 +1,125 @@
+"""Words that the shell completes: profiles, workers, models, prompts, keys and hosts.
+
+All imports are inside: a command that runs completes nothing.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+
+def _profile(context: Any) -> Any:
+    """The profile on the command line, else that of the environment, else the default."""
+    from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE
+    from vla_zenoh.errors import VlaZenohError
+    from vla_zenoh.profile import load_profile
+
+    given = context.params
+    name = given.get("profile") or next(iter(given.get("names") or ()), None)
+    name = name or os.environ.get(PROFILE_VARIABLE)
+    try:
+        return load_profile(name or DEFAULT_PROFILE)
+    except VlaZenohError:
+        return load_profile(DEFAULT_PROFILE)
+
+
+def profiles(context: Any) -> Iterable[str]:
+    """Names of profiles."""
+    from vla_zenoh.profile import profile_names
+
+    return profile_names()
+
+
+def models(context: Any) -> Iterable[str]:
+    """Workers of the profile, and names of models."""
+    from vla_zenoh.resources import names
+
+    return [*_profile(context).workers, *names("models")]
+
+
+def workers(context: Any) -> Iterable[str]:
+    """Workers of the profile."""
+    return _profile(context).workers
+
+
+def hosts(context: Any) -> Iterable[str]:
+    """Hosts of the profile."""
+    return _profile(context).hosts
+
+
+def cameras(context: Any) -> Iterable[str]:
+    """Cameras of the profile."""
+    return _profile(context).cameras
+
+
+def prompts(context: Any) -> Iterable[str]:
+    """The profile's prompt, one task of every kind, and the motions of the scripted worker."""
+    from vla_zenoh.policy.scripted_motions import HARD
+
+    tasks = ("put the red brick in the box", "stack the red brick on the green brick")
+    words = [_profile(context).task.prompt, *tasks, "push the red brick left", "hold"]
+    return [*words, *(f"HARD: {name}" for name in HARD)]
+
+
+def keys(context: Any) -> Iterable[str]:
+    """Keys of the robot, below ``<root>/<robot>/``."""
+    profile = _profile(context)
+    found = profile.keys
+    members = vars(type(found)).items()
+    named = [getattr(found, name) for name, kind in members if isinstance(kind, property)]
+    named += map(found.camera_jpeg, profile.cameras)
+    for worker in profile.workers:
+        named += [found.delta(worker), found.spec(worker), found.seen_record(worker)]
+    words = [found.short(word) for word in named if isinstance(word, str)]
+    return [word for word in words if "*" not in word]
+
+
+class Word(NamedTuple):
+    """A word for the shell; the fields are those that Typer reads."""
+
+    value: str
+    type: str = "plain"
+    help: str | None = None
+
+
+COMPLETIONS: Mapping[str, Callable[[Any], Iterable[str]]] = {
+    "profile": profiles,
+    "also": profiles,
+    "profile show.name": profiles,
+    "profile check.names": profiles,
+    "model": models,
+    "worker": workers,
+    "workers": workers,
+    "lab compare.a": workers,
+    "lab compare.b": workers,
+    "host": hosts,
+    "cameras": cameras,
+    "prompt": prompts,
+    "prompts": prompts,
+    "prompt.text": prompts,
+    "key": keys,
+    "keys": keys,
+}
+"""What completes a parameter, by its name; of one command where its words stand before."""
+NO_HOST_OF_A_LAB = "lab serve-openpi.host"
+
+
+def add_completion(parameter: Any, command: str) -> None:
+    """Let the shell complete a parameter of a command.
+
+    Args:
+        parameter: of the command line's library.
+        command: its words.
+    """
+    name = f"{command}.{parameter.name}"
+    words = COMPLETIONS.get(name) or COMPLETIONS.get(parameter.name)
+    if words is None or name == NO_HOST_OF_A_LAB:
+        return
+
+    def complete(context: Any, incomplete: str) -> list[Word]:
+        found = sorted({word for word in words(context) if word.startswith(incomplete)})
+        return [Word(word) for word in found]
+
+    parameter.shell_complete = complete
