@@ -347,3 +347,7 @@ NO_DEADMAN_TOKEN = "is not there (a liveliness token on the key holding/NAME)"
 def worker_node(worker: str) -> str:
     """Node name of a worker."""
     return f"worker-{worker}"
+
+
+CRASHED, STARTING = "crashed", "starting"
+"""States in the status that `vla-zenoh up` publishes for a node of its host that does not run."""

@@ -6,6 +6,7 @@ moves on.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -28,31 +29,52 @@ EXTRA_OF = {
 
 
 def main() -> None:
-    """Run the command line. Errors of this package become one line and exit code 1."""
+    """Run the command line. Errors of this package become one line and exit code 1.
+
+    Under a supervisor every error becomes one line for it, and the traceback lines for its log.
+    """
     try:
         _chosen(sys.argv[1:])()
-    except ImportError as error:
-        extra = EXTRA_OF.get((error.name or "").partition(".")[0])
-        if extra is None and ".so" not in str(error):
-            raise
-        from vla_zenoh.cli.plain import fail
-        from vla_zenoh.errors import how_to_install
-
-        fail(
-            f"{error}; install it with: {how_to_install(extra)}"
-            if extra
-            else f"{error}; `vla-zenoh doctor` names the system package"
-        )
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
-        from vla_zenoh.errors import VlaZenohError
+        from vla_zenoh.runtime.parent_watch import PARENT_VARIABLE
 
-        if not isinstance(error, VlaZenohError):
+        sentence = _sentence(error)
+        if PARENT_VARIABLE in os.environ:
+            _tell_supervisor(error, sentence)
+            sys.exit(1)
+        if sentence is None:
             raise
         from vla_zenoh.cli.plain import fail
 
-        fail(str(error))
+        fail(sentence)
+
+
+def _sentence(error: Exception) -> str | None:
+    """What a person is told of an expected error; None: it is a mistake in a program."""
+    from vla_zenoh.errors import VlaZenohError, how_to_install
+
+    if isinstance(error, VlaZenohError):
+        return str(error)
+    if not isinstance(error, ImportError):
+        return None
+    extra = EXTRA_OF.get((error.name or "").partition(".")[0])
+    if extra:
+        return f"{error}; install it with: {how_to_install(extra)}"
+    return f"{error}; `vla-zenoh doctor` names the system package" if ".so" in str(error) else None
+
+
+def _tell_supervisor(error: Exception, sentence: str | None) -> None:
+    import traceback
+
+    from vla_zenoh.cli.plain import say
+    from vla_zenoh.runtime.parent_watch import DETAIL, FATAL
+
+    for line in "".join(traceback.format_exception(error)).splitlines():
+        say(f"{DETAIL}{line}")
+    what = sentence or f"{type(error).__name__}: {error}"
+    say(f"{FATAL}{'; '.join(what.splitlines())}")
 
 
 def _chosen(words: Sequence[str]) -> Callable[[], None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from vla_zenoh.keys import CRASHED, STARTING
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import NodeStatus
 
@@ -18,9 +19,8 @@ MODE_WORDS = {
     UNKNOWN: ("MODE UNKNOWN", "no command node says whether a robot moves", "bold"),
 }
 """Mode -> (word in front of what moves, sentence, style)."""
-CRASHED, STARTING, MISSING, DEAD = "crashed", "starting", "missing", "dead"
+MISSING, DEAD = "missing", "dead"
 ON_BEHALF = frozenset({CRASHED, STARTING})
-"""States that `vla-zenoh up` publishes for a node that does not run."""
 
 
 class NodeRow(NamedTuple):

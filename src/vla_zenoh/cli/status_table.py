@@ -237,7 +237,7 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
         return _lines([one_line(each, MAX_WORDS) for each in bad])
     text = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
     if not text and "obeyed" in detail:
-        return f"{mode} moves the arm" if detail["obeyed"] else "standby"
+        return f"{mode} moves the arm" if detail["obeyed"] else "shadow mode"
     return one_line(text or _days_left(detail.get("certificates")), MAX_WORDS)
 
 

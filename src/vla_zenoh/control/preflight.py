@@ -41,6 +41,8 @@ class PeerSnapshot:
         holders: clients present as a deadman.
         camera_faults: camera -> why its images are invalid, by its node's status: the rest of a
             sentence that starts with ``camera NAME``.
+        camera_whys: camera -> why it sends no picture, by its node's status.
+        down: node of the profile that does not run -> why, by `vla-zenoh up` of its host.
     """
 
     alive: frozenset[str] = frozenset()
@@ -55,6 +57,13 @@ class PeerSnapshot:
     clocks: Mapping[str, ClockOffset] = field(default_factory=dict)
     holders: frozenset[str] = frozenset()
     camera_faults: Mapping[str, str] = field(default_factory=dict)
+    camera_whys: Mapping[str, str] = field(default_factory=dict)
+    down: Mapping[str, str] = field(default_factory=dict)
+
+    def not_alive(self, node: str) -> str:
+        """The end of a sentence about a node: that it is not alive, and why if that is known."""
+        why = self.down.get(node)
+        return f"is not alive: {why}" if why else "is not alive"
 
 
 def reasons_not_to_activate(
@@ -100,7 +109,7 @@ def _robot(
 ) -> list[str]:
     reasons: list[str] = []
     if peers.robot_node not in peers.alive:
-        reasons.append(f"the robot's node {peers.robot_node!r} is not alive")
+        reasons.append(f"the robot's node {peers.robot_node!r} {peers.not_alive(peers.robot_node)}")
     if pose is None:
         return [*reasons, "the TCP pose is not known: nothing received on state/pose"]
     reasons += _too_old("TCP pose", pose, profile, now_ns)
@@ -145,7 +154,8 @@ def _worker(worker: str, prompt: str, peers: PeerSnapshot) -> list[str]:
         others = sorted(
             name.removeprefix("worker-") for name in peers.alive if name.startswith("worker-")
         )
-        return [f"worker {worker!r} is not alive; alive are: {', '.join(others) or 'none'}"]
+        alive = ", ".join(others) or "none"
+        return [f"worker {worker!r} {peers.not_alive(node)}; alive are: {alive}"]
     spec = peers.specs.get(worker)
     if spec is None:
         return [f"worker {worker!r} has not published its spec"]
@@ -227,10 +237,15 @@ def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
             continue  # reported already, with the spec
         age_s = peers.camera_ages_s.get(camera, math.inf)
         node = peers.camera_nodes.get(camera)
-        if node is None or node not in peers.alive:
-            reasons.append(f"no living node serves camera {camera!r}")
+        server = profile.camera_servers()[camera]
+        if node is None and server in peers.alive and camera in peers.camera_whys:
+            reasons.append(f"camera {camera!r} sends no picture: {peers.camera_whys[camera]}")
+        elif node is None or node not in peers.alive:
+            down = f": {server} {peers.not_alive(server)}" if server in peers.down else ""
+            reasons.append(f"no living node serves camera {camera!r}{down}")
         elif age_s > CAMERA_PATIENCE_S:
-            reasons.append(f"camera {camera!r} has sent no picture for {age_s:.1f} s")
+            why = f": {peers.camera_whys[camera]}" if camera in peers.camera_whys else ""
+            reasons.append(f"camera {camera!r} has sent no picture for {age_s:.1f} s{why}")
         elif camera in peers.camera_faults:
             reasons.append(f"camera {camera!r} {peers.camera_faults[camera]}")
     return reasons
