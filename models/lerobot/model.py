@@ -73,7 +73,7 @@ class LeRobot:
 
     def __init__(
         self,
-        checkpoint: str = "",
+        checkpoint: str,
         state: str = "",
         map: str = "",
         size: str = "auto",

@@ -74,7 +74,7 @@ class OpenVLA:
 
     def __init__(
         self,
-        checkpoint: str = "",
+        checkpoint: str,
         unnorm_key: str = "",
         adapter: str = "",
         cameras: str = "front",

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import reprlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -130,9 +131,12 @@ _VALIDATION_WORDS = {
     "missing": "is missing",
     "extra_forbidden": "is not known here",
     "float_type": "wants a number",
+    "float_parsing": "wants a number",
     "int_type": "wants a whole number",
     "int_from_float": "wants a whole number",
+    "int_parsing": "wants a whole number",
     "bool_type": "wants true or false",
+    "bool_parsing": "wants true or false",
     "string_type": "wants text",
     "string_unicode": "holds half a character (a surrogate)",
     "tuple_type": "wants a list",
@@ -155,15 +159,69 @@ def describe_fault(fault: Any) -> str:
     """One entry of ``ValidationError.errors()``, as what is to be said after a field's name."""
     context = fault.get("ctx", {})
     if fault["type"] == "literal_error":
-        near = nearest(str(fault.get("input")), _QUOTED.findall(context["expected"]))
+        near = nearest(str(fault.get("input")), _QUOTED.findall(context["expected"]), "")
         return f"wants {context['expected']}{near}"
     words = _VALIDATION_WORDS.get(fault["type"])
     if words is not None:
         return words.format(**context)
-    return fault["msg"].removeprefix("Value error, ")
+    said = fault["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    if not said.startswith("Input should "):
+        return said
+    wanted = re.sub(r", unable to .*|(?<=a )valid ", "", said.removeprefix("Input should "))
+    return f"wants {wanted.removeprefix('be ')}"
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
-    """``; did you mean 'x'?`` where one of `known` is like `word`, else nothing."""
+def nearest(word: str, known: Iterable[str], otherwise: str = ".") -> str:
+    """``; did you mean 'x'?`` if one of `known` is like `word`, else `otherwise`."""
     close = difflib.get_close_matches(word, list(known), 1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    return f"; did you mean {close[0]!r}?" if close else otherwise
+
+
+def counted(count: int, noun: str) -> str:
+    """``1 error``, ``2 errors``."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+MAX_FOREIGN = 600
+"""Characters of another library's message that are kept."""
+
+
+def in_words(error: BaseException) -> str:
+    """Message of any exception, for a person: without addresses of manuals or unsafe advice.
+
+    A message of ours is kept. That of another library follows the name of its exception; faults of
+    a Pydantic model are named field by field, and a file that PyTorch refuses to unpickle is not
+    answered by its own advice to run what the file contains.
+    """
+    if isinstance(error, VlaZenohError):
+        return str(error)
+    faults = getattr(error, "errors", None)
+    if type(error).__name__ == "ValidationError" and callable(faults):
+        return f"{getattr(error, 'title', 'it')} is wrong: " + "; ".join(_fields(faults))
+    text = str(error)
+    if "weights_only" in text:
+        return (
+            f"{type(error).__name__}: the file holds Python objects beside weights, and loading "
+            "those runs code from the file. Convert it to safetensors, or save its state_dict() "
+            "alone, where you trust it"
+        )
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, KeyError) and error.args:
+        return f"KeyError: there is no {error.args[0]!r}"
+    name = type(error).__name__
+    text = text.strip()
+    short = text if len(text) <= MAX_FOREIGN else f"{text[:MAX_FOREIGN]} ..."
+    return f"{name}: {short}" if short else name
+
+
+def _fields(faults: Any) -> list[str]:
+    """Faults of a Pydantic model: field, what is wrong, what was given."""
+    out: list[str] = []
+    for fault in faults(include_url=False):
+        place = ".".join(str(part) for part in fault["loc"])
+        given = fault.get("input")
+        shown = isinstance(given, (str, int, float, bool)) and fault["type"] != "missing"
+        value = f" (given: {reprlib.repr(given)})" if shown else ""
+        out.append(f"{place}: " * bool(place) + describe_fault(fault) + value)
+    return out

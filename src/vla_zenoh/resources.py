@@ -6,11 +6,10 @@ Looked through in this order, first hit wins: an explicit path, each folder in `
 
 from __future__ import annotations
 
-import difflib
 import os
 from pathlib import Path
 
-from vla_zenoh.errors import MissingExtraError, ProfileError, ResourceError
+from vla_zenoh.errors import MissingExtraError, ProfileError, ResourceError, nearest
 
 PROFILE_SUFFIXES = (".yaml", ".yml")
 KINDS = {"models": (".py", ""), "profiles": PROFILE_SUFFIXES, "sim": ("",)}
@@ -74,13 +73,12 @@ def find(kind: str, name: str) -> Path:
             if path.exists() and (suffix or path.is_dir()):
                 return path
     known = names(kind)
-    near = difflib.get_close_matches(name, known, 1)
-    hint = f"; did you mean {near[0]!r}?" if near else "."
     own = f"by a profile's models: {{{name[:80]}: PATH}}, " if kind == "models" else ""
     raise ResourceError(
-        f"no {ONE[kind]} called {name!r}{hint} Known: {', '.join(known) or 'none'}. One of your "
-        f"own is found by its path, {own}or as {kind}/{name[:80]}{KINDS[kind][0]} below a folder "
-        f"that {SEARCH_PATH_VARIABLE} names"
+        f"no {ONE[kind]} called {name!r}{nearest(name, known)} "
+        f"Known: {', '.join(known) or 'none'}. One of your own is found by its path, "
+        f"{own}or as {kind}/{name[:80]}{KINDS[kind][0]} below a folder that "
+        f"{SEARCH_PATH_VARIABLE} names"
     )
 
 

@@ -56,7 +56,10 @@ ERRORS = {
     "gripper": ("gripper_range", "gripper 255, declared as open_fraction"),
     "grows": ("memory_growth", r"every inference keeps \d+ KiB"),
     "late": ("slower_than_chunk", r"its 4 steps of 0\.001 s are over by then"),
-    "camera": ("camera", "needs camera 'ceiling', the profile has: front, wrist"),
+    "camera": (
+        "camera",
+        "needs camera 'ceiling', the profile has: front, wrist; add it to",
+    ),
     "size": ("picture_size", "sends 640x480, the spec asks for 32x24"),
 }
 WARNINGS = {
@@ -390,4 +393,4 @@ def test_a_file_that_is_no_model_is_named() -> None:
     assert done.returncode == 1
     (finding,) = json.loads(done.stdout)["findings"]
     assert finding["name"] == "cannot_be_made"
-    assert "options it takes: file" in finding["why"]
+    assert "Its options: file" in finding["why"]

@@ -189,9 +189,39 @@ def test_a_killed_supervisor_that_nobody_has_buried_yet_counts_as_gone(tmp_path:
         ends(running)
 
 
+def test_a_profile_that_cannot_run_starts_nothing(tmp_path: Path) -> None:
+    with up(str(write_profile(tmp_path, more="robot: {tcp_frame: nobody}\n"))) as running:
+        running.process.wait(READY_PATIENCE_S)
+        running.thread.join(5.0)
+        assert running.process.returncode == 1
+        assert "robot: panda.urdf has no link 'nobody'" in running.text
+        assert "nothing was started" in running.text
+        assert "started (pid" not in running.text
+
+
+ARM_WITHOUT_CABLE = """
+class Arm:
+    def __init__(self): raise RuntimeError("no cable")
+    def read(self): ...
+    def move(self, command): ...
+"""
+WITHOUT_CABLE = """
+extends: small
+robot: {driver: arm}
+arm: {file: ./without_cable.py}
+cameras: null
+options: {scripted: {camera: ""}}
+hosts: {here: {nodes: [router, arm, command, worker]}}
+"""
+
+
 @pytest.mark.slow
 def test_a_node_that_dies_at_every_start_is_given_up(tmp_path: Path) -> None:
-    with up(str(write_profile(tmp_path, more="robot: {tcp_frame: nobody}\n"))) as running:
+    (tmp_path / "without_cable.py").write_text(ARM_WITHOUT_CABLE)
+    write_profile(tmp_path)
+    path = tmp_path / "arm.yaml"
+    path.write_text(WITHOUT_CABLE)
+    with up(str(path)) as running:
         began = time.monotonic()
         running.process.wait(GIVE_UP_S)
         running.thread.join(5.0)
@@ -200,12 +230,25 @@ def test_a_node_that_dies_at_every_start_is_given_up(tmp_path: Path) -> None:
         assert running.children() == {}
         assert f"crashed {GIVE_UP_AFTER} times in a row; giving up" in running.text
         assert "dies again and again" in running.text
-        assert "has no link 'nobody'" in running.text
+        assert "Arm cannot be made: RuntimeError: no cable" in running.text
+
+
+DIES_IN_LOAD = """
+import os
+from vla_zenoh.policy import ActionSpec, ModelSpec
+
+class Dies:
+    spec = ModelSpec(name="dies", action=ActionSpec(horizon=1, dt_s=0.1))
+    def load(self): os._exit(3)
+    def infer(self, observation): ...
+"""
 
 
 @pytest.mark.slow
 def test_a_worker_that_dies_at_every_start_leaves_the_robot_to_the_others(tmp_path: Path) -> None:
-    path = write_profile(tmp_path, more="workers: [scripted, missing_model]\n")
+    (tmp_path / "dies.py").write_text(DIES_IN_LOAD)
+    more = "workers: [scripted, dies]\nmodels: {dies: ./dies.py}\n"
+    path = write_profile(tmp_path, more=more)
     with up(str(path)) as running, client_of(path) as (client, recorder):
         said = f"crashed {GIVE_UP_AFTER} times in a row; not restarting it"
         until("it is left alone", lambda: said in running.text, GIVE_UP_S)

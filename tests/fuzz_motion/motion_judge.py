@@ -361,8 +361,10 @@ class Judge:
         for share in set(shares.tolist()) - {0.0, 1.0}:
             its = shares == share
             slow = limits * share ** np.array([[1.0], [2.0], [3.0]])
-            down, up = ends_of(*(part[its] for part in (*motion, ahead)), slow)
-            low[its], high[its] = np.minimum(low[its], down), np.maximum(high[its], up)
+            moved = [part[its] for part in (*motion, ahead)]
+            for more in (None, unreversed(*moved[:2], slow, limits)):
+                down, up = ends_of(*moved, slow, more)
+                low[its], high[its] = np.minimum(low[its], down), np.maximum(high[its], up)
         # An axis whose own goal stays keeps the ends it had.
         stays = np.abs(goal_m[begins[1:]] - goal_m[begins[1:] - 1]) <= 1e-10
         stays &= usable[begins[1:] - 1, None]
@@ -533,7 +535,20 @@ def brake_range(p: Array, v: Array, a: Array, limits: Array) -> tuple[Array, Arr
     return low, high
 
 
-def ends_of(v: Array, a: Array, ahead: Array, limits: Array) -> tuple[Array, Array]:
+def unreversed(v: Array, a: Array, limits: Array, most: Array) -> Array:
+    """(n, 6) how much of the jerk of `limits` ends each acceleration before its axis reverses.
+
+    At least 1, and no more than there is in `most`. An axis that reverses with less jerk may take
+    it, and goes further with it than if it reversed.
+    """
+    slows = v * a < 0
+    needed = np.where(slows, a * a / (2 * np.maximum(np.abs(v), 1e-6)), 0.0)
+    return np.clip(needed, limits[2], most[2]) / limits[2]
+
+
+def ends_of(
+    v: Array, a: Array, ahead: Array, limits: Array, jerks: Array | None = None
+) -> tuple[Array, Array]:
     """Between what ends, from where it is, each axis stays on the way to a goal, (n, 6) each.
 
     That is here, the goal, and where a brake would end: each axis by itself, or, of a motion that
@@ -544,6 +559,7 @@ def ends_of(v: Array, a: Array, ahead: Array, limits: Array) -> tuple[Array, Arr
         a: (n, 6) acceleration.
         ahead: (n, 6) way to the goal.
         limits: (3, 6).
+        jerks: (n, 6) factors of the limits of jerk.
     """
     low, high = np.minimum(ahead, 0.0), np.maximum(ahead, 0.0)
     shares = [np.ones(v.shape)]
@@ -556,7 +572,7 @@ def ends_of(v: Array, a: Array, ahead: Array, limits: Array) -> tuple[Array, Arr
         straight = np.ones(len(v), bool)
         for order, (part, length) in enumerate(zip(parts, scale, strict=True)):
             off = part - (part * along).sum(axis=1, keepdims=True) * along
-            little = beside * limits[order, axes].min() if order < 2 else beside * length
+            little = beside * limits[order, axes].min() if order < 2 else beside * length + SAME
             straight &= np.linalg.norm(off, axis=1) <= 1e-6 * length + 1e-9 + little
         ratio = np.abs(along) / limits[1, axes]
         together = ratio / np.maximum(ratio.max(axis=1, keepdims=True), 1e-300) * (1 - beside)
@@ -566,6 +582,8 @@ def ends_of(v: Array, a: Array, ahead: Array, limits: Array) -> tuple[Array, Arr
     for share in shares:
         for axis in range(v.shape[1]):
             scaled = limits[:, axis, None] * share[:, axis]
+            if jerks is not None:
+                scaled[2] *= jerks[:, axis]
             down, up = brake_range(np.zeros(len(v)), v[:, axis], a[:, axis], scaled)
             low[:, axis] = np.minimum(low[:, axis], down)
             high[:, axis] = np.maximum(high[:, axis], up)

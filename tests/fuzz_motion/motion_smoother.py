@@ -21,6 +21,7 @@ from motion_judge import (
     ends_of,
     log_of,
     norms,
+    unreversed,
 )
 
 from vla_zenoh.control.smoothing import ROTATION_BOX, Motion, MotionLimits, Shares, Smoother
@@ -182,11 +183,15 @@ class _Way(NamedTuple):
         ahead = np.hstack([wanted - place[at], turned])
         low, high = ends_of(v, a, ahead, box)
         if any(min(part) < 1.0 for part in parts):
-            # With less of them it may go as far as a brake would with that much.
+            # With less of them it may go as far as a brake would with that much, and with what
+            # jerk it takes where an axis would get too fast, or turn round.
             for n, part in enumerate(parts):
                 one = slice(n, n + 1)
-                down, up = ends_of(v[one], a[one], ahead[one], box * np.array(part)[:, None])
-                low[one], high[one] = np.minimum(low[one], down), np.maximum(high[one], up)
+                moved, scaled = (v[one], a[one], ahead[one]), box * np.array(part)[:, None]
+                whole_jerk = np.full((1, 6), 1.0 / part.jerk)
+                for more in (None, unreversed(*moved[:2], scaled, box), whole_jerk):
+                    down, up = ends_of(*moved, scaled, more)
+                    low[one], high[one] = np.minimum(low[one], down), np.maximum(high[one], up)
         beyond = np.zeros(6)
         for n, begin in enumerate(begins):
             end = begins[n + 1] if n + 1 < len(begins) else len(motions)
@@ -195,12 +200,9 @@ class _Way(NamedTuple):
             )
             over = np.maximum(low[n] - moved, moved - high[n]).max(axis=0)
             beyond = np.maximum(beyond, over)
-        # With parts of the limits more of the jerk is taken than the part that is asked for, where
-        # the arm would get too fast: between the ends that both allow.
-        more = 50 if any(min(part) < 1.0 for part in parts) else 1
         for name, over, limit, unit in (
-            ("way", float(beyond[:3].max()), more * WANDER_M, "mm"),
-            ("turn", float(beyond[3:].max()), more * WANDER_RAD, "mrad"),
+            ("way", float(beyond[:3].max()), WANDER_M, "mm"),
+            ("turn", float(beyond[3:].max()), WANDER_RAD, "mrad"),
         ):
             if over > limit:
                 bad.append((f"smoother: a {name} leaves its ends", over * 1e3, unit, shape))

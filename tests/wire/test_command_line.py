@@ -57,7 +57,9 @@ def test_a_session_from_prompt_to_reset(chain: Chain) -> None:
     assert f"stopped: {named}; {how}" in ok(chain, "stop")
     refused = run(chain, "activate")
     assert refused.returncode == REFUSED
-    assert "the state is stopped (emergency stop); reset it first" in refused.stderr
+    assert (
+        "the state is stopped (emergency stop); clear it with `vla-zenoh reset`" in refused.stderr
+    )
     assert "reset; inactive" in ok(chain, "reset")
 
 

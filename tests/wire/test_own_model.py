@@ -83,5 +83,5 @@ def test_a_model_that_cannot_be_made_is_told_by_its_own_last_lines(model: Path) 
     words = ["bench", "task", "--model", str(model), "--episodes", "1", "--set", "colour=red"]
     done = command_line(*words, timeout_s=TIMEOUT_S)
     assert done.returncode == 1
-    assert "options it takes: step_m" in done.stderr
+    assert "Its options: step_m" in done.stderr
     assert "error: worker-riser dies again and again: " in done.stderr

@@ -135,7 +135,7 @@ def test_a_stop_is_obeyed_at_once_and_latched_until_reset(chain: Chain) -> None:
     stood_s = chain.recorder.track().time_to_stand_s(stopped_ns)
     print(f"stop: to rest in {stood_s:.3f} s")
     assert stood_s < STOP_S + BUSY_S
-    with pytest.raises(SessionError, match="reset it first"):
+    with pytest.raises(SessionError, match="clear it with `vla-zenoh reset`"):
         chain.client.activate()
     chain.client.publish(chain.client.keys.active, "false")
     time.sleep(0.2)

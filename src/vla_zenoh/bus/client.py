@@ -16,7 +16,7 @@ import zenoh
 from vla_zenoh.bus.buffers import bytes_of, header_of
 from vla_zenoh.bus.node_registry import MAX_STATUS_BYTES, NodeRegistry
 from vla_zenoh.bus.session import put_text
-from vla_zenoh.codec import records
+from vla_zenoh.codec import records, settings
 from vla_zenoh.codec.settings import encode_deadman_activation
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, last_chunk
@@ -185,13 +185,18 @@ class Client:
         Raises:
             SessionError: it was rejected, with the reasons, or not accepted in time.
         """
-        wanted = prompt.strip()
+        wanted = settings.decode_text(prompt.encode())
         return self._set(
             self.keys.prompt, prompt, lambda task: task.prompt == wanted, "prompt", timeout_s
         )
 
     def set_rate(self, rate_hz: float, timeout_s: float = 2.0) -> Task:
-        """Set the rate of action chunks, as `set_prompt`."""
+        """Set the rate of action chunks, as `set_prompt`.
+
+        Raises:
+            CodecError: it is not allowed.
+        """
+        settings.decode_rate(f"{rate_hz:g}".encode())
         return self._set(
             self.keys.rate,
             f"{rate_hz:g}",
@@ -212,10 +217,16 @@ class Client:
         def taken(task: Task) -> bool:
             return math.isclose(task.speed_percent, percent, rel_tol=1e-5, abs_tol=1e-9)
 
+        settings.decode_percent(f"{percent:g}".encode())
         return self._set(key, f"{percent:g}", taken, what, timeout_s)
 
     def set_worker(self, worker: str, timeout_s: float = 2.0) -> Task:
-        """Choose the worker whose chunks are carried out, as `set_prompt`."""
+        """Choose the worker whose chunks are carried out, as `set_prompt`.
+
+        Raises:
+            CodecError: it cannot be a worker's name.
+        """
+        settings.decode_name(worker.encode())
         return self._set(
             self.keys.worker, worker, lambda task: task.worker == worker, "worker", timeout_s
         )
@@ -325,8 +336,12 @@ class Client:
         if "command" not in self.alive:
             raise SessionError(f"{what}: no command node of robot {self.keys.robot!r} is running")
         status = self.status("command")
-        why = f"; its status: {status.detail.get('why', '')}" if status else ""
-        raise SessionError(f"{what}: not accepted by the command node within {timeout_s:g} s{why}")
+        state = f"its state is {status.state}" if status else "it has not reported its state yet"
+        raise SessionError(
+            f"{what}: the command node of robot {self.keys.robot!r} is alive, but did not accept "
+            f"this within {timeout_s:g} s; {state}. It may just have started: try again, or see "
+            "`vla-zenoh status`"
+        )
 
     def _taken(self, taken: Callable[[Task], bool], since_s: float) -> Task | None:
         with self._lock:

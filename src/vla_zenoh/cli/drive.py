@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 from vla_zenoh.cli.node_rows import MODE_WORDS, mode_of
 from vla_zenoh.cli.plain import BOLD_RED, complain, fail, say, say_marked, warn
 from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.codec.settings import decode_name, decode_percent, decode_rate, decode_text
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import Keys
 
@@ -35,6 +36,7 @@ def prompt(
     text: Annotated[str, typer.Argument(help="What the model shall do.")], target: RobotTarget
 ) -> None:
     """Set the prompt. Any Zenoh client can: put the text on <root>/<robot>/prompt."""
+    decode_text(text.encode())  # rejects it before a router is asked
     with target.operator("prompt", text) as client:
         task = client.set_prompt(text)
         _show(
@@ -117,6 +119,7 @@ def use(
     target: RobotTarget,
 ) -> None:
     """Select the worker that moves the arm; the others keep running."""
+    decode_name(worker.encode())
     with target.operator("use", worker) as client:
         _show(target, client, f"worker: {client.set_worker(worker).worker}")
 
@@ -125,6 +128,7 @@ def rate(
     rate_hz: Annotated[float, typer.Argument(help="Chunks per second.")], target: RobotTarget
 ) -> None:
     """Set how often the workers infer."""
+    decode_rate(f"{rate_hz:g}".encode())
     with target.operator("rate", f"{rate_hz:g}") as client:
         _show(target, client, f"rate: {client.set_rate(rate_hz).rate_hz:g} Hz")
 
@@ -137,8 +141,6 @@ def speed(
     ] = None,
 ) -> None:
     """Slow the arm down on the same path. Lowering needs only the right to stop."""
-    from vla_zenoh.codec.settings import decode_percent
-
     wanted = None if percent is None else decode_percent(percent.encode())
     with target.client(stop=wanted is not None) as client:
         task = client.wait_for(lambda: client.task, PATIENCE_S)
@@ -238,7 +240,7 @@ def _fail(target: RobotTarget, client: Client, command: str, what: str) -> NoRet
 
 def _stop_all(target: RobotTarget, own: Client) -> None:
     from vla_zenoh.bus.client import Client
-    from vla_zenoh.bus.liveliness import alive_robots
+    from vla_zenoh.bus.session import alive_robots
 
     robots: list[str] = []
     give_up = time.monotonic() + DISCOVERY_S

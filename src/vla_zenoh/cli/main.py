@@ -14,6 +14,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from vla_zenoh import __version__
 from vla_zenoh.cli.words import WORDS
+from vla_zenoh.errors import describe_fault
 
 NODES = frozenset({"up", "worker", "node"})
 """Commands that write a log; Zenoh's own log belongs into it."""
@@ -183,6 +184,19 @@ def _lazy_group(
         def _line(self, name: str, entry: str | Group) -> str:
             line = entry.help if isinstance(entry, Group) else _short_help(entry)
             return line or self.commands[name].short_help
+
+        def invoke(self, ctx: Any) -> Any:
+            try:
+                return super().invoke(ctx)
+            except typer.BadParameter as error:
+                faults = getattr(error.__cause__, "errors", None)
+                if callable(faults):  # Typer repeats Pydantic, which leaves out what was given
+                    fault: Any = next(iter(faults(include_url=False)))  # pyright: ignore
+                    given = (
+                        "" if fault["type"] == "value_error" else f" (given: {fault['input']!r})"
+                    )
+                    error.message = describe_fault(fault) + given
+                raise
 
     return LazyGroup
 

@@ -12,9 +12,9 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from vla_zenoh.bus.host_id import HOST_VARIABLE
+from vla_zenoh.bus.clock import HOST_VARIABLE
 from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE
-from vla_zenoh.policy.loader import ModelFile, find_worker
+from vla_zenoh.policy.loader import ConstructorOptions, ModelFile, find_worker
 from vla_zenoh.profile import Profile, load_profile, override
 
 ProfileOption = Annotated[
@@ -108,7 +108,16 @@ def effective_profile(
     Raises:
         ProfileError: the profile is invalid.
     """
-    profile = load_profile(name)
+    return overridden(load_profile(name), connect, listen, host)
+
+
+def overridden(
+    profile: Profile,
+    connect: list[str] | None = None,
+    listen: list[str] | None = None,
+    host: str | None = None,
+) -> Profile:
+    """A profile with endpoints of the command line in place of its own; see `effective_profile`."""
     changes: dict[str, Any] = {}
     if host is not None and profile.session.security is not None:
         changes["security"] = {"host": host}
@@ -170,14 +179,19 @@ class ModelOptions:
 
         Raises:
             ResourceError: there is no such model.
-            WorkerError: its header cannot be read.
+            WorkerError: its header cannot be read, or it has no such option.
             typer.BadParameter: an option is not ``name=value``.
         """
         given = model_options(self.settings or [])
         own, model = find_worker(word, profile.models if profile is not None else {})
         called = name or own
         usual = profile.options.get(called, {}) if profile is not None else {}
-        return WorkerChoice(called, model, {**usual, **given})
+        chosen = {**usual, **given}
+        # Before an environment is made for the model, which may take minutes and gigabytes.
+        declared = ConstructorOptions.declared(model.path) if model.missing() else None
+        if declared is not None:
+            declared.check(chosen, str(model.path))
+        return WorkerChoice(called, model, chosen)
 
 
 def model_options(given: list[str]) -> dict[str, str]:

@@ -153,7 +153,7 @@ class RobotTarget:
 
     def others(self, client: Client) -> list[str]:
         """Other robots whose command node is alive."""
-        from vla_zenoh.bus.liveliness import alive_robots
+        from vla_zenoh.bus.session import alive_robots
 
         return [
             name for name in alive_robots(client.session, client.keys) if name != client.keys.robot

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import logging.handlers
 import os
+import subprocess
+import sys
 import threading
 import zlib
 from pathlib import Path
@@ -21,17 +23,18 @@ from vla_zenoh.cli.options import (
     ListenOption,
     effective_profile,
 )
-from vla_zenoh.cli.output import console, styled
+from vla_zenoh.cli.output import console, errors, fail, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import load_profile, profile_file
 from vla_zenoh.resources import is_path
-from vla_zenoh.runtime.launch import Host, choose_host
+from vla_zenoh.runtime.launch import Host, choose_host, host_lock
 from vla_zenoh.runtime.parent_watch import DETAIL, FATAL
 from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
 
 LOG_BYTES = 10 * 1024 * 1024
 COLOURS = ("cyan", "magenta", "green", "yellow", "blue", "bright_cyan", "bright_magenta")
+CHECK_PATIENCE_S = 60.0
 
 
 def up(
@@ -55,11 +58,20 @@ def up(
         ),
     ] = None,
 ) -> None:
-    """Start and supervise all nodes of this host. Ctrl-C brakes the arm, then ends them."""
+    """Start and supervise all nodes of this host. Ctrl-C brakes the arm, then ends them.
+
+    The profile is checked first, as `profile check` does; nothing starts if it cannot run.
+    """
     stop = stop_on_signals()
     die_with_parent()
     loaded = effective_profile(profile, connect, listen)
     name, _ = choose_host(loaded, host)
+    once = host_lock(loaded, name)
+    once.take()  # says at once who runs already; the host takes it again
+    once.release()
+    reject_wrong(profile, host, connect, listen)
+    if stop.is_set():
+        raise typer.Exit(130)
     file, logger = log_file(log_dir or default_log_folder(), f"{loaded.robot.name}-{name}")
     out = console()
     lock = threading.Lock()
@@ -117,6 +129,34 @@ def log_file(folder: Path, name: str) -> tuple[Path, logging.Logger]:
     logger = logging.Logger("up", logging.DEBUG)
     logger.addHandler(handler)
     return path, logger
+
+
+def reject_wrong(
+    profile: str, host: str | None, connect: list[str] | None, listen: list[str] | None
+) -> None:
+    """Exit with the errors of ``vla-zenoh profile check``, if there are any.
+
+    A process of its own checks: models are imported there, which may take much memory.
+    """
+    words = ["profile", "check", profile]
+    words += ["--host", host] if host is not None else []
+    for option, endpoints in (("--connect", connect), ("--listen", listen)):
+        words += [word for endpoint in endpoints or () for word in (option, endpoint)]
+    command = [sys.executable, "-m", "vla_zenoh", *words]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", timeout=CHECK_PATIENCE_S
+        )
+    except subprocess.TimeoutExpired:
+        why = f"the check of the profile took over {CHECK_PATIENCE_S:g} s; starting without it"
+        errors().print(styled(why, "yellow"), soft_wrap=True)
+        return
+    if done.returncode == 0:
+        return
+    lines = done.stderr.splitlines() or [f"`profile check` ended with code {done.returncode}"]
+    for line in lines:
+        errors().print(styled(line, "red"), soft_wrap=True)
+    fail(f"nothing was started: {profile} has faults, which `vla-zenoh profile check` names too")
 
 
 def target_of(profile: str, running: Host) -> RobotTarget:

@@ -82,11 +82,17 @@ def decode_rate(payload: bytes) -> float:
     """
     word = decode_text(payload)
     if not _NUMBER.fullmatch(word):
-        raise CodecError("invalid", f"{word[:40]!r} is not a number of Hz")
+        raise CodecError(
+            "invalid",
+            f"rate {word[:40]!r} is not a number: give {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} chunks "
+            "per second",
+        )
     rate_hz = float(word)
     if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
         raise CodecError(
-            "invalid", f"rate {word[:40]!r} Hz is outside [{MIN_RATE_HZ:g}, {MAX_RATE_HZ:g}]"
+            "invalid",
+            f"rate {word[:40]!r} Hz is out of range: give {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} "
+            "chunks per second",
         )
     return rate_hz
 
@@ -105,7 +111,9 @@ def decode_percent(payload: bytes) -> float:
         )
     percent = float(number)
     if not 0.0 <= percent <= 100.0:
-        raise CodecError("invalid", f"speed {word[:40]!r} percent is outside [0, 100]")
+        raise CodecError(
+            "invalid", f"speed {word[:40]!r} percent is out of range: give 0 to 100 percent"
+        )
     return abs(percent)  # of "-0"
 
 

@@ -22,16 +22,19 @@ from vla_zenoh.control.commander_io import (
     make_event,
 )
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
-from vla_zenoh.control.joint_monitor import JointMonitor
+from vla_zenoh.control.joint_monitor import JOINT_PATIENCE_S, JointMonitor, joint_state_faults
 from vla_zenoh.control.limits import Slowdown
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.plan_timeline import EpisodeProgress, Goal, Plan
-from vla_zenoh.control.preflight import PeerSnapshot, reasons_not_to_activate
+from vla_zenoh.control.preflight import (
+    PeerSnapshot,
+    reasons_by_joints,
+    reasons_not_to_activate,
+)
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watchdog import Deadman, Watchdog
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.joint_check import JOINT_PATIENCE_S, joint_state_faults
 from vla_zenoh.kinematics.so3 import held_pose, pose_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
@@ -269,12 +272,17 @@ class Commander:
             return
         if self.state is not State.INACTIVE:
             self._reject_setting(
-                "activate", [f"the state is {self.state.value} ({self.why}); reset it first"]
+                "activate",
+                [
+                    f"the state is {self.state.value} ({self.why}); clear it with `vla-zenoh "
+                    "reset`, or put anything on the key reset"
+                ],
             )
             return
         lease, reasons = self._preflight(self.task.worker, now_ns)
         reasons += self.deadman.reasons_against(holder, self._peers.holders)
-        reasons += self._motion.unsettled(now_ns)
+        self._measure()
+        reasons += self._motion.unsettled()
         if lease is None or self.pose is None or self.gripper_state is None or reasons:
             self._reject_setting("activate", reasons + self._ended_before())
             return
@@ -320,6 +328,11 @@ class Commander:
             reasons += joint_state_faults(
                 self.profile, self.reach.kinematics, self.joint, self.pose, now_ns
             )
+            spec = self._peers.specs.get(worker)
+            if spec is not None and chunk is not None and self.joint is not None:
+                reasons += reasons_by_joints(
+                    self.profile, worker, spec, chunk.record, self.reach.kinematics, self.joint
+                )
         if self.joint is not None and self.pose is not None:
             writers = {self.joint.header.source, self.pose.header.source}
             if len(writers) > 1:
@@ -420,10 +433,14 @@ class Commander:
         self._watchdog.expect_next(max(plan.end_ns, now_ns), rate_hz, now_ns, speed)
 
     # -- supervision --------------------------------------------------------------------------
+    def _measure(self) -> None:
+        if self.pose is not None:
+            self._motion.measure(self.pose.record, self.pose.received_ns)
+
     def _supervise(self, now_ns: int) -> None:
         if self.pose is not None:
             self._watchdog.measure(self._motion.commanded, pose_of(self.pose.record))
-            self._motion.measure(self.pose.record, now_ns)
+        self._measure()
         if self._retreat.busy and not self._may_retreat(now_ns):
             self._retreat.end()
         if self.state not in OBEYING:

@@ -114,6 +114,7 @@ class MotionPipeline:
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
         self._standing: tuple[Pose, int] | None = None
+        self._measured_ns = 0
         self._timing: StepTiming | None = None
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
@@ -199,16 +200,20 @@ class MotionPipeline:
             self.timeline.restart(goal, now_ns)
         self.goal = None if blocked else goal
 
-    def measure(self, measured: PoseState, now_ns: int) -> None:
-        """Track whether the robot still moves while the stream stands."""
+    def measure(self, measured: PoseState, received_ns: int) -> None:
+        """Track whether the robot still moves while the stream stands.
+
+        A record that is repeated does not show that the robot stands.
+        """
         if not self.streaming or not self.at_rest:
             self._standing = None
             return
         held = held_pose(measured)
         if self._standing is None or max(pose_distance(held, self._standing[0])) > SETTLED:
-            self._standing = held, now_ns
+            self._standing = held, received_ns
+        self._measured_ns = received_ns
 
-    def unsettled(self, now_ns: int) -> list[str]:
+    def unsettled(self) -> list[str]:
         """Reasons against an activation now: the robot still moves to the end of the stream.
 
         A robot that has braked by itself stands elsewhere: a new stream begins there.
@@ -217,7 +222,7 @@ class MotionPipeline:
             return []
         held, since_ns = self._standing
         apart_m, apart_rad = pose_distance(self._smoother.motion.pose, held)
-        if self._near(apart_m, apart_rad) or now_ns - since_ns > SETTLED_NS:
+        if self._near(apart_m, apart_rad) or self._measured_ns - since_ns > SETTLED_NS:
             return []
         return [
             f"the robot is still {apart_m:.3f} m and {apart_rad:.3f} rad from its last command; "

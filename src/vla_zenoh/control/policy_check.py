@@ -89,7 +89,8 @@ def _cameras(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
             yield error(
                 "camera",
                 f"needs camera {camera.camera!r}, the profile has: "
-                f"{', '.join(profile.cameras) or 'none'}",
+                f"{', '.join(profile.cameras) or 'none'}; add it to cameras, or name another in "
+                "the model's options",
             )
             continue
         yield from _size(profile, camera)
@@ -123,7 +124,8 @@ def _joints(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
         return
     yield warning(
         "too_few_joints",
-        f"{short}: steps that it has no joint for are shortened, to nothing at worst (limit reach)",
+        f"{short}: steps that it has no joint for are shortened, to nothing at worst (limit "
+        "reach); `vla-zenoh profile check` names the axes",
     )
 
 
@@ -196,6 +198,107 @@ def check_chunk(
     ]
 
 
+NEAR_RAD = 0.3
+FAR_M = 0.1
+
+
+def joints_as_pose(
+    spec: ActionSpec, steps: Steps, joints_rad: NDArray[np.float64], limits: Limits
+) -> list[Finding]:
+    """An error if absolute poses look like joint positions, of which a step has as many numbers.
+
+    Args:
+        spec: the declared meaning of the numbers.
+        steps: (H, D).
+        joints_rad: (n,) of the arm at the observation.
+        limits: of the robot.
+    """
+    count = len(joints_rad)
+    if spec.kind != "absolute" or spec.dimension not in (count, count + 1):
+        return []
+    first = steps[:, :count].astype(np.float64)
+    low, high = _box(limits)
+    position_m = steps[:, :3].astype(np.float64) * spec.position_scale_m
+    outside_m = np.maximum(low - position_m, position_m - high).max(axis=1)
+    away_rad = float(np.abs(first[0] - joints_rad).max())
+    if away_rad > NEAR_RAD and float(outside_m.min()) <= FAR_M:
+        return []
+    like = (
+        f"its first {count} numbers are within {away_rad:.2f} of the joints in rad"
+        if away_rad <= NEAR_RAD
+        else f"every pose is {float(outside_m.min()):.2f} m or more outside the workspace"
+    )
+    return [
+        error(
+            "joints_as_pose",
+            f"declared as absolute poses (x, y, z, {spec.rotation}), but {like}, and a step has as "
+            f"many numbers as this arm has joints: these are joint positions. Turn them into poses "
+            "of the TCP, as vla_zenoh.interop.action_semantics.make_forward does",
+        )
+    ]
+
+
+def beyond_joints(
+    spec: ActionSpec,
+    steps: Steps,
+    jacobian: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+) -> list[str]:
+    """Axes along which a chunk of deltas asks an arm for what its joints cannot do, with amounts.
+
+    Args:
+        spec: the declared meaning of the numbers.
+        steps: (H, D).
+        jacobian: (6, n) of the TCP in base axes, linear first.
+        rotation: (3, 3) of the TCP, for deltas in its frame.
+    """
+    if spec.kind != "delta" or jacobian.shape[1] >= POSE_JOINTS:
+        return []
+    asked = np.zeros(6)
+    asked[:3] = steps[:, :3].sum(axis=0) * spec.position_scale_m
+    asked[3:] = steps[:, 3:6].sum(axis=0) * (2.0 if spec.rotation == "quaternion" else 1.0)
+    if spec.frame == "tcp":
+        asked = np.concatenate([rotation @ asked[:3], rotation @ asked[3:]])
+    scale = np.array([1.0] * 3 + [_LEVER_M] * 3)
+    lost = float(np.linalg.norm(scale * lost_motion(jacobian, asked)))
+    if lost <= LOST_SHARE * float(np.linalg.norm(scale * asked)):
+        return []  # together the axes are one motion of the joints, as those of a model for it
+    blocked = immovable_axes(jacobian)
+    return [
+        f"{name} ({value:+.3g} {'m' if index < 3 else 'rad'})"
+        for index, (name, value) in enumerate(zip(AXES, asked.tolist(), strict=True))
+        if name in blocked and abs(value) > (LEAST_M if index < 3 else LEAST_RAD)
+    ]
+
+
+LEAST_M, LEAST_RAD = 0.002, 0.01
+"""Less than this of a chunk is noise."""
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Directions of a twist in base axes; roll, pitch and yaw are rotations about x, y and z."""
+_LEVER_M = 0.3
+"""A rotation of 1 rad counts as much as a motion of this length."""
+LOST_SHARE = 0.3
+
+
+def lost_motion(jacobian: NDArray[np.float64], twist: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Part of a twist (6,) m and rad that no velocity of the joints (6, n) gives."""
+    scale = np.array([1.0] * 3 + [_LEVER_M] * 3)
+    scaled = scale[:, None] * jacobian
+    joints = np.linalg.lstsq(scaled, scale * twist, rcond=1e-6)[0]
+    return twist - jacobian @ joints
+
+
+def immovable_axes(jacobian: NDArray[np.float64]) -> tuple[str, ...]:
+    """Axes along or about which the TCP cannot move without moving otherwise too."""
+    scale = np.array([1.0] * 3 + [_LEVER_M] * 3)
+    return tuple(
+        name
+        for index, name in enumerate(AXES)
+        if float(np.linalg.norm(scale * lost_motion(jacobian, np.eye(6)[index])))
+        > LOST_SHARE * scale[index]
+    )
+
+
 def gripper_opening(spec: ActionSpec, steps: Steps) -> NDArray[np.float64] | None:
     """Opening of the gripper at each step, 0 closed to 1 open; None: not given as a fraction."""
     if spec.gripper not in ("open_fraction", "binary"):
@@ -204,6 +307,13 @@ def gripper_opening(spec: ActionSpec, steps: Steps) -> NDArray[np.float64] | Non
     if spec.gripper == "binary":
         value = (value > spec.gripper_threshold).astype(np.float64)
     return value if spec.gripper_open_is_high else 1.0 - value
+
+
+def _box(limits: Limits) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest and highest corner of the workspace, m."""
+    box = limits.workspace
+    low, high = zip(box.x_m, box.y_m, box.z_m, strict=True)
+    return np.array(low), np.array(high)
 
 
 def _position(
@@ -220,8 +330,7 @@ def _position(
             )
             return
         box = limits.workspace
-        low = np.array([box.x_m[0], box.y_m[0], box.z_m[0]])
-        high = np.array([box.x_m[1], box.y_m[1], box.z_m[1]])
+        low, high = _box(limits)
         outside_m = float(np.maximum(low - position_m, position_m - high).max())
         if outside_m > limits.step_m:
             yield warning(

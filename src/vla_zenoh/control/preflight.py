@@ -9,12 +9,13 @@ from typing import Any
 
 from vla_zenoh.control import policy_check
 from vla_zenoh.control.limits import into_workspace
-from vla_zenoh.errors import SpecError
+from vla_zenoh.errors import RecordError, SpecError
 from vla_zenoh.keys import worker_node
+from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.ntp import ClockOffset
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, GripperState, PoseState, Stamped
+from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped
 
 CHUNK_PATIENCE_S = 2.0
 """Every worker publishes chunks all the time; its newest may be this old, plus one period."""
@@ -39,9 +40,9 @@ class PeerSnapshot:
         same_host: nodes that certainly run on the command node's host and share its clock.
         clocks: node -> its clock minus that of the command node, where measured.
         holders: clients present as a deadman.
+        camera_reasons: camera -> why it sends no images, by its node's status.
         camera_faults: camera -> why its images are invalid, by its node's status: the rest of a
             sentence that starts with ``camera NAME``.
-        camera_whys: camera -> why it sends no picture, by its node's status.
         down: node of the profile that does not run -> why, by `vla-zenoh up` of its host.
     """
 
@@ -57,7 +58,7 @@ class PeerSnapshot:
     clocks: Mapping[str, ClockOffset] = field(default_factory=dict)
     holders: frozenset[str] = frozenset()
     camera_faults: Mapping[str, str] = field(default_factory=dict)
-    camera_whys: Mapping[str, str] = field(default_factory=dict)
+    camera_reasons: Mapping[str, str] = field(default_factory=dict)
     down: Mapping[str, str] = field(default_factory=dict)
 
     def not_alive(self, node: str) -> str:
@@ -99,6 +100,42 @@ def reasons_not_to_activate(
         *_cameras(profile, worker, peers),
         *_clocks(profile, worker, peers),
     ]
+
+
+def reasons_by_joints(
+    profile: Profile,
+    worker: str,
+    spec: ModelSpec,
+    chunk: ActionChunk,
+    kinematics: Kinematics,
+    joint: Stamped[JointState],
+) -> list[str]:
+    """Reasons against a worker whose newest chunk is not for the joints of this arm.
+
+    Args:
+        profile: the effective profile.
+        worker: the worker that gets the lease.
+        spec: its spec.
+        chunk: its newest chunk.
+        kinematics: of the arm.
+        joint: newest joint state.
+    """
+    try:
+        joints_rad = kinematics.joints_of(joint.record)
+        steps = check_steps(spec.action, chunk.steps)
+    except (RecordError, SpecError):
+        return []  # there is a reason for it already
+    found = policy_check.joints_as_pose(spec.action, steps, joints_rad, profile.limits)
+    here, jacobian = kinematics.pose_and_jacobian(joints_rad)
+    axes = policy_check.beyond_joints(spec.action, steps, jacobian, here.rotation)
+    reasons = [f"worker {worker!r}: its newest chunk is not sane: {why}" for _, _, why in found]
+    if axes:
+        reasons.append(
+            f"worker {worker!r} asks for motion that the {len(joints_rad)} joints of robot "
+            f"{profile.robot.name!r} cannot make from here: {', '.join(axes)}; use a model or "
+            "prompt that leaves out these axes, or move the arm"
+        )
+    return reasons
 
 
 def _robot(
@@ -236,16 +273,18 @@ def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
         if camera not in profile.cameras:
             continue  # reported already, with the spec
         age_s = peers.camera_ages_s.get(camera, math.inf)
-        node = peers.camera_nodes.get(camera)
-        server = profile.camera_servers()[camera]
-        if node is None and server in peers.alive and camera in peers.camera_whys:
-            reasons.append(f"camera {camera!r} sends no picture: {peers.camera_whys[camera]}")
-        elif node is None or node not in peers.alive:
-            down = f": {server} {peers.not_alive(server)}" if server in peers.down else ""
-            reasons.append(f"no living node serves camera {camera!r}{down}")
+        node = peers.camera_nodes.get(camera) or profile.camera_servers()[camera]
+        why = peers.camera_reasons.get(camera)
+        if node not in peers.alive:
+            reasons.append(
+                f"camera {camera!r}: its node {node!r} {peers.not_alive(node)}; `vla-zenoh up` on "
+                "its host starts it"
+            )
         elif age_s > CAMERA_PATIENCE_S:
-            why = f": {peers.camera_whys[camera]}" if camera in peers.camera_whys else ""
-            reasons.append(f"camera {camera!r} has sent no picture for {age_s:.1f} s{why}")
+            since = "yet" if math.isinf(age_s) else f"for {age_s:.1f} s"
+            reasons.append(
+                f"camera {camera!r} has sent no image {since}: {why or 'it gives no reason'}"
+            )
         elif camera in peers.camera_faults:
             reasons.append(f"camera {camera!r} {peers.camera_faults[camera]}")
     return reasons

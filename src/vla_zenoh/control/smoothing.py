@@ -22,7 +22,6 @@ states", RSS 2021.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -53,8 +52,11 @@ precision of Ruckig's solver; such an acceleration changes a velocity by less in
 OVERSHOOT = 1e-6
 """m and rad: rounding by which a plan may leave the range between start, target and stop."""
 
+ASIDE = 2e-7
+"""m and rad: a target nearer to the line of the motion is on it; goals are float32, 30 nm off."""
 BESIDE = 0.01
-"""Part of the limits for motion beside the line: goals are float32, 30 nm off the line."""
+"""Part of the limits for motion beside the line."""
+_ASIDE = np.array([[ASIDE], *([quiet] for quiet in QUIET[1:])])
 TINY, MOST = 1e-12, 1e9
 
 ROTATION_BOX = 0.55
@@ -179,6 +181,8 @@ class Smoother:
         self._target = self._state.position
         self._plan: _Plan | None = None
         self._elapsed_s = 0.0
+        self._jerk, self._sign = zeros, zeros
+        self._slowing_to: tuple[Pose, Shares, bool] | None = None
         self.braking = False
         self.motion = Motion(
             Pose(np.array(pose.position_m, dtype=np.float64), self._anchor),
@@ -202,11 +206,14 @@ class Smoother:
         self._anchor_here()
         self.braking = False
         self._target = np.array([*pose.position_m, *log3(self._anchor.T @ pose.rotation)])
-        limits = self.box * np.array(shares._replace(jerk=self._least_jerk(shares)))[:, None]
+        limits, unreversed = self._limits(shares)
         way = self._target - self._state.position
         way[np.abs(way) < QUIET[0]] = 0.0
-        plan, enough = self._towards(way, limits, all_to_stop)
+        plan, enough = self._towards(way, limits, unreversed, all_to_stop)
         self._begin(plan)
+        _, velocity, acceleration = self._state
+        slows = (velocity * acceleration < 0) & (np.abs(velocity) > limits[0])
+        self._slowing_to = (pose, shares, all_to_stop) if slows.any() and not self.braking else None
         return enough
 
     def brake(self, shares: Shares | None = None) -> None:
@@ -219,10 +226,11 @@ class Smoother:
         """
         if self.braking:
             return
+        self._slowing_to = None
         self._anchor_here()
         limits = self.box
         if shares is not None:
-            limits = limits * np.array(shares._replace(jerk=self._least_jerk(shares)))[:, None]
+            _, limits = self._limits(shares)
         self.braking = True
         self._begin(self._stop(limits, together=shares is not None))
 
@@ -240,15 +248,25 @@ class Smoother:
         self._plan = plan
 
     def _towards(
-        self, way: FloatArray, limits: FloatArray, all_to_stop: bool
+        self, way: FloatArray, limits: FloatArray, unreversed: FloatArray, all_to_stop: bool
     ) -> tuple[_Plan | None, bool]:
-        """The plan of a motion by `way` (6,) without detours, and whether `limits` suffice."""
+        """The plan of a motion by `way` (6,) without detours, and whether `limits` suffice.
+
+        Args:
+            way: of the motion.
+            limits: (3, 6) to keep to.
+            unreversed: (3, 6) to keep to where an axis would else reverse for nothing.
+            all_to_stop: see `target`.
+        """
         if not np.isfinite(way).all():
             return None, False
         basis, parts = self._coordinates(way, limits)
         plan: _Plan | None = None
         hardest = np.concatenate([limits[:1], self.box[1:]])
-        for most in (limits, hardest) if (limits < hardest).any() else (limits,):
+        attempts = [limits]
+        attempts += [unreversed] * bool((limits < unreversed).any())
+        attempts += [hardest] * bool((unreversed < hardest).any())
+        for most in attempts:
             ask = self._input(basis, most, parts)
             ask.target_position = (basis.T @ way).tolist()
             for synchronization in (Synchronization.Time, Synchronization.No):
@@ -260,16 +278,18 @@ class Smoother:
                 if path is None:
                     continue
                 plan = _Plan(self._state.position, basis, path)
-                may_take = hardest if all_to_stop else most
+                may_take = hardest if all_to_stop else np.maximum(most, unreversed)
                 # The fastest plan with all limits available: it goes no further than necessary.
-                shortest = most is may_take and (
+                shortest = bool((most >= may_take).all()) and (
                     synchronization is Synchronization.No or len(parts) == 1
                 )
                 overshoots = not shortest and self._overshoots(
                     path, basis.T @ way, self._input(basis, may_take, parts)
                 )
                 if not overshoots and not self._leaves(plan):
-                    return plan, most is limits
+                    if most is not limits:
+                        self._jerk = most[2] / self.box[2]
+                    return plan, most is not hardest
         return plan, False
 
     def _leaves(self, plan: _Plan) -> bool:
@@ -294,12 +314,8 @@ class Smoother:
         One, if the motion is already along `way`. Otherwise those of translation and rotation: the
         line and two directions beside it if the motion there is small, or the axes.
         """
-        velocity, acceleration = self._state[1:]
-        whole = way / max(math.sqrt(float(way @ way)), TINY)
-        if all(
-            (np.abs(value - float(whole @ value) * whole) <= quiet).all()
-            for value, quiet in ((velocity, QUIET[1]), (acceleration, QUIET[2]))
-        ):
+        whole = _line(way, *self._state[1:])
+        if whole is not None:
             return whole[:, None], [1.0]
         columns: list[FloatArray] = []
         parts: list[float] = []
@@ -315,13 +331,14 @@ class Smoother:
     ) -> tuple[FloatArray, list[float]]:
         """The same for three axes: (3, k), with `way` (3,) and `limits` (3, 3)."""
         motion = np.array([self._state.velocity[axes], self._state.acceleration[axes]])
+        line = _line(way, *motion)
+        if line is not None:
+            return (line[:, None], [1.0]) if line.any() else (np.zeros((3, 0)), [])
         length = norm3(way)
         if length == 0.0:
-            return (np.eye(3), [1.0] * 3) if motion.any() else (np.zeros((3, 0)), [])
+            return np.eye(3), [1.0] * 3
         along = way / length
         beside = motion - np.outer(motion @ along, along)
-        if (np.abs(beside) <= np.array(QUIET[1:])[:, None]).all():
-            return along[:, None], [1.0]
         least = np.eye(3)[int(np.argmin(np.abs(along)))]
         across = cross3(along, least)
         across /= norm3(across)
@@ -398,17 +415,29 @@ class Smoother:
             return None
         return path if done else None
 
-    def _least_jerk(self, shares: Shares) -> float:
-        """The share of the jerk limits that lets every acceleration end in time.
+    def _limits(self, shares: Shares) -> tuple[FloatArray, FloatArray]:
+        """Limits (3, 6) of every axis: `shares` of them and as much jerk as an axis needs, twice.
 
-        In time is before an axis exceeds its velocity limit, or reverses while it slows down. With
-        less jerk the arm would continue to accelerate, to any speed.
+        The first ends every acceleration before its axis exceeds the velocity limit; with less
+        jerk it would continue, to any speed. The second ends it before an axis that slows down
+        reverses, too. An axis keeps what it needed until its acceleration ends: with less again it
+        would pass its target.
         """
         _, velocity, acceleration = self._state
         speed = np.abs(velocity)
-        room = np.where(velocity * acceleration < 0, speed, self.box[0] - speed)
-        needed = acceleration**2 / (2 * np.maximum(room, REST_VELOCITY)) / self.box[2]
-        return max(shares.jerk, min(float(needed.max()), 1.0))
+        slows = velocity * acceleration < 0
+        room = np.maximum(np.where(slows, speed, self.box[0] - speed), REST_VELOCITY)
+        needed = np.minimum(acceleration**2 / (2 * room) / self.box[2], 1.0)
+        kept = np.where(acceleration * self._sign > 0.0, self._jerk, 0.0)
+        self._jerk, self._sign = (
+            np.maximum(np.where(slows, 0.0, needed), kept),
+            np.sign(acceleration),
+        )
+        limits = self.box * np.array(shares)[:, None]
+        limits[2] = np.maximum(limits[2], self.box[2] * self._jerk)
+        unreversed = limits.copy()
+        unreversed[2] = np.maximum(limits[2], self.box[2] * needed)
+        return limits, unreversed
 
     def resting_pose(self) -> Pose:
         """Brake, and return where the brake will end."""
@@ -442,6 +471,10 @@ class Smoother:
             pace: part of the tick by which the motion advances, for a slow follower. Twist and
                 acceleration are those at full pace.
         """
+        if self._slowing_to is not None and not (self._state[1] * self._state[2] < 0).any():
+            # It was too fast for its shares, and may go as fast again by the plan it has.
+            pose, shares, all_to_stop = self._slowing_to
+            self.target(pose, shares, all_to_stop=all_to_stop)
         if self._plan is None:
             return self.motion
         self._elapsed_s += pace * self._dt_s
@@ -476,6 +509,25 @@ class Smoother:
         velocity[np.abs(velocity) < QUIET[1]] = 0.0
         acceleration[np.abs(acceleration) < QUIET[2]] = 0.0
         self._state = _State(np.concatenate([position[:3], np.zeros(3)]), velocity, acceleration)
+
+
+def _line(way: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray | None:
+    """The direction of a motion on a straight line through its target, None if it is on none.
+
+    That of the way if there is one; the motion's own where the target is about to be passed, and
+    so near that its direction is rounding. Zero where there is neither way nor motion.
+    """
+    all_ = np.stack([way, velocity, acceleration])
+    lengths = np.sqrt((all_ * all_).sum(axis=1))
+    if not lengths.any():
+        return way
+    for value, length in zip(all_, lengths.tolist(), strict=True):
+        if length > 0.0:
+            line = value / length
+            beside = np.abs(all_ - np.outer(all_ @ line, line))
+            if (beside <= _ASIDE).all():
+                return line
+    return None
 
 
 def _extrema(path: Trajectory) -> tuple[FloatArray, FloatArray]:

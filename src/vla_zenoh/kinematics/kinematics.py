@@ -7,7 +7,6 @@ One object serves one thread: it keeps Pinocchio's work space. Joint vectors are
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from vla_zenoh import resources
-from vla_zenoh.errors import ProfileError, RecordError
+from vla_zenoh.errors import ProfileError, RecordError, nearest
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import JointEnds, Profile
 from vla_zenoh.types import FloatArray, JointState
@@ -177,11 +176,6 @@ def manipulability(jacobian: FloatArray) -> float:
     return math.sqrt(max(float(np.linalg.det(jacobian @ jacobian.T)), 0.0))
 
 
-def _near(name: str, known: Sequence[str]) -> str:
-    match = difflib.get_close_matches(name, known, 1)
-    return f"; did you mean {match[0]!r}?" if match else ""
-
-
 def _locked(
     model: Any,
     urdf: Path,
@@ -194,7 +188,8 @@ def _locked(
     for name in (*arm_joints, *finger_joints):
         if name not in known:
             raise ProfileError(
-                f"{urdf.name} has no joint {name!r}{_near(name, known)}; it has: {', '.join(known)}"
+                f"{urdf.name} has no joint {name!r}{nearest(name, known, '')}; "
+                f"it has: {', '.join(known)}"
             )
     for name in arm_joints:
         joint = model.joints[model.getJointId(name)]
@@ -242,7 +237,8 @@ def _frame(model: Any, urdf: Path, name: str) -> int:
     if not model.existFrame(name):
         known = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
         raise ProfileError(
-            f"{urdf.name} has no link {name!r}{_near(name, known)}; it has: {', '.join(known)}"
+            f"{urdf.name} has no link {name!r}{nearest(name, known, '')}; "
+            f"it has: {', '.join(known)}"
         )
     return model.getFrameId(name)
 

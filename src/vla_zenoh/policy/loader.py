@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.metadata
 import importlib.util
 import inspect
+import operator
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from vla_zenoh import resources
-from vla_zenoh.errors import ResourceError, WorkerError
+from vla_zenoh.errors import ResourceError, WorkerError, in_words, nearest
 from vla_zenoh.policy import ModelSpec, Policy
 from vla_zenoh.robot import Robot
 
@@ -41,8 +43,10 @@ class ModelFile:
     requires_python: str | None = None
 
     def missing(self) -> list[str]:
-        """Dependencies that this environment lacks (by name; uv checks versions)."""
+        """Requirements that this environment lacks (packages by name; uv checks versions)."""
         absent: list[str] = []
+        if self.requires_python is not None and not _this_python_is(self.requires_python):
+            absent.append(f"Python {self.requires_python}")
         for requirement in self.dependencies:
             name = re.split(r"[\s<>=!~;\[@(]", requirement, maxsplit=1)[0]
             try:
@@ -50,6 +54,29 @@ class ModelFile:
             except importlib.metadata.PackageNotFoundError:
                 absent.append(requirement)
         return absent
+
+
+_CLAUSE = re.compile(r"(>=|<=|==|!=|~=|>|<)\s*(\d+(?:\.\d+)*)(\.\*)?")
+
+
+def _this_python_is(wanted: str) -> bool:
+    """Whether this interpreter has a version that ``requires-python`` allows."""
+    compare = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
+    for clause in wanted.split(","):
+        found = _CLAUSE.fullmatch(clause.strip())
+        if found is None:
+            continue  # uv reads it where it makes an environment
+        sign, version = found[1], tuple(map(int, found[2].split(".")))
+        here = tuple(sys.version_info[: len(version)])
+        if sign == "~=":
+            fits = here >= version and here[:-1] == version[:-1]
+        elif sign in ("==", "!="):
+            fits = (here == version) is (sign == "==")
+        else:
+            fits = compare[sign](here, version)
+        if not fits:
+            return False
+    return True
 
 
 def find_model(name: str) -> ModelFile:
@@ -143,9 +170,7 @@ def import_model(model: ModelFile) -> ModuleType:
             if isinstance(error, ModuleNotFoundError)
             else ""
         )
-        raise WorkerError(
-            f"{model.path} cannot be imported: {type(error).__name__}: {error}{hint}"
-        ) from error
+        raise WorkerError(f"{model.path} cannot be imported: {in_words(error)}{hint}") from error
     return module
 
 
@@ -165,14 +190,14 @@ def make_policy(
     maker = _maker(module, model.path, "MODEL", "infer")
     name = getattr(maker, "__name__", "MODEL")
     chosen = dict(options or {})
-    if profile is not None and "profile" in _parameters(maker):
+    if profile is not None and "profile" in _options_of(maker).names:
         chosen.setdefault("profile", profile)
     policy = _made(maker, model.path, name, chosen)
     try:
         fits = isinstance(policy, Policy) and isinstance(policy.spec, ModelSpec)
     except Exception as error:  # a property that fails
         raise WorkerError(
-            f"{model.path}: the spec of {name} cannot be read: {type(error).__name__}: {error}"
+            f"{model.path}: the spec of {name} cannot be read: {in_words(error)}"
         ) from error
     if not fits:
         raise WorkerError(
@@ -191,15 +216,112 @@ def make_robot(path: Path, options: Mapping[str, str] | None = None) -> Robot:
     Raises:
         WorkerError: the file fails to import, has no such class, or rejects the options.
     """
-    if not path.is_file():
-        raise WorkerError(f"{path} is not a file; arm.file of the profile names it")
-    module = import_model(ModelFile(path.stem, path))
-    maker = _maker(module, path, "ROBOT", "move")
-    name = getattr(maker, "__name__", "ROBOT")
+    maker, name = _robot_class(path)
     robot = _made(maker, path, name, dict(options or {}))
     if not isinstance(robot, Robot):
         raise WorkerError(f"{path}: {name} needs methods `read()` and `move(command)`")
     return robot
+
+
+def _options_of(maker: Callable[..., Any]) -> ConstructorOptions:
+    try:
+        return ConstructorOptions.of(inspect.signature(maker).parameters.values())
+    except (TypeError, ValueError):  # written in C, without a signature
+        return ConstructorOptions((), (), anything=True)
+
+
+@dataclass(frozen=True, slots=True)
+class ConstructorOptions:
+    """Options that a class takes: keyword arguments of its constructor.
+
+    Args:
+        names: all of them.
+        required: those without a default.
+        anything: it takes any other name too.
+    """
+
+    names: tuple[str, ...]
+    required: tuple[str, ...]
+    anything: bool = False
+
+    @staticmethod
+    def of(parameters: Iterable[inspect.Parameter]) -> ConstructorOptions:
+        """The options among the parameters of a constructor."""
+        variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+        found = list(parameters)
+        named = [each for each in found if each.kind not in variable]
+        return ConstructorOptions(
+            tuple(each.name for each in named),
+            tuple(each.name for each in named if each.default is each.empty),
+            any(each.kind is each.VAR_KEYWORD for each in found),
+        )
+
+    @staticmethod
+    def declared(path: Path) -> ConstructorOptions | None:
+        """Options of the model class in a file that is not run; None: not written there."""
+        try:
+            body = ast.parse(path.read_bytes()).body
+        except (OSError, SyntaxError, ValueError):
+            return None  # `import_model` says what is wrong
+        classes = [each for each in body if isinstance(each, ast.ClassDef)]
+        methods = [{f.name: f for f in c.body if isinstance(f, ast.FunctionDef)} for c in classes]
+        found = [each for each in methods if "infer" in each]
+        if len(found) != 1 or "__init__" not in found[0]:
+            return None
+        given = found[0]["__init__"].args
+        plain = [each.arg for each in (*given.posonlyargs, *given.args)][1:]
+        first_default = len(plain) - len(given.defaults)
+        keywords = list(zip(given.kwonlyargs, given.kw_defaults, strict=True))
+        return ConstructorOptions(
+            (*plain, *(each.arg for each, _ in keywords)),
+            (*plain[:first_default], *(each.arg for each, default in keywords if default is None)),
+            given.kwarg is not None,
+        )
+
+    @property
+    def listed(self) -> str:
+        """Their names, as text."""
+        return ", ".join(self.names) or "none"
+
+    def check(self, given: Mapping[str, str], what: str) -> None:
+        """Compare with the options that are given.
+
+        Raises:
+            WorkerError: one is unknown, or a required one is missing.
+        """
+        missing = [name for name in self.required if name not in given]
+        for name in given:
+            known = name in self.names or (self.anything and not nearest(name, missing, ""))
+            if not known:
+                raise WorkerError(
+                    f"{what} has no option {name!r}{nearest(name, self.names)} "
+                    f"Its options: {self.listed}"
+                )
+        if missing:
+            raise WorkerError(
+                f"{what} needs the option {missing[0]!r}: give {missing[0]}=VALUE, with --set or "
+                f"in the profile's options. Its options: {self.listed}"
+            )
+
+
+def inspect_robot(path: Path, options: Mapping[str, str]) -> None:
+    """Import the file of a robot and compare its options, without making the robot.
+
+    Raises:
+        WorkerError: as `make_robot`.
+    """
+    maker, name = _robot_class(path)
+    _options_of(maker).check(options, f"{path}: {name}")
+    if not all(callable(getattr(maker, method, None)) for method in ("read", "move")):
+        raise WorkerError(f"{path}: {name} needs methods `read()` and `move(command)`")
+
+
+def _robot_class(path: Path) -> tuple[Callable[..., Any], str]:
+    if not path.is_file():
+        raise WorkerError(f"{path} is not a file; arm.file of the profile names it")
+    module = import_model(ModelFile(path.stem, path))
+    maker = _maker(module, path, "ROBOT", "move")
+    return maker, getattr(maker, "__name__", "ROBOT")
 
 
 def _maker(module: ModuleType, path: Path, named: str, method: str) -> Callable[..., Any]:
@@ -210,24 +332,14 @@ def _maker(module: ModuleType, path: Path, named: str, method: str) -> Callable[
 
 
 def _made(maker: Callable[..., Any], path: Path, name: str, options: Mapping[str, str]) -> Any:
+    taken = _options_of(maker)
+    taken.check(options, f"{path}: {name}")
     try:
         return maker(**options)
     except (Exception, SystemExit) as error:
         raise WorkerError(
-            f"{path}: {name} cannot be made: {error} (options it takes: {_accepted(maker)})"
+            f"{path}: {name} cannot be made: {in_words(error)} (its options: {taken.listed})"
         ) from error
-
-
-def _accepted(maker: Callable[..., Any]) -> str:
-    return ", ".join(_parameters(maker)) or "none"
-
-
-def _parameters(maker: Callable[..., Any]) -> list[str]:
-    try:
-        found = inspect.signature(maker).parameters.values()
-        return [each.name for each in found if each.kind is not each.VAR_KEYWORD]
-    except (TypeError, ValueError):  # written in C, without a signature
-        return []
 
 
 def _only_class(module: ModuleType, path: Path, named: str, method: str) -> type:

@@ -95,7 +95,11 @@ def checkpoint_folder(text: str) -> Path:
         raise WorkerError("it needs weights: --set checkpoint=DIRECTORY")
     folder = Path(text).expanduser()
     if not folder.is_dir():
-        raise WorkerError(f"checkpoint {str(folder)!r} is not a folder")
+        what = "a file" if folder.exists() else "not there"
+        raise WorkerError(
+            f"checkpoint {text!r} is {what}, wanted a folder: looked at {folder.absolute()}. "
+            "./PATH in a profile's options starts at the profile, with --set at this folder"
+        )
     return folder
 
 

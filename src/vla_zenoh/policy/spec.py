@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     ValidationError,
@@ -55,6 +56,16 @@ class _Spec(BaseModel):
     """Strict: neither ``"8"`` nor ``true`` is a number, so a slip is not read as a meaning."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+
+def _no_joints(kind: Any) -> Any:
+    if isinstance(kind, str) and "joint" in kind:
+        raise ValueError(
+            f"{kind!r} is not an action of a model file: wants 'delta' or 'absolute' poses of the "
+            "TCP. Turn joint positions into poses with "
+            "vla_zenoh.interop.action_semantics.make_forward, and declare them as 'absolute'"
+        )
+    return kind
 
 
 class CameraSpec(_Spec):
@@ -133,7 +144,7 @@ class ActionSpec(_Spec):
 
     horizon: int = Field(ge=1, le=1000)
     dt_s: float = Field(gt=0, le=60)
-    kind: MotionKind = "delta"
+    kind: Annotated[MotionKind, BeforeValidator(_no_joints)] = "delta"
     frame: Frame = "base"
     rotation: Rotation = "rpy"
     position_scale_m: float = Field(default=1.0, gt=0, le=10)

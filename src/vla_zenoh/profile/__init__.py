@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from vla_zenoh.profile.load import (
         as_robot,
         load_profile,
+        load_with_lines,
         override,
         profile_file,
         profile_names,
@@ -46,6 +47,7 @@ __all__ = [
     "Timing",
     "as_robot",
     "load_profile",
+    "load_with_lines",
     "override",
     "profile_file",
     "profile_names",

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
-from vla_zenoh import resources
-from vla_zenoh.errors import MissingExtraError, ResourceError, WorkerError
-from vla_zenoh.policy.loader import find_worker
 from vla_zenoh.profile.profile import Profile
-from vla_zenoh.profile.robot import POSE_JOINTS
 from vla_zenoh.profile.session import ANYWHERE, address_of, is_loopback
 
 
@@ -18,8 +13,6 @@ def advice(profile: Profile) -> list[str]:
     return [
         *_network(profile),
         *_placement(profile),
-        *_joints(profile),
-        *_found_here(profile),
         *_timing(profile),
     ]
 
@@ -81,37 +74,6 @@ def _placement(profile: Profile) -> Iterator[str]:
         for kind, named in (("camera", host.cameras), ("worker", host.workers)):
             if named is not None and kind not in host.nodes:
                 yield f"hosts.{name}.{kind}s: has no effect without {kind} in hosts.{name}.nodes"
-
-
-def _joints(profile: Profile) -> Iterator[str]:
-    joints = len(profile.robot.arm_joints)
-    if joints < POSE_JOINTS:
-        yield (
-            f"robot.arm_joints: with {joints} of them the TCP cannot reach every pose, as with "
-            "six: models with absolute poses or joint positions are rejected, and delta steps are "
-            "shortened to what the arm can do"
-        )
-
-
-def _found_here(profile: Profile) -> Iterator[str]:
-    try:
-        resources.robot_urdf(profile.robot.description)
-    except (ResourceError, MissingExtraError) as error:
-        yield f"robot.description: {error}"
-    if profile.arm is not None and not Path(profile.arm.file).expanduser().is_file():
-        yield f"arm.file: on this computer there is no {profile.arm.file}"
-    running = {kind for host in profile.hosts.values() for kind in host.nodes}
-    if "sim" in running:
-        try:
-            resources.find("sim", profile.sim.scene)
-        except ResourceError as error:
-            yield f"sim.scene: on this computer there is {error}"
-    for worker in profile.workers:
-        where = f"models.{worker}" if worker in profile.models else "workers"
-        try:
-            find_worker(worker, profile.models)
-        except (ResourceError, WorkerError) as error:
-            yield f"{where}: on this computer: {error}"
 
 
 def _timing(profile: Profile) -> Iterator[str]:

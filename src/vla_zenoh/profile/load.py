@@ -24,6 +24,7 @@ from vla_zenoh.resources import (
 MAX_EXTENDS = 8
 REPLACED_WHOLE = {("hosts",)}
 WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("models",), ("serves",), ("options",)}
+"""Maps of which null removes an inherited entry; null in place of the map: all of them."""
 
 
 def profile_names() -> list[str]:
@@ -37,10 +38,15 @@ def load_profile(name: str) -> Profile:
     Raises:
         ProfileError: every fault, each with file, line, path and what is allowed.
     """
+    return load_with_lines(name)[0]
+
+
+def load_with_lines(name: str) -> tuple[Profile, Lines]:
+    """The effective profile `name`, and where each value comes from; see `load_profile`."""
     path = profile_file(name)
     data, lines = _read(path, ())
     data.setdefault("name", path.stem)
-    return _checked(data, lines)
+    return _checked(data, lines), lines
 
 
 def followed(name: str) -> list[tuple[Path, str]]:
@@ -104,8 +110,10 @@ def to_yaml(profile: Profile) -> str:
 
 
 def _checked(data: Mapping[str, Any], lines: Lines) -> Profile:
+    empty = {place[0] for place in WITH_REMOVABLE if len(place) == 1}
+    given = {key: value for key, value in data.items() if value is not None or key not in empty}
     try:
-        return Profile.model_validate(data)
+        return Profile.model_validate(given)
     except ValidationError as error:
         raise ProfileError("\n".join(explain(error, lines, Profile))) from error
 
@@ -170,6 +178,7 @@ def _move(place: Place, lines: Lines, out: Lines) -> None:
 
 
 FILE_SOURCE = "file:"
+BESIDE = ("./", "../")
 
 
 def anchor(data: dict[str, Any], folder: Path) -> None:
@@ -186,8 +195,9 @@ def anchor(data: dict[str, Any], folder: Path) -> None:
 def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
     """Paths of files in `data`: (section, key, prefix of the path in the value).
 
-    These are ``robot.description``, ``arm.file``, ``ros2.messages.*``, paths in ``models.*``, and
-    ``cameras.*.source`` of the form ``file:PATH``.
+    These are ``robot.description``, ``arm.file``, ``ros2.messages.*``, paths in ``models.*``,
+    ``cameras.*.source`` of the form ``file:PATH``, and options of models and of the arm that start
+    with ``./`` or ``../``: of any other text only the model knows whether it is a path.
     """
     robot, arm, ros2 = (_map(data.get(name)) for name in ("robot", "arm", "ros2"))
     description = robot.get("description")
@@ -206,6 +216,10 @@ def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
     for name, path in messages.items():
         if isinstance(path, str):
             yield messages, name, ""
+    for options in (*_map(data.get("options")).values(), arm.get("options")):
+        for name, value in _map(options).items():
+            if isinstance(value, str) and (value in (".", "..") or value.startswith(BESIDE)):
+                yield _map(options), name, ""
 
 
 def below(folder: Path, path: str) -> str:

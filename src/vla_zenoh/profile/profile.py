@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from vla_zenoh import keys
-from vla_zenoh.errors import ProfileError, nearest
-from vla_zenoh.keys import Keys
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.keys import NODE_KINDS, Keys
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import ArmProfile, Options, RobotProfile
 from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Gripper, Ros2Profile
@@ -24,7 +24,17 @@ from vla_zenoh.profile.schema import (
     TaskProfile,
     Timing,
 )
-from vla_zenoh.profile.section import Fault, Name, Names, Place, Section, Text, Word, reject
+from vla_zenoh.profile.section import (
+    Fault,
+    Name,
+    Names,
+    Place,
+    Section,
+    Text,
+    Word,
+    reject,
+    unknown_name,
+)
 from vla_zenoh.profile.session import (
     TRUSTED_PROTOCOLS,
     SessionProfile,
@@ -32,13 +42,6 @@ from vla_zenoh.profile.session import (
     is_loopback,
 )
 from vla_zenoh.resources import is_path
-
-ONLY_ONE = {
-    "command": "the robot obeys one command node",
-    "sim": "there is one simulated robot",
-    "ros2": "the robot has one driver",
-    "arm": "the robot has one driver",
-}
 
 
 def _root(value: str) -> str:
@@ -122,6 +125,14 @@ class Profile(Section):
         if "camera" not in host.nodes:
             return ()
         return tuple(self.cameras) if host.cameras is None else host.cameras
+
+    def served_cameras(self, host: HostProfile) -> tuple[str, ...]:
+        """Those of `cameras_of` that its camera node opens: cameras of ROS 2 have another node."""
+        return tuple(
+            name
+            for name in self.cameras_of(host)
+            if name not in self.cameras or not self.cameras[name].source.startswith("ros2:")
+        )
 
     def workers_of(self, host: HostProfile) -> tuple[str, ...]:
         """Names of the workers that run on `host`."""
@@ -245,12 +256,7 @@ def _way_to_ros2(profile: Profile) -> Iterator[Fault]:
 
 def _task(profile: Profile) -> Iterator[Fault]:
     if profile.task.worker not in profile.workers:
-        yield (
-            ("task", "worker"),
-            f"{profile.task.worker!r} is not among workers"
-            f"{nearest(profile.task.worker, profile.workers)} "
-            f"Known: {', '.join(profile.workers) or 'none'}",
-        )
+        yield unknown_name(("task", "worker"), profile.task.worker, "workers", profile.workers)
 
 
 def _serves(profile: Profile) -> Iterator[Fault]:
@@ -281,8 +287,18 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
             yield (*place, "pictures"), "is for workers, and this host runs none"
         elif host.pictures is not None and "camera" in host.nodes:
             yield (*place, "pictures"), "is for cameras elsewhere, and this host has its own"
+        named = set(host.cameras or ()) & set(profile.cameras) if "camera" in host.nodes else set()
+        for camera in sorted(named - set(profile.served_cameras(host))):
+            yield (*place, "cameras"), f"has {camera}, of ROS 2: the node ros2 serves it"
+        if "camera" in host.nodes and not profile.served_cameras(host):
+            yield (
+                (*place, "nodes"),
+                "has camera, and there is no camera for it to serve: describe one in cameras, or "
+                "take camera out of nodes",
+                [(("cameras",), "leaves none for the node camera in {}: take it out of nodes")],
+            )
         for kind in host.nodes:
-            if kind in ONLY_ONE:
+            if NODE_KINDS[kind].only_one:
                 runs["nodes", kind].append(name)
         for camera in profile.cameras_of(host):
             runs["cameras", camera].append(name)
@@ -292,7 +308,7 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
     yield from _routers(profile)
     for (what, name), hosts in runs.items():
         if len(hosts) > 1:
-            why = ONLY_ONE.get(name) if what == "nodes" else "each key has one writer"
+            why = NODE_KINDS[name].only_one if what == "nodes" else "each key has one writer"
             hint = "" if what == "nodes" else f". List on each host which {what} it runs"
             yield (
                 ("hosts", hosts[-1], what),
@@ -325,10 +341,7 @@ def _routers(profile: Profile) -> Iterator[Fault]:
 def _unknown(
     place: Place, named: Iterable[str], what: str, known: Iterable[str]
 ) -> Iterator[Fault]:
+    entries = isinstance(named, Mapping)
     for name in named:
         if name not in known:
-            yield (
-                place,
-                f"{name!r} is not among {what}{nearest(name, known)} "
-                f"Known: {', '.join(known) or 'none'}",
-            )
+            yield unknown_name((*place, name) if entries else place, name, what, known)

@@ -18,15 +18,6 @@ from vla_zenoh.profile.section import (
 from vla_zenoh.profile.session import Endpoints
 
 NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker"]
-NODE_KINDS: tuple[NodeKind, ...] = (
-    "router",
-    "sim",
-    "ros2",
-    "arm",
-    "camera",
-    "command",
-    "worker",
-)
 SIMULATED: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")
 CAMERA_SOURCES = {
     "sim": "sim:CAMERA",
@@ -36,7 +27,7 @@ CAMERA_SOURCES = {
     "file": "file:PATH",
     "ros2": "ros2:TOPIC",
 }
-"""Kind of a camera's source -> how it is written. `nodes.camera.grabber.make_source` opens them."""
+"""Kind of a camera's source -> how it is written. `nodes.camera.node.make_source` opens them."""
 MIN_PERIODS = 3
 """A healthy link may be silent for up to this many periods."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
@@ -15,8 +15,10 @@ from vla_zenoh.types import MAX_TEXT, shown
 
 Place = tuple[str, ...]
 """Keys from the top of the profile down to a value."""
-Fault = tuple[Place, str]
-"""Where something is wrong, and a sentence that continues ``PLACE: ``."""
+Fault = tuple[Place, str] | tuple[Place, str, "Sequence[tuple[Place, str]]"]
+"""Where something is wrong, and a sentence that continues ``PLACE: ``. Of places that contradict
+each other also the other ones, with their sentences: the fault is where the loaded file itself
+says something, for what it extends may be right. ``{}`` there stands for the first place."""
 Lines = dict[Place, str]
 """Place -> ``file:line``."""
 
@@ -39,7 +41,7 @@ class InconsistentSections(ValueError):
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self.faults = tuple(faults)
-        super().__init__("; ".join(f"{'.'.join(place)} {why}" for place, why in faults))
+        super().__init__("; ".join(f"{'.'.join(fault[0])} {fault[1]}" for fault in faults))
 
 
 def reject(faults: Sequence[Fault]) -> None:
@@ -77,6 +79,10 @@ Range = Annotated[tuple[float, float], Field(strict=False), AfterValidator(_orde
 Distinct = AfterValidator(_differ)
 
 
+NOT_MADE = {
+    "depth": "cameras give colour images only; depth is not read.",
+}
+"""Key that looks like a slip of another one but is a wish -> what there is."""
 _NO_VALUE_SHOWN = {"missing", "extra_forbidden", "too_long", "too_short", "value_error"}
 
 
@@ -87,26 +93,66 @@ def explain(error: ValidationError, lines: Lines, model: type[Section]) -> list[
         place = tuple(str(part) for part in fault["loc"] if part != "[key]")
         cause = fault.get("ctx", {}).get("error")
         if isinstance(cause, InconsistentSections):
-            lines_out += [_line((*place, *below), why, lines) for below, why in cause.faults]
+            lines_out += [_located(fault, lines, place) for fault in cause.faults]
         else:
-            lines_out.append(_line(place, _why(fault, place, model), lines))
+            lines_out.append(located(place, _why(fault, place, model), lines))
     return lines_out
 
 
-def _line(place: Place, why: str, lines: Lines) -> str:
-    known = place
-    while known not in lines and known:
-        known = known[:-1]
+def line_of(place: Place, lines: Lines) -> str:
+    """``file:line`` of a value, or of what it is in; empty if unknown."""
+    while place not in lines and place:
+        place = place[:-1]
+    return lines.get(place, "")
+
+
+def located(place: Place, why: str, lines: Lines) -> str:
+    """Sentence about a place, with file and line where they are known."""
     name = ".".join(place) or "the profile"
-    where = lines.get(known)
+    where = line_of(place, lines)
     return f"{where}: {name}: {why}" if where else f"{name}: {why}"
+
+
+def unknown_name(place: Place, name: str, section: str, known: Iterable[str]) -> Fault:
+    """Fault of a `name` at `place` that `section` does not list."""
+    near, listed = nearest(name, known, ""), ", ".join(known) or "none"
+    why = f"{name!r} is not among {section}{near or '.'} Known: {listed}"
+    # Of a map the entry goes, of any other value only its content can change.
+    to_do = ": {".join((*place, "null")) + "}" * (len(place) - 1) if place[-1] == name else ""
+    remedy = f"Or remove that too: {to_do}" if to_do else "Or name another one there"
+    slip = f"; is {near.split(chr(39))[1]!r} a slip for it?" if near else "."
+    return (
+        place,
+        why,
+        (
+            ((section, name), f"is removed, but {{}} names it. {remedy}"),
+            ((section,), f"lacks {name!r}, but {{}} names it{slip} {remedy}"),
+        ),
+    )
+
+
+def _located(fault: Fault, lines: Lines, above: Place) -> str:
+    """The line of a fault: at the first of its places that the loaded file itself gives."""
+    below, why, *rest = fault
+    place = (*above, *below)
+    own, first = _file(line_of((), lines)), line_of(place, lines)
+    if rest and _file(first) != own:
+        for other, sentence in rest[0]:
+            if other in lines and _file(lines[other]) == own:
+                return located(other, sentence.format(f"{'.'.join(place)} ({first})"), lines)
+    return located(place, why, lines)
+
+
+def _file(where: str) -> str:
+    return where.rpartition(":")[0]
 
 
 def _why(fault: Any, place: Place, model: type[Section]) -> str:
     words, given = describe_fault(fault), fault.get("input")
     if fault["type"] == "extra_forbidden":
         allowed = field_names(model, place[:-1])
-        return f"unknown key{nearest(place[-1], allowed)} Known here: {', '.join(allowed)}"
+        near = nearest(place[-1], allowed)
+        return f"{NOT_MADE.get(place[-1], f'unknown key{near}')} Known here: {', '.join(allowed)}"
     if fault["type"] == "missing" and place == ("robot",):
         return "is missing: describe the robot, or start from another profile: extends: NAME"
     if fault["type"] == "missing" and place[-1].isdigit():
@@ -114,6 +160,8 @@ def _why(fault: Any, place: Place, model: type[Section]) -> str:
     if fault["type"] in ("dict_type", "model_type"):
         names = field_names(model, place)
         words = f"wants a map of: {', '.join(names)}" if names else words
+        if given is None:
+            words = f"is empty: {words}, or leave it out"
     if fault["type"] == "string_type" and isinstance(given, (bool, int, float)):
         words = "wants text; put it in quotes"
     if fault["type"] in _NO_VALUE_SHOWN or isinstance(given, (dict, BaseModel)):

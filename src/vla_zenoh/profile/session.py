@@ -109,6 +109,15 @@ def endpoint_faults(
     return out
 
 
+def ends_at(target: str, listening: str) -> bool:
+    """Whether a connection to `target` on this computer can end at an endpoint `listening`."""
+    there, here = (_HOST_AND_PORT.fullmatch(address_of(each)) for each in (target, listening))
+    if there is None or here is None:
+        return address_of(target) == address_of(listening)
+    same_protocol = target.partition("/")[0] == listening.partition("/")[0]
+    return same_protocol and there["port"] == here["port"]
+
+
 def _has_a_second(endpoint: str) -> bool:
     match = _HOST_AND_PORT.fullmatch(endpoint.partition("/")[2])
     return match is not None and 0 < int(match["port"]) < 65535

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 import sys
 import sysconfig
 from collections.abc import Sequence
 from pathlib import Path
 
 from vla_zenoh import __version__
-from vla_zenoh.errors import WorkerError
+from vla_zenoh.errors import WorkerError, how_to_install
 from vla_zenoh.policy.loader import ModelFile
 from vla_zenoh.runtime.parent_watch import die_with_parent
 
@@ -49,14 +50,35 @@ def run_in_own_environment(
     arguments = ["-m", program, *sys.argv[1:]]
     environment = {**os.environ, INSIDE_VARIABLE: str(model.path)}
     if python is not None:
-        if shutil.which(python) is None:
-            raise WorkerError(f"--python {python!r} is not an interpreter")
+        _check_interpreter(python)
         os.execvpe(python, [python, *arguments], environment)
     command = environment_command(model, extra=extra)
     # Not on stdout, where `vla-zenoh check --json` writes its result.
     said = f"preparing an environment for {model.name}: {', '.join(model.dependencies)}"
     print(said, file=sys.stderr, flush=True)
     os.execve(command[0], [*command, "python", *arguments], environment)
+
+
+def _check_interpreter(python: str) -> None:
+    """Make sure that an interpreter exists and has this package.
+
+    Raises:
+        WorkerError: it does not.
+    """
+    if shutil.which(python) is None:
+        raise WorkerError(
+            f"--python {python!r} is not a program: give the interpreter of an environment, as "
+            "venv/bin/python"
+        )
+    look = "import importlib.util as u, sys; sys.exit(u.find_spec('vla_zenoh') is None)"
+    try:
+        absent = subprocess.run([python, "-c", look], capture_output=True).returncode
+    except OSError as error:
+        raise WorkerError(f"--python {python!r} cannot be run: {error.strerror}") from error
+    if absent:
+        raise WorkerError(
+            f"--python {python!r} has no vla-zenoh; install it there: {how_to_install()}"
+        )
 
 
 def environment_command(

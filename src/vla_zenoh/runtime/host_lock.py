@@ -18,18 +18,17 @@ class HostLock:
 
     Args:
         name: of what runs only once.
+        what: the same, for the error.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, what: str) -> None:
         readable = "".join(c if c.isalnum() or c in "-._" else "_" for c in name)
         self.path = _folder() / f"{readable[:200]}.lock"
+        self._what = what
         self._file: int | None = None
 
-    def take(self, what: str) -> None:
+    def take(self) -> None:
         """Hold the lock.
-
-        Args:
-            what: runs, for the error.
 
         Raises:
             NodeError: another process holds it; says which, and since when.
@@ -40,7 +39,7 @@ class HostLock:
         except BlockingIOError:
             holder = os.read(number, 4096)
             os.close(number)
-            raise NodeError(f"{what} runs already{_described(holder)}") from None
+            raise NodeError(f"{self._what} runs already{_described(holder)}") from None
         os.ftruncate(number, 0)
         os.write(number, json.dumps({"pid": os.getpid(), "since_s": time.time()}).encode())
         self._file = number

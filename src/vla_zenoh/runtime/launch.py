@@ -15,10 +15,10 @@ from typing import Any
 import zenoh
 
 from vla_zenoh.bus.client import DROPPED_HINT, Client
-from vla_zenoh.bus.host_id import HOST_VARIABLE, own_boot_id
+from vla_zenoh.bus.clock import HOST_VARIABLE, own_boot_id
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import NodeError, ProfileError, SessionError
-from vla_zenoh.keys import worker_node
+from vla_zenoh.keys import NODE_KINDS, worker_node
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.runtime.down_nodes import DownNodes
@@ -27,7 +27,6 @@ from vla_zenoh.runtime.host_lock import HostLock
 from vla_zenoh.runtime.supervisor import DownNode, NodeCommand, Supervisor
 from vla_zenoh.security.identity import Role, operator_role
 
-START_ORDER = ("router", "sim", "ros2", "arm", "command", "camera", "worker")
 EXPENDABLE = ("worker",)
 ROUTER_PATIENCE_S = 10.0
 BRAKE_PATIENCE_S = 1.0
@@ -54,6 +53,13 @@ def choose_host(profile: Profile, host: str | None) -> tuple[str, HostProfile]:
             f"profile {profile.name} has no host {host!r}; it has: {', '.join(profile.hosts)}"
         )
     return host, profile.hosts[host]
+
+
+def host_lock(profile: Profile, host: str) -> HostLock:
+    """What a running `Host` holds, so that there is only one."""
+    router = (profile.hosts[host].connect or profile.session.connect)[0]
+    what = f"host {host} of robot {profile.robot.name}"
+    return HostLock("-".join((profile.root, profile.robot.name, host, router)), what)
 
 
 def node_commands(
@@ -93,7 +99,7 @@ def node_commands(
         )
     common = ("--profile", str(profile_file))
     commands: list[NodeCommand] = []
-    for kind in sorted(part.nodes, key=START_ORDER.index):
+    for kind in sorted(part.nodes, key=list(NODE_KINDS).index):
         name = profile.node_name(host, kind)
         if kind == "worker":
             for worker in profile.workers_of(part):
@@ -183,8 +189,7 @@ class Host:
             variables={HOST_VARIABLE: self.host},
         )
         self._own_router = own_router
-        where = (profile.root, profile.robot.name, self.host, profile.session.connect[0])
-        self._once = HostLock("-".join(where))
+        self._once = host_lock(profile, self.host)
         self._down: DownNodes | None = None
         self._ready, self._dry_run = False, dry_run
         self._expiry = CertificateExpiry(profile.session.security)
@@ -207,7 +212,7 @@ class Host:
         return self
 
     def _start(self) -> None:
-        self._once.take(f"host {self.host} of robot {self.profile.robot.name}")
+        self._once.take()
         answers = self._router_answers()
         if answers and self._own_router:
             where = ", ".join(self.profile.session.connect)
@@ -344,7 +349,7 @@ class Host:
             return
         names = {child.command.name for child in self.supervisor.children}
         names &= self.client.expected.keys()
-        if not self.supervisor.down(self.client.alive) and names <= self.client.snapshot().keys():
+        if not self._nodes_down() and names <= self.client.snapshot().keys():
             self._ready = True
             self._tell("up", f"{self.mode} | ready: {', '.join(sorted(names))}")
 

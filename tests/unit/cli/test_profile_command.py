@@ -116,7 +116,7 @@ def test_what_the_description_of_the_robot_does_not_have_is_a_fault(
     result = RUNNER.invoke(profile_app, ["check", "lab"])
     assert result.exit_code == 1
     assert result.stdout == ""
-    assert result.stderr.startswith(f"{own_folder / 'lab.yaml'}: robot: ")
+    assert result.stderr.startswith(f"{own_folder / 'lab.yaml'}:2: robot: ")
     assert told in result.stderr
 
 
@@ -158,7 +158,7 @@ def test_a_robot_that_is_not_here_is_a_fault_where_the_command_node_runs_and_els
     assert RUNNER.invoke(profile_app, ["check", "one"]).exit_code == 1
     result = RUNNER.invoke(profile_app, ["check", "lab", "--host", "robot"])
     assert result.exit_code == 1
-    assert "hosts: has no 'robot', it has: desk, gpu" in result.stderr
+    assert "hosts: has no 'robot'. It has: desk, gpu" in result.stderr
 
 
 def test_what_is_questionable_is_advice_and_no_failure() -> None:

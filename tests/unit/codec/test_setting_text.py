@@ -101,13 +101,13 @@ def test_a_rate_is_a_plain_number(word: str, rate_hz: float) -> None:
     "word", ["", "fast", "5 Hz", "1_0", "\u0665", "0x5", "nan", "inf", "5,0", "True"]
 )
 def test_what_is_no_plain_number_is_no_rate(word: str) -> None:
-    with pytest.raises(CodecError, match="is not a number of Hz"):
+    with pytest.raises(CodecError, match=r"is not a number: give 0\.05 to 100 chunks per second"):
         settings.decode_rate(word.encode())
 
 
 @pytest.mark.parametrize("word", ["0", "-5", "0.049", "100.1", "1e999"])
 def test_a_rate_stays_within_bounds(word: str) -> None:
-    with pytest.raises(CodecError, match=r"outside \[0\.05, 100\]"):
+    with pytest.raises(CodecError, match=r"out of range: give 0\.05 to 100"):
         settings.decode_rate(word.encode())
 
 
@@ -127,7 +127,7 @@ def test_what_is_no_percentage_is_no_speed(word: str) -> None:
 
 @pytest.mark.parametrize("word", ["-1", "100.1 %", "1e999", "1e3"])
 def test_a_speed_is_never_more_than_planned_nor_less_than_none(word: str) -> None:
-    with pytest.raises(CodecError, match=r"outside \[0, 100\]"):
+    with pytest.raises(CodecError, match=r"is out of range: give 0 to 100 percent"):
         settings.decode_percent(word.encode())
 
 

@@ -25,7 +25,7 @@ from vla_zenoh.control.motion_pipeline import LINGER_NS
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.types import GripperState, PoseState
+from vla_zenoh.types import GripperState, PoseState, Stamped
 
 UP = [0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.0]
 FORTH = [0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
@@ -379,6 +379,48 @@ def test_the_stream_ends_a_while_after_the_arm_stands() -> None:
         assert rig.now_ns < began_ns + 2 * LINGER_NS
     assert rig.now_ns - began_ns == pytest.approx(LINGER_NS, abs=10 * MS)
     assert not rig.commander.streaming
+
+
+def robot_away_from_its_last_command(rig: Rig, away_m: float) -> Stamped[PoseState]:
+    """A state of a robot whose controller's set-point is this far above the stream's."""
+    pose = Rig.pose_state(rig)
+    held_m = rig.commands[-1].position_m + [0.0, 0.0, away_m]
+    record = replace(pose.record, reference_position_m=held_m)
+    return Stamped(pose.header, record, pose.received_ns)
+
+
+def test_a_robot_that_swings_past_its_last_command_is_not_activated_before_it_stands() -> None:
+    rig = moving_rig()
+    rig.put("active", False)
+    while not rig.commander.at_rest:
+        rig.tick()
+    rig.tick(chunks=[rig.chunk([[0.0] * 7])])
+    for away_m in (0.012, 0.008, 0.004, 0.001):
+        rig.pose_state = lambda away_m=away_m: robot_away_from_its_last_command(rig, away_m)
+        rig.tick()
+    rig.pose_state = lambda: robot_away_from_its_last_command(rig, -0.004)
+    rig.put("active", True)
+    assert rig.state == "inactive"
+    assert "the robot is still 0.004 m" in rig.commander.why
+    rig.assert_smooth()
+
+
+def test_a_repeated_state_does_not_show_that_the_robot_stands() -> None:
+    rig = moving_rig()
+    rig.put("active", False)
+    while not rig.commander.at_rest:
+        rig.tick()
+    rig.tick(chunks=[rig.chunk([[0.0] * 7])])
+    repeated = robot_away_from_its_last_command(rig, 0.01)
+    rig.pose_state = lambda: repeated
+    rig.run(0.15)
+    rig.put("active", True)
+    assert rig.state == "inactive"
+    assert "the robot is still 0.010 m" in rig.commander.why
+    rig.pose_state = lambda: robot_away_from_its_last_command(rig, 0.01)
+    rig.run(0.15)
+    rig.put("active", True)
+    assert rig.state == "active"
 
 
 def test_a_stop_is_latched_until_it_is_reset() -> None:

@@ -153,10 +153,19 @@ def test_when_all_is_well_there_is_no_reason() -> None:
             r"newest chunk is not sane: gripper_range: gripper 80",
             another_chunk(steps=np.array([[0, 0, 0, 0, 0, 0, 80.0]])),
         ),
-        ("no living node serves camera 'front'", gone("camera")),
-        ("no living node serves camera 'front'", peers(camera_nodes={})),
-        ("camera 'front' has sent no picture for 1.5 s", peers(camera_ages_s={"front": 1.5})),
-        ("camera 'front' has sent no picture for inf s", peers(camera_ages_s={})),
+        ("camera 'front': its node 'camera' is not alive; `vla-zenoh up` on its", gone("camera")),
+        (
+            "camera 'front' has sent no image for 1.5 s: it gives no reason",
+            peers(camera_ages_s={"front": 1.5}),
+        ),
+        (
+            "camera 'front' has sent no image yet: there is no /dev/video0",
+            peers(
+                camera_ages_s={},
+                camera_nodes={},
+                camera_reasons={"front": "there is no /dev/video0"},
+            ),
+        ),
         (
             r"camera 'front' shows the same picture since 1\.2 s",
             peers(camera_faults={"front": "shows the same picture since 1.2 s"}),
@@ -198,7 +207,10 @@ def test_a_clock_that_is_measured_need_not_be_our_own() -> None:
 def test_a_camera_the_profile_does_not_have_is_a_reason() -> None:
     ready = Ready()
     ready.profile = ready.profile.model_copy(update={"cameras": {}})
-    assert ready.reasons() == ["worker 'scripted' needs camera 'front', the profile has: none"]
+    assert ready.reasons() == [
+        "worker 'scripted' needs camera 'front', the profile has: none; add it to cameras, or name "
+        "another in the model's options"
+    ]
 
 
 def test_a_slow_rate_gives_the_worker_more_time() -> None:

@@ -350,3 +350,60 @@ def test_a_motion_along_a_line_stays_on_it_whatever_the_limits_become(
             away = Ends(motion).away()
             beside = away - (away @ way) / max(length, 1e-9) ** 2 * way
             assert np.abs(beside).max() < AT_GOAL[0]
+
+
+def test_an_arm_that_goes_back_over_its_start_slowly_stays_on_its_line() -> None:
+    motion, slow = smoother(), Shares(0.02, 0.01, 0.001)
+    line = np.array([-0.39, 0.9, 0.156]) / norm3(np.array([-0.39, 0.9, 0.156]))
+
+    def towards(part_m: float) -> None:
+        # In the precision of a model's answer.
+        way_m = (part_m * line).astype(np.float32).astype(np.float64)
+        motion.target(Pose(START.position_m + way_m, START.rotation), slow)
+
+    def here_m() -> float:
+        return float((motion.motion.pose.position_m - START.position_m) @ line)
+
+    towards(0.03)
+    for _ in range(600):
+        motion.tick()
+    towards(here_m() + 2e-7)  # about to be passed
+    motion.tick()
+    beside_m = 0.0
+    for _ in range(800):
+        towards(here_m() - 2e-3)
+        motion.tick()
+        apart = motion.motion.pose.position_m - START.position_m
+        beside_m = max(beside_m, norm3(apart - (apart @ line) * line))
+    assert beside_m < 1e-6
+
+
+@pytest.mark.parametrize("again", range(10, 80))
+def test_an_arm_that_had_to_slow_down_keeps_to_its_lower_speed(again: int) -> None:
+    slow, most = Shares(0.01, 1.0, 1.0), 0.01 * LIMITS.rotation[0]
+    motion = smoother()
+    far = Pose(START.position_m, START.rotation @ exp3(np.array([0.03, -0.015, 0.2])))
+    motion.target(far, Shares(0.4))
+    for _ in range(60):
+        motion.tick()
+    motion.target(far, slow, all_to_stop=True)
+    for tick in range(250):
+        if tick == again:
+            motion.target(far, slow, all_to_stop=True)
+        motion.tick()
+    assert norm3(motion.motion.twist[3:]) <= most * (1 + LIMIT_RTOL)
+
+
+def test_an_axis_that_turns_round_for_its_target_reaches_it_without_passing_it() -> None:
+    little = Shares(0.1, 0.25, 0.125)
+    motion = smoother()
+    motion.target(Pose(START.position_m + [0.0, 0.0, 0.1], START.rotation), little)
+    for _ in range(100):
+        motion.tick()
+    goal = Pose(motion.motion.pose.position_m - [1e-4, 0.0, 1e-3], START.rotation)
+    lowest_m = np.inf
+    for _ in range(600):  # the same target over and over, as while the joints hold back
+        motion.target(goal, little)
+        lowest_m = min(lowest_m, float(motion.tick().pose.position_m[2] - goal.position_m[2]))
+    assert lowest_m > -AT_GOAL[0]
+    assert motion.at_rest

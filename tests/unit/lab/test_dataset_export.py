@@ -197,7 +197,7 @@ def test_what_cannot_become_a_dataset_is_named(run_file: Path, tmp_path: Path) -
     assert episodes_of(run, "somebody") == []
     with pytest.raises(RecordingError, match="hold no episode"):
         export(tmp_path / "a", [], [], PARTS)
-    with pytest.raises(RecordingError, match="no picture of camera 'wrist'"):
+    with pytest.raises(RecordingError, match="has no images of camera 'wrist'; it has"):
         export(tmp_path / "a", episodes_of(run), ["wrist"], PARTS)
     with pytest.raises(RecordingError, match="no state/joint"):
         export(tmp_path / "a", episodes_of(run), [], read_parts("joint"))

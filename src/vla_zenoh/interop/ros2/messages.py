@@ -100,8 +100,8 @@ class Messages:
         if kind not in self:
             known = sorted(self._store.fielddefs)
             raise ProfileError(
-                f"{kind} is not a type of ROS 2 {self.distribution}{nearest(kind, known)}; "
-                "a definition of your own is named in ros2.messages"
+                f"{kind} is not a type of ROS 2 {self.distribution}{nearest(kind, known)} "
+                "A definition of your own is named in ros2.messages"
             )
 
     def fields(self, kind: str) -> dict[str, Any]:

@@ -260,6 +260,9 @@ class Examination:
             findings.append(error(fault.reason, f"{style.name}: {fault}"))
             return None
         findings += policy_check.check_chunk(action, steps, self._limits, self._width_m)
+        if self._profile is not None:
+            home_rad = np.array(self._profile.robot.home_rad)
+            findings += policy_check.joints_as_pose(action, steps, home_rad, self._limits)
         self._answers.append((style, steps))
         # A model with real-time chunking gets committed steps at the next inference.
         arrival_ns = observation.stamp_wall_ns + round(took_s * 1e9)

@@ -25,6 +25,8 @@ MEANINGS: Mapping[str, str] = {
     "not_finite": "NaN or infinity among the steps",
     "position_units": "steps too long to be metres",
     "rotation_units": "rotations too large to be radians",
+    "joints_as_pose": "joint positions that the spec declares as poses",
+    "too_few_joints": "the arm has fewer joints than a pose of the TCP needs",
     "quaternion": "a quaternion that is not unit, or not in the order x, y, z, w",
     "gripper_range": "a number that the declared meaning of the gripper cannot have",
     "gripper_polarity": "it shuts an open, empty gripper whatever it sees",

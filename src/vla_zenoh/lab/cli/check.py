@@ -20,10 +20,11 @@ from vla_zenoh.cli.options import (
 )
 from vla_zenoh.cli.output import console, new_table, print_json, styled
 from vla_zenoh.control.policy_check import Finding, error
-from vla_zenoh.errors import WorkerError
+from vla_zenoh.errors import WorkerError, counted
 from vla_zenoh.lab.check.examination import DEFAULT_RUNS, Examination
 from vla_zenoh.lab.check.model_runner import ModelRunner
 from vla_zenoh.lab.check.report import CheckReport
+from vla_zenoh.policy import ActionSpec
 from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.runtime.environments import run_in_own_environment
@@ -132,9 +133,10 @@ def _print(report: CheckReport) -> None:
         out.print(finding.why, soft_wrap=True)
     errors, warnings = len(_of(report, "error")), len(_of(report, "warning"))
     if report.ok:
-        out.print(Text.assemble(("keeps its contract", "green"), f", {warnings} warnings"))
+        counts = f", {counted(warnings, 'warning')}"
+        out.print(Text.assemble(("keeps its contract", "green"), counts))
     else:
-        counts = f": {errors} errors, {warnings} warnings"
+        counts = f": {counted(errors, 'error')}, {counted(warnings, 'warning')}"
         out.print(Text.assemble(("breaks its contract", "bold red"), counts))
 
 
@@ -155,7 +157,10 @@ def _rows(report: CheckReport) -> list[tuple[str, str]]:
     if report.shape is not None:
         rows.append(("first answer", f"{report.shape[0]} x {report.shape[1]}"))
     if report.step_range:
-        ranges = ", ".join(f"{low:.3g}..{high:.3g}" for low, high in report.step_range)
+        ranges = ", ".join(
+            f"{column} {low:.3g}..{high:.3g}"
+            for column, (low, high) in zip(_columns(action), report.step_range, strict=True)
+        )
         rows.append(("values", ranges))
     if report.latency_ms is not None:
         p50, p95, worst = report.latency_ms
@@ -177,6 +182,18 @@ def _rows(report: CheckReport) -> list[tuple[str, str]]:
     return rows + [
         (f"depends on {what}", words[known]) for what, known in report.depends_on.items()
     ]
+
+
+def _columns(action: ActionSpec) -> list[str]:
+    """Name and unit of each number of a step."""
+    unit = "m" if action.position_scale_m == 1.0 else f"* {action.position_scale_m:g} m"
+    rotations = {
+        "rpy": ("roll rad", "pitch rad", "yaw rad"),
+        "rotvec": ("rx rad", "ry rad", "rz rad"),
+        "quaternion": ("qx", "qy", "qz", "qw"),
+    }
+    names = [*(f"{axis} {unit}" for axis in "xyz"), *rotations[action.rotation]]
+    return [*names, *(["gripper"] if action.gripper != "none" else [])]
 
 
 def _inputs(report: CheckReport) -> str:

@@ -10,7 +10,7 @@ import typer
 
 from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.cli.output import console, errors, fail, print_json
-from vla_zenoh.errors import RecordingError
+from vla_zenoh.errors import RecordingError, counted, nearest
 from vla_zenoh.lab.evaluation.evaluate import MCAP
 
 dataset_app = typer.Typer(
@@ -48,17 +48,29 @@ def export(
     from vla_zenoh.policy.state_vector import read_parts
 
     parts = read_parts(state)
-    episodes, seen = [], None
+    episodes, seen, workers, failed = [], None, set[str](), 0
     for path in _files(runs):
         run = load_run(path)
         for problem in run.problems:
             errors().print(f"{path.name}: {problem}", style="yellow")
+        workers |= {heard.record.worker for heard in run.chunks}
         found = episodes_of(run, worker)
         for episode in found:
             episode.success = succeeded(episode)
-        episodes += [each for each in found if each.success or not successful]
+        kept = [each for each in found if each.success or not successful]
+        episodes += kept
+        failed += len(found) - len(kept)
         if found:
             seen = set(run.picture_counts) if seen is None else seen & set(run.picture_counts)
+    if worker is not None and worker not in workers:
+        known = ", ".join(sorted(workers)) or "none"
+        fail(
+            f"no episode of worker {worker!r} is in the recordings{nearest(worker, workers)} "
+            f"Workers there: {known}"
+        )
+    if failed and not episodes:
+        those = counted(failed, "episode")
+        fail(f"none of {those} is known to be successful; leave out --successful")
     written = write(out, episodes, cameras or sorted(seen or ()), parts)
     if as_json:
         print_json(written._asdict())

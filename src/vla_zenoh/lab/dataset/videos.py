@@ -34,6 +34,12 @@ def chosen(episode: RecordedEpisode, camera: str, stamps: list[int]) -> list[int
     for frame in episode.frames:
         at = max(bisect_right(in_time, frame.stamp_ns) - 1, 0)
         if not in_time or abs(frame.stamp_ns - in_time[at]) > OLDEST_NS:
+            if not in_time:
+                there = ", ".join(sorted(episode.run.picture_counts)) or "none"
+                raise RecordingError(
+                    f"{episode.run.path} has no images of camera {camera!r}; it has those of: "
+                    f"{there}"
+                )
             raise RecordingError(
                 f"{episode.run.path}: no picture of camera {camera!r} within "
                 f"{OLDEST_NS / 1e9:g} s before a frame; leave the camera out with --camera"

@@ -107,6 +107,7 @@ class CommandNode:
             self._latch.close()
         self.node.publish_status("stopped", now=True)
         self.node.close()
+        gc.unfreeze()  # so that the interpreter frees everything at its end
 
     def _loop(self, stop: threading.Event) -> None:
         loop = FixedRate(self.node.profile.timing.command_hz)

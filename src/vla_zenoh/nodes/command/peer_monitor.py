@@ -9,7 +9,7 @@ from typing import Any
 
 from vla_zenoh import keys as key_names
 from vla_zenoh.bus.buffers import ReceivedSample, ZenohRing
-from vla_zenoh.bus.host_id import HostId
+from vla_zenoh.bus.clock import HostId
 from vla_zenoh.bus.node import Node
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.errors import CodecError
@@ -41,7 +41,7 @@ class PeerMonitor:
         self._servers = node.profile.camera_servers()
         self._cameras: dict[str, tuple[float, int]] = {}
         self._camera_faults: dict[str, str] = {}
-        self._camera_whys: dict[str, str] = {}
+        self._camera_reasons: dict[str, str] = {}
         self._expected = frozenset(expected_nodes(node.profile))
         self._down: dict[str, str] = {}
         self._hosts: dict[str, HostId] = {}
@@ -108,7 +108,7 @@ class PeerMonitor:
                 self._node.clocks.offsets(),
                 frozenset(self._holders),
                 dict(self._camera_faults),
-                dict(self._camera_whys),
+                dict(self._camera_reasons),
                 dict(self._down),
             )
 
@@ -231,16 +231,14 @@ class PeerMonitor:
                 node,
             )
             return
-        age_s, bad = fields.get("age_s"), fields.get("bad")
+        age_s, bad, reason = (fields.get(name) for name in ("age_s", "bad", "why"))
+        reason = reason[:MAX_WHY] if isinstance(reason, str) else ""
+        if self._camera_reasons.get(camera, "") != reason:
+            self._camera_reasons[camera], self._changed = reason, True
         why = bad.get("why") if isinstance(bad, Mapping) else None
         if isinstance(why, str):
             self._camera_faults[camera], self._changed = why[:MAX_WHY], True
         elif self._camera_faults.pop(camera, None) is not None:
-            self._changed = True
-        missing = fields.get("why") if fields.get("state") not in ("ok", "ended") else None
-        if isinstance(missing, str) and missing:
-            self._camera_whys[camera], self._changed = missing[:MAX_WHY], True
-        elif self._camera_whys.pop(camera, None) is not None:
             self._changed = True
         if isinstance(age_s, (int, float)) and not isinstance(age_s, bool):
             self._cameras[camera] = (max(float(age_s), 0.0), now_ns)

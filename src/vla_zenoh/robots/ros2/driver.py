@@ -123,10 +123,10 @@ class Ros2Driver(RobotDriver):
             raise ProfileError(f"ros2 lacks {command}_command")
         self._output = output
         self._frame = output.frame or self.profile.robot.base_frame
-        self._write = self._writing(output)
+        self._write = self.writing(output)
         self._writer = graph.publisher(output.topic, output.type, COMMAND)
 
-    def _writing(self, output: Ros2Output) -> table.Write:
+    def writing(self, output: Ros2Output) -> table.Write:
         """Function that fills a message of the output's type.
 
         Raises:
