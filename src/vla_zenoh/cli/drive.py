@@ -10,10 +10,8 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
-from vla_zenoh.cli.node_rows import MODE_WORDS, mode_of
 from vla_zenoh.cli.plain import BOLD_RED, complain, fail, say, say_marked, warn
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.codec.settings import decode_name, decode_percent, decode_rate, decode_text
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import Keys
 
@@ -36,6 +34,8 @@ def prompt(
     text: Annotated[str, typer.Argument(help="What the model shall do.")], target: RobotTarget
 ) -> None:
     """Set the prompt. Any Zenoh client can: put the text on <root>/<robot>/prompt."""
+    from vla_zenoh.codec.settings import decode_text
+
     decode_text(text.encode())  # rejects it before a router is asked
     with target.operator("prompt", text) as client:
         task = client.set_prompt(text)
@@ -69,6 +69,8 @@ def activate(
 
 def _mode(client: Client) -> str:
     """SIM, DRY RUN or LIVE, which stands in front of what says that the arm moves."""
+    from vla_zenoh.cli.node_rows import MODE_WORDS, mode_of
+
     client.wait_for(lambda: client.status("command"), MODE_PATIENCE_S)
     return MODE_WORDS[mode_of(client.snapshot())][0]
 
@@ -119,6 +121,8 @@ def use(
     target: RobotTarget,
 ) -> None:
     """Select the worker that moves the arm; the others keep running."""
+    from vla_zenoh.codec.settings import decode_name
+
     decode_name(worker.encode())
     with target.operator("use", worker) as client:
         _show(target, client, f"worker: {client.set_worker(worker).worker}")
@@ -128,6 +132,8 @@ def rate(
     rate_hz: Annotated[float, typer.Argument(help="Chunks per second.")], target: RobotTarget
 ) -> None:
     """Set how often the workers infer."""
+    from vla_zenoh.codec.settings import decode_rate
+
     decode_rate(f"{rate_hz:g}".encode())
     with target.operator("rate", f"{rate_hz:g}") as client:
         _show(target, client, f"rate: {client.set_rate(rate_hz).rate_hz:g} Hz")
@@ -141,6 +147,8 @@ def speed(
     ] = None,
 ) -> None:
     """Slow the arm down on the same path. Lowering needs only the right to stop."""
+    from vla_zenoh.codec.settings import decode_percent
+
     wanted = None if percent is None else decode_percent(percent.encode())
     with target.client(stop=wanted is not None) as client:
         task = client.wait_for(lambda: client.task, PATIENCE_S)

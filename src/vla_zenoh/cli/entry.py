@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib import import_module
 
 from vla_zenoh.cli.words import WORDS, parse
@@ -28,11 +29,18 @@ EXTRA_OF = {
 """Module -> extra that brings it, for the error of a missing import."""
 
 
+HASTE = -20
+"""Niceness of a stop."""
+
+
 def main() -> None:
     """Run the command line. Errors of this package become one line and exit code 1.
 
     Under a supervisor every error becomes one line for it, and the traceback lines for its log.
     """
+    if sys.argv[1:2] == ["stop"]:  # goes before other programs, where that is allowed
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, HASTE)
     try:
         _chosen(sys.argv[1:])()
     except KeyboardInterrupt:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.security.identity import PEOPLE, Role, operator_role
-from vla_zenoh.security.store import Store
 
 if TYPE_CHECKING:
     from vla_zenoh.profile import Profile
@@ -38,6 +37,8 @@ def operator_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
         return []
     if security.host is not None and not stop:
         return [security.host]
+    from vla_zenoh.security.store import Store
+
     store = Store(security.folder)
     own = security.host or store.known_host()
     ranks: dict[str, int] = {}
@@ -57,6 +58,8 @@ def local_role(profile: Profile) -> Role | None:
     security = profile.session.security
     if security is None:
         return None
+    from vla_zenoh.security.store import Store
+
     try:
         files = Store(security.folder).identity_files(security.host, None, security.people)
     except SecurityError:
