@@ -32,22 +32,28 @@ def stop_by_key(target: RobotTarget, confirm: Callable[[Client], None]) -> None:
             not.
     """
     with target.client(stop=True) as client, _keys() as pressed:
-        client.wait_for(lambda: _connected(client), APPEARS_S)
-        name = target.named(client)
-        say(f"Every key stops {name}; so does leaving: Ctrl-C, or closing this terminal.")
-        connected = True
         try:
-            while (key := pressed()) is not False:
-                if key:
-                    client.stop()
-                    with suppress(SystemExit):  # it has been said; the hand stays on the key
-                        confirm(client)
-                if connected != (connected := _connected(client)):
-                    _tell(connected, name)
+            _stand(client, target.named(client), pressed, confirm)
         except KeyboardInterrupt:
             _leave(client, confirm)
             raise
         _leave(client, confirm)
+
+
+def _stand(
+    client: Client, name: str, pressed: Callable[[], bool | None], confirm: Callable[[Client], None]
+) -> None:
+    """Stop the robot at every key, until the input ends."""
+    client.wait_for(lambda: _connected(client), APPEARS_S)
+    say(f"Every key stops {name}; so does leaving: Ctrl-C, or closing this terminal.")
+    connected = True
+    while (key := pressed()) is not False:
+        if key:
+            client.stop()
+            with suppress(SystemExit):  # it has been said; the hand stays on the key
+                confirm(client)
+        if connected != (connected := _connected(client)):
+            _tell(connected, name)
 
 
 def _leave(client: Client, confirm: Callable[[Client], None]) -> None:
