@@ -131,9 +131,9 @@ def _write_files(stage: Stage, run: Run) -> None:
 
 
 def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
-    columns = ("prompt", "steps", "asked", "reached", "drift", "rotation drift", "")
+    columns = ("prompt", "steps", "asked", "reached", "drift", "rotation drift", "verdict")
     title = "asked and reached, measured at rest"
-    table = new_table(*columns, title=title, left=("prompt", ""))
+    table = new_table(*columns, title=title, left=("prompt", "verdict"))
     for outcome in result.outcomes:
         asked, reached = _amounts(outcome)
         faults = outcome.faults()
