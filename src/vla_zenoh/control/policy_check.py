@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.control.actions import GRIPPER_SLACK, GRIPPER_SLACK_M
-from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, CameraSpec, ModelSpec
 from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
 from vla_zenoh.types import QUATERNION_NORM_TOLERANCE
@@ -216,7 +215,7 @@ def joints_as_pose(
     if spec.kind != "absolute" or spec.dimension not in (count, count + 1):
         return []
     first = steps[:, :count].astype(np.float64)
-    low, high = workspace_corners(limits)
+    low, high = _corners(limits)
     position_m = steps[:, :3].astype(np.float64) * spec.position_scale_m
     outside_m = np.maximum(low - position_m, position_m - high).max(axis=1)
     away_rad = float(np.abs(first[0] - joints_rad).max())
@@ -298,6 +297,12 @@ def immovable_axes(jacobian: NDArray[np.float64]) -> tuple[str, ...]:
     )
 
 
+def _corners(limits: Limits) -> NDArray[np.float64]:
+    """Lower and upper corner (2, 3) of the workspace box, m; this module does without Ruckig."""
+    box = limits.workspace
+    return np.array([box.x_m, box.y_m, box.z_m]).T
+
+
 def _position(
     spec: ActionSpec, position_m: NDArray[np.float64], limits: Limits
 ) -> Iterator[Finding]:
@@ -312,7 +317,7 @@ def _position(
             )
             return
         box = limits.workspace
-        low, high = workspace_corners(limits)
+        low, high = _corners(limits)
         outside_m = float(np.maximum(low - position_m, position_m - high).max())
         if outside_m > limits.step_m:
             yield warning(
