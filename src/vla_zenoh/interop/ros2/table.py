@@ -1,4 +1,4 @@
-"""ROS type -> what we make of it. A new type is one file in ``topics`` and one line here."""
+"""ROS types that are read and written. A new type is one file in ``topics`` and one line here."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from vla_zenoh.interop.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES
 from vla_zenoh.interop.ros2.samples import Joints, RosImage, Stamp, Transform, Wrench
 from vla_zenoh.interop.ros2.topics import (
     compressed_image,
-    float_array,
     image,
     joint_state,
     joint_trajectory,
@@ -72,13 +71,13 @@ READINGS = (
 
 
 GRIPPER_WRITINGS = (
-    Writing(float_array.TYPE, "command_gripper", float, float_array.write_position),
+    Writing(plain.NUMBERS, "command_gripper", float, plain.write_position),
     Writing(plain.NUMBER, "command_gripper", float, plain.write_position),
 )
 
 
 def writings(posture_rad: FloatArray, lead_ns: int) -> tuple[Writing, ...]:
-    """What commands can be sent as.
+    """Types in which commands can be sent.
 
     Args:
         posture_rad: (n,) what a nullspace prefers.
@@ -95,7 +94,7 @@ def writings(posture_rad: FloatArray, lead_ns: int) -> tuple[Writing, ...]:
             poses,
         ),
         Writing(joint_trajectory.TYPE, "command_joint", JointCommand, joints),
-        Writing(float_array.TYPE, "command_joint", JointCommand, float_array.write_joints),
+        Writing(plain.NUMBERS, "command_joint", JointCommand, plain.write_joints),
         *GRIPPER_WRITINGS,
     )
 
@@ -104,7 +103,7 @@ _BY_TYPE = {reading.type: reading for reading in READINGS}
 
 
 def read(messages: Messages, kind: str, payload: bytes) -> Any:
-    """What CDR bytes of a type in `READINGS` say.
+    """Decode CDR bytes of a type in `READINGS`.
 
     Raises:
         CodecError: whatever else the bytes are.
