@@ -46,13 +46,11 @@ def up(
 
     The profile is checked first, as `profile check` does; nothing starts if it cannot run.
     """
-    stop = stop_on_signals()
-    die_with_parent()
     loaded = effective_profile(profile, connect, listen)
     choose_host(loaded, host)
     reject_wrong(profile, host, connect, listen)
-    if stop.is_set():
-        raise typer.Exit(130)
+    stop = stop_on_signals()
+    die_with_parent()
     out = console()
     lock = threading.Lock()
 
