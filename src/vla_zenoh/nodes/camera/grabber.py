@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 
-from vla_zenoh.errors import NodeError, VlaZenohError
+from vla_zenoh.errors import NodeError, in_words
 from vla_zenoh.nodes.camera.camera_publisher import ENDED, OK, CameraPublisher
 from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S, Source
 from vla_zenoh.profile import Profile
@@ -86,8 +86,7 @@ class Grabber:
             except Exception as error:  # whatever a driver raises must not end the other cameras
                 if stop.is_set():
                     return
-                known = isinstance(error, VlaZenohError)
-                self._publisher.lose(str(error) if known else f"{type(error).__name__}: {error}")
+                self._publisher.lose(in_words(error))
             else:
                 if not stop.is_set():
                     self._publisher.set_state(ENDED, "the last image was shown, and loop is false")
