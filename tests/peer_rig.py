@@ -19,10 +19,9 @@ from typing import Any
 
 import pytest
 from camera_rig import free_endpoint, until
+from model_wires import origami
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.interop import origami
-from vla_zenoh.keys import origami_key
 from vla_zenoh.profile import SessionProfile
 
 PEERS = Path(__file__).parent / "peers"
@@ -217,7 +216,7 @@ def reachable(kind: Kind, **changes: Any) -> Iterator[Server]:
         asked = origami.request("metadata", "rig", "vla-zenoh")
 
         def answers() -> bool:
-            replies = session.get(origami_key("metadata"), payload=asked, timeout=1.0)
+            replies = session.get(f"{origami.PROTOCOL}/metadata", payload=asked, timeout=1.0)
             return any(reply.ok is not None for reply in replies)
 
         until(f"{kind.script} answers", answers, START_S)

@@ -37,7 +37,7 @@ def load(
     pictures of 640x480, which are read raw.
     """
     from benchmarks.load.runner import Load
-    from vla_zenoh.cli.addresses import own_address
+    from vla_zenoh.lab.cli.loopback import own_address
     from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
 
     robot_counts, camera_counts = _counts("--robots", robots), _counts("--cameras", cameras)

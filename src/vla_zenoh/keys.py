@@ -312,11 +312,6 @@ class Keys:
             return None
 
 
-def origami_key(operation: str) -> str:
-    """Where a policy of another system answers queries; see interop/origami.py."""
-    return f"origami-zenoh-v1/{key_chunk(operation, 'operation')}"
-
-
 def last_chunk(key: str) -> str:
     """The last part of a key: the node, worker or camera it is about."""
     return key.rsplit("/", 1)[-1]

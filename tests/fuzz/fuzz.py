@@ -27,9 +27,12 @@ except ImportError:
         "only. Elsewhere: HYPOTHESIS_PROFILE=thorough python -m pytest tests/fuzz"
     )
 
+sys.path.append(str(Path(__file__).parents[1]))  # model_wires
+MODELS = ("groot", "openvla_rest", "origami")
 # What is imported here counts which of its branches are taken: that is what guides the fuzzer.
 with atheris.instrument_imports(
-    include=["vla_zenoh", "mcap", "rosbags"], exclude=["vla_zenoh.simulation"]
+    include=["vla_zenoh", *(f"vla_zenoh_model_{name}" for name in MODELS), "mcap", "rosbags"],
+    exclude=["vla_zenoh.simulation"],
 ):
     from targets import CORPUS, TARGETS, Target
 

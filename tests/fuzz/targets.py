@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import typer
+from model_wires import groot, npy, openvla_rest, origami
 
 from vla_zenoh.bus.clock_sync import decode_stamps
 from vla_zenoh.cli import keys as cli_keys
@@ -27,7 +28,7 @@ from vla_zenoh.cli.options import model_options, number_list
 from vla_zenoh.cli.output import Screen, plain_types
 from vla_zenoh.codec import image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
-from vla_zenoh.interop import groot, npy, openpi, openvla_rest, origami
+from vla_zenoh.interop import openpi
 from vla_zenoh.interop.ros2 import attachment, table
 from vla_zenoh.interop.ros2.definitions import parse
 from vla_zenoh.interop.ros2.messages import Messages
@@ -36,10 +37,11 @@ from vla_zenoh.lab.cli import inspect as cli_inspect
 from vla_zenoh.lab.cli import net as cli_net
 from vla_zenoh.lab.evaluation.csv_file import evaluate_csv
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
+from vla_zenoh.lab.inference_views import InferenceView
 from vla_zenoh.lab.recording.record_json import record_from_json, record_to_json
 from vla_zenoh.lab.recording.record_types import RECORDS
+from vla_zenoh.lab.serve import openpi_frames
 from vla_zenoh.lab.tasks.wording import parse_prompt
-from vla_zenoh.nodes.worker.inference_debug import InferenceView
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.policy.scripted_motions import parse_scripted
@@ -350,7 +352,7 @@ def _targets() -> Iterator[Target]:
     # -- other systems
     yield Target(
         "openpi",
-        _all_of(openpi.read_metadata, openpi.read_answer, openpi.read_observation),
+        _all_of(openpi.read_metadata, openpi.read_answer, openpi_frames.read_observation),
         peer,
         lambda: [message.pack({"actions": np.zeros((2, 7), np.float32)})],
     )

@@ -15,7 +15,7 @@ from vla_zenoh.bus.node_registry import MAX_OTHERS
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES
-from vla_zenoh.nodes.worker.inference_debug import MAX_SAMPLES, InferenceDebugSubscriber
+from vla_zenoh.lab.inference_views import MAX_SAMPLES, InferenceDebugSubscriber
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import Event, Header, InferenceDebug, NodeStatus

@@ -416,6 +416,14 @@ def test_a_prompt_on_a_topic_becomes_our_prompt(rig: Ros2Rig) -> None:
 
     rig.wait("the prompt", say)
     assert heard[0] == "go up"
+    heard.clear()
+    for words in ("go down", "go up", "stay"):
+        rig.peer.put("/vla/prompt", rig.peer.message("std_msgs/msg/String", data=words))
+    rig.wait("the last prompt", lambda: "stay" in heard)
+    assert heard == ["go down", "go up", "stay"]
+    rig.peer.put("/vla/prompt", rig.peer.message("std_msgs/msg/String", data="a\x07b"))
+    rig.wait("it is rejected", lambda: rig.happened("invalid"))
+    assert heard == ["go down", "go up", "stay"]
     subscriber.undeclare()
 
 

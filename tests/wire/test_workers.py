@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from chain import MOVING_M_S, READY_PATIENCE_S, Chain, command_line
 
-from vla_zenoh.bus.host_id import own_boot_id
+from vla_zenoh.bus.clock import own_boot_id
 from vla_zenoh.codec.image import decode_jpeg
-from vla_zenoh.nodes.worker.inference_debug import InferenceDebugSubscriber, InferenceView
+from vla_zenoh.lab.inference_views import InferenceDebugSubscriber, InferenceView
 from vla_zenoh.profile import override
 from vla_zenoh.runtime.launch import EXPENDABLE, Host
 

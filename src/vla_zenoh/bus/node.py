@@ -20,13 +20,10 @@ from vla_zenoh.bus.buffers import (
     bytes_of,
     header_of,
 )
-from vla_zenoh.bus.clock import Clock
+from vla_zenoh.bus.clock import Clock, own_host_id
 from vla_zenoh.bus.clock_sync import ClockSync, reply_with_stamps
-from vla_zenoh.bus.event_throttle import EventThrottle
-from vla_zenoh.bus.host_id import own_host_id
-from vla_zenoh.bus.liveliness import alive_nodes
-from vla_zenoh.bus.metrics import Traffic
-from vla_zenoh.bus.session import QOS, open_session
+from vla_zenoh.bus.metrics import EventThrottle, Traffic
+from vla_zenoh.bus.session import QOS, alive_nodes, open_session
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind, last_chunk

@@ -10,7 +10,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.liveliness import alive_robots
+from vla_zenoh.bus.session import alive_robots
 from vla_zenoh.cli.options import options
 from vla_zenoh.cli.output import complain, console, errors, fail, styled
 from vla_zenoh.cli.target import RobotTarget

@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from vla_zenoh.bus.host_id import HOST_VARIABLE
+from vla_zenoh.bus.clock import HOST_VARIABLE
 from vla_zenoh.policy.loader import ConstructorOptions, ModelFile, find_worker
 from vla_zenoh.profile import Profile, load_profile, override
 

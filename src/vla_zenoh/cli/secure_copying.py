@@ -1,4 +1,4 @@
-"""Shell commands that copy certificates, a profile and all its files to other computers."""
+"""Shell commands that copy certificates and a profile to other computers."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.files import FileUse, NeededFiles, needed_files
+from vla_zenoh.profile.load import followed, paths_in
+from vla_zenoh.resources import shipped
 from vla_zenoh.security.store import Store
-
-SEARCHED = "vla-zenoh"
-"""Folder in the home on the other computer, for files that a profile finds by name."""
 
 
 def copy_commands(
     profile: Profile, file: Path, store: Store, hosts: Collection[str], more: Collection[str] = ()
 ) -> Iterator[str]:
     """Lines to type here, then on the other computers.
+
+    Files beside the profile are copied with it; others that it names are listed.
 
     Args:
         profile: the secured one.
@@ -26,18 +26,16 @@ def copy_commands(
         hosts: get their certificates and the profile.
         more: get only the profile.
     """
-    needed = needed_files(str(file))
+    if not (hosts or more):
+        return
+    beside, elsewhere = _files(profile, file)
     for host in (*hosts, *more):
         if host in hosts:
             yield from _certificates(profile, store, host)
-        yield from _files(needed, file, host)
-    for what in needed.missing:
-        yield f"Not on this computer, so not copied: {what}"
-    if not (hosts or more):
-        return
-    if needed.searched:
-        yield f"There, first: export VLA_ZENOH_PATH=~/{SEARCHED}"
-    there = shlex.quote(f"./{needed.profile}")
+        yield f"  scp {' '.join(shlex.quote(_shown(path)) for path in beside)} {host}:"
+    for path in elsewhere:
+        yield f"Copy this file as well, to the same place: {path}"
+    there = shlex.quote(f"./{file.name}")
     if any(host in profile.hosts for host in hosts):
         yield f"There: vla-zenoh up {there} --host NAME"
     yield f"To watch, there: vla-zenoh status --profile {there}"
@@ -51,27 +49,16 @@ def _certificates(profile: Profile, store: Store, host: str) -> Iterator[str]:
     yield f"  scp -rp {shlex.quote(str(store.folder / host))} {host}:{target}/"
 
 
-def _files(needed: NeededFiles, file: Path, host: str) -> Iterator[str]:
-    beside = needed.beside
-    if all("/" not in name and (beside.base / name).is_file() for name in beside.names):
-        paths = [file if name == needed.profile else beside.base / name for name in beside.names]
-        yield f"  scp {' '.join(shlex.quote(_shown(path)) for path in paths)} {host}:"
-    else:
-        yield _packed(beside, host)
-    for part in needed.searched:
-        yield f"  ssh {host} mkdir -p {SEARCHED}"
-        yield _packed(part, host, SEARCHED)
-    if needed.home.names:
-        yield _packed(needed.home, host)
-    if needed.whole.names:
-        yield _packed(needed.whole, host, "/")
-
-
-def _packed(part: FileUse, host: str, there: str = "") -> str:
-    """Files with their folders, copied below the home or another folder there."""
-    names = " ".join(map(shlex.quote, part.names))
-    into = f"-C {there} " if there else ""
-    return f"  tar -C {shlex.quote(str(part.base))} -chf - {names} | ssh {host} tar {into}-xf -"
+def _files(profile: Profile, file: Path) -> tuple[list[Path], list[Path]]:
+    """Files that the profile consists of or names: those beside it, and the others."""
+    chain = [path for path, _ in followed(str(file)) if path.parent != shipped("profiles")]
+    texts = [
+        section[key].removeprefix(prefix) for section, key, prefix in paths_in(profile.model_dump())
+    ]
+    found = [path.absolute() for path in (*chain, *(Path(text).expanduser() for text in texts))]
+    here = file.absolute().parent
+    unique = list(dict.fromkeys(found))
+    return [p for p in unique if p.parent == here], [p for p in unique if p.parent != here]
 
 
 def _shown(path: Path) -> str:

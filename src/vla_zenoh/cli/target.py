@@ -13,8 +13,7 @@ import typer
 import zenoh
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.liveliness import alive_robots
-from vla_zenoh.bus.session import open_session
+from vla_zenoh.bus.session import alive_robots, open_session
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     PROFILE_VARIABLE,

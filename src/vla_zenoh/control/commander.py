@@ -22,7 +22,7 @@ from vla_zenoh.control.commander_io import (
     make_event,
 )
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
-from vla_zenoh.control.joint_monitor import JointMonitor
+from vla_zenoh.control.joint_monitor import JOINT_PATIENCE_S, JointMonitor, joint_state_faults
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.plan_timeline import EpisodeProgress, Goal, Plan
 from vla_zenoh.control.preflight import (
@@ -34,7 +34,6 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watchdog import Deadman, Watchdog
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.joint_check import JOINT_PATIENCE_S, joint_state_faults
 from vla_zenoh.kinematics.so3 import held_pose, pose_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (

@@ -16,7 +16,6 @@ from typing import Any
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError
 from vla_zenoh.interop.field_mapping import FieldMapping
-from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import shown
 
 PORT = 8000
@@ -28,7 +27,6 @@ SPEC = "vla_zenoh_action"
 """Where a server of ours says what its actions mean."""
 
 
-# -- the asking end -------------------------------------------------------------------------------
 def request(fields: Mapping[str, Any], session: str | None = None) -> bytes:
     """One observation; `session` only for servers that know it."""
     extra = {} if session is None else {"session_id": session}
@@ -127,46 +125,3 @@ def mismatches(metadata: Mapping[str, Any], mapping: FieldMapping) -> list[str]:
 
 
 _MEANING = ("kind", "frame", "rotation", "gripper", "gripper_open_is_high", "dt_s")
-
-
-# -- the answering end ----------------------------------------------------------------------------
-def metadata(action: ActionSpec, names: Mapping[str, str]) -> bytes:
-    """The first frame of a server of ours.
-
-    Args:
-        action: what its actions mean.
-        names: name of an observation -> its content, as text.
-    """
-    return message.pack(
-        {
-            "action_dim": action.dimension,
-            "action_horizon": action.horizon,
-            "observation": dict(names),
-            SPEC: action.model_dump(mode="json"),
-        }
-    )
-
-
-def read_observation(frame: bytes | str) -> dict[str, Any]:
-    """One request to a server of ours.
-
-    Raises:
-        PeerError: it is no map that can be read.
-    """
-    if isinstance(frame, str):
-        raise PeerError("peer_request", "a text frame; observations are msgpack in binary frames")
-    try:
-        found = message.unpack(frame)
-    except CodecError as error:
-        raise PeerError("peer_request", f"the frame cannot be read: {error}") from error
-    if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
-        raise PeerError("peer_request", f"an observation is a map of names, not {shown(found)}")
-    return found
-
-
-def answer(actions: Any, infer_ms: float, previous_ms: float | None) -> bytes:
-    """One reply of a server of ours; `previous_ms`: the whole request before this one took."""
-    timing = {"infer_ms": infer_ms}
-    if previous_ms is not None:
-        timing["prev_total_ms"] = previous_ms
-    return message.pack({"actions": actions, "server_timing": timing})

@@ -110,22 +110,3 @@ OPENVLA_REST: Presets = {
         "horizon": "8",
     },
 }
-
-ORIGAMI: Presets = {
-    "north_right": {
-        "map": "observation/image/head_left=camera:front, "
-        "observation/image/head_right=camera:front, "
-        "observation/image/wrist_left=blank:224x224, observation/image/wrist_right=camera:wrist, "
-        "observation/state=zero*29+joint+zero*29, observation/state/joint_torque=zero*65, "
-        "observation/tactile=zero*60, observation/image/tactile_deform=blank:480x1200, "
-        "prompt=prompt",
-        "resize": "stretch",
-        "columns": "29:36",
-        "action": "joint_position",
-        "gripper": "none",
-        "dt_s": "0.1",
-        "horizon": "25",
-    },
-}
-"""The right arm of the competition's two-armed robot; everything else is sent as zero. Its rate is
-not published: set dt_s."""

@@ -16,6 +16,7 @@ from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import ArmProfile, Options, RobotProfile
 from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Gripper, Ros2Profile
 from vla_zenoh.profile.schema import (
+    NODE_KINDS,
     SIMULATED,
     CameraProfile,
     Composition,
@@ -42,13 +43,6 @@ from vla_zenoh.profile.session import (
     is_loopback,
 )
 from vla_zenoh.resources import is_path
-
-ONLY_ONE = {
-    "command": "the robot obeys one command node",
-    "sim": "there is one simulated robot",
-    "ros2": "the robot has one driver",
-    "arm": "the robot has one driver",
-}
 
 
 def _root(value: str) -> str:
@@ -305,7 +299,7 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
                 [(("cameras",), "leaves none for the node camera in {}: take it out of nodes")],
             )
         for kind in host.nodes:
-            if kind in ONLY_ONE:
+            if NODE_KINDS[kind].only_one:
                 runs["nodes", kind].append(name)
         for camera in profile.cameras_of(host):
             runs["cameras", camera].append(name)
@@ -315,7 +309,7 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
     yield from _routers(profile)
     for (what, name), hosts in runs.items():
         if len(hosts) > 1:
-            why = ONLY_ONE.get(name) if what == "nodes" else "each key has one writer"
+            why = NODE_KINDS[name].only_one if what == "nodes" else "each key has one writer"
             hint = "" if what == "nodes" else f". List on each host which {what} it runs"
             yield (
                 ("hosts", hosts[-1], what),

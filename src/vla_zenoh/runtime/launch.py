@@ -15,17 +15,17 @@ from typing import Any
 import zenoh
 
 from vla_zenoh.bus.client import DROPPED_HINT, Client
-from vla_zenoh.bus.host_id import HOST_VARIABLE, own_boot_id
+from vla_zenoh.bus.clock import HOST_VARIABLE, own_boot_id
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import NodeError, ProfileError, SessionError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
+from vla_zenoh.profile.schema import NODE_KINDS
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.runtime.hang_detection import LastStatus, hung_nodes
 from vla_zenoh.runtime.supervisor import NodeCommand, Supervisor
 from vla_zenoh.security.identity import Role, operator_role
 
-START_ORDER = ("router", "sim", "ros2", "arm", "command", "camera", "worker")
 EXPENDABLE = ("worker",)
 ROUTER_PATIENCE_S = 10.0
 BRAKE_PATIENCE_S = 1.0
@@ -91,7 +91,7 @@ def node_commands(
         )
     common = ("--profile", str(profile_file))
     commands: list[NodeCommand] = []
-    for kind in sorted(part.nodes, key=START_ORDER.index):
+    for kind in sorted(part.nodes, key=list(NODE_KINDS).index):
         name = profile.node_name(host, kind)
         if kind == "worker":
             for worker in profile.workers_of(part):

@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from vla_zenoh.profile.schema import NODE_KINDS
 from vla_zenoh.runtime.parent_watch import PARENT_VARIABLE, RUN_FOLDER_VARIABLE
 
 BACKOFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
@@ -21,10 +22,9 @@ STABLE_S = 60.0
 a busy machine, to find that it cannot run."""
 GIVE_UP_AFTER = 6
 """Crashes in a row, each before `STABLE_S`."""
-STOP_ORDER = (
-    (("worker", "camera", "command"), 0.8),
-    (("sim", "ros2", "arm"), 0.4),
-    (("router",), 0.1),
+STOP_ORDER = tuple(
+    (tuple(kind for kind, traits in NODE_KINDS.items() if traits.stop_s == stop_s), stop_s)
+    for stop_s in sorted({traits.stop_s for traits in NODE_KINDS.values()}, reverse=True)
 )
 """Kinds in the order they are stopped, and how long before the deadline the next follow."""
 POLL_S = 0.05
@@ -36,7 +36,7 @@ class NodeCommand:
 
     Args:
         name: as in logs and status.
-        kind: router, sim, ros2, arm, camera, command or worker.
+        kind: one of `NODE_KINDS`.
         arguments: of the command line, after ``vla-zenoh``.
     """
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from vla_zenoh.errors import ProfileError, SecurityError
+from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.profile import Profile
+from vla_zenoh.profile.schema import NODE_KINDS
 
 
 class Role(Enum):
@@ -27,16 +28,6 @@ class Role(Enum):
     BRIDGE = "bridge"  # a ROS 2 robot's; serves the node ros2 alone, has no rights at our routers
 
 
-ROLE_OF_KIND = {
-    "router": Role.ROUTER,
-    "sim": Role.ROBOT,
-    "ros2": Role.ROBOT,
-    "arm": Role.ROBOT,
-    "camera": Role.CAMERA,
-    "worker": Role.WORKER,
-    "command": Role.COMMAND,
-}
-"""Kind of node in a profile -> its role."""
 PEOPLE = (Role.OPERATOR, Role.VIEWER, Role.REPLAY)
 TELEOP = "teleop"
 """Worker name of an operator who drives by hand."""
@@ -91,7 +82,6 @@ def identities_of(profile: Profile, host: str) -> list[Identity]:
 
     Raises:
         ProfileError: neither hosts nor session.security.people know it.
-        SecurityError: a kind of node has no role.
     """
     role = operator_role(profile, host)
     if role is None:
@@ -114,11 +104,7 @@ def operator_identities(host: str, role: Role) -> list[Identity]:
 
 
 def identities(profile: Profile) -> list[Identity]:
-    """Everybody in the lab.
-
-    Raises:
-        SecurityError: a kind of node has no role.
-    """
+    """Everybody in the lab."""
     hosts = dict.fromkeys([*profile.hosts, *_people(profile)])
     return [identity for host in hosts for identity in identities_of(profile, host)]
 
@@ -133,11 +119,7 @@ def _nodes(profile: Profile, host: str) -> list[Identity]:
     from_ros2 = tuple(n for n, c in profile.cameras.items() if c.source.startswith("ros2:"))
     found: list[Identity] = []
     for kind in part.nodes:
-        role = ROLE_OF_KIND.get(kind)
-        if role is None:
-            raise SecurityError(
-                f"nodes of kind {kind!r} have no role: name it in security/identity.py"
-            )
+        role = Role(NODE_KINDS[kind].role)
         if role is Role.WORKER:
             found += [
                 Identity(role, worker_node(worker), host, worker=worker)

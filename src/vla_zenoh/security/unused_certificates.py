@@ -19,9 +19,6 @@ def unused_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path
     Args:
         profile: secured.
         entries: of its folder.
-
-    Raises:
-        SecurityError: a kind of node has no role.
     """
     security = profile.session.security
     people = security.people if security is not None else {}

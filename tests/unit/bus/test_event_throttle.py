@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.bus.event_throttle import KINDS, PERIOD_S, EventThrottle
+from vla_zenoh.bus.metrics import KINDS, PERIOD_S, EventThrottle
 from vla_zenoh.types import Event
 
 REFUSED = Event("warning", "refusal", "activate_refused", "worker 'a' is not alive")

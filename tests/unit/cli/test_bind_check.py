@@ -9,9 +9,9 @@ from threading import Event
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.addresses import require_loopback
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import SecurityError
+from vla_zenoh.lab.cli.loopback import require_loopback
 from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.profile import Profile, load_profile, override, to_yaml
 

@@ -7,15 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from model_wires import groot, origami
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop import action_semantics as meaning
-from vla_zenoh.interop import field_mapping, groot, openpi, origami
+from vla_zenoh.interop import field_mapping, openpi
 from vla_zenoh.interop.action_semantics import make_forward
 from vla_zenoh.interop.adapter import FIRST_S, LONGEST_S, Backoff
 from vla_zenoh.interop.field_mapping import DEFAULTS, FieldMapping, read_columns, read_field_mapping
-from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, ORIGAMI, Presets
+from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, Presets
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
+from vla_zenoh.lab.serve import openpi_frames
 from vla_zenoh.policy import Observation, example_observation
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState, JointState, PoseState
@@ -29,7 +31,7 @@ ALL: dict[str, tuple[Presets, str]] = {
         "openpi": OPENPI,
         "groot": GROOT,
         "openvla_rest": OPENVLA_REST,
-        "origami": ORIGAMI,
+        "origami": origami.PRESETS,
     }.items()
     for preset in presets
 }
@@ -139,7 +141,7 @@ def test_joints_in_another_order_lead_to_the_same_poses() -> None:
 
 
 def test_origami_takes_the_columns_of_one_arm() -> None:
-    of = layout(ORIGAMI, "north_right")
+    of = layout(origami.PRESETS, "north_right")
     observation, forward = seen(of), make_forward(load_profile("panda_sim"))
     state = of.request(observation)["observation/state"]
     assert observation.joint is not None
@@ -299,7 +301,7 @@ def test_the_spec_of_every_option_has_its_default_documented() -> None:
 # -- what servers say of themselves ---------------------------------------------------------------
 def test_a_server_that_says_what_is_set_fits() -> None:
     of = layout(preset="own")
-    said = openpi.read_metadata(openpi.metadata(of.spec.action, {}))
+    said = openpi.read_metadata(openpi_frames.metadata(of.spec.action, {}))
     assert openpi.mismatches(said, of) == []
     assert openpi.mismatches({}, of) == []
 
@@ -339,7 +341,7 @@ def test_what_groots_server_says_otherwise_is_named() -> None:
 
 
 def test_what_origamis_policy_says_otherwise_is_named() -> None:
-    of = layout(ORIGAMI, "north_right")
+    of = layout(origami.PRESETS, "north_right")
     fits = {"action_dim": 65, "action_type": "absolute_joint_position", "action_units": "radians"}
     assert origami.mismatches(fits, of) == []
     assert "column 35" in origami.mismatches({**fits, "action_dim": 14}, of)[0]

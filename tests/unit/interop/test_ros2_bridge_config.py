@@ -18,12 +18,12 @@ from vla_zenoh.errors import ProfileError
 from vla_zenoh.interop.ros2.bridge import bridge_command, bridge_config, bridge_text
 from vla_zenoh.interop.ros2.graph import camera_topics
 from vla_zenoh.interop.ros2.keys import Ros2Dds
+from vla_zenoh.lab.doctor.access_rules import Passage, allows, passages
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.security import authority as ca
 from vla_zenoh.security.bridge import bridge_locks, bridges
 from vla_zenoh.security.identity import Role
 from vla_zenoh.security.roles import Act
-from vla_zenoh.security.rules import Passage, allows, passages
 from vla_zenoh.security.store import Store
 
 RUNNER = CliRunner()
@@ -69,7 +69,6 @@ def test_the_shipped_profile_lets_through_what_it_names_and_nothing_else() -> No
             "/camera/realsense2_camera/color/image_raw",
             "/camera/wrist_camera/color/image_raw",
             "/joint_states",
-            "/vla/active",
             "/vla/prompt",
         ],
         "subscribers": [

@@ -14,11 +14,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from model_wires import groot, npy, openvla_rest, origami
 
 from vla_zenoh.errors import PeerError
-from vla_zenoh.interop import groot, npy, openpi, openvla_rest, origami
+from vla_zenoh.interop import openpi
 from vla_zenoh.interop.field_mapping import read_field_mapping
 from vla_zenoh.interop.presets import GROOT, OPENPI
+from vla_zenoh.lab.serve import openpi_frames
 from vla_zenoh.policy import ActionSpec
 
 EXAMPLES, MUTATIONS = 20, 60
@@ -77,7 +79,7 @@ def test_openvlas_values_come_back(value: dict[str, Any]) -> None:
 @settings(max_examples=EXAMPLES)
 @given(maps)
 def test_openpis_observations_come_back(fields: dict[str, Any]) -> None:
-    assert same(openpi.read_observation(openpi.request(fields)), fields)
+    assert same(openpi_frames.read_observation(openpi.request(fields)), fields)
 
 
 @settings(max_examples=EXAMPLES)
@@ -110,17 +112,18 @@ def test_an_array_of_openpi_has_byte_keys_and_one_of_groot_is_an_npy_file() -> N
 
 
 # -- whatever comes in ----------------------------------------------------------------------------
+SERVED = ActionSpec(horizon=1, dt_s=0.1)
 ACTIONS = np.linspace(-1, 1, 14, dtype=np.float32).reshape(2, 7)
 MODALITY = {"__ModalityConfig_class__": True, "as_json": '{"modality_keys": ["x"]}'}
 ANSWERS: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
-    "openpi": (openpi.answer(ACTIONS, 1.0, None), openpi.read_answer),
+    "openpi": (openpi_frames.answer(ACTIONS, 1.0, None), openpi.read_answer),
     "openpi metadata": (
-        openpi.metadata(ActionSpec(horizon=1, dt_s=0.1), {"a": "b"}),
+        openpi_frames.metadata(SERVED, {"a": "b"}),
         openpi.read_metadata,
     ),
     "openpi request": (
         openpi.request({"image": np.zeros((2, 2, 3), np.uint8), "prompt": "up"}),
-        openpi.read_observation,
+        openpi_frames.read_observation,
     ),
     "groot": (groot.pack([{"x": ACTIONS}, {}]), groot.read_actions),
     "groot modalities": (groot.pack({"video": MODALITY}), groot.read_answer),
@@ -139,6 +142,20 @@ ANSWERS: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         ),
         lambda payload: origami.read_answer(payload, "infer", "1"),
     ),
+}
+READ: dict[str, Any] = {
+    "openpi": {"actions": ACTIONS, "server_timing": {"infer_ms": 1.0}},
+    "openpi metadata": {
+        "action_dim": SERVED.dimension,
+        "action_horizon": 1,
+        "observation": {"a": "b"},
+        openpi.SPEC: SERVED.model_dump(mode="json"),
+    },
+    "openpi request": {"image": np.zeros((2, 2, 3), np.uint8), "prompt": "up"},
+    "groot": {"x": ACTIONS},
+    "groot modalities": {"video": {"modality_keys": ["x"]}},
+    "openvla": ACTIONS,
+    "origami": ACTIONS,
 }
 
 
@@ -160,7 +177,7 @@ def refused(read: Callable[[bytes], Any], payload: bytes) -> PeerError | None:
 @pytest.mark.parametrize("name", ANSWERS)
 def test_an_untouched_answer_is_read(name: str) -> None:
     payload, read = ANSWERS[name]
-    read(payload)
+    assert same(read(payload), READ[name])
 
 
 @pytest.mark.parametrize("name", ANSWERS)

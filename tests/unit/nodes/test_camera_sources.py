@@ -20,7 +20,7 @@ from vla_zenoh.nodes.camera import v4l2
 from vla_zenoh.nodes.camera.camera_publisher import resize, to_rgb
 from vla_zenoh.nodes.camera.file import FileSource, natural, open_frames
 from vla_zenoh.nodes.camera.fitted_streams import EARLY, LATE, RateLimiter
-from vla_zenoh.nodes.camera.grabber import choose_cameras, make_source
+from vla_zenoh.nodes.camera.node import choose_cameras, make_source
 from vla_zenoh.nodes.camera.rtsp import RtspSource
 from vla_zenoh.nodes.camera.source import without_password
 from vla_zenoh.nodes.camera.v4l2 import V4l2Source, captured_ns
@@ -309,7 +309,7 @@ def test_what_opencv_says_of_broken_sources_does_not_reach_the_terminal(tmp_path
     program = f"""
 import threading
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.camera.grabber import make_source
+from vla_zenoh.nodes.camera.node import make_source
 from vla_zenoh.nodes.camera.opencv import prepare
 from vla_zenoh.profile.schema import CameraProfile
 prepare()

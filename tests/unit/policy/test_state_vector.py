@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from vla_zenoh.errors import SpecError
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation, rotation_from_quat, rotation_from_rpy
+from vla_zenoh.lab.serve.state_parts import state_of
 from vla_zenoh.policy import (
     ActionSpec,
     ModelSpec,
@@ -90,7 +91,7 @@ def test_joints_are_as_many_as_the_arm_has(joints: int, part: str, unit: float) 
     numbers = state_vector.state_vector(names, replace(seen(), joint=arm), MAX_WIDTH_M)
     wanted = unit * np.arange(joints) / 10
     np.testing.assert_allclose(numbers, [*wanted, 0.25], rtol=ATOL)
-    back = state_vector.state_of(names, numbers.astype(float), joints, MAX_WIDTH_M)
+    back = state_of(names, numbers.astype(float), joints, MAX_WIDTH_M)
     np.testing.assert_allclose(back["joint"], arm.position_rad, atol=ATOL)
     with pytest.raises(SpecError, match=rf"has 9 numbers, 'joint' has {joints}; .*\({joints}\)"):
         state_vector.read_state("joint", 9, joints)
@@ -109,7 +110,7 @@ def test_a_state_in_any_form_is_read_back(
     quat = quat_from_rotation(exp3(rotvec))
     names = state_vector.read_parts(f"position+{turn}+zero*2+{grip}")
     numbers = state_vector.state_vector(names, seen(quat, width_m), MAX_WIDTH_M)
-    back = state_vector.state_of(names, numbers.astype(float), 7, MAX_WIDTH_M)
+    back = state_of(names, numbers.astype(float), 7, MAX_WIDTH_M)
     np.testing.assert_allclose(back["position_m"], [0.4, 0.1, 0.3], atol=ATOL)
     assert abs(back["quat_xyzw"] @ quat) == pytest.approx(1.0, abs=1e-5)
     assert back["width_m"] == pytest.approx(width_m, abs=ATOL)
@@ -127,9 +128,9 @@ def test_single_coordinates_are_those_of_the_whole(whole: str) -> None:
 
 def test_what_says_too_little_is_not_read_back() -> None:
     with pytest.raises(SpecError, match="roll alone says too little"):
-        state_vector.state_of(["roll"], np.zeros(1), 7, MAX_WIDTH_M)
+        state_of(["roll"], np.zeros(1), 7, MAX_WIDTH_M)
     with pytest.raises(SpecError, match=r"rpy has shape \(2,\), wanted \(3,\)"):
-        state_vector.state_of(["rpy"], np.zeros(2), 7, MAX_WIDTH_M)
+        state_of(["rpy"], np.zeros(2), 7, MAX_WIDTH_M)
 
 
 @pytest.mark.parametrize(

@@ -6,16 +6,18 @@ import os
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import pytest
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.host_id import own_boot_id
+from vla_zenoh.bus.clock import own_boot_id
+from vla_zenoh.cli.main import COMMANDS, Group
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.profile.schema import NODE_KINDS
-from vla_zenoh.runtime.launch import START_ORDER, Host, node_commands
+from vla_zenoh.profile.robot import RobotProfile
+from vla_zenoh.profile.schema import NODE_KINDS, NodeKind
+from vla_zenoh.runtime.launch import Host, node_commands
 from vla_zenoh.runtime.supervisor import STOP_ORDER
 from vla_zenoh.types import NodeStatus
 
@@ -30,9 +32,26 @@ def words_of(profile: Profile, host: str, kind: str, *also: Path) -> tuple[str, 
     return words
 
 
-def test_every_kind_of_node_has_its_turn_to_start_and_to_end() -> None:
-    assert sorted(START_ORDER) == sorted(NODE_KINDS)
-    assert sorted(kind for kinds, _ in STOP_ORDER for kind in kinds) == sorted(NODE_KINDS)
+def test_nodes_start_from_the_router_on_and_the_robot_stops_after_what_drives_it() -> None:
+    assert list(NODE_KINDS) == ["router", "sim", "ros2", "arm", "command", "camera", "worker"]
+    assert [set(kinds) for kinds, _ in STOP_ORDER] == [
+        {"worker", "camera", "command"},
+        {"sim", "ros2", "arm"},
+        {"router"},
+    ]
+
+
+def test_every_kind_of_node_may_stand_in_a_profile_and_every_robot_driver_is_one() -> None:
+    assert set(get_args(NodeKind)) == set(NODE_KINDS)
+    robots = {kind for kind, traits in NODE_KINDS.items() if traits.role == "robot"}
+    assert robots == set(get_args(RobotProfile.model_fields["driver"].annotation))
+
+
+def test_every_kind_of_node_has_a_command() -> None:
+    nodes = COMMANDS["Run"]["node"]
+    assert isinstance(nodes, Group)
+    assert {*nodes.commands, "worker"} == set(NODE_KINDS)
+    assert "worker" in COMMANDS["Run"]
 
 
 def test_the_router_is_told_of_every_robot_it_serves() -> None:

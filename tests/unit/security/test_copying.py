@@ -39,12 +39,11 @@ LAB = """\
 extends: panda_sim_two_hosts
 arm: {file: my_arm.py}
 """
-URDF = (
-    '<robot name="arm"><link name="a"><mesh filename="package://arm/meshes/a.stl"/></link></robot>'
-)
+URDF = '<robot name="arm"/>'
 WHOLE = """\
 extends: panda_sim_two_hosts
-robot: {description: arm/urdf/arm.urdf}
+robot: {description: arm/arm.urdf}
+models: {nod: ../../nod.py}
 workers: [scripted, nod]
 hosts:
   robot: {nodes: [router, command]}
@@ -141,30 +140,15 @@ def test_a_chain_of_profiles_with_an_arm_of_ones_own_loads_on_the_other_computer
     assert not list(world.home("gpu").rglob("ca.key"))
 
 
-def test_a_profile_elsewhere_with_meshes_and_a_model_found_by_its_name_loads_as_well(
-    world: World, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    lab, own = world.here / "lab", tmp_path / "own"
-    write(lab / "arm/urdf/arm.urdf", URDF)
-    write(lab / "arm/meshes/a.stl", "solid")
+def test_files_that_are_not_beside_the_profile_are_named(world: World, tmp_path: Path) -> None:
+    lab = world.here / "lab"
+    write(lab / "arm/arm.urdf", URDF)
     write(lab / "base.yaml", WHOLE)
-    write(own / "models/nod.py", "class Nod: ...\n")
-    monkeypatch.setenv("VLA_ZENOH_PATH", str(own))
-    (world.here / "desk").mkdir()
-    monkeypatch.chdir(world.here / "desk")
-    said = world.secure("init", "--profile", "../lab/base.yaml")
-    assert "extends: ../lab/base.yaml" in (world.here / "desk/base_secure.yaml").read_text()
-    world.type(said)
-    there = world.home("gpu")
-    assert "There, first: export VLA_ZENOH_PATH=~/vla-zenoh" in said
-    assert "There: vla-zenoh up ./desk/base_secure.yaml --host NAME" in said
-    before = load_profile("base_secure.yaml")
-    world.at("gpu", monkeypatch)
-    after = load_profile("./desk/base_secure.yaml")
-    assert same_but_for_places(before, after)
-    assert Path(after.robot.description) == there / "lab/arm/urdf/arm.urdf"
-    assert (there / "lab/arm/meshes/a.stl").read_text() == "solid"
-    assert (there / "vla-zenoh/models/nod.py").is_file()
+    write(tmp_path / "nod.py", "class Nod: ...\n")
+    said = world.secure("init", "--profile", "lab/base.yaml")
+    assert "  scp base_secure.yaml gpu:" in said
+    for file in (lab / "base.yaml", lab / "arm/arm.urdf", tmp_path / "nod.py"):
+        assert f"Copy this file as well, to the same place: {file}" in said
 
 
 def test_a_computer_that_is_added_gets_the_whole_profile_and_so_does_the_router(

@@ -10,17 +10,17 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import Keys, covers
+from vla_zenoh.lab.doctor.access_rules import Passage, allows, missing, passages
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.profile.schema import NODE_KINDS
 from vla_zenoh.security.identity import (
-    ROLE_OF_KIND,
     Identity,
     Role,
     identities,
     identities_of,
 )
 from vla_zenoh.security.roles import TABLE, Act, Right, expressions, key_members, rights
-from vla_zenoh.security.rules import Passage, access_control, allows, missing, passages, wide
+from vla_zenoh.security.rules import access_control, wide
 
 KEYS = Keys("panda")
 LAB = {
@@ -52,7 +52,7 @@ def test_every_key_has_a_row_in_the_table_of_roles() -> None:
 
 
 def test_every_kind_of_node_has_a_role() -> None:
-    assert set(NODE_KINDS) <= set(ROLE_OF_KIND)
+    assert {traits.role for traits in NODE_KINDS.values()} <= {role.value for role in Role}
 
 
 @pytest.mark.parametrize("row", TABLE, ids=lambda row: row.member)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from vla_zenoh.interop.ros2 import diagnostics
 from vla_zenoh.interop.ros2.gripper_actions import GRASP
 from vla_zenoh.interop.ros2.keys import Endpoint, EntityRole
-from vla_zenoh.interop.ros2.services import ACTIVE_TOPIC, PROMPT_TOPIC, SERVICES, STATUS_TOPIC
+from vla_zenoh.interop.ros2.services import PROMPT_TOPIC, SERVICES, STATUS_TOPIC
 from vla_zenoh.interop.ros2.topics import joint_state, plain, transforms, wrench
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Camera, Ros2Gripper, Ros2Profile
@@ -72,5 +72,4 @@ def _services(prefix: str) -> Iterator[Endpoint]:
     for service in SERVICES:
         yield Endpoint(EntityRole.SERVER, f"{prefix}/{service.name}", service.type)
     yield Endpoint(EntityRole.SUBSCRIBER, f"{prefix}/{PROMPT_TOPIC}", plain.TEXT)
-    yield Endpoint(EntityRole.SUBSCRIBER, f"{prefix}/{ACTIVE_TOPIC}", plain.TRUTH)
     yield Endpoint(EntityRole.PUBLISHER, f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)

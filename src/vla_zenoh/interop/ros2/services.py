@@ -19,4 +19,4 @@ SET_PROMPT = Service("set_prompt", "vla_msgs/srv/SetPrompt")
 SET_REQUEST = Service("set_request", "vla_msgs/srv/SetRequest")
 SERVICES = (SET_ACTIVE, STOP, RESET, SET_PROMPT, SET_REQUEST)
 
-PROMPT_TOPIC, ACTIVE_TOPIC, STATUS_TOPIC = "prompt", "active", "status"
+PROMPT_TOPIC, STATUS_TOPIC = "prompt", "status"

@@ -68,7 +68,6 @@ READINGS = (
     RosReading(image.TYPE, _CAMERA, RosImage, image.read, MAX_PICTURE_BYTES),
     RosReading(compressed_image.TYPE, _CAMERA, RosImage, compressed_image.read, MAX_PICTURE_BYTES),
     RosReading(plain.TEXT, ("prompt",), str, plain.read),
-    RosReading(plain.TRUTH, ("active",), bool, plain.read),
 )
 
 

@@ -100,7 +100,7 @@ class _Run:
 
     def in_real_time(self) -> None:
         """Run with real nodes."""
-        from vla_zenoh.cli.addresses import own_address
+        from vla_zenoh.lab.cli.loopback import own_address
         from vla_zenoh.lab.episode import Interrupted
         from vla_zenoh.runtime.process import die_with_parent
 

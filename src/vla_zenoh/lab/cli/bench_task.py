@@ -259,8 +259,8 @@ def _real_time(
     stop: threading.Event,
     advance: Callable[[TaskScore], None],
 ) -> None:
-    from vla_zenoh.cli.addresses import own_address
     from vla_zenoh.lab.bench.task_runner import TaskRunner
+    from vla_zenoh.lab.cli.loopback import own_address
     from vla_zenoh.lab.episode import Interrupted
     from vla_zenoh.runtime.launch import Host
     from vla_zenoh.runtime.process import die_with_parent

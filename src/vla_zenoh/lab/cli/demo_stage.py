@@ -14,9 +14,9 @@ from typing import Any
 
 from rich.progress import Progress
 
-from vla_zenoh.cli.addresses import own_address
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import Screen, errors, progress_bars
+from vla_zenoh.lab.cli.loopback import own_address
 from vla_zenoh.lab.demo.video import write_video
 from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.recording.run import Run, load_run, pictures

@@ -19,7 +19,7 @@ from vla_zenoh.cli.output import console, errors, fail, new_table
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
-from vla_zenoh.nodes.worker.inference_debug import InferenceDebugSubscriber, InferenceView
+from vla_zenoh.lab.inference_views import InferenceDebugSubscriber, InferenceView
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.sanitize import one_line
 

@@ -11,6 +11,7 @@ import typer
 from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.errors import counted
 from vla_zenoh.runtime.process import run_node
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def _show(recorded: RecordingResult, as_json: bool) -> None:
     else:
         console().print(
             f"{recorded.path}: {recorded.samples.total():,} samples of "
-            f"{len(recorded.samples)} keys in {recorded.seconds:.1f} s, "
+            f"{counted(len(recorded.samples), 'key')} in {recorded.seconds:.1f} s, "
             f"{recorded.size_bytes / 1e6:.1f} MB, {recorded.dropped.total()} dropped"
         )
     if recorded.dropped:

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vla_zenoh.cli.addresses import require_loopback
 from vla_zenoh.cli.options import options
 from vla_zenoh.cli.output import errors, fail
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.errors import MissingExtraError, ProfileError, RecordingError
+from vla_zenoh.errors import MissingExtraError, ProfileError, RecordingError, counted
+from vla_zenoh.lab.cli.loopback import require_loopback
 from vla_zenoh.lab.view.viewer import Viewer, open_server, open_window
 from vla_zenoh.profile import Profile, read_profile
 from vla_zenoh.runtime.process import run_node, stop_on_signals
@@ -208,7 +208,7 @@ def _summarise(logger: RerunLogger, save: Path | None) -> None:
     screen = errors()
     where = f" in {save}" if save is not None else ""
     screen.print(
-        f"{logger.shown.total():,} samples of {len(logger.shown)} keys{where}",
+        f"{logger.shown.total():,} samples of {counted(len(logger.shown), 'key')}{where}",
         soft_wrap=True,
     )
     if logger.rejected:

@@ -24,11 +24,12 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import Keys, covers
 from vla_zenoh.lab.doctor.access import AccessVerdict
+from vla_zenoh.lab.doctor.access_rules import allowing, missing, passages
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import SecurityProfile
 from vla_zenoh.security.identity import Identity, Role, identities
 from vla_zenoh.security.roles import TABLE, Act, Right, expressions, rights
-from vla_zenoh.security.rules import EVERY_MESSAGE, access_control, allowing, missing, passages
+from vla_zenoh.security.rules import EVERY_MESSAGE, access_control
 from vla_zenoh.security.store import Store
 
 Done = set[tuple[str, Act, str]]

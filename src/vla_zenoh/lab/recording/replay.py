@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from vla_zenoh.bus.liveliness import alive_nodes
 from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.session import alive_nodes
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import CodecError, NodeError, RecordingError
 from vla_zenoh.lab.recording.reader import Recording

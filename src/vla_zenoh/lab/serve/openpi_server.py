@@ -15,6 +15,7 @@ from typing import Any
 
 from vla_zenoh.errors import MissingExtraError, PeerError, SpecError, in_words
 from vla_zenoh.interop import openpi
+from vla_zenoh.lab.serve import openpi_frames
 from vla_zenoh.lab.serve.served_policy import ServedPolicy
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
 
@@ -90,7 +91,7 @@ class OpenPiServer:
             self._busy.release()
 
     def _serve(self, connection: ServerConnection) -> None:
-        connection.send(openpi.metadata(self._policy.spec.action, self._offer.described()))
+        connection.send(openpi_frames.metadata(self._policy.spec.action, self._offer.described()))
         prompt: str | None = None
         previous_ms: float | None = None
         while True:
@@ -98,7 +99,7 @@ class OpenPiServer:
             began_s = time.monotonic()
             try:
                 self._seq += 1
-                given = openpi.read_observation(frame)
+                given = openpi_frames.read_observation(frame)
                 observation = self._offer.observe(given, time.time_ns(), self._seq)
                 if observation.prompt != prompt:
                     prompt = observation.prompt
@@ -113,7 +114,7 @@ class OpenPiServer:
                 connection.close(INTERNAL_ERROR, "the reason is in the frame before")
                 return
             infer_ms = (time.monotonic() - began_s) * 1e3
-            connection.send(openpi.answer(actions, infer_ms, previous_ms))
+            connection.send(openpi_frames.answer(actions, infer_ms, previous_ms))
             previous_ms = (time.monotonic() - began_s) * 1e3
 
 

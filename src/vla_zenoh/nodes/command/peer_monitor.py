@@ -9,7 +9,7 @@ from typing import Any
 
 from vla_zenoh import keys as key_names
 from vla_zenoh.bus.buffers import ReceivedSample, ZenohRing
-from vla_zenoh.bus.host_id import HostId
+from vla_zenoh.bus.clock import HostId
 from vla_zenoh.bus.node import Node
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.errors import CodecError

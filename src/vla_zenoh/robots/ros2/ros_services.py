@@ -1,4 +1,4 @@
-"""ROS services that control the robot: activate, stop, reset, prompt. Topics: see `RosTopics`.
+"""ROS services that control the robot: activate, stop, reset, prompt; topics of prompt and status.
 
 They run in a thread of their own, because the command node has to confirm a setting before the call
 is answered. A stop is sent at once, and no call made before it is carried out after it.
@@ -15,14 +15,16 @@ from typing import Any
 
 import zenoh
 
+from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.client import Client
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError, SessionError
-from vla_zenoh.interop.ros2 import diagnostics
+from vla_zenoh.interop.ros2 import diagnostics, table
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.names import request_of, response_of
 from vla_zenoh.interop.ros2.samples import Stamp
 from vla_zenoh.interop.ros2.services import (
+    PROMPT_TOPIC,
     RESET,
     SERVICES,
     SET_ACTIVE,
@@ -32,18 +34,73 @@ from vla_zenoh.interop.ros2.services import (
     STOP,
     Service,
 )
+from vla_zenoh.interop.ros2.topics import plain
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
-from vla_zenoh.robots.ros2.ros_topics import EstopOrder, Reject, RosTopics, prompt_text
 
 STATUS_PERIOD_S = 1.0
 POLL_S = 0.05
 MAX_WAITING = 32
 STATE_TIMEOUT_S = 2.0
 
+Reject = Callable[[str, str, str], None]
+
+
+class EstopOrder:
+    """Times of the last emergency stops, of this process and of others.
+
+    A reset or an activation that waits, while another call is answered or this process does not
+    run, must not undo a stop that came later and was sent at once.
+
+    Args:
+        session: to subscribe to the stops of others.
+        key: of stops.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._lock = threading.Lock()
+        self._ours_ns = self._others_ns = -1
+        handler = zenoh.handlers.Callback(self._on_stop, indirect=False)
+        self._subscriber = session.declare_subscriber(
+            key, handler, allowed_origin=zenoh.Locality.REMOTE
+        )
+
+    def _on_stop(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._others_ns = time.monotonic_ns()
+
+    def stop(self, publish: Callable[[], None]) -> None:
+        """Stop by calling `publish`."""
+        with self._lock:
+            self._ours_ns = time.monotonic_ns()
+            publish()
+
+    def overtook(self, asked_ns: int) -> bool:
+        """Whether a stop came after `asked_ns` on the monotonic clock."""
+        return max(self._ours_ns, self._others_ns) > asked_ns
+
+    def check(self, asked_ns: int) -> None:
+        """Check that no stop came after `asked_ns`.
+
+        Raises:
+            SessionError: one came.
+        """
+        if self.overtook(asked_ns):
+            raise SessionError("an emergency stop came after this request; send it again")
+
+    def unless_stopped(self, asked_ns: int, publish: Callable[[], None]) -> None:
+        """Call `publish`; no stop of this process comes between the check and it.
+
+        Raises:
+            SessionError: a stop came after `asked_ns`.
+        """
+        with self._lock:
+            self.check(asked_ns)
+            publish()
+
 
 class RosServices:
-    """Serves the control services, the control topics and the status topic.
+    """Serves the control services, applies the prompt topic, and publishes the status topic.
 
     Args:
         profile: the effective profile.
@@ -77,9 +134,8 @@ class RosServices:
         }
         for service in SERVICES:
             graph.serve(f"{prefix}/{service.name}", service.type, self._enqueue(service))
-        self._topics = RosTopics(
-            self._client, graph, Messages(messages.distribution), prefix, reject, self._stops
-        )
+        self._prompt_topic, self._prompt = f"{prefix}/{PROMPT_TOPIC}", ""
+        self._prompts = graph.subscribe(self._prompt_topic, plain.TEXT, CallbackRing(MAX_WAITING))
         self._status = graph.publisher(f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)
 
     def _enqueue(self, service: Service) -> Callable[[Request], None]:
@@ -95,18 +151,29 @@ class RosServices:
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set."""
-        topics = threading.Thread(
-            target=self._topics.run, args=(stop,), name="ros2 topics", daemon=True
-        )
-        topics.start()
         next_status_s = time.monotonic()
         while not stop.is_set():
             with contextlib.suppress(queue.Empty):
                 self._answer(*self._calls.get(timeout=POLL_S))
+            self._poll_prompts()
             if time.monotonic() >= next_status_s:
                 next_status_s = time.monotonic() + STATUS_PERIOD_S
                 self._publish_status()
-        topics.join()
+
+    def _poll_prompts(self) -> None:
+        """Apply the prompts of the topic; a repeated one only if the task has another meanwhile."""
+        for arrival in self._prompts.drain():
+            try:
+                payload = arrival.sample.payload.to_bytes()
+                prompt = prompt_text(table.read(self._messages, plain.TEXT, payload))
+            except CodecError as error:
+                self._reject(error.reason, f"{self._prompt_topic}: {error}", PROMPT_TOPIC)
+                continue
+            # The task may lag behind what was just published: a new prompt counts in any case.
+            changed, self._prompt = self._prompt not in ("", prompt), prompt
+            task = self._client.task
+            if changed or task is None or task.prompt != prompt:
+                self._client.publish(self._client.keys.prompt, prompt)
 
     # -- services -----------------------------------------------------------------------------
     def _answer(self, service: Service, request: Request, called_ns: int) -> None:
@@ -191,3 +258,12 @@ class RosServices:
             self._messages, self._robot, self._client.snapshot(), Stamp(time.time_ns(), "")
         )
         self._status.publish(self._messages.encode(message))
+
+
+def prompt_text(value: str) -> str:
+    """A prompt as the command node accepts it.
+
+    Raises:
+        CodecError: it is not acceptable.
+    """
+    return settings.decode_text(value.encode("utf-8", "surrogatepass"))

@@ -1,4 +1,4 @@
-"""std_msgs/String, Bool and Float64: one field called data."""
+"""std_msgs/String and Float64: one field called data."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.samples import Stamp
 
-TEXT, TRUTH, NUMBER = "std_msgs/msg/String", "std_msgs/msg/Bool", "std_msgs/msg/Float64"
+TEXT, NUMBER = "std_msgs/msg/String", "std_msgs/msg/Float64"
 
 
 def read(message: Any) -> Any:

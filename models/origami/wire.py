@@ -14,11 +14,30 @@ from typing import Any, Literal
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError
 from vla_zenoh.interop.field_mapping import FieldMapping
+from vla_zenoh.interop.presets import Presets
 from vla_zenoh.types import shown
 
 PROTOCOL = "origami-zenoh-v1"
 Operation = Literal["metadata", "reset", "infer"]
 ENCODING = "application/msgpack"
+PRESETS: Presets = {
+    "north_right": {
+        "map": "observation/image/head_left=camera:front, "
+        "observation/image/head_right=camera:front, "
+        "observation/image/wrist_left=blank:224x224, observation/image/wrist_right=camera:wrist, "
+        "observation/state=zero*29+joint+zero*29, observation/state/joint_torque=zero*65, "
+        "observation/tactile=zero*60, observation/image/tactile_deform=blank:480x1200, "
+        "prompt=prompt",
+        "resize": "stretch",
+        "columns": "29:36",
+        "action": "joint_position",
+        "gripper": "none",
+        "dt_s": "0.1",
+        "horizon": "25",
+    },
+}
+"""The right arm of the competition's two-armed robot; everything else is sent as zero. Its rate is
+not published: set dt_s."""
 
 
 def request(

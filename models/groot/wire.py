@@ -24,10 +24,10 @@ from typing import Any, Literal
 
 import msgpack
 import numpy as np
+from vla_zenoh_model_groot import npy
 
 from vla_zenoh.codec.message import MAX_ITEMS, MAX_PAYLOAD_BYTES, count_containers
 from vla_zenoh.errors import PeerError
-from vla_zenoh.interop import npy
 from vla_zenoh.interop.field_mapping import FieldMapping
 from vla_zenoh.types import shown
 

@@ -16,7 +16,8 @@ import time
 from contextlib import suppress
 from typing import Any
 
-from vla_zenoh.interop import openvla_rest
+from vla_zenoh_model_openvla_rest import wire
+
 from vla_zenoh.interop.adapter import Adapter
 from vla_zenoh.interop.presets import OPENVLA_REST
 from vla_zenoh.policy.model_options import address, yes_no
@@ -39,7 +40,7 @@ class OpenVlaRest(Adapter):
 
     def __init__(
         self,
-        url: str = f"http://127.0.0.1:{openvla_rest.PORT}",
+        url: str = f"http://127.0.0.1:{wire.PORT}",
         preset: str = "",
         unnorm_key: str = "",
         encoded: str = "no",
@@ -65,8 +66,8 @@ class OpenVlaRest(Adapter):
         return []  # each request does, and the server does not describe itself
 
     def _ask(self, fields: dict[str, Any], *, begins: bool) -> Any:
-        body = openvla_rest.request(fields, self._unnorm_key, encoded=self._encoded)
-        return openvla_rest.read_answer(*self._post(body))
+        body = wire.request(fields, self._unnorm_key, encoded=self._encoded)
+        return wire.read_answer(*self._post(body))
 
     def _post(self, body: bytes) -> tuple[int, bytes]:
         secure = self._url.scheme == "https"
@@ -87,10 +88,10 @@ class OpenVlaRest(Adapter):
             timer.daemon = True
             timer.start()
             headers = {"Content-Type": "application/json", "Connection": "close"}
-            path = self._url.path.rstrip("/") or openvla_rest.PATH
+            path = self._url.path.rstrip("/") or wire.PATH
             connection.request("POST", path, body, headers)
             response = connection.getresponse()
-            answer = response.status, response.read(openvla_rest.MAX_BYTES + 1)
+            answer = response.status, response.read(wire.MAX_BYTES + 1)
         except self.lost as error:
             if late.is_set():
                 raise TimeoutError from error

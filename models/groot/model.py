@@ -14,9 +14,9 @@ from contextlib import suppress
 from typing import Any, cast, get_args
 
 import zmq
+from vla_zenoh_model_groot import wire
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop import groot
 from vla_zenoh.interop.adapter import Adapter
 from vla_zenoh.interop.presets import GROOT
 from vla_zenoh.policy.model_options import address, one_of
@@ -40,7 +40,7 @@ class Groot(Adapter):
 
     def __init__(
         self,
-        url: str = f"tcp://127.0.0.1:{groot.PORT}",
+        url: str = f"tcp://127.0.0.1:{wire.PORT}",
         version: str = "n1.6",
         preset: str = "",
         timeout_s: str = "2",
@@ -58,11 +58,11 @@ class Groot(Adapter):
             profile=profile,
             clock_s=time.monotonic,
         )
-        one_of("version", version, get_args(groot.Version))
-        self._version: groot.Version = cast(groot.Version, version)
+        one_of("version", version, get_args(wire.Version))
+        self._version: wire.Version = cast(wire.Version, version)
         self._token = api_token
         for name, source in self.mapping.fields.items():
-            prefix = groot.STATE if source.parts else "" if source.prompt else groot.VIDEO
+            prefix = wire.STATE if source.parts else "" if source.prompt else wire.VIDEO
             if not name.startswith(prefix):
                 raise SpecError(f"map: {name!r} must begin with {prefix!r}")
         self._socket: zmq.Socket[Any] | None = None
@@ -75,29 +75,29 @@ class Groot(Adapter):
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.SNDTIMEO, milliseconds)
         socket.setsockopt(zmq.RCVTIMEO, milliseconds)
-        socket.setsockopt(zmq.MAXMSGSIZE, groot.MAX_BYTES)
+        socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_BYTES)
         # Without this, requests to an absent server would be queued and sent later.
         socket.setsockopt(zmq.IMMEDIATE, 1)
         socket.connect(self.where)
         try:
-            modalities = groot.read_answer(self._call("get_modality_config"))
+            modalities = wire.read_answer(self._call("get_modality_config"))
         except PeerError as error:
             if error.reason != "peer_error":
                 raise
             modalities = None  # a server without this endpoint does not describe itself
-        return groot.mismatches(modalities, self.mapping)
+        return wire.mismatches(modalities, self.mapping)
 
     def _ask(self, fields: dict[str, Any], *, begins: bool) -> Any:
-        reset = groot.reset_data(self._version)
+        reset = wire.reset_data(self._version)
         if begins and reset is not None:
-            groot.read_answer(self._call("reset", reset))
-        asked = groot.observation(fields, self._version)
-        return groot.read_actions(self._call("get_action", asked))
+            wire.read_answer(self._call("reset", reset))
+        asked = wire.observation(fields, self._version)
+        return wire.read_actions(self._call("get_action", asked))
 
     def _call(self, endpoint: str, data: Any = None) -> bytes:
         assert self._socket is not None
         try:
-            self._socket.send(groot.request(endpoint, data, self._token))
+            self._socket.send(wire.request(endpoint, data, self._token))
         except zmq.Again as error:
             raise PeerError("peer_gone", f"no answer from {self.where}") from error
         try:

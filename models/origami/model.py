@@ -15,12 +15,11 @@ import uuid
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from vla_zenoh_model_origami import wire
+
 from vla_zenoh.codec.message import MAX_PAYLOAD_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError
-from vla_zenoh.interop import origami
 from vla_zenoh.interop.adapter import Adapter
-from vla_zenoh.interop.presets import ORIGAMI
-from vla_zenoh.keys import origami_key
 
 if TYPE_CHECKING:
     import zenoh
@@ -32,7 +31,7 @@ class Origami(Adapter):
     Args:
         url: the router, as tcp/HOST:PORT.
         session_id: the session the policy was started for.
-        preset: north_right; see vla_zenoh/interop/presets.py.
+        preset: north_right; see wire.py.
         timeout_s: for each answer.
         profile: of the robot whose arm and gripper are meant.
         layout: see vla_zenoh/interop/field_mapping.py.
@@ -54,7 +53,7 @@ class Origami(Adapter):
         super().__init__(
             "origami",
             f"the policy behind {url}",
-            ORIGAMI,
+            wire.PRESETS,
             preset,
             mapping,
             timeout_s=timeout_s,
@@ -68,7 +67,7 @@ class Origami(Adapter):
     def _connect(self) -> list[str]:
         if self._known:
             return []
-        wrong = origami.mismatches(self._query("metadata"), self.mapping)
+        wrong = wire.mismatches(self._query("metadata"), self.mapping)
         self._known = not wrong
         return wrong
 
@@ -77,7 +76,7 @@ class Origami(Adapter):
             self._query("reset")
         return self._query("infer", fields)
 
-    def _query(self, operation: origami.Operation, fields: dict[str, Any] | None = None) -> Any:
+    def _query(self, operation: wire.Operation, fields: dict[str, Any] | None = None) -> Any:
         import zenoh
 
         from vla_zenoh.bus.buffers import bytes_of
@@ -87,9 +86,9 @@ class Origami(Adapter):
             session = self._opened()
             asked_s = time.monotonic()
             replies = session.get(
-                origami_key(operation),
-                payload=origami.request(operation, request_id, self._session_id, fields),
-                encoding=zenoh.Encoding(origami.ENCODING),
+                f"{wire.PROTOCOL}/{operation}",
+                payload=wire.request(operation, request_id, self._session_id, fields),
+                encoding=zenoh.Encoding(wire.ENCODING),
                 congestion_control=zenoh.CongestionControl.DROP,
                 timeout=self.timeout_s,
             )
@@ -98,7 +97,7 @@ class Origami(Adapter):
                 payload = bytes_of(found.payload, MAX_PAYLOAD_BYTES) if found is not None else b""
                 if reply.ok is None and payload == b"Timeout":
                     break
-                return origami.read_answer(payload, operation, request_id)
+                return wire.read_answer(payload, operation, request_id)
         except CodecError as error:
             raise PeerError("peer_reply", f"the answer is too large: {error}") from error
         except zenoh.ZError as error:

@@ -18,7 +18,7 @@ from vla_zenoh.errors import PeerError
 MAGIC = b"\x93NUMPY"
 _HEADER = re.compile(
     rb"\{'descr': '([<>|](?:b1|[iu][1248]|f[248]))', 'fortran_order': (True|False), "
-    rb"'shape': \(((?:[0-9]{1,10}(?:, ?)?)*)\), ?\} *\n"
+    rb"'shape': \(((?:[0-9]{1,10}(?:, ?[0-9]{1,10})*)?),?\), ?\} *\n"
 )
 MAX_DIMENSIONS = 8
 

@@ -1,0 +1,54 @@
+"""Frames of a server of openpi's protocol; its clients use `vla_zenoh.interop.openpi`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from vla_zenoh.codec import message
+from vla_zenoh.errors import CodecError, PeerError
+from vla_zenoh.interop.openpi import SPEC
+from vla_zenoh.policy import ActionSpec
+from vla_zenoh.types import shown
+
+
+def metadata(action: ActionSpec, names: Mapping[str, str]) -> bytes:
+    """The first frame of a server of ours.
+
+    Args:
+        action: what its actions mean.
+        names: name of an observation -> its content, as text.
+    """
+    return message.pack(
+        {
+            "action_dim": action.dimension,
+            "action_horizon": action.horizon,
+            "observation": dict(names),
+            SPEC: action.model_dump(mode="json"),
+        }
+    )
+
+
+def read_observation(frame: bytes | str) -> dict[str, Any]:
+    """One request to a server of ours.
+
+    Raises:
+        PeerError: it is no map that can be read.
+    """
+    if isinstance(frame, str):
+        raise PeerError("peer_request", "a text frame; observations are msgpack in binary frames")
+    try:
+        found = message.unpack(frame)
+    except CodecError as error:
+        raise PeerError("peer_request", f"the frame cannot be read: {error}") from error
+    if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
+        raise PeerError("peer_request", f"an observation is a map of names, not {shown(found)}")
+    return found
+
+
+def answer(actions: Any, infer_ms: float, previous_ms: float | None) -> bytes:
+    """One reply of a server of ours; `previous_ms`: the whole request before this one took."""
+    timing = {"infer_ms": infer_ms}
+    if previous_ms is not None:
+        timing["prev_total_ms"] = previous_ms
+    return message.pack({"actions": actions, "server_timing": timing})

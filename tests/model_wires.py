@@ -1,0 +1,15 @@
+"""Wires of the policy servers: modules of the models that query them."""
+
+from __future__ import annotations
+
+from vla_zenoh.policy.loader import find_model, import_model
+
+for _name in ("groot", "openvla_rest", "origami"):
+    import_model(find_model(_name))
+
+from vla_zenoh_model_groot import npy  # noqa: E402
+from vla_zenoh_model_groot import wire as groot  # noqa: E402
+from vla_zenoh_model_openvla_rest import wire as openvla_rest  # noqa: E402
+from vla_zenoh_model_origami import wire as origami  # noqa: E402
+
+__all__ = ["groot", "npy", "openvla_rest", "origami"]
