@@ -1,10 +1,11 @@
-"""Makes the pictures of the docs from a recording, without a screen.
+"""Makes the pictures of the docs from the run folder of a demo, without a screen.
 
-    .venv/bin/python scripts/pictures.py view RUN.mcap [--at SECONDS]    docs/images/view.png
-    .venv/bin/python scripts/pictures.py report RUN...                   docs/images/report.png
+    vla-zenoh demo --out runs/demo
+    python scripts/pictures.py runs/demo             # all of docs/images
+    python scripts/pictures.py runs/demo view        # only docs/images/view.jpg
 
 `view` needs a Vulkan driver: Debian's ``mesa-vulkan-drivers`` has one that does without a GPU.
-`report` needs ``chromium``.
+`report` and `report_phone` need ``chromium``.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import rerun as rr
 from rerun.experimental import ViewerClient
@@ -30,27 +32,30 @@ from vla_zenoh.profile import read_profile
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs" / "images"
-VIEW_PX, REPORT_PX = (1600, 1000), (1500, 1720)
+VIEW_PX, REPORT_PX, PHONE_PX = (1600, 1000), (1500, 1330), (500, 1500)
+AT_S = 9.5
+"""The first brick is in the gripper."""
+MOST_BYTES = 200_000
+DARK = ("--force-dark-mode", "--blink-settings=preferredColorScheme=0")
 PATIENCE_S = 120.0
 SETTLED_S = 15.0
 """All that was sent is drawn, and the viewer's own notices have gone."""
 
 
-def picture_view(run: Path, at_s: float | None, out: Path) -> None:
-    """Rerun's window with `run`, `at_s` after its beginning (half-way without it)."""
+def picture_view(run: Path, at_s: float, out: Path) -> None:
+    """Rerun's window with `run`, `at_s` after its beginning."""
     file = open_recording(run)
     viewer = open_headless(*VIEW_PX)
     try:
         stream = rr.RecordingStream(APPLICATION)
         stream.connect_grpc(viewer.data_url)
         show = RerunLogger(read_profile(file.profile_yaml, str(run)), stream, keys=file.keys)
-        began_ns = ended_ns = 0
+        began_ns = 0
         for entry in file.entries(lambda key: not key.endswith("/raw")):
-            began_ns, ended_ns = began_ns or entry.received_ns, entry.received_ns
+            began_ns = began_ns or entry.received_ns
             show.log(entry)
         stream.disconnect()
-        offset_ns = (ended_ns - began_ns) // 2 if at_s is None else int(at_s * 1e9)
-        moment = np.datetime64(began_ns + offset_ns, "ns")
+        moment = np.datetime64(began_ns + int(at_s * 1e9), "ns")
         client = ViewerClient.connect(viewer.data_url)
         insist(lambda: client.set_time(TIMELINE, timestamp=moment, play_state="paused"))
         time.sleep(SETTLED_S)
@@ -71,39 +76,57 @@ def insist(ask: Callable[[], None]) -> None:
             time.sleep(1.0)
 
 
-def picture_report(runs: list[Path], out: Path) -> None:
+def picture_report(run: Path, out: Path, size: tuple[int, int], *more: str) -> None:
     """The page of ``vla-zenoh eval --html``."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         sys.exit("no chromium on PATH")
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / "report.html"
-        words = [sys.executable, "-m", "vla_zenoh", "eval", *map(str, runs), "--html", str(page)]
+        words = [sys.executable, "-m", "vla_zenoh", "eval", str(run), "--html", str(page)]
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
         subprocess.run(
             [
-                *(browser, "--headless", "--no-sandbox", "--hide-scrollbars"),
-                *("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-                *(f"--window-size={REPORT_PX[0]},{REPORT_PX[1]}", "--virtual-time-budget=15000"),
+                *(browser, "--headless", "--no-sandbox", "--hide-scrollbars", "--disable-gpu"),
+                *(f"--window-size={size[0]},{size[1]}", "--virtual-time-budget=8000", *more),
                 *(f"--user-data-dir={folder}/profile", f"--screenshot={out}", page.as_uri()),
             ],
             check=True,
         )
 
 
+def small(picture: Path, out: Path) -> None:
+    """`picture` as JPEG of at most `MOST_BYTES`."""
+    for quality in range(92, 20, -4):
+        cv2.imwrite(str(out), cv2.imread(str(picture)), [cv2.IMWRITE_JPEG_QUALITY, quality])
+        if out.stat().st_size <= MOST_BYTES:
+            return
+    sys.exit(f"{out} has {out.stat().st_size} bytes, at most {MOST_BYTES}")
+
+
 def main() -> None:
+    names = ("tasks", "plot", "report", "report_phone", "view")
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("view", "report"))
-    parser.add_argument("runs", type=Path, nargs="+")
-    parser.add_argument("--at", type=float, help="seconds after the beginning")
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("run", type=Path, help="run folder of a demo")
+    parser.add_argument("what", choices=[*names, []], nargs="*")
+    parser.add_argument("--at", type=float, default=AT_S, help="moment of view, s")
     given = parser.parse_args()
-    out = (given.out or IMAGES / f"{given.what}.png").resolve()
-    if given.what == "view":
-        picture_view(given.runs[0], given.at, out)
-    else:
-        picture_report(given.runs, out)
-    print(out)
+    file = given.run / "run.mcap"
+    with tempfile.TemporaryDirectory() as folder:
+        png = Path(folder) / "picture.png"
+        for name in given.what or names:
+            if name == "tasks":
+                png.write_bytes((given.run / "tasks.jpg").read_bytes())
+            elif name == "plot":
+                png.write_bytes((given.run / "plot.png").read_bytes())
+            elif name == "view":
+                picture_view(file, given.at, png)
+            elif name == "report":
+                picture_report(file, png, REPORT_PX)
+            else:
+                picture_report(file, png, PHONE_PX, *DARK)
+            small(png, IMAGES / f"{name}.jpg")
+            print(IMAGES / f"{name}.jpg")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ from vla_zenoh_model_groot import wire
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop.adapter import Adapter
-from vla_zenoh.interop.presets import GROOT
 from vla_zenoh.policy.model_options import address, one_of
 
 
@@ -28,7 +27,7 @@ class Groot(Adapter):
     Args:
         url: of the server, as tcp://HOST:PORT.
         version: n1.5 (flat names), n1.6 (nested ones; also N1.7).
-        preset: libero or bridge, see vla_zenoh/interop/presets.py; none: no defaults.
+        preset: libero or bridge, see wire.py; none: no defaults.
         timeout_s: for connecting, and for each answer.
         api_token: if the server requires one.
         profile: of the robot: its gripper and, if answers are joints, its arm.
@@ -51,7 +50,7 @@ class Groot(Adapter):
         super().__init__(
             "groot",
             address(url, "tcp").geturl(),
-            GROOT,
+            wire.PRESETS,
             preset,
             mapping,
             timeout_s=timeout_s,

@@ -29,6 +29,7 @@ from vla_zenoh_model_groot import npy
 from vla_zenoh.codec.message import MAX_ITEMS, MAX_PAYLOAD_BYTES, count_containers
 from vla_zenoh.errors import PeerError
 from vla_zenoh.interop.field_mapping import FieldMapping
+from vla_zenoh.interop.presets import BRIDGE, OPENS_AT_1, OSC, Presets
 from vla_zenoh.types import shown
 
 Version = Literal["n1.5", "n1.6"]
@@ -37,6 +38,28 @@ MAX_BYTES = MAX_PAYLOAD_BYTES
 VIDEO, STATE, ACTION = "video.", "state.", "action."
 _ARRAY, _CONFIG = "__ndarray_class__", "__ModalityConfig_class__"
 _PICKLES = (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05", b"PK\x03\x04")
+
+PRESETS: Presets = {
+    "libero": {
+        "map": "video.image=camera:front, video.wrist_image=camera:wrist, state.x=x, state.y=y, "
+        "state.z=z, state.roll=rx, state.pitch=ry, state.yaw=rz, state.gripper=fingers_m, "
+        "annotation.human.action.task_description=prompt",
+        "size": "256x256",
+        "keys": "x,y,z,roll,pitch,yaw,gripper",
+        **OSC,
+        **OPENS_AT_1,
+        "horizon": "16",
+    },
+    "bridge": {
+        "map": "video.image_0=camera:front, state.x=x, state.y=y, state.z=z, state.roll=roll, "
+        "state.pitch=pitch, state.yaw=yaw, state.pad=zero, state.gripper=gripper_open, "
+        "annotation.human.action.task_description=prompt",
+        "size": "256x256",
+        "keys": "x,y,z,roll,pitch,yaw,gripper",
+        **BRIDGE,
+        "horizon": "8",
+    },
+}
 
 
 def pack(value: Any) -> bytes:

@@ -19,7 +19,6 @@ from typing import Any
 from vla_zenoh_model_openvla_rest import wire
 
 from vla_zenoh.interop.adapter import Adapter
-from vla_zenoh.interop.presets import OPENVLA_REST
 from vla_zenoh.policy.model_options import address, yes_no
 
 
@@ -28,7 +27,7 @@ class OpenVlaRest(Adapter):
 
     Args:
         url: of the server, as http://HOST:PORT or https://HOST:PORT; /act is added.
-        preset: bridge, libero or oft_libero, see vla_zenoh/interop/presets.py; none: no defaults.
+        preset: bridge, libero or oft_libero, see wire.py; none: no defaults.
         unnorm_key: statistics the server unnormalises with, empty: its own choice.
         encoded: yes: JSON within JSON, for servers without json_numpy on the wire.
         timeout_s: for each request.
@@ -52,7 +51,7 @@ class OpenVlaRest(Adapter):
         super().__init__(
             "openvla_rest",
             self._url.geturl(),
-            OPENVLA_REST,
+            wire.PRESETS,
             preset,
             mapping,
             timeout_s=timeout_s,

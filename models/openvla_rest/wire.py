@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from vla_zenoh.errors import PeerError
+from vla_zenoh.interop.presets import BRIDGE, OPENS_AT_1, OSC, STATE8, Presets
 from vla_zenoh.types import shown
 
 PORT = 8000
@@ -26,6 +27,27 @@ PATH = "/act"
 MAX_BYTES = 16 * 1024 * 1024
 """Of an answer; a chunk of actions is a few kilobytes."""
 _DTYPE = re.compile(r"[<>|=]?(?:b1|[iu][1248]|f[248])")
+
+PRESETS: Presets = {
+    "bridge": {
+        "map": "image=camera:front, instruction=prompt",
+        **BRIDGE,
+        "horizon": "1",
+    },
+    "libero": {
+        "map": "image=camera:front, instruction=prompt",
+        **OSC,
+        **OPENS_AT_1,
+        "horizon": "1",
+    },
+    "oft_libero": {
+        "map": "full_image=camera:front, wrist_image=camera:wrist, "
+        f"state={STATE8}, instruction=prompt",
+        **OSC,
+        **OPENS_AT_1,
+        "horizon": "8",
+    },
+}
 
 
 def pack(value: Any) -> str:

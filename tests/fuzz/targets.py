@@ -19,21 +19,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import typer
-from model_wires import groot, npy, openvla_rest, origami
+from model_wires import groot, npy, openpi, openvla_rest, origami
 
 from vla_zenoh.bus.clock_sync import decode_stamps
-from vla_zenoh.cli import keys as cli_keys
 from vla_zenoh.cli import status as cli_status
 from vla_zenoh.cli.options import model_options, number_list
 from vla_zenoh.cli.output import Screen, plain_types
 from vla_zenoh.codec import image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
-from vla_zenoh.interop import openpi
 from vla_zenoh.interop.ros2 import attachment, table
 from vla_zenoh.interop.ros2.definitions import parse
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.cli import inspect as cli_inspect
+from vla_zenoh.lab.cli import keys as cli_keys
 from vla_zenoh.lab.cli import net as cli_net
 from vla_zenoh.lab.evaluation.csv_file import evaluate_csv
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run

@@ -18,14 +18,13 @@ from typing import Any
 
 import pytest
 from camera_rig import until
-from model_wires import origami
+from model_wires import groot, openpi, openvla_rest, origami
 from typer.main import get_command
 
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import PeerError
 from vla_zenoh.interop.action_semantics import ACTION_OPTIONS, read_action_semantics
 from vla_zenoh.interop.field_mapping import DEFAULTS, read_map
-from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST
 from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.policy import (
     ActionSpec,
@@ -114,7 +113,7 @@ def test_the_model_with_weights_says_what_it_needs_and_which_options_it_takes(
 
 
 def test_every_preset_and_option_is_told() -> None:
-    for presets in (OPENPI, GROOT, OPENVLA_REST, origami.PRESETS):
+    for presets in (openpi.PRESETS, groot.PRESETS, openvla_rest.PRESETS, origami.PRESETS):
         for preset in presets:
             assert f"`{preset}`" in TEXT, preset
     for option in (*DEFAULTS, "none"):

@@ -17,12 +17,12 @@ import msgpack
 import numpy as np
 import pytest
 from camera_rig import until
+from model_wires import openpi
 from peer_rig import OPENPI_CLIENT, free_port, python_with
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop import openpi
 from vla_zenoh.lab.serve.served_policy import make_served_policy
 from vla_zenoh.policy import ModelSpec, example_observation
 from vla_zenoh.policy.loader import find_model, make_policy

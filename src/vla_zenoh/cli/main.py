@@ -77,8 +77,8 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
         "record": "lab.cli.record:record",
         "replay": "lab.cli.replay:replay",
         "eval": "lab.cli.evaluate:evaluation",
-        "keys": "cli.keys:keys",
-        "echo": "cli.keys:echo",
+        "keys": "lab.cli.keys:keys",
+        "echo": "lab.cli.keys:echo",
     },
     "Check and measure": {
         "check": "lab.cli.check:check",

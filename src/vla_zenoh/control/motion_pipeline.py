@@ -189,7 +189,7 @@ class MotionPipeline:
         self.gripper.restart(width_m)
         # The goal of a blocked arm is where it is. Otherwise a brake continues, and the goal is
         # where it ends.
-        goal = Goal(actual if blocked else self._smoother.resting_pose(), width_m)
+        goal = Goal(actual if blocked else self._resting_pose(self._smoother, actual), width_m)
         assert self._timing is not None
         self._timing.restart()
         if self.timeline is None:
@@ -197,6 +197,12 @@ class MotionPipeline:
         else:
             self.timeline.restart(goal, now_ns)
         self.goal = None if blocked else goal
+
+    def _resting_pose(self, smoother: Smoother, actual: Pose) -> Pose:
+        """Where a brake will end, inside the box or no further outside than the arm is."""
+        rest, (low, high) = smoother.resting_pose(), workspace_corners(self._limits)
+        least, most = np.minimum(low, actual.position_m), np.maximum(high, actual.position_m)
+        return Pose(np.clip(rest.position_m, least, most), rest.rotation)
 
     def measure(self, measured: PoseState, received_ns: int) -> None:
         """Track whether the robot still moves while the stream stands.
@@ -481,5 +487,6 @@ def _within(smoother: Smoother, override: float) -> bool:
     # The limits of rotation apply to axes that turn with the arm.
     speed, change = (np.abs(np.append(part[:3], rotation.T @ part[3:])) for part in motion)
     return bool(
-        (change <= most[1]).all() and (speed + change**2 / (2 * most[2]) <= most[0] * 1.001).all()
+        (change <= most[1] * 1.001).all()
+        and (speed + change**2 / (2 * most[2]) <= most[0] * 1.001).all()
     )

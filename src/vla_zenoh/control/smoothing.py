@@ -58,6 +58,12 @@ BESIDE = 0.01
 """Part of the limits for motion beside the line."""
 _ASIDE = np.array([[ASIDE], *([quiet] for quiet in QUIET[1:])])
 TINY, MOST = 1e-12, 1e9
+_WAYS = (
+    (Synchronization.Time, False),
+    (Synchronization.No, False),
+    (Synchronization.No, True),
+)
+"""Of planning a motion, in this order: how axes are synchronised, and `slowly` of `_input`."""
 
 ROTATION_BOX = 0.55
 """Share of a rotation limit per axis, so that the norm over three axes (sqrt 3 of it) and the small
@@ -267,9 +273,12 @@ class Smoother:
         attempts += [unreversed] * bool((limits < unreversed).any())
         attempts += [hardest] * bool((unreversed < hardest).any())
         for most in attempts:
-            ask = self._input(basis, most, parts)
-            ask.target_position = (basis.T @ way).tolist()
-            for synchronization in (Synchronization.Time, Synchronization.No):
+            may_take = self._input(
+                basis, hardest if all_to_stop else np.maximum(most, unreversed), parts
+            )
+            for synchronization, slowly in _WAYS:
+                ask = self._input(basis, most, parts, slowly=slowly)
+                ask.target_position = (basis.T @ way).tolist()
                 # Motion beside the line ends as soon as it can, independent of the others.
                 ask.per_dof_synchronization = [
                     Synchronization.No if part == BESIDE else synchronization for part in parts
@@ -277,19 +286,12 @@ class Smoother:
                 path = self._calculated(ask)
                 if path is None:
                     continue
-                plan = _Plan(self._state.position, basis, path)
-                may_take = hardest if all_to_stop else np.maximum(most, unreversed)
-                # The fastest plan with all limits available: it goes no further than necessary.
-                shortest = bool((most >= may_take).all()) and (
-                    synchronization is Synchronization.No or len(parts) == 1
-                )
-                overshoots = not shortest and self._overshoots(
-                    path, basis.T @ way, self._input(basis, may_take, parts)
-                )
-                if not overshoots and not self._leaves(plan):
+                found = _Plan(self._state.position, basis, path)
+                if not self._overshoots(path, basis.T @ way, may_take) and not self._leaves(found):
                     if most is not limits:
                         self._jerk = most[2] / self.box[2]
-                    return plan, most is not hardest
+                    return found, most is not hardest
+                plan = plan if slowly and plan is not None else found
         return plan, False
 
     def _leaves(self, plan: _Plan) -> bool:
@@ -387,8 +389,18 @@ class Smoother:
                 return _Plan(self._state.position, basis, path)
         return None
 
-    def _input(self, basis: FloatArray, limits: FloatArray, parts: list[float]) -> InputParameter:
-        """Ruckig's input along the columns of `basis` (6, k), each with its part of the limits."""
+    def _input(
+        self, basis: FloatArray, limits: FloatArray, parts: list[float], *, slowly: bool = False
+    ) -> InputParameter:
+        """Ruckig's input along the columns of `basis` (6, k), each with its part of the limits.
+
+        Args:
+            basis: of the motion.
+            limits: (3, 6) of the axes.
+            parts: of the limits, for each column.
+            slowly: what is too fast brakes so that it does not fall below half its velocity limit.
+                With all of its acceleration it would have to reverse before that has ended.
+        """
         _, velocity, acceleration = self._state
         with np.errstate(divide="ignore"):
             along = (limits[:, :, None] / np.abs(basis)).min(axis=1) * np.array(parts)
@@ -398,6 +410,9 @@ class Smoother:
         slows = velocity * acceleration < 0
         after = speed - acceleration**2 / (2 * along[2])
         along[0] = np.where(slows & (after <= along[0]), np.maximum(speed, along[0]), along[0])
+        if slowly:
+            most = np.minimum(along[1], np.sqrt(along[2] * along[0]))
+            along[1] = np.where(speed > along[0], most, along[1])
         ask = InputParameter(len(parts))
         ask.current_position = [0.0] * len(parts)
         ask.current_velocity, ask.current_acceleration = velocity.tolist(), acceleration.tolist()

@@ -171,6 +171,7 @@ class Extrapolation(Generic[Reference]):
         # Twice the time the acceleration may last before the motion is too fast or reverses.
         room_s = 2 * np.where(reversing, speed, velocity_limit - speed) / change
         fading_s = np.maximum(np.minimum(room_s, FADING_S), change / jerk_limit)
+        fading_s *= np.maximum(self._space.sizes(change / fading_s / jerk_limit), 1.0)
         steady_s = np.clip((room_s - fading_s) / 2, 0.0, ACCELERATE_S - self._gap_s)
         steady_s[self._jerk * then.change < 0] = 0.0
         return then, steady_s, fading_s, -then.change / fading_s

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from model_wires import openpi
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop.adapter import FIRST_S, LONGEST_S, Adapter
-from vla_zenoh.interop.presets import OPENPI
 from vla_zenoh.policy import example_observation
 
 STEP = [[0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]
@@ -29,7 +29,7 @@ class Wired(Adapter):
         super().__init__(
             "wired",
             "the wire",
-            OPENPI,
+            openpi.PRESETS,
             "libero",
             options,
             timeout_s="1",

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from model_wires import groot, origami
+from model_wires import groot, openpi, openvla_rest, origami
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop import action_semantics as meaning
-from vla_zenoh.interop import field_mapping, openpi
+from vla_zenoh.interop import field_mapping
 from vla_zenoh.interop.action_semantics import make_forward
 from vla_zenoh.interop.adapter import FIRST_S, LONGEST_S, Backoff
 from vla_zenoh.interop.field_mapping import DEFAULTS, FieldMapping, read_columns, read_field_mapping
-from vla_zenoh.interop.presets import GROOT, OPENPI, OPENVLA_REST, Presets
+from vla_zenoh.interop.presets import Presets
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
 from vla_zenoh.lab.serve import openpi_frames
 from vla_zenoh.policy import Observation, example_observation
@@ -28,16 +28,18 @@ ATOL, ATOL_F32 = 1e-9, 1e-6
 ALL: dict[str, tuple[Presets, str]] = {
     f"{model}/{preset}": (presets, preset)
     for model, presets in {
-        "openpi": OPENPI,
-        "groot": GROOT,
-        "openvla_rest": OPENVLA_REST,
+        "openpi": openpi.PRESETS,
+        "groot": groot.PRESETS,
+        "openvla_rest": openvla_rest.PRESETS,
         "origami": origami.PRESETS,
     }.items()
     for preset in presets
 }
 
 
-def layout(presets: Presets = OPENPI, /, preset: str = "libero", **options: str) -> FieldMapping:
+def layout(
+    presets: Presets = openpi.PRESETS, /, preset: str = "libero", **options: str
+) -> FieldMapping:
     return read_field_mapping("x", presets, preset, options, max_width_m=WIDTH_M)
 
 
@@ -162,7 +164,7 @@ def test_a_quaternion_may_begin_with_w() -> None:
 
 
 def test_named_parts_stand_side_by_side_whatever_their_shape() -> None:
-    of = layout(GROOT, "bridge", keys="move,gripper", horizon="3")
+    of = layout(groot.PRESETS, "bridge", keys="move,gripper", horizon="3")
     move = np.arange(24.0).reshape(1, 4, 6) / 100
     for grip in (np.ones((1, 4, 1)), np.ones((4, 1)), np.ones(4)):
         steps = of.steps({"move": move, "gripper": grip, "more": "x"}, seen(of))
@@ -322,7 +324,7 @@ def test_what_openpis_server_says_otherwise_is_named(said: dict[str, Any], named
 
 
 def test_what_groots_server_says_otherwise_is_named() -> None:
-    of = layout(GROOT, "bridge")
+    of = layout(groot.PRESETS, "bridge")
     said = {
         "video": {"modality_keys": ["image_0", "wrist"], "delta_indices": [-1, 0]},
         "state": {"modality_keys": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]},

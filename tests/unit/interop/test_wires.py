@@ -14,12 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from model_wires import groot, npy, openvla_rest, origami
+from model_wires import groot, npy, openpi, openvla_rest, origami
 
 from vla_zenoh.errors import PeerError
-from vla_zenoh.interop import openpi
 from vla_zenoh.interop.field_mapping import read_field_mapping
-from vla_zenoh.interop.presets import GROOT, OPENPI
 from vla_zenoh.lab.serve import openpi_frames
 from vla_zenoh.policy import ActionSpec
 
@@ -159,8 +157,8 @@ READ: dict[str, Any] = {
 }
 
 
-LAYOUT = read_field_mapping("x", OPENPI, "libero", {"keys": "actions"}, max_width_m=0.08)
-NAMED = read_field_mapping("x", GROOT, "libero", {"keys": "x"}, max_width_m=0.08)
+LAYOUT = read_field_mapping("x", openpi.PRESETS, "libero", {"keys": "actions"}, max_width_m=0.08)
+NAMED = read_field_mapping("x", groot.PRESETS, "libero", {"keys": "x"}, max_width_m=0.08)
 MAX_MESSAGE = 1500
 
 

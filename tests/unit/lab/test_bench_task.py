@@ -6,6 +6,7 @@ import json
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,14 @@ from typer.testing import CliRunner
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.bench.task import BASELINES, TaskOutcome, TaskPlan, TaskRequest, TaskScore
-from vla_zenoh.lab.bench.task_sheet import TEXT_HEIGHT, TILE_HEIGHT, TILE_WIDTH, failure_sheet
+from vla_zenoh.lab.bench.task_sheet import (
+    FRAME_HEIGHT,
+    FRAME_WIDTH,
+    GAP,
+    TITLE_HEIGHT,
+    failure_sheet,
+    sheet,
+)
 from vla_zenoh.lab.cli.bench_file import LAST_LINES, up_with_last_lines
 from vla_zenoh.lab.cli.bench_task import _named, _varied, _with_bricks, task
 from vla_zenoh.lab.statistics import wilson_95
@@ -191,10 +199,30 @@ def test_a_result_says_with_which_options_it_was_made_and_keeps_secrets() -> Non
 
 def test_the_sheet_shows_the_failures_alone() -> None:
     assert failure_sheet([ended("put")]) is None
-    sheet = failure_sheet([ended("put"), *(ended("push", "off_course") for _ in range(4))])
-    assert sheet is not None
-    height, width, _ = decode_jpeg(sheet).rgb.shape
-    assert (height, width) == (2 * (TILE_HEIGHT + TEXT_HEIGHT), 3 * 2 * TILE_WIDTH)
+    found = failure_sheet([ended("put"), *(ended("push", "off_course") for _ in range(4))])
+    assert found is not None
+    height, width, _ = decode_jpeg(found).rgb.shape
+    assert (height, width) == (
+        4 * (TITLE_HEIGHT + FRAME_HEIGHT + GAP),
+        2 * FRAME_WIDTH + 3 * GAP,
+    )
+
+
+@pytest.mark.parametrize(("failure", "strongest"), [("", "green"), ("off_course", "red")])
+def test_the_mark_of_a_row_tells_success_from_failure(failure: str, strongest: str) -> None:
+    found = sheet([replace(ended("push", failure), prompt="push the red brick left")])
+    assert found is not None
+    mark = decode_jpeg(found).rgb[:TITLE_HEIGHT, :TITLE_HEIGHT].reshape(-1, 3).astype(int)
+    coloured = mark[np.ptp(mark, axis=1) > 80].mean(axis=0)
+    assert ("red", "green", "blue")[int(coloured.argmax())] == strongest
+
+
+def test_a_prompt_that_nobody_can_judge_has_neither_colour() -> None:
+    unknown = replace(ended("put"), prompt="make me a sandwich")
+    found = sheet([unknown])
+    assert found is not None
+    mark = decode_jpeg(found).rgb[:TITLE_HEIGHT, :TITLE_HEIGHT].reshape(-1, 3).astype(int)
+    assert not (np.ptp(mark, axis=1) > 80).any()
 
 
 def test_the_profile_gets_the_scene_the_worker_and_what_is_varied() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,11 +14,18 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
+from vla_zenoh.lab.evaluation.plot_image import write_plot
+from vla_zenoh.lab.evaluation.report import page
+from vla_zenoh.lab.evaluation.result import TASKS, Evaluation, PlotTrace
+from vla_zenoh.lab.evaluation.timelines import unbroken
+from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.restamp import Restamper
+from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, TEXT, Sample
 from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
+from vla_zenoh.profile import load_profile, to_yaml
 from vla_zenoh.types import (
     ActionChunk,
     Cause,
@@ -241,3 +249,83 @@ def test_at_twice_the_speed_everything_takes_half_the_time(recording: Path) -> N
     moved = [restamper.move(entry) for entry in entries]
     assert moved[-1].received_ns - ZERO_NS == (entries[-1].received_ns - ZERO_NS) // 2
     assert restamper.moved_ns(0) == 0
+
+
+# -- pictures -------------------------------------------------------------------------------------
+PROVENANCE = {"profile": "panda_bricks", "command": "vla-zenoh demo", "host": "lab", "code": "1.2"}
+TASK = {"prompt": "push the red brick left", "success": False, "said": "off course"}
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recording of a demo that says where it comes from, and its verdict."""
+    path = tmp_path_factory.mktemp("judged") / "run.mcap"
+    text = to_yaml(load_profile("panda_bricks"))
+    out = RecordingWriter(
+        path, KEYS, profile_yaml=text, base_frame="base", began_ns=ZERO_NS, about=PROVENANCE
+    )
+    samples = [*chunks(), *commands(), *states(), *others()]
+    for sample in sorted(samples, key=lambda each: each.received_ns):
+        out.write(sample)
+    out.finish({"dropped": {}, TASKS: [TASK], "seed": 7})
+    return path
+
+
+def test_a_run_says_where_it_comes_from(judged: Path) -> None:
+    about = evaluate_run(judged).about
+    assert about.items() >= PROVENANCE.items()
+    assert about["seed"] == "7"
+    assert about["model"] == "scripted"
+    assert about["recorded"].startswith("2023-11-1")
+
+
+def test_the_verdicts_on_its_tasks_are_those_of_the_judge(judged: Path, recording: Path) -> None:
+    (verdict,) = evaluate_run(judged).verdicts
+    assert (verdict.prompt, verdict.success, verdict.said) == tuple(TASK.values())
+    assert evaluate_run(recording).verdicts == []
+
+
+def test_a_page_of_one_run_shows_provenance_verdict_curves_and_video(judged: Path) -> None:
+    run = evaluate_run(judged, pictures=2)
+    text = page([run], {})
+    body = text[text.index("<body>") :]
+    assert f"<h1>Evaluation of {run.name}</h1>" in body
+    assert all(value in body for value in PROVENANCE.values())
+    assert 'class="bad"' in body
+    assert "off course" in body
+    assert 'src="data:video/mp4;base64,' in body
+    for part in ("time1", "histogram1", "path1"):
+        assert f'draw("{part}", {{"data"' in body
+
+
+def test_a_page_counts_only_runs(judged: Path, recording: Path) -> None:
+    runs = [evaluate_run(judged), evaluate_run(recording)]
+    text = page(runs, {})
+    assert "<h1>Evaluation of 2 runs</h1>" in text
+    assert text.count("<section id=") == len(runs)
+
+
+def test_the_film_is_as_long_as_the_run_and_shows_every_camera(
+    judged: Path, tmp_path: Path
+) -> None:
+    run = load_run(judged)
+    frames = write_film(tmp_path / "a.mp4", run, Film(height_px=48, rate_hz=10))
+    assert frames == pytest.approx(run.seconds * 10, abs=1)
+    film = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    assert (film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_COUNT)) == (64, frames)
+
+
+def test_the_curves_are_drawn_into_a_picture(judged: Path, tmp_path: Path) -> None:
+    assert write_plot(tmp_path / "plot.png", evaluate_run(judged))
+    assert cv2.imread(str(tmp_path / "plot.png")).shape[1] > 1000
+    assert not write_plot(tmp_path / "none.png", Evaluation("empty", "mcap"))
+    assert not (tmp_path / "none.png").exists()
+
+
+def test_a_reset_and_a_gap_break_a_curve() -> None:
+    t_s = np.array([0.0, 0.1, 0.2, 0.3, 2.0])
+    x_m = np.array([0.0, 0.01, 0.5, 0.51, 0.52])
+    position_m = np.column_stack([x_m, 0 * x_m, 0 * x_m])
+    times, values = unbroken(PlotTrace(t_s, position_m, position_m))
+    assert np.flatnonzero(np.isnan(times)).tolist() == [2, 5]
+    assert np.isnan(values[[2, 5]]).all()

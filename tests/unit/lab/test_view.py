@@ -133,7 +133,11 @@ def run() -> Iterable[Sample]:
         )
         yield put(KEYS.state_gripper, GripperState(0.04, False, False), at_ns, index)
         yield put(KEYS.command_pose, command(at_ns), at_ns, index)
-    objects = ObjectPoses(("brick",), np.array([[0.5, 0.1, 0.01]]), np.array([[0.0, 0, 0, 1]]))
+    objects = ObjectPoses(
+        ("red_brick", "puck"),
+        np.array([[0.5, 0.1, 0.01], [-1.2, 0.6, 0.0]]),
+        np.array([[0.0, 0, 0, 1]] * 2),
+    )
     yield put(KEYS.sim_objects, objects, SECOND)
     yield chunk(SECOND, 1)
     cause = Cause("scripted", 1, *(ZERO_NS + SECOND + ms * MS for ms in (-50, -40, -40, -10)),
@@ -411,3 +415,14 @@ def test_a_stamp_of_another_clock_does_not_stretch_the_time_line(tmp_path: Path)
     far = Sample(sample.key, sample.payload, MSGPACK, Header(1, 0, "x#1"), ZERO_NS)
     _, shown = heard(tmp_path, far)
     assert shown.stamps_ns("events/command") == [ZERO_NS]
+
+
+def test_objects_that_are_parked_away_are_left_out(shown: Shown) -> None:
+    (labels,) = shown.values("world/objects", "Points3D:labels")
+    assert labels == ["red"]
+
+
+def test_the_first_step_of_an_answer_has_names_and_units(shown: Shown) -> None:
+    (answer,) = shown.texts("seen/scripted/answer")
+    assert "| first step | x | y | z |" in answer
+    assert "| mm | +0.0 | +0.0 | +0.0 |" in answer

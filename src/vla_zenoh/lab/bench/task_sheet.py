@@ -1,8 +1,7 @@
-"""Contact sheet of outcomes: start and end of each episode, with its prompt."""
+"""Sheet of outcomes: a row for each episode, its start and end side by side, and the verdict."""
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 
 import cv2
@@ -10,12 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
-from vla_zenoh.lab.bench.task import TaskOutcome
+from vla_zenoh.lab.bench.task import TaskOutcome, is_judged
 from vla_zenoh.types import Image
 
-TILE_WIDTH, TILE_HEIGHT, TEXT_HEIGHT = 240, 180, 60
-COLUMNS, MAX_TILES = 3, 60
-LETTERS = 76
+FRAME_WIDTH, FRAME_HEIGHT, TITLE_HEIGHT, GAP = 560, 420, 56, 8
+MAX_ROWS = 30
+MARK_PX = 34
+GREEN, RED, GREY = (24, 140, 60), (200, 30, 30), (110, 110, 110)
+INK, PAPER, SOFT = (25, 30, 36), 255, (90, 98, 106)
+FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 Picture = NDArray[np.uint8]
 
@@ -27,37 +29,53 @@ def failure_sheet(ended: Sequence[TaskOutcome]) -> bytes | None:
 
 def sheet(ended: Sequence[TaskOutcome]) -> bytes | None:
     """A JPEG of the first outcomes with pictures; None: there are none."""
-    shown = [each for each in ended if each.pictures is not None][:MAX_TILES]
+    shown = [each for each in ended if each.pictures is not None][:MAX_ROWS]
     if not shown:
         return None
-    tiles = [_tile(each) for each in shown]
-    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % min(COLUMNS, len(tiles)))
-    columns = min(COLUMNS, len(tiles))
-    rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
-    return encode_jpeg(Image(np.ascontiguousarray(np.vstack(rows))))
+    return encode_jpeg(Image(np.ascontiguousarray(np.vstack([_row(each) for each in shown]))))
 
 
-def _tile(ended: TaskOutcome) -> Picture:
+def _row(ended: TaskOutcome) -> Picture:
     assert ended.pictures is not None
-    tile = np.full((TILE_HEIGHT + TEXT_HEIGHT, 2 * TILE_WIDTH, 3), 255, np.uint8)
-    for index, jpeg in enumerate(ended.pictures):
+    width, height = 2 * FRAME_WIDTH + 3 * GAP, TITLE_HEIGHT + FRAME_HEIGHT + GAP
+    row = np.full((height, width, 3), PAPER, np.uint8)
+    judged = is_judged(ended.prompt) or not ended.success
+    colour = GREY if not judged else GREEN if ended.success else RED
+    _mark(row, colour, done=ended.success, judged=judged)
+    word = "not judged" if not judged else ended.failure.replace("_", " ") or "done"
+    text = f"{word}, {ended.time_s:.1f} s"
+    size, _ = cv2.getTextSize(text, FONT, 0.7, 2)
+    prompt = ended.prompt.encode("ascii", "replace").decode()  # OpenCV draws only ASCII
+    _write(row, prompt, (GAP + MARK_PX + 14, 36), 0.8, INK)
+    _write(row, text, (width - size[0] - 2 * GAP, 36), 0.7, colour)
+    for index, (jpeg, label) in enumerate(zip(ended.pictures, ("before", "after"), strict=True)):
+        left = GAP + index * (FRAME_WIDTH + GAP)
+        frame = row[TITLE_HEIGHT : TITLE_HEIGHT + FRAME_HEIGHT, left : left + FRAME_WIDTH]
+        frame[:] = 235
         if jpeg:
-            small = cv2.resize(
-                decode_jpeg(jpeg).rgb, (TILE_WIDTH, TILE_HEIGHT), interpolation=cv2.INTER_AREA
-            )
-            tile[:TILE_HEIGHT, index * TILE_WIDTH : (index + 1) * TILE_WIDTH] = small
-    title = f"{ended.episode.seed}: {ended.failure or 'done'}, {ended.time_s:.1f} s"
-    # OpenCV draws only ASCII.
-    prompt = ended.prompt.encode("ascii", "replace").decode()
-    for row, line in enumerate([title, *textwrap.wrap(prompt, LETTERS)[:2]]):
-        cv2.putText(
-            tile,
-            line,
-            (6, TILE_HEIGHT + 18 + 16 * row),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.38,
-            (180, 0, 0) if row == 0 and not ended.success else (0, 0, 0),
-            1,
-            cv2.LINE_AA,
-        )
-    return tile
+            small = decode_jpeg(jpeg).rgb
+            frame[:] = cv2.resize(small, (FRAME_WIDTH, FRAME_HEIGHT), interpolation=cv2.INTER_AREA)
+        size, _ = cv2.getTextSize(label, FONT, 0.6, 1)
+        frame[: size[1] + 16, : size[0] + 20] = PAPER
+        _write(frame, label, (10, size[1] + 7), 0.6, SOFT)
+    return row
+
+
+def _mark(row: Picture, colour: tuple[int, int, int], *, done: bool, judged: bool) -> None:
+    """A disc with a tick, a cross, or a dash where nobody judged."""
+    x, y, r = GAP + MARK_PX // 2, TITLE_HEIGHT // 2, MARK_PX // 2
+    cv2.circle(row, (x, y), r, colour, -1, cv2.LINE_AA)
+    if not judged:
+        lines = [((-8, 0), (8, 0))]
+    elif done:
+        lines = [((-8, 1), (-2, 7)), ((-2, 7), (8, -6))]
+    else:
+        lines = [((-6, -6), (6, 6)), ((-6, 6), (6, -6))]
+    for (x0, y0), (x1, y1) in lines:
+        cv2.line(row, (x + x0, y + y0), (x + x1, y + y1), (255, 255, 255), 3, cv2.LINE_AA)
+
+
+def _write(
+    picture: Picture, text: str, at: tuple[int, int], scale: float, colour: tuple[int, int, int]
+) -> None:
+    cv2.putText(picture, text, at, FONT, scale, colour, 1 if scale < 0.7 else 2, cv2.LINE_AA)

@@ -154,11 +154,19 @@ class _Run:
 
 
 def _plot(folder: Path, profile: Profile, row: dict[str, Any], recording: Any) -> None:
-    from vla_zenoh.lab.demo.plot import plot_run
+    from vla_zenoh.lab.evaluation.mcap_file import add_motion
+    from vla_zenoh.lab.evaluation.plot_image import write_plot
+    from vla_zenoh.lab.evaluation.result import Evaluation
 
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{row['prompt']}_{row['rate_hz']:g}Hz_{row['horizon']}.png".replace(" ", "_")
-    plot_run(folder / name, profile, recording.poses, recording.commands, recording.marks, [])
+    if not recording.poses:
+        return
+    zero_ns = recording.poses[0].header.stamp_wall_ns
+    run = Evaluation(f"{row['prompt']}, {row['rate_hz']:g} Hz, {profile.name}", "mcap")
+    add_motion(run, recording, zero_ns, recording.poses[-1].header.stamp_wall_ns)
+    run.marks = [((stamp_ns - zero_ns) / 1e9, prompt) for stamp_ns, prompt in recording.marks]
+    write_plot(folder / name, run)
 
 
 @options

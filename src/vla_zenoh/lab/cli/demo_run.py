@@ -7,19 +7,18 @@ from typing import Any
 
 import typer
 
-from vla_zenoh.cli.output import console, new_table, progress_bars, styled
+from vla_zenoh.cli.output import console, new_table, styled
 from vla_zenoh.lab.cli.demo_options import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, prepare, refusals
-from vla_zenoh.lab.demo.plot import plot_run
 from vla_zenoh.lab.demo.runner import DemoResult, DemoRunner
 from vla_zenoh.lab.demo.segments import DemoSegment, SegmentOutcome, latencies
 from vla_zenoh.lab.demo.tables import write_chunks, write_commands, write_poses
+from vla_zenoh.lab.evaluation.result import TASKS
 from vla_zenoh.lab.recording.run import Run
 from vla_zenoh.lab.recording.stream_listener import StreamListener
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile
 
-HOLD = "hold"
 KEPT = 400
 """States that the demo keeps."""
 
@@ -59,6 +58,7 @@ def _run(
         try:
             run = DemoRunner(running.client, listener, stop, watch, progress)
             result = run.run(segments, rate_hz, seconds)
+            stage.facts[TASKS] = [_fact(outcome) for outcome in result.outcomes]
         finally:
             listener.close()
         for index, task in enumerate(tasks):
@@ -92,6 +92,16 @@ def _summary(profile: Profile, rate_hz: float, result: DemoResult, run: Run) -> 
     }
 
 
+def _fact(outcome: SegmentOutcome) -> dict[str, Any]:
+    faults = outcome.faults()
+    return {
+        "prompt": outcome.segment.prompt,
+        "success": not faults,
+        "said": "; ".join(faults) or "done",
+        "time_s": round(outcome.duration_s, 2),
+    }
+
+
 def _rate(entries: list[Any]) -> float:
     if len(entries) < 2:
         return 0.0
@@ -118,12 +128,8 @@ def _write_tables(stage: Stage, run: Run) -> None:
         if entry.record.worker == worker and entry.header.seq in obeyed
     ]
     write_chunks(folder / "chunks.npz", spec, chunks)
-    marks = [(at_ns, prompt) for at_ns, prompt in run.prompts() if prompt != HOLD]
-    with progress_bars(24, stage.screen, counted=False) as bars:
-        plotting = bars.add_task("drawing plot.png", total=1)
-        plot_run(folder / "plot.png", profile, run.poses, run.commands, marks, first)
-        bars.update(plotting, completed=1)
-    stage.film(run, marks)
+    stage.draw(run)
+    stage.film(run)
 
 
 def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
@@ -159,7 +165,7 @@ def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
     screen.print(f"rates: {rates}; refusals: {refused or 'none'}")
     screen.print(
         f"run folder: {folder} (run.mcap, summary.json, commands.csv, poses.csv, chunks.npz, "
-        "plot.png, front.mp4)"
+        "plot.png, video.mp4)"
     )
     if result.interrupted:
         screen.print("interrupted; the arm braked", style="yellow")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shlex
+import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +19,17 @@ from rich.progress import Progress
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import Screen, errors, progress_bars
 from vla_zenoh.lab.cli.loopback import own_address
-from vla_zenoh.lab.demo.video import write_video
+from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
+from vla_zenoh.lab.evaluation.plot_image import write_plot
+from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.recorder import Recorder
-from vla_zenoh.lab.recording.run import Run, load_run, pictures
+from vla_zenoh.lab.recording.run import Run, load_run
 from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
 from vla_zenoh.types import NodeStatus
 
 MAX_LOG_LINES = 20
-IMAGE_NS = 60_000_000
-"""Least time between images of the video: twice its frame rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,16 +41,18 @@ class Stage:
         folder: of the run.
         stop: set by Ctrl-C.
         screen: for progress; stdout is for the summary.
+        facts: for the end of the recording, such as the verdicts.
     """
 
     profile: Profile
     folder: Path
     stop: threading.Event
     screen: Screen
+    facts: dict[str, Any] = field(default_factory=dict)
 
     @property
     def camera(self) -> str | None:
-        """The camera that is recorded; None: there is none."""
+        """The camera whose images show a task; None: there is none."""
         cameras = self.profile.cameras
         return "front" if "front" in cameras else next(iter(cameras), None)
 
@@ -75,8 +79,6 @@ class Stage:
                 log_file.write(f"{node:>16} | {line}\n")
                 lines.append(f"{node}: {line}")
 
-            # Images of one camera only: each more costs processor time.
-            images = [profile.keys.camera_jpeg(self.camera)] if self.camera else []
             try:
                 with Host(profile, None, log=log, tell=log, own_router=True) as running:
                     assert running.session is not None
@@ -85,12 +87,12 @@ class Stage:
                         profile,
                         running.session,
                         self.recording,
-                        expressions=(*profile.keys.without_images, *images),
+                        about={"command": shlex.join(["vla-zenoh", *sys.argv[1:]])},
                     ).start()
                     try:
                         yield running, bars
                     finally:
-                        recorder.close()
+                        recorder.close(self.facts)
             except Exception:
                 last = "\n".join(lines[-MAX_LOG_LINES:])
                 self.screen.print(last, style="dim")
@@ -109,26 +111,26 @@ class Stage:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_text(text, "utf-8")
 
-    def film(self, run: Run, marks: list[tuple[int, str]]) -> None:
-        """Write front.mp4 with `marks` (ns, text) in it."""
-        frames = self._frames(run)
+    def film(self, run: Run, verdicts: Sequence[tuple[int, str, bool]] = ()) -> None:
+        """Write video.mp4 with `verdicts` (ns, text, success) in it."""
         with progress_bars(24, self.screen, counted=False) as bars:
-            filming = bars.add_task("writing front.mp4", total=max(1, len(frames)))
-            written = write_video(
-                self.folder / "front.mp4",
-                frames,
-                marks,
+            filming = bars.add_task("writing video.mp4", total=None)
+            written = write_film(
+                self.folder / "video.mp4",
+                run,
+                Film(),
+                verdicts,
                 lambda done, total: bars.update(filming, completed=done, total=total),
             )
             if not written:
                 bars.update(filming, description="no images, no video", completed=1, total=1)
 
-    def _frames(self, run: Run) -> list[tuple[int, bytes]]:
-        frames: list[tuple[int, bytes]] = []
-        for picture in pictures(run.file, self.camera) if self.camera is not None else ():
-            if not frames or picture.received_ns - frames[-1][0] >= IMAGE_NS:
-                frames.append((picture.received_ns, picture.jpeg))
-        return frames
+    def draw(self, run: Run) -> None:
+        """Write plot.png."""
+        with progress_bars(24, self.screen, counted=False) as bars:
+            drawing = bars.add_task("drawing plot.png", total=1)
+            write_plot(self.folder / "plot.png", evaluate_loaded(run))
+            bars.update(drawing, completed=1)
 
 
 def prepare(profile: str, out: Path | None) -> Stage:

@@ -17,6 +17,7 @@ from vla_zenoh.lab.cli.demo_options import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, prepare, refusals
 from vla_zenoh.lab.demo.segments import latencies
 from vla_zenoh.lab.episode import Interrupted
+from vla_zenoh.lab.evaluation.result import TASKS
 from vla_zenoh.lab.tasks import FAILURES, LIMIT_S
 from vla_zenoh.sanitize import one_line, printable
 
@@ -36,7 +37,6 @@ def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOption
         prompts=tuple(prompts),
         limit_s=given.seconds or LIMIT_S,
     )
-    began_ns = time.time_ns()
     ended, refused = _run(stage, plan)
     run = stage.recorded()
     summary = {
@@ -53,8 +53,9 @@ def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOption
     picture = sheet(ended)
     if picture is not None:
         (folder / "tasks.jpg").write_bytes(picture)
-    marks = [(at_ns, prompt) for at_ns, prompt in run.prompts() if at_ns >= began_ns]
-    stage.film(run, marks)
+    stage.draw(run)
+    facts = stage.facts[TASKS]
+    stage.film(run, [(fact["ended_ns"], fact["said"], fact["success"]) for fact in facts])
     _show(ended, summary, folder)
     if stage.stop.is_set():
         raise typer.Exit(130)
@@ -64,6 +65,7 @@ def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOption
 
 def _run(stage: Stage, plan: DemoPlan) -> tuple[list[TaskOutcome], dict[str, int]]:
     ended: list[TaskOutcome] = []
+    stage.facts.update({TASKS: [], "seed": plan.seed})
     with stage.nodes(52) as (running, bars):
         assert running.client is not None
         client = running.client
@@ -71,6 +73,7 @@ def _run(stage: Stage, plan: DemoPlan) -> tuple[list[TaskOutcome], dict[str, int
         try:
             for each in TaskRunner(running, plan, stage.stop, stage.camera).run():
                 ended.append(each)
+                stage.facts[TASKS].append(_fact(each))
                 said = f"{one_line(each.prompt, 40)}: {_word(each)}"
                 bars.update(bar, completed=len(ended), description=said)
         except Interrupted:
@@ -95,8 +98,19 @@ def _word(ended: TaskOutcome) -> str:
     return f"done in {ended.time_s:.1f} s" if done else ended.failure
 
 
+def _fact(ended: TaskOutcome) -> dict[str, Any]:
+    return {
+        "prompt": ended.prompt,
+        "success": _well(ended),
+        "said": _word(ended),
+        "why": ended.why,
+        "time_s": round(ended.time_s, 2),
+        "ended_ns": time.time_ns(),
+    }
+
+
 def _show(ended: list[TaskOutcome], summary: dict[str, Any], folder: Path) -> None:
-    table = new_table("prompt", "", title="prompts, judged by the true poses")
+    table = new_table("prompt", "verdict", title="prompts, judged by the true poses")
     for each in ended:
         colour = {True: "green", False: "red", None: "yellow"}[_well(each)]
         known = is_judged(each.prompt) and each.failure in FAILURES
@@ -112,4 +126,4 @@ def _show(ended: list[TaskOutcome], summary: dict[str, Any], folder: Path) -> No
             f"p95 {latency['p95']:.1f} ms; inference p50 "
             f"{latency['stages']['inference'].get('p50', 0.0):.1f} ms"
         )
-    screen.print(f"run folder: {folder} (run.mcap, summary.json, tasks.jpg, front.mp4)")
+    screen.print(f"run folder: {folder} (run.mcap, summary.json, tasks.jpg, plot.png, video.mp4)")

@@ -17,8 +17,8 @@ from vla_zenoh.cli.options import (
     options,
 )
 from vla_zenoh.cli.output import console
-from vla_zenoh.interop.openpi import PORT
 from vla_zenoh.lab.cli.loopback import require_loopback
+from vla_zenoh.lab.serve.openpi_frames import PORT
 from vla_zenoh.lab.serve.served_policy import make_served_policy
 from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.runtime.environments import run_in_own_environment

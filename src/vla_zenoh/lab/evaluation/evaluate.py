@@ -18,7 +18,14 @@ MCAP, CSV = ".mcap", ".csv"
 COMBINED = "ALL"
 """``record_id`` of all runs together."""
 _IDENTITY, _SERIES = {"name", "kind", "path"}, {"request_t_s", "width_m", "width_t_s"}
-_OF_ONE_RUN = _IDENTITY | _SERIES | {"problems", "measured", "commanded", "marks", "views"}
+_OF_ONE_RUN = (
+    _IDENTITY
+    | _SERIES
+    | {
+        *("problems", "measured", "commanded", "marks", "views"),
+        *("about", "film"),
+    }
+)
 
 
 def evaluate(

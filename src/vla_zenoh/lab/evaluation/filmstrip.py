@@ -16,7 +16,7 @@ from vla_zenoh.policy import CameraSpec
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.types import ActionChunk, Image
 
-HEIGHT_PX = 150
+HEIGHT_PX = 300
 QUALITY = 80
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
@@ -10,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.lab.evaluation import trajectory
 from vla_zenoh.lab.evaluation.activations import (
     activations,
@@ -19,11 +21,16 @@ from vla_zenoh.lab.evaluation.activations import (
     until,
 )
 from vla_zenoh.lab.evaluation.filmstrip import filmstrip
+from vla_zenoh.lab.evaluation.provenance import provenance, verdicts
 from vla_zenoh.lab.evaluation.result import Evaluation, PlotTrace
 from vla_zenoh.lab.evaluation.segments import segment
+from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.run import RecordedSample, Run, load_run
+from vla_zenoh.lab.recording.stream_listener import Streams
 from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray, NodeStatus
 
+FILM, MAX_FILM_S = Film(height_px=270, rate_hz=10, quality=30), 180.0
+"""The film of a page, and how long a run may be for one."""
 GAP_S = 0.05
 """A longer gap in a stream is an interruption; nothing is derived across it."""
 
@@ -78,22 +85,42 @@ def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) ->
         wanted = {(entry.record.worker, entry.header.seq) for entry in obeyed}
         causes = [each for each in causes if (each[0].worker, each[0].chunk_seq) in wanted]
     _requests(out, obeyed, causes, zero_ns)
-    measured, commanded = _measured(run, zero_ns, until_ns), _commanded(run, zero_ns, until_ns)
-    _motion(out, measured, commanded, run)
+    measured = add_motion(out, run, zero_ns, until_ns)
     _seams(out, until(run.commands, until_ns))
     _joint_jerk(out, until(run.joint_commands, until_ns))
     active = _active(run, until_ns, zero_ns)
     _idle(out, active, measured)
     out.refusals = _counted(run.first_statuses, run.statuses, "refused.")
     out.skipped = _counted(run.first_statuses, run.statuses, "skipped.")
+    out.gripper_orders = len(until(run.gripper_commands, until_ns))
+    _segments(out, run, causes, measured, until_ns)
+    out.about, out.verdicts = provenance(run), verdicts(run)
+    if pictures:
+        out.views = filmstrip(run, [entry.record for entry in obeyed], pictures)
+        out.film = _film(run)
+    return out
+
+
+def _film(run: Run) -> bytes:
+    """The cameras as MP4; empty where there is none, it would be too long, or PyAV is missing."""
+    if not 0 < run.seconds <= MAX_FILM_S:
+        return b""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.mp4"
+        try:
+            return path.read_bytes() if write_film(path, run, FILM) else b""
+        except MissingExtraError:
+            return b""
+
+
+def add_motion(out: Evaluation, run: Run | Streams, zero_ns: int, until_ns: int) -> MeasuredMotion:
+    """Add what the arm and the gripper did; returns the measured motion."""
+    measured, commanded = _measured(run, zero_ns, until_ns), _commanded(run, zero_ns, until_ns)
+    _motion(out, measured, commanded)
     grippers = until(run.grippers, until_ns)
     out.width_m = np.array([entry.record.width_m for entry in grippers])
     out.width_t_s = np.array([(e.header.stamp_wall_ns - zero_ns) / 1e9 for e in grippers])
-    out.gripper_orders = len(until(run.gripper_commands, until_ns))
-    _segments(out, run, causes, measured, until_ns)
-    if pictures:
-        out.views = filmstrip(run, [entry.record for entry in obeyed], pictures)
-    return out
+    return measured
 
 
 # -- requests -------------------------------------------------------------------------------------
@@ -130,7 +157,7 @@ def _stream(entries: Iterable[Any], zero_ns: int) -> MeasuredMotion:
     return MeasuredMotion(t_s[order], position[order], quat[order], twist[order])
 
 
-def _measured(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
+def _measured(run: Run | Streams, zero_ns: int, until_ns: int) -> MeasuredMotion:
     return _stream(
         (
             (e.header.stamp_wall_ns, e.record.position_m, e.record.quat_xyzw, e.record.twist)
@@ -140,7 +167,7 @@ def _measured(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
     )
 
 
-def _commanded(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
+def _commanded(run: Run | Streams, zero_ns: int, until_ns: int) -> MeasuredMotion:
     """Pose commands; for joint commands the reference pose of the controller."""
     if run.commands:
         return _stream(
@@ -166,7 +193,7 @@ def _commanded(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
     )
 
 
-def _motion(out: Evaluation, measured: MeasuredMotion, commanded: MeasuredMotion, run: Run) -> None:
+def _motion(out: Evaluation, measured: MeasuredMotion, commanded: MeasuredMotion) -> None:
     out.path_m = trajectory.path_m(measured.position_m)
     out.path_rad = trajectory.turned_rad(measured.quat_xyzw)
     out.command_path_m = trajectory.path_m(commanded.position_m)
@@ -175,8 +202,9 @@ def _motion(out: Evaluation, measured: MeasuredMotion, commanded: MeasuredMotion
     for name, motion in (("measured", measured), ("commanded", commanded)):
         if len(motion.t_s):
             quats = np.vstack([start.quat_xyzw[:1], motion.quat_xyzw])
-            trace = PlotTrace(motion.t_s, motion.position_m, trajectory.rotvecs(quats)[1:])
-            setattr(out, name, trace)
+            speed_m_s = np.linalg.norm(motion.twist[:, :3], axis=1)
+            turns = trajectory.rotvecs(quats)[1:]
+            setattr(out, name, PlotTrace(motion.t_s, motion.position_m, turns, speed_m_s))
     if not (len(measured.t_s) and len(commanded.t_s) > 1):
         return
     later = np.clip(np.searchsorted(commanded.t_s, measured.t_s), 1, len(commanded.t_s) - 1)

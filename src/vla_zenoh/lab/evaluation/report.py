@@ -1,7 +1,8 @@
-"""HTML page with tables and plots, in one file without network access."""
+"""HTML page with video, tables and plots, in one file without network access."""
 
 from __future__ import annotations
 
+import datetime as dt
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
@@ -9,12 +10,15 @@ from typing import Any
 
 from vla_zenoh import __version__
 from vla_zenoh.errors import MissingExtraError
-from vla_zenoh.lab.evaluation import plots
+from vla_zenoh.lab.evaluation import plots, tables
 from vla_zenoh.lab.evaluation.evaluate import combined
 from vla_zenoh.lab.evaluation.result import STAGES, CameraView, Evaluation
-from vla_zenoh.lab.evaluation.tables import LATENCY_COLUMNS, figures, latency_rows, segment_rows
 
 TEMPLATE = "report.html.j2"
+TABLE = """<table><tr>{% for name in columns %}<th{{ "" if loop.first else ' class="n"' | safe }}>\
+{{ name }}</th>{% endfor %}</tr>{% for row in rows %}<tr>{% for value in row %}\
+<td{{ "" if loop.first else ' class="n"' | safe }}>{{ value }}</td>{% endfor %}</tr>{% endfor %}\
+</table>"""
 
 
 def page(runs: Sequence[Evaluation], faults: Mapping[str, str]) -> str:
@@ -29,30 +33,48 @@ def page(runs: Sequence[Evaluation], faults: Mapping[str, str]) -> str:
     except ImportError as error:
         raise MissingExtraError("jinja2", "record") from error
     text = files("vla_zenoh.lab.evaluation").joinpath(TEMPLATE).read_text("utf-8")
-    template = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(text)
-    shown = [combined(runs), *runs] if len(runs) > 1 else list(runs)
-    return template.render(
+    language = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    cells = language.from_string(TABLE)
+    together = [combined(runs)] if len(runs) > 1 else []
+    return language.from_string(text).render(
+        title=f"Evaluation of {runs[0].name if len(runs) == 1 else f'{len(runs)} runs'}",
         version=__version__,
+        made=f"{dt.datetime.now():%Y-%m-%d %H:%M}",
         library=Markup(plots.library()),
         faults=faults,
-        stages=STAGES,
-        latency_columns=LATENCY_COLUMNS,
-        runs=[_shown(run, Markup) for run in shown],
+        hints=tables.HINTS,
+        table=lambda columns, rows: Markup(cells.render(columns=columns, rows=rows)),
+        latency_columns=("stage", *tables.LATENCY_COLUMNS),
+        segment_columns=("prompt", *tables.SEGMENT_COLUMNS[1:]),
+        summary_columns=(*tables.SUMMARY_COLUMNS, "tasks done"),
+        summary=[(*tables.summary_row(run), _done(run)) for run in (*runs, *together)],
+        runs=[_shown(run, Markup) for run in runs],
     )
+
+
+def _done(run: Evaluation) -> str:
+    judged = [verdict.success for verdict in run.verdicts if verdict.success is not None]
+    return f"{sum(judged)} of {len(judged)}" if judged else tables.NONE
 
 
 def _shown(run: Evaluation, markup: Any) -> dict[str, Any]:
     return {
         "name": run.name,
         "file": run.path.name if run.path else "",
+        "about": run.about,
+        "verdicts": run.verdicts,
         "problems": run.problems,
-        "figures": figures(run),
-        "latency": latency_rows(run),
-        # The combined run would repeat every prompt.
-        "segments": segment_rows(run) if run.path else [],
-        "plots": [markup(plot) for plot in plots.plots_of(run)],
+        "figures": tables.figures(run),
+        "latency": [(f"{row[0]}: {STAGES[row[0]]}", *row[1:]) for row in tables.latency_rows(run)],
+        "segments": [
+            (f"{number}. {row[0]}", *row[1:])
+            for number, row in enumerate(tables.segment_rows(run), 1)
+        ],
+        "film": b64encode(run.film).decode(),
         "strips": _strips(run.views),
-        "refusals": dict(run.refusals.most_common()),
+        "timeline": markup(plots.timeline(run)),
+        "histogram": markup(plots.histogram(run)),
+        "path": markup(plots.path(run)),
     }
 
 

@@ -22,6 +22,8 @@ STAGES = {
     "command_to_pose": "of that, until the pose command",
 }
 """Stages of a request, and their meaning."""
+TASKS = "tasks"
+"""Name of a demo's verdicts in the metadata at the end of a recording."""
 THESIS_NAMES = {"e2e": "end_to_end", "backend": "inference", "outbound": "outbound"}
 """Names of the thesis for its three stages."""
 
@@ -71,11 +73,28 @@ class PlotTrace:
         t_s: (n,) since the run began.
         position_m: (n, 3).
         rotvec_rad: (n, 3) since its first orientation, base axes.
+        speed_m_s: (n,) of the position; empty where unknown.
     """
 
     t_s: FloatArray
     position_m: FloatArray
     rotvec_rad: FloatArray
+    speed_m_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True)
+class TaskVerdict:
+    """Verdict on a task, of a demo's judge or of a person.
+
+    Args:
+        prompt: of the task.
+        success: None: nobody judged.
+        said: in words.
+    """
+
+    prompt: str
+    success: bool | None
+    said: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +147,9 @@ class Evaluation:
         gripper_orders: number of gripper commands.
         segments: motion during each prompt.
         problems: messages about what could not be read.
+        about: where it comes from: name and value of each known fact.
+        verdicts: on the tasks of the run.
+        film: MP4 file of the cameras; its time is that of the run.
         measured: for plots.
         commanded: for plots.
         marks: (seconds, prompt), for plots.
@@ -162,6 +184,9 @@ class Evaluation:
     gripper_orders: int | None = None
     segments: list[PromptSegment] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+    about: dict[str, str] = field(default_factory=dict)
+    verdicts: list[TaskVerdict] = field(default_factory=list)
+    film: bytes = b""
     measured: PlotTrace | None = None
     commanded: PlotTrace | None = None
     marks: list[tuple[float, str]] = field(default_factory=list)
@@ -238,6 +263,8 @@ class Evaluation:
                 for segment in self.segments
             ],
             "problems": self.problems,
+            "about": self.about,
+            "verdicts": [asdict(verdict) for verdict in self.verdicts],
         }
 
 

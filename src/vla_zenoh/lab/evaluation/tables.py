@@ -55,9 +55,13 @@ def summary_row(run: Evaluation) -> tuple[str, ...]:
 
 
 def latency_rows(run: Evaluation) -> list[tuple[str, ...]]:
-    """Stage, its five figures in ms."""
+    """Stage, its five figures in ms.
+
+    A chunk that arrives within a tick is used in it: its latency may be some microseconds below
+    zero, and is shown as zero.
+    """
     return [
-        (stage, *(f"{getattr(found, name):.3f}" for name in LATENCY_COLUMNS))
+        (stage, *(f"{max(getattr(found, name), 0.0):.1f}" for name in LATENCY_COLUMNS))
         for stage, found in run.latency().items()
     ]
 
@@ -97,6 +101,21 @@ SEGMENT_COLUMNS = (
 )
 
 
+HINTS = {
+    "requests": "chunks of the worker in control while the arm was active",
+    "succeeded": "requests of which at least one step was carried out",
+    "path": "length of the measured way of the TCP",
+    "tracking error, mean / p95 / max": "measured from commanded position at the same time",
+    "idle while active": "the arm stood still though it was active",
+    "chunk seams": "where a new chunk took over from the one before",
+    "goal at seams moves, mean / p95 / max": "how far the goal jumped there",
+    "velocity step at seams": "change of velocity there that the acceleration does not explain",
+    "refused": "messages that nodes rejected during the recording, by reason",
+    "skipped": "chunks left out in normal operation, by reason",
+}
+"""Figure -> what it means."""
+
+
 def figures(run: Evaluation) -> list[tuple[str, str]]:
     """Name and value of every figure; docs/how-to/recording.md says what they mean."""
     jerk_unit = run.jerk_unit.replace("_s3", "/s³")
@@ -122,7 +141,7 @@ def figures(run: Evaluation) -> list[tuple[str, str]]:
     return [(name, value) for name, value in rows if value != NONE]
 
 
-def _three(values: FloatArray, unit: str, digits: int = 3) -> str:
+def _three(values: FloatArray, unit: str, digits: int = 2) -> str:
     found = distribution(values)
     if found is None:
         return NONE

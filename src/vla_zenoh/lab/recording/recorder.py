@@ -6,6 +6,8 @@ by key, in the status and in the file.
 
 from __future__ import annotations
 
+import socket
+import subprocess
 import sys
 import threading
 import time
@@ -17,6 +19,7 @@ from typing import Any
 
 import zenoh
 
+from vla_zenoh import __version__
 from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import RecordingError
@@ -35,8 +38,22 @@ COMMIT_S = 0.5
 """A recorder killed with -9 loses at most the samples of this period."""
 POLL_S, WRITE_S = 0.1, 0.025
 ANSWER_S = 1.0
+GIT_S = 2.0
 SWITCH_INTERVAL_S = 5e-4
 RECORDING, FAILED, STOPPED = "recording", "failed", "stopped"
+
+
+def code_version() -> str:
+    """Version of this package, and the commit where it runs from a checkout."""
+    package = Path(__file__).resolve().parents[2]
+    if not (package.parents[1] / ".git").exists():
+        return __version__
+    words = ("git", "-C", str(package), "describe", "--always", "--dirty")
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=GIT_S, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return __version__
+    return f"{__version__}, commit {done.stdout.strip()}"
 
 
 @dataclass(slots=True)
@@ -90,6 +107,7 @@ class Recorder:
         expressions: keys to record; None: the default of `recorded_keys`.
         name: node name; a second recorder needs another one.
         queue_bytes: payloads in memory at most.
+        about: further metadata of the run, kept at the start of the file.
 
     Raises:
         RecordingError: the file cannot be created.
@@ -105,6 +123,7 @@ class Recorder:
         expressions: Sequence[str] | None = None,
         name: str = NAME,
         queue_bytes: int = QUEUE_BYTES,
+        about: Mapping[str, str] | None = None,
     ) -> None:
         self.node = Node(name, profile, session)
         self._expressions = expressions or recorded_keys(self.node.keys)
@@ -121,7 +140,13 @@ class Recorder:
             profile_yaml=to_yaml(profile),
             base_frame=profile.robot.base_frame,
             began_ns=self.node.clock.wall_ns(),
-            about={"profile": profile.name, "keys": " ".join(self._expressions)},
+            about={
+                "profile": profile.name,
+                "keys": " ".join(self._expressions),
+                "host": socket.gethostname(),
+                "code": code_version(),
+                **(about or {}),
+            },
         )
         self._thread = threading.Thread(target=self._write_all, name=name, daemon=True)
 

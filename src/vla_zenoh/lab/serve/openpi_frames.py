@@ -1,4 +1,4 @@
-"""Frames of a server of openpi's protocol; its clients use `vla_zenoh.interop.openpi`."""
+"""Frames of a server of openpi's protocol; for its clients see `models/openpi/wire.py`."""
 
 from __future__ import annotations
 
@@ -7,9 +7,14 @@ from typing import Any
 
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError
-from vla_zenoh.interop.openpi import SPEC
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import shown
+
+PORT = 8000
+HEALTH_PATH = "/healthz"
+MAX_BYTES = message.MAX_PAYLOAD_BYTES
+SPEC = "vla_zenoh_action"
+"""Where a server of ours says what its actions mean."""
 
 
 def metadata(action: ActionSpec, names: Mapping[str, str]) -> bytes:

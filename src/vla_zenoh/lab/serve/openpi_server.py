@@ -14,7 +14,6 @@ from http import HTTPStatus
 from typing import Any
 
 from vla_zenoh.errors import MissingExtraError, PeerError, SpecError, in_words
-from vla_zenoh.interop import openpi
 from vla_zenoh.lab.serve import openpi_frames
 from vla_zenoh.lab.serve.served_policy import ServedPolicy
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
@@ -54,7 +53,7 @@ class OpenPiServer:
             host,
             port,
             compression=None,
-            max_size=openpi.MAX_BYTES,
+            max_size=openpi_frames.MAX_BYTES,
             process_request=self._admit,
         )
         self.port: int = self._server.socket.getsockname()[1]
@@ -69,7 +68,7 @@ class OpenPiServer:
 
     # -- connections --------------------------------------------------------------------------
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        if request.path == openpi.HEALTH_PATH:
+        if request.path == openpi_frames.HEALTH_PATH:
             return connection.respond(HTTPStatus.OK, "OK\n")
         if self._key and not _has_key(request.headers, self._key):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "wrong or no API key\n")

@@ -33,11 +33,13 @@ def blueprint(
         widest_mm: largest opening of the gripper.
         live: follow the newest data.
     """
-    left = rrb.Vertical(_scene(), _texts(), row_shares=[3, 1])
-    pictures, plots = _pictures(cameras, seen), _plots(widest_mm)
-    right = rrb.Vertical(*pictures, plots, row_shares=_shares(cameras, seen))
+    views = _camera_views(cameras, seen)
+    above: Any = _scene()
+    if views:
+        above = rrb.Horizontal(above, rrb.Vertical(*views), column_shares=[4, 5])
+    below = rrb.Horizontal(_texts(seen), _plots(widest_mm), column_shares=[4, 5])
     return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[1, 1]),
+        rrb.Vertical(above, below, row_shares=[4, 3]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(
@@ -62,62 +64,58 @@ def _scene() -> Any:
     )
 
 
-def _texts() -> Any:
-    columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
-    log = rrb.TextLogView(origin=paths.EVENTS, name="Events", columns=columns)
+def _texts(seen: Collection[str]) -> Any:
     now = rrb.TextDocumentView(origin=paths.NOW, name="Now")
+    answers = [
+        rrb.TextDocumentView(origin=paths.answer(worker), name=f"{worker} answers")
+        for worker in sorted(seen)
+    ]
+    columns = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["loglevel", "body"])
+    log = rrb.TextLogView(origin=paths.EVENTS, name="Events", columns=columns)
     profile = rrb.TextDocumentView(origin=paths.PROFILE, name="Profile")
-    return rrb.Horizontal(now, rrb.Tabs(log, profile), column_shares=[2, 3])
+    upper = rrb.Horizontal(now, rrb.Tabs(*answers)) if answers else now
+    return rrb.Vertical(upper, rrb.Tabs(log, profile), row_shares=[4, 5])
 
 
-def _pictures(cameras: Collection[str], seen: Mapping[str, Collection[str]]) -> list[Any]:
+def _camera_views(cameras: Collection[str], seen: Mapping[str, Collection[str]]) -> list[Any]:
+    """A row of the cameras, and one of what models see."""
     rows: list[Any] = []
     if cameras:
-        rows.append(
-            rrb.Horizontal(
-                *(
-                    rrb.Spatial2DView(origin=paths.picture(name), name=f"Camera {name}")
-                    for name in sorted(cameras)
-                )
-            )
-        )
+        views = [
+            rrb.Spatial2DView(origin=paths.picture(name), name=f"Camera {name}")
+            for name in sorted(cameras)
+        ]
+        rows.append(rrb.Horizontal(*views))
     models = [
         rrb.Horizontal(
             *(
                 rrb.Spatial2DView(origin=paths.seen(worker, name), name=f"{worker} sees {name}")
                 for name in sorted(seen[worker])
             ),
-            rrb.TextDocumentView(origin=paths.answer(worker), name=f"{worker} answers"),
             name=worker,
         )
         for worker in sorted(seen)
+        if seen[worker]
     ]
     if models:
         rows.append(models[0] if len(models) == 1 else rrb.Tabs(*models))
     return rows
 
 
-def _shares(cameras: Collection[str], seen: Mapping[str, Collection[str]]) -> list[float]:
-    of_models = 4.0 if any(seen.values()) else 2.0
-    return [*([5.0] if cameras else []), *([of_models] if seen else []), 7.0]
-
-
 def _plots(widest_mm: float) -> Any:
     wide = (-0.05 * widest_mm, 1.05 * widest_mm)
     return rrb.Grid(
-        _plot("Latency, ms", paths.LATENCY),
-        _plot("Speed of the TCP, mm/s", paths.SPEED),
-        _plot("Gripper, mm", paths.GRIPPER, span=wide),
-        _plot("Commanded to measured, mm", paths.TRACKING, legend=False),
-        _plot("Speed left by bounds, %", paths.BOUNDS, span=SHARE_RANGE, legend=False),
-        _plot("Joints, rad", paths.JOINTS, legend=False),
+        _plot("Latency, ms: all grey, camera blue, model pink", paths.LATENCY),
+        _plot("Speed, mm/s: commanded orange, measured blue", paths.SPEED),
+        _plot("Gripper, mm: commanded orange, measured blue", paths.GRIPPER, span=wide),
+        _plot("Commanded to measured, mm", paths.TRACKING),
+        _plot("Speed left by limits, %", paths.BOUNDS, span=SHARE_RANGE),
+        _plot("Joints, rad", paths.JOINTS),
         grid_columns=2,
     )
 
 
-def _plot(
-    name: str, origin: str, *, span: tuple[float, float] | None = None, legend: bool = True
-) -> Any:
+def _plot(name: str, origin: str, *, span: tuple[float, float] | None = None) -> Any:
     window = rrb.VisibleTimeRange(
         paths.TIMELINE,
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-WINDOW_S),
@@ -128,5 +126,5 @@ def _plot(
         name=name,
         time_ranges=[window],
         axis_y=None if span is None else rrb.ScalarAxis(range=span, zoom_lock=True),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+        plot_legend=rrb.PlotLegend(visible=False),
     )

@@ -275,7 +275,7 @@ class RerunLogger:
         if seen.worker not in self._seen:
             self._seen[seen.worker] = set()
             self._layout()
-        self._texts.answer(seen)
+        self._texts.answer(seen, self._specs.get(seen.spec_hash))
 
     # -- texts --------------------------------------------------------------------------------
     def _on_task(self, _: Sample, stamp_ns: int, task: Task) -> None:

@@ -27,6 +27,15 @@ STALE_NS = 2_000_000_000
 """Age at which a ribbon that no newer chunk of its worker replaces is removed."""
 TRAIL_RADIUS_M, RIBBON_RADIUS_M, AXIS_M = 0.0018, 0.003, 0.06
 OBJECT_RADIUS_M = 0.012
+OBJECT_COLOURS = {
+    "red": (255, 110, 100),
+    "green": (110, 225, 120),
+    "blue": (120, 170, 255),
+    "yellow": (250, 220, 90),
+}
+OTHER_OBJECT = (225, 228, 235)
+REACH_M = 0.3
+"""An object this far outside of the workspace is not the robot's concern."""
 
 
 class PoseTrail:
@@ -84,6 +93,7 @@ class Scene:
         log(paths.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         space = profile.limits.workspace
         low, high = np.array([space.x_m, space.y_m, space.z_m]).T
+        self._reach = low - REACH_M, high + REACH_M
         box = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[(120, 130, 150, 70)], radii=0.001)
         log(f"{paths.WORLD}/workspace", box, static=True)
 
@@ -172,16 +182,18 @@ class Scene:
 
     # -- objects ------------------------------------------------------------------------------
     def objects(self, objects: ObjectPoses) -> None:
-        """Draw the simulator's objects."""
-        self._stream.log(
-            paths.OBJECTS,
-            rr.Points3D(
-                objects.position_m,
-                radii=OBJECT_RADIUS_M,
-                labels=list(objects.names),
-                colors=[(235, 90, 80)] * len(objects.names),
-            ),
+        """Draw the simulator's objects; those that are parked away from the robot are left out."""
+        low, high = self._reach
+        near = ((objects.position_m >= low) & (objects.position_m <= high)).all(axis=1)
+        names = [name for name, shown in zip(objects.names, near, strict=True) if shown]
+        colours = [OBJECT_COLOURS.get(name.split("_")[0], OTHER_OBJECT) for name in names]
+        points = rr.Points3D(
+            objects.position_m[near],
+            radii=OBJECT_RADIUS_M,
+            labels=[name.removesuffix("_brick") for name in names],
+            colors=colours,
         )
+        self._stream.log(paths.OBJECTS, points)
 
 
 def pose_of(position_m: FloatArray, quat_xyzw: FloatArray) -> Pose:

@@ -10,6 +10,7 @@ from typing import Any
 import rerun as rr
 
 from vla_zenoh.lab.view import paths
+from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import Event, InferenceDebug, NodeStatus, Task
 
 LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
@@ -81,7 +82,7 @@ class TextPanels:
             "",
             f"**{plain(state) or 'unknown'}**{f', {plain(why)}' if why else ''}",
             "",
-            f"{plain(task.worker)} at {task.rate_hz:g} Hz, episode {task.episode}, "
+            f"{plain(task.worker)} at {task.rate_hz:g} Hz, "
             f"{'active' if task.active else 'not active'}"
             f"{f', speed {task.speed_percent:g} %' if task.speed_percent < 100 else ''}",
         ]
@@ -120,19 +121,41 @@ class TextPanels:
         line = f"{name}: {text}" if text else name
         self._stream.log(f"{paths.EVENTS}/settings", rr.TextLog(line, level="INFO"))
 
-    def answer(self, seen: InferenceDebug) -> None:
-        """Log a request to a model and its answer."""
-        first = " ".join(f"{value:+.4f}" for value in seen.steps[0]) if len(seen.steps) else ""
+    def answer(self, seen: InferenceDebug, spec: ModelSpec | None) -> None:
+        """Log a request to a model and its answer.
+
+        Args:
+            seen: both.
+            spec: of the model; None: not received yet, its numbers have no names.
+        """
         lines = [
             f"**{plain(seen.prompt)}**",
             "",
             f"chunk {seen.chunk_seq}, {seen.inference_ms:.1f} ms, {len(seen.steps)} steps"
             + (", the last ones" if seen.done else ""),
             "",
-            f"first step `{first}`",
+            _first_step(seen, spec),
             *_raw(seen.raw),
         ]
         self._document(paths.answer(seen.worker), "\n".join(lines))
+
+
+def _first_step(seen: InferenceDebug, spec: ModelSpec | None) -> str:
+    if not len(seen.steps):
+        return ""
+    step = seen.steps[0]
+    if spec is None or len(step) != spec.action.dimension:
+        return "first step " + " ".join(f"{value:+.4f}" for value in step)
+    action, scale_mm = spec.action, spec.action.position_scale_m * 1e3
+    rows = ["| first step | x | y | z |", "|---|---|---|---|"]
+    rows.append("| mm | " + " | ".join(f"{value * scale_mm:+.1f}" for value in step[:3]) + " |")
+    turn = [float(value) for value in step[3 : action.dimension - (action.gripper != "none")]]
+    if len(turn) == 3:
+        rows.append("| mrad | " + " | ".join(f"{value * 1e3:+.1f}" for value in turn) + " |")
+    text = "\n".join(rows)
+    if action.gripper != "none":
+        text += f"\n\ngripper {float(step[-1]):+.3f} ({action.gripper.replace('_', ' ')})"
+    return text
 
 
 def _raw(raw: Mapping[str, Any]) -> list[str]:

@@ -16,13 +16,12 @@ import uuid
 from contextlib import ExitStack, suppress
 from typing import Any
 
+from vla_zenoh_model_openpi import wire
 from websockets.exceptions import WebSocketException
 from websockets.protocol import State
 from websockets.sync.client import ClientConnection, connect
 
-from vla_zenoh.interop import openpi
 from vla_zenoh.interop.adapter import Adapter
-from vla_zenoh.interop.presets import OPENPI
 from vla_zenoh.policy.model_options import address, one_of
 
 CLOSE_S = 0.1
@@ -33,7 +32,7 @@ class OpenPi(Adapter):
 
     Args:
         url: of the server, as ws://HOST:PORT or wss://HOST:PORT.
-        preset: libero, droid or own, see vla_zenoh/interop/presets.py; none: no defaults.
+        preset: libero, droid or own, see wire.py; none: no defaults.
         timeout_s: for connecting, and for each answer.
         dialect: openpi, vllm (knows resets and sessions), auto: by the path of the URL.
         api_key: sent as ``Authorization: Api-Key``.
@@ -46,7 +45,7 @@ class OpenPi(Adapter):
 
     def __init__(
         self,
-        url: str = f"ws://127.0.0.1:{openpi.PORT}",
+        url: str = f"ws://127.0.0.1:{wire.PORT}",
         preset: str = "",
         timeout_s: str = "2",
         dialect: str = "auto",
@@ -58,7 +57,7 @@ class OpenPi(Adapter):
         super().__init__(
             "openpi",
             server.geturl(),
-            OPENPI,
+            wire.PRESETS,
             preset,
             mapping,
             timeout_s=timeout_s,
@@ -66,7 +65,7 @@ class OpenPi(Adapter):
             clock_s=time.monotonic,
         )
         one_of("dialect", dialect, ("auto", "openpi", "vllm"))
-        by_path = server.path == openpi.VLLM_PATH
+        by_path = server.path == wire.VLLM_PATH
         self._vllm = by_path if dialect == "auto" else dialect == "vllm"
         self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
         self._connection: ClientConnection | None = None
@@ -82,7 +81,7 @@ class OpenPi(Adapter):
             connect(
                 self.where,
                 compression=None,
-                max_size=openpi.MAX_BYTES,
+                max_size=wire.MAX_BYTES,
                 additional_headers=self._headers,
                 proxy=None,
                 open_timeout=self.timeout_s,
@@ -93,14 +92,14 @@ class OpenPi(Adapter):
         # A stopped server reads nothing, and sending would block forever.
         seconds = struct.pack("ll", int(self.timeout_s), int(self.timeout_s % 1 * 1e6))
         connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, seconds)
-        metadata = openpi.read_metadata(connection.recv(self.timeout_s))
-        return openpi.mismatches(metadata, self.mapping)
+        metadata = wire.read_metadata(connection.recv(self.timeout_s))
+        return wire.mismatches(metadata, self.mapping)
 
     def _ask(self, fields: dict[str, Any], *, begins: bool) -> Any:
         if self._vllm and begins:
             self._session = uuid.uuid4().hex
-            openpi.read_reset(self._call(openpi.reset_request()))
-        return openpi.read_answer(self._call(openpi.request(fields, self._session)))
+            wire.read_reset(self._call(wire.reset_request()))
+        return wire.read_answer(self._call(wire.request(fields, self._session)))
 
     def _call(self, request: bytes) -> bytes | str:
         assert self._connection is not None

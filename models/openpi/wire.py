@@ -16,15 +16,54 @@ from typing import Any
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError
 from vla_zenoh.interop.field_mapping import FieldMapping
+from vla_zenoh.interop.presets import OSC, STATE8, Presets
 from vla_zenoh.types import shown
 
 PORT = 8000
-HEALTH_PATH = "/healthz"
 VLLM_PATH = "/v1/realtime/robot/openpi"
 MAX_BYTES = message.MAX_PAYLOAD_BYTES
 MAX_ERROR = 400
 SPEC = "vla_zenoh_action"
 """Where a server of ours says what its actions mean."""
+
+_OWN = {
+    "size": "",
+    "resize": "none",
+    "action": "delta",
+    "rotation": "rpy",
+    "gripper": "absolute_m",
+    "dt_s": "0.1",
+    "horizon": "16",
+}
+
+PRESETS: Presets = {
+    "libero": {
+        "map": "observation/image=camera:front, observation/wrist_image=camera:wrist, "
+        f"observation/state={STATE8}, prompt=prompt",
+        **OSC,
+        "gripper": "binary",
+        "gripper_open": "low",
+        "gripper_threshold": "0",
+        "horizon": "10",
+    },
+    "droid": {
+        "map": "observation/exterior_image_1_left=camera:front, "
+        "observation/wrist_image_left=camera:wrist, observation/joint_position=joint, "
+        "observation/gripper_position=gripper_closed, prompt=prompt",
+        "action": "joint_delta",
+        "joint_scale_rad": "0.2",
+        "clip": "1",
+        "gripper": "binary",
+        "gripper_open": "low",
+        "dt_s": "0.0666667",
+        "horizon": "8",
+    },
+    "own": {
+        "map": "observation/front=camera:front, observation/pose=position+quat_xyzw, "
+        "observation/gripper=gripper_m, prompt=prompt",
+        **_OWN,
+    },
+}
 
 
 def request(fields: Mapping[str, Any], session: str | None = None) -> bytes:
