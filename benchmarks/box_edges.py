@@ -195,7 +195,7 @@ def main() -> int:
     parser.add_argument("--command", choices=["pose", "joint"], default="pose")
     parser.add_argument("--perfect", action="store_true", help="without physics, much faster")
     parser.add_argument("--jobs", type=int, help="at a time; else one a core")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="every policy")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="every policy")
     options = parser.parse_args()
     how = (options.profile, options.command, options.perfect)
     jobs = [(p, options.seed + n, *how) for p in places() for n in range(options.n)]
@@ -223,8 +223,8 @@ def main() -> int:
     for row in found:
         if row["state"] not in ("active", "holding"):
             print(f"{row['place']} seed {row['seed']}: {row['state']}, {row['why'][:100]}")
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
+    if options.output:
+        options.output.write_text(json.dumps(found, indent=1) + "\n")
     return 0
 
 

@@ -9,10 +9,9 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from vla_zenoh.cli.options import model_options
-from vla_zenoh.cli.output import console
+from vla_zenoh.cli.options import model_options, options
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.lab.cli.bench_file import JsonFileOption, write_json
+from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json
 from vla_zenoh.policy.loader import find_model, import_model, make_policy, module_name
 from vla_zenoh.policy.model_options import one_of
 from vla_zenoh.runtime.environments import run_in_own_environment
@@ -21,8 +20,10 @@ NAME = "openvla"
 DTYPES = ("bfloat16", "float16", "float32")
 
 
+@options
 def openvla(
-    options: Annotated[
+    output: ResultOptions,
+    settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Option of the worker as name=value; checkpoint=DIR."),
     ] = None,
@@ -31,7 +32,6 @@ def openvla(
         typer.Option("--full-size", help="Random weights of the published size, 15 GB in bfloat16"),
     ] = False,
     rounds: Annotated[int, typer.Option("--rounds", min=1, max=1000)] = 20,
-    json_file: JsonFileOption = None,
     python: Annotated[
         str | None, typer.Option("--python", help="Interpreter of a prepared environment.")
     ] = None,
@@ -40,20 +40,19 @@ def openvla(
 
     Runs in OpenVLA's environment, without robot, camera or Zenoh.
     """
-    chosen = model_options(options or [])
+    chosen = model_options(settings or [])
     if full_size == ("checkpoint" in chosen):
         raise typer.BadParameter("give either --set checkpoint=DIR or --full-size")
     model = find_model(NAME)
     run_in_own_environment(model, python, program="benchmarks")
     import_model(model)
-    report = _full_size(rounds, chosen) if full_size else _loaded(rounds, chosen)
-    write_json(json_file, report)
-    out = console()
-    out.print(_table(report))
+    with output.open() as file:
+        report = _full_size(rounds, chosen) if full_size else _loaded(rounds, chosen)
+        write_json(file, report)
     memory = ", ".join(f"{part} {mb:.0f} MB" for part, mb in report["memory_mb"].items())
-    out.print(f"memory: {memory}")
     same = ("yes", "") if report["same_tokens"] else ("no", "bold")
-    out.print(Text.assemble("both ways gave the same tokens: ", same))
+    agree = Text.assemble("both ways gave the same tokens: ", same)
+    output.show(report, _table(report), f"memory: {memory}", agree)
 
 
 def _part(name: str) -> Any:

@@ -1,6 +1,6 @@
 """How steadily an arm moves that is asked for the same step again and again.
 
-    python -m benchmarks.steady_motion [--perfect] [--plot FILE.png] [--json FILE]
+    python -m benchmarks.steady_motion [--perfect] [--plot FILE.png] [-o FILE]
 
 The scripted model asks for 50 steps of 0.01 m and of 0.05 rad, at several rates, in chunks of
 several lengths; an inference takes 140 ms, with and without jitter; a step lasts one period, or
@@ -226,7 +226,7 @@ def main() -> int:
     parser.add_argument("--rate", type=float, action="append", help="only these, in Hz")
     parser.add_argument("--horizon", type=int, action="append", help="only these")
     parser.add_argument("--jobs", type=int, help="at a time; else one a core")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="all rows")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="all rows")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="speed against time")
     options = parser.parse_args()
     jobs = [
@@ -243,9 +243,9 @@ def main() -> int:
         print(line(row))
     if options.plot:
         plot(rows, options.plot)
-    if options.json:
+    if options.output:
         kept = [{name: row[name] for name in row if name != "trace"} for row in rows]
-        options.json.write_text(json.dumps(kept, indent=1) + "\n")
+        options.output.write_text(json.dumps(kept, indent=1) + "\n")
     return 0
 
 

@@ -1,6 +1,6 @@
 """Reads a recording, prints how far the arm went and how long commands took, plots its height.
 
-    vla-zenoh record --out run.mcap                  # while the robot moves; Ctrl-C ends it
+    vla-zenoh record -o run.mcap                  # while the robot moves; Ctrl-C ends it
     python examples/evaluate_and_plot.py run.mcap
 
 `vla-zenoh eval run.mcap` makes a whole report.

@@ -4,7 +4,7 @@
 # ///
 """Plays a recorded chunk file: a model whose every answer is known beforehand.
 
-The file is what ``vla-zenoh demo --out`` writes as ``chunks.npz``::
+The file is what ``vla-zenoh demo`` writes as ``chunks.npz``::
 
     spec     the ModelSpec as JSON text
     steps    (N, H, D) float32, one chunk after the other

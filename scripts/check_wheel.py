@@ -23,7 +23,7 @@ LEFT_OUT = ("training/", ".safetensors", "benchmarks/", "tests/", "openvla/measu
 TRIALS = [
     ["--help"],
     ["profile", "list"],
-    ["demo", "--prompt", "HARD: go up", "--rate", "5", "--steps", "5", "--out", "runs"],
+    ["demo", "--prompt", "HARD: go up", "--rate", "5", "--steps", "5", "--output", "runs"],
 ]
 
 
@@ -65,7 +65,7 @@ def try_out(archive: Path, extra: str) -> None:
         for trial in TRIALS:
             run(folder / "venv" / "bin" / "vla-zenoh", *trial, cwd=work)
         if not any((work / "runs").rglob("*")):
-            sys.exit("build: the demo left nothing in the folder named with --out")
+            sys.exit("build: the demo left nothing in the folder named with --output")
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """Makes the pictures of the docs from the run folder of a demo, without a screen.
 
-    vla-zenoh demo --out runs/demo
+    vla-zenoh demo -o runs/demo
     python scripts/pictures.py runs/demo             # all of docs/images
     python scripts/pictures.py runs/demo view        # only docs/images/view.jpg
 
@@ -77,13 +77,13 @@ def insist(ask: Callable[[], None]) -> None:
 
 
 def picture_report(run: Path, out: Path, size: tuple[int, int], *more: str) -> None:
-    """The page of ``vla-zenoh eval --html``."""
+    """The page of ``vla-zenoh eval -o report.html``."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         sys.exit("no chromium on PATH")
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / "report.html"
-        words = [sys.executable, "-m", "vla_zenoh", "eval", str(run), "--html", str(page)]
+        words = [sys.executable, "-m", "vla_zenoh", "eval", str(run), "--output", str(page)]
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
         subprocess.run(
             [

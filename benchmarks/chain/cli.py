@@ -6,11 +6,14 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.output import console, errors
-from vla_zenoh.lab.cli.bench_file import JsonFileOption, write_json
+from vla_zenoh.cli.options import options
+from vla_zenoh.cli.output import progress_bars
+from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json
 
 
+@options
 def chain(
+    output: ResultOptions,
     rounds: Annotated[
         int, typer.Option("--rounds", help="Turns that every way has.", min=1, max=100)
     ] = 5,
@@ -21,15 +24,12 @@ def chain(
         list[str] | None,
         typer.Option("--only", help="Measure this way alone; may be given more than once."),
     ] = None,
-    json_file: JsonFileOption = None,
 ) -> None:
     """Measure picture to chunk and to pose command, beside other ways of serving a model.
 
     Every way carries the same picture of 640x480 and seven floats back; the model takes no time.
     All servers are processes on this computer, started and ended by turns.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from benchmarks.chain import report
     from benchmarks.chain.run import run
     from benchmarks.chain.ways import WAYS, ServingWay
@@ -39,13 +39,7 @@ def chain(
     if unknown:
         raise typer.BadParameter(f"{unknown[0]!r} is not a way; there are: {', '.join(names)}")
     ways = [way for way in WAYS if not only or way.name in only]
-    with Progress(
-        TextColumn("{task.description:<44}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=errors(),
-    ) as bars:
+    with output.open() as file, progress_bars(44) as bars:
         turns = rounds * sum(not way.missing() for way in ways)
         bar = bars.add_task("", total=turns)
         begun = 0
@@ -57,11 +51,11 @@ def chain(
 
         result = run(ways, rounds, requests, progress)
         bars.update(bar, description="measured", completed=turns)
-    write_json(json_file, result.to_dict())
-    out = console()
-    out.print(report.main_table(result))
+        write_json(file, result.to_dict())
     stages = report.stage_table(result)
-    if stages is not None:
-        out.print(stages)
-    for note in report.notes(result):
-        out.print(f"- {note}")
+    output.show(
+        result.to_dict(),
+        report.main_table(result),
+        *([] if stages is None else [stages]),
+        *(f"- {note}" for note in report.notes(result)),
+    )

@@ -7,17 +7,16 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from vla_zenoh.cli.output import console
-from vla_zenoh.lab.cli.bench_file import JsonFileOption, write_json
+from vla_zenoh.cli.options import options
+from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json
 
 BUDGET_S = 0.3
 """Time for one figure, at most `MAX_TURNS` turns."""
 MIN_TURNS, MAX_TURNS = 5, 2000
 
 
-def codec(
-    json_file: JsonFileOption = None,
-) -> None:
+@options
+def codec(output: ResultOptions) -> None:
     """Measure encoding and decoding, ours and ROS 2's, in microseconds.
 
     Of ROS 2 beside cyclonedds and pycdr2, where they are installed.
@@ -28,15 +27,16 @@ def codec(
     from benchmarks.codec.other_cdr import MODULES
 
     rows: list[dict[str, Any]] = []
-    for case in cases():
-        us = {"encode": _median_us(case.encode), "decode": _median_us(case.decode)}
-        for library, (encode, decode) in case.others.items():
-            us |= {
-                f"{library} encode": _median_us(encode),
-                f"{library} decode": _median_us(decode),
-            }
-        rows.append({"name": case.name, "bytes": case.payload_bytes, "us": us})
-    write_json(json_file, rows)
+    with output.open() as file:
+        for case in cases():
+            us = {"encode": _median_us(case.encode), "decode": _median_us(case.decode)}
+            for library, (encode, decode) in case.others.items():
+                us |= {
+                    f"{library} encode": _median_us(encode),
+                    f"{library} decode": _median_us(decode),
+                }
+            rows.append({"name": case.name, "bytes": case.payload_bytes, "us": us})
+        write_json(file, rows)
     table = Table(title="microseconds (or ms) to encode / decode, median")
     table.add_column("what")
     table.add_column("bytes", justify="right", no_wrap=True)
@@ -45,7 +45,7 @@ def codec(
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:
         table.add_row(row["name"], str(row["bytes"]), *(_pair(row["us"], c) for c in columns))
-    console().print(table)
+    output.show(rows, table)
 
 
 def _pair(us: dict[str, float], who: str) -> str:

@@ -8,15 +8,16 @@ import typer
 from rich.box import SIMPLE
 from rich.table import Table
 
-from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list
-from vla_zenoh.cli.output import console, errors
-from vla_zenoh.lab.cli.bench_file import JsonFileOption, kept_rows
+from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, number_list, options
+from vla_zenoh.cli.output import errors
+from vla_zenoh.lab.cli.bench_file import ResultOptions, kept_rows
 
-WIDTH = 140
 MOST = 64
 
 
+@options
 def load(
+    output: ResultOptions,
     robots: Annotated[
         str, typer.Option("--robots", help="Numbers of robots, separated by commas; empty: none.")
     ] = "1,2,4,8,16",
@@ -29,7 +30,6 @@ def load(
     profile: Annotated[
         str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
     ] = DEFAULT_PROFILE,
-    json_file: JsonFileOption = None,
 ) -> None:
     """Measure how many robots and cameras one router and this computer carry.
 
@@ -44,7 +44,7 @@ def load(
     stop = stop_on_signals()
     die_with_parent()
     loaded = own_address(effective_profile(profile))
-    with kept_rows(json_file) as rows:
+    with kept_rows(output) as rows:
         for counts, make in ((robot_counts, "robots"), (camera_counts, "cameras")):
             if not counts:
                 continue
@@ -52,14 +52,15 @@ def load(
                 for row in getattr(running, make)(counts, seconds):
                     rows.append(row)
                     errors().print(f"{row[make]} {make} measured", style="dim")
-    out = console(WIDTH)
+    tables: list[Table] = []
     for title, kind, columns in (
         ("Robots", "robots", ROBOT_COLUMNS),
         ("Cameras of 640x480 at 30 Hz, raw", "cameras", CAMERA_COLUMNS),
     ):
         chosen = [row for row in rows if row[kind]]
         if chosen:
-            out.print(_table(title, kind, columns, chosen))
+            tables.append(_table(title, kind, columns, chosen))
+    output.show(rows, *tables)
 
 
 ROBOT_COLUMNS = {

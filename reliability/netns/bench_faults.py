@@ -1,6 +1,6 @@
 """What a lab network's faults do to an arm in motion, as a table.
 
-    make bench-faults ARGS="--only cut-5 --json faults.json"
+    make bench-faults ARGS="--only cut-5 -o faults.json"
 
 Needs root. Hosts are network namespaces with mutual TLS and access control; every row is one motion
 of the simulated arm, measured from what its simulator logged. Rewrites the table of
@@ -58,7 +58,7 @@ def rows(faults: list[Fault], screen: Console) -> Iterator[Row]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path, help="write all figures to this file")
+    parser.add_argument("-o", "--output", type=Path, help="write all figures to this file")
     parser.add_argument("--only", action="append", help="this fault; may be given more than once")
     parser.add_argument("--no-table", action="store_true", help="do not rewrite the table in docs/")
     given = parser.parse_args()
@@ -82,8 +82,8 @@ def main() -> int:
         for row in rows(chosen, screen):
             done.append(row)
     finally:
-        if given.json is not None:
-            given.json.write_text(json.dumps([row.to_dict() for row in done], indent=2) + "\n")
+        if given.output is not None:
+            given.output.write_text(json.dumps([row.to_dict() for row in done], indent=2) + "\n")
         if not given.no_table:
             table.write(DOCUMENT, done, names)
     wrong = [f"{row.name}: {fault}" for row in done for fault in row.wrong]

@@ -11,6 +11,8 @@
     ├── MissingExtraError  an optional dependency is not installed
     ├── SessionError       no Zenoh session could be had
     ├── WorkerError        a model worker cannot be loaded or broke its contract
+    ├── RecordingError     a recorded run cannot be written or read
+    ├── OutputError        an output file cannot be written, or would overwrite something
     ├── PeerError          a policy server gave no answer that can be used
     ├── NodeError          a node cannot start or go on (a second command node, a dead device)
     └── SecurityError      a certificate or key cannot be made or used
@@ -105,6 +107,10 @@ class WorkerError(VlaZenohError):
 
 class RecordingError(VlaZenohError):
     """A recorded run cannot be written or read."""
+
+
+class OutputError(VlaZenohError):
+    """An output file or folder cannot be written, or would overwrite something."""
 
 
 class PeerError(VlaZenohError):

@@ -79,7 +79,7 @@ def test_it_keeps_its_contract(checkpoint: Path) -> None:
 def test_the_stages_of_an_action_are_measured(checkpoint: Path, tmp_path: Path) -> None:
     file = tmp_path / "stages.json"
     options = [f"--set=checkpoint={checkpoint}", *(f"--set={option}" for option in OPTIONS)]
-    words = ["-m", "benchmarks", "openvla", *options, "--rounds", "3", "--json", str(file)]
+    words = ["-m", "benchmarks", "openvla", *options, "--rounds", "3", "--output", str(file)]
     done = subprocess.run(
         [sys.executable, *words], capture_output=True, text=True, check=False, timeout=START_S
     )

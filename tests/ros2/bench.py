@@ -1,6 +1,6 @@
 """How much longer a picture's way to a pose is over ROS 2, and whose share is what.
 
-    make bench-ros2        (python tests/ros2/bench.py --requests 300 --json result.json)
+    make bench-ros2        (python tests/ros2/bench.py --requests 300 -o result.json)
 
 A DDS participant publishes pictures of 640x480, our nodes answer through the real bridge, and the
 pose comes back over DDS to the same process. On its way it is seen on every Zenoh key, so that the
@@ -322,7 +322,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description="Latency of the ROS 2 path, leg by leg")
     parser.add_argument("--requests", type=int, default=200)
-    parser.add_argument("--json", type=Path, help="file for the result")
+    parser.add_argument("-o", "--output", type=Path, help="file for the result")
     parser.add_argument("--answer", type=int, metavar="DOMAIN", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.answer is not None:
@@ -349,9 +349,9 @@ def main() -> None:
         "at the start. Shares of one core: "
         + ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
     )
-    if chosen.json:
+    if chosen.output:
         told = {"ms": measured, "cpu": shares, "lost": lost, "load": load}
-        chosen.json.write_text(json.dumps(told, indent=2))
+        chosen.output.write_text(json.dumps(told, indent=2))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ WAIT_TOLERANCE_MS = 0.1
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    file = tmp_path_factory.mktemp("bench") / "deep" / "result.json"
+    file = tmp_path_factory.mktemp("bench") / "result.json"
     return run_bench(file, "chain-250", "zenoh-router", "zenoh-direct", "zmq")
 
 
@@ -28,7 +28,7 @@ def run_bench(file: Path, *ways: str) -> dict:
     arguments = [part for way in ways for part in ("--only", way)]
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks", "chain", "--rounds", "1"]
-        + ["--requests", str(REQUESTS), "--json", str(file), *arguments],
+        + ["--requests", str(REQUESTS), "--output", str(file), *arguments],
         capture_output=True,
         text=True,
         check=False,

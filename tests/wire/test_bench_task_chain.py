@@ -24,12 +24,12 @@ ORACLE = Path(__file__).parents[1] / "oracle"
 def test_who_knows_no_task_does_none_through_the_real_chain(
     tmp_path: Path, model: str, family: str, successes: int, failures: dict[str, int] | None
 ) -> None:
-    json_file, out = tmp_path / "result.json", tmp_path / "run"
+    out = tmp_path / "run"
     words = ["bench", "task", "--model", model, "--family", family, "--episodes", "2"]
-    words += ["--limit", "8", "--delay", "60", "--json", str(json_file), "--out", str(out)]
+    words += ["--limit", "8", "--delay", "60", "--output", str(out)]
     done = command_line(*words, timeout_s=TIMEOUT_S)
     assert done.returncode == 0, done.stderr
-    result = json.loads(json_file.read_text())
+    result = json.loads((out / "result.json").read_text())
     assert result["mode"] == "real_time"
     assert (result["successes"], result["episodes"]) == (successes, 2)
     assert failures is None or result["failures"] == failures
@@ -40,9 +40,9 @@ def test_who_knows_no_task_does_none_through_the_real_chain(
 
 @pytest.mark.slow
 def test_who_does_the_task_through_the_real_chain_is_said_to_have_done_it(tmp_path: Path) -> None:
-    json_file = tmp_path / "result.json"
+    out = tmp_path / "run"
     words = ["bench", "task", "--model", "oracle", "--family", "put", "--episodes", "3"]
-    words += ["--rate", "10", "--json", str(json_file), "--out", str(tmp_path / "run")]
+    words += ["--rate", "10", "--output", str(out)]
     done = subprocess.run(
         [sys.executable, "-m", "vla_zenoh", *words],
         env={**os.environ, "VLA_ZENOH_PATH": str(ORACLE)},
@@ -52,6 +52,6 @@ def test_who_does_the_task_through_the_real_chain_is_said_to_have_done_it(tmp_pa
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    result = json.loads(json_file.read_text())
+    result = json.loads((out / "result.json").read_text())
     assert result["successes"] == 3, result["all"]
     assert result["time_to_success_s"]["p95"] < result["limit_s"]

@@ -88,7 +88,7 @@ def test_the_arm_is_driven_by_the_zenoh_package_alone(chain: Chain, tmp_path: Pa
 
 def test_a_recording_is_evaluated_and_plotted(chain: Chain, tmp_path: Path) -> None:
     file = tmp_path / "run.mcap"
-    words = ("record", "--profile", profile_file(chain), "--out", str(file), "--seconds", "10")
+    words = ("record", "--profile", profile_file(chain), "--output", str(file), "--seconds", "10")
     recording = threading.Thread(target=command_line, args=words)
     recording.start()
     chain.until("the recorder is alive", lambda: "recorder" in chain.client.alive)

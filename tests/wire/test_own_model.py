@@ -64,12 +64,12 @@ options: {up: {step_m: "0.01"}, down: {step_m: "-0.01"}}
 def test_bench_task_runs_a_path_and_bench_compare_reads_what_it_wrote(
     model: Path, tmp_path: Path
 ) -> None:
-    still, moved = tmp_path / "still.json", tmp_path / "moved.json"
+    still, moved = tmp_path / "still", tmp_path / "moved"
     words = ["bench", "task", "--model", str(model), "--family", "stay", "--episodes", "6"]
     words += ["--limit", "4", "--lockstep", "--processes", "2"]
-    for step_m, file in (("0.0", still), ("0.02", moved)):
+    for step_m, folder in (("0.0", still), ("0.02", moved)):
         done = command_line(
-            *words, "--set", f"step_m={step_m}", "--json", str(file), timeout_s=TIMEOUT_S
+            *words, "--set", f"step_m={step_m}", "--output", str(folder), timeout_s=TIMEOUT_S
         )
         assert done.returncode == 0, done.stderr
     found = command_line("bench", "compare", str(still), str(moved), "--json")

@@ -260,8 +260,9 @@ def test_what_the_queue_cannot_take_is_counted_and_said(chain: Chain, tmp_path: 
 
 @pytest.mark.slow
 def test_a_recorder_that_is_killed_leaves_a_readable_file(chain: Chain, tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    with process("record", "--out", str(path), profile=chain.profile_file) as child:
+    path = tmp_path / "a.part.mcap"
+    words = ("record", "--output", str(tmp_path / "a.mcap"))
+    with process(*words, profile=chain.profile_file) as child:
         until(
             "something is recorded",
             lambda: path.exists() and path.stat().st_size > 50_000,
@@ -285,12 +286,13 @@ def test_a_full_disk_ends_the_recording_and_spares_the_file(chain: Chain, tmp_pa
         resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_LIMIT_BYTES, FILE_LIMIT_BYTES))
 
     with process(
-        "record", "--out", str(path), profile=chain.profile_file, preexec_fn=limit
+        "record", "--output", str(path), profile=chain.profile_file, preexec_fn=limit
     ) as child:
         output, _ = child.communicate(timeout=60)
     assert child.returncode == 1
     assert "File too large; what was recorded until then is whole" in " ".join(output.split())
-    run = load_run(path)
+    assert not path.exists()
+    run = load_run(tmp_path / "a.part.mcap")
     assert run.file.damage == ""
     assert len(run.poses) > 10
 
@@ -299,7 +301,7 @@ def test_the_recorder_says_how_it_goes(chain: Chain, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     done = command_line(
         "record",
-        "--out",
+        "--output",
         str(path),
         "--seconds",
         "2",

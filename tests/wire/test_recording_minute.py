@@ -31,7 +31,7 @@ LAB_S = 60.0
 def test_a_minute_of_two_cameras_is_recorded_whole_and_replayed(tmp_path: Path) -> None:
     lab, first, again = (tmp_path / name for name in ("lab.yaml", "first.mcap", "again.mcap"))
     lab.write_text(LAB.format(endpoint=free_endpoint()))
-    words = ("record", "--out", str(first), "--seconds", f"{LAB_S:g}", "--json")
+    words = ("record", "--output", str(first), "--seconds", f"{LAB_S:g}", "--json")
     with running_chain(tmp_path, profile_file=lab) as chain:
         chain.activate_when_ready()
         results: list[Any] = []

@@ -57,7 +57,7 @@ def trial(
 ) -> Iterator[subprocess.Popen[str]]:
     """The command at work, ended with the block."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "vla_zenoh", "lab", "trial", "--out", str(out), *words],
+        [sys.executable, "-m", "vla_zenoh", "lab", "trial", "--output", str(out), *words],
         stdin=stdin,
         stdout=subprocess.PIPE,
         stderr=err,

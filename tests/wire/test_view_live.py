@@ -93,7 +93,7 @@ def answers(port: int) -> bool:
 
 def test_a_robot_at_work_is_written_for_rerun(chain: Chain, tmp_path: Path) -> None:
     path = tmp_path / "live.rrd"
-    with view("--save", str(path), chain=chain) as command:
+    with view("--output", str(path), chain=chain) as command:
         until("it looks", lambda: bool(command.said("viewing robot")), READY_PATIENCE_S)
         chain.client.set_prompt(f"HARD: go up x{STEPS}")
         chain.client.activate()
@@ -122,7 +122,7 @@ def test_what_it_cannot_keep_is_counted(chain: Chain) -> None:
 def test_without_a_screen_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(NodeError, match=r"no screen here.*--serve.*--save FILE\.rrd"):
+    with pytest.raises(NodeError, match=r"no screen here.*--serve.*-o FILE\.rrd"):
         open_window()
 
 

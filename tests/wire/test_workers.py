@@ -220,7 +220,7 @@ def test_what_a_model_sees_is_shown_with_its_prompt_raw_output_and_steps(
 
         out = tmp_path / "out"
         said = command_line(
-            *("lab", "inspect", "--count", "2", "--json", "--out", str(out)),
+            *("lab", "inspect", "--count", "2", "--json", "--output", str(out)),
             profile=chain.profile_file,
         )
         assert said.returncode == 0, said.stderr

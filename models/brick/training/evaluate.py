@@ -235,7 +235,7 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=LIMIT_S, help="s for one episode")
     parser.add_argument("--pictures", type=Path, help="folder for picture sheets of failures")
     parser.add_argument("--collect", type=Path, help="folder for what was seen, labelled")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("-o", "--output", type=Path)
     args = parser.parse_args()
     cv2.setNumThreads(1)
     names = VARIATIONS if args.vary == "all" else tuple(v for v in args.vary.split(",") if v)
@@ -269,8 +269,8 @@ def main() -> None:
             "wilson_95": [low, high],
             "failures": dict(failures),
         }
-    if args.json:
-        args.json.write_text(json.dumps(report, indent=1) + "\n", "utf-8")
+    if args.output:
+        args.output.write_text(json.dumps(report, indent=1) + "\n", "utf-8")
     if args.collect and samples:
         args.collect.mkdir(parents=True, exist_ok=True)
         stacked = {key: np.stack([s[key] for s in samples]) for key in samples[0]}

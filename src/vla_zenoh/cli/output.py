@@ -23,6 +23,7 @@ from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.segment import Segment
+from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
@@ -157,6 +158,11 @@ def progress_bars(width: int, screen: Screen | None = None, *, counted: bool = T
         TimeElapsedColumn(),
         console=screen or errors(),
     )
+
+
+def progress(doing: str) -> Status:
+    """A line with a spinner on stderr, for what takes longer than a moment; not in a pipe."""
+    return errors().status(styled(doing, ""))
 
 
 def print_json(value: Any) -> None:

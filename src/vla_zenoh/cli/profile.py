@@ -67,6 +67,7 @@ def check(
     host: HostOption = None,
     connect: ConnectOption = None,
     listen: ListenOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Check profiles: everything that `up` would fail with, with file and line; then advice.
 
@@ -74,18 +75,18 @@ def check(
     What only one host needs (files, meshes, packages) is an error on that host, which --host names
     if there are several, and advice elsewhere. Exits with 1 when a profile cannot run.
     """
-    wrong = False
-    for name in names:
-        report = check_profile(name, host, connect, listen)
+    reports = {name: check_profile(name, host, connect, listen) for name in names}
+    if as_json:
+        print_json({name: report._asdict() for name, report in reports.items()})
+    for name, report in ({} if as_json else reports).items():
         for line in report.errors:
             errors().print(line, style="red", soft_wrap=True)
         if report.errors:
-            wrong = True
             continue
         console().print(styled("ok", "green"), name, soft_wrap=True)
         for line in report.advice:
             errors().print(styled("advice", "yellow"), line, soft_wrap=True)
-    if wrong:
+    if any(report.errors for report in reports.values()):
         raise typer.Exit(1)
 
 

@@ -15,6 +15,7 @@ from rich.text import Text
 from vla_zenoh.cli.addresses import is_own
 from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, ProfileOption
 from vla_zenoh.cli.output import console, errors, fail, new_table, print_json, styled
+from vla_zenoh.cli.output_path import ForceOption, output_file
 from vla_zenoh.cli.secure_copying import copy_commands
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
@@ -66,6 +67,8 @@ def init(
     address: AddressOption = None,
     days: DaysOption = CERTIFICATE_DAYS,
     host: HostOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Make an authority, certificates for all hosts of a profile, and a secured profile."""
     plain = load_profile(profile)
@@ -77,25 +80,36 @@ def init(
     if plain.session.security is not None:
         fail(f"profile {plain.name} is already secured; `vla-zenoh secure add HOST` adds to it")
     file = output or Path(f"{plain.name}_secure.yaml")
-    if file.exists():
-        fail(f"{file} already exists and is not overwritten; give another one with --output")
     store, now = Store(folder or DEFAULT_FOLDER), _now()
     addresses = _router_addresses(at or ())
     endpoints = moved_hosts(plain, addresses)
     text = profile_text(plain, _extends(profile, file), store.folder.absolute(), endpoints)
-    _write(file, text)
-    try:
-        written = load_profile(str(file))
-        made = [store.make_authority(lab, now)]
-        serving = serving_addresses(plain, (*addresses.values(), *(address or ())))
-        everyone = [*identities(plain), *bridges(plain)]
-        made += store.add(everyone, now, days=days, addresses=serving)
-        here = host or _this_host(plain, addresses)
-        if here is not None:
-            store.remember_host(here)
-    except VlaZenohError:
-        file.unlink()
-        raise
+    with output_file(file, force=force, inputs=[profile_file(profile)]) as part:
+        part.write_text(text, "utf-8")
+        try:
+            load_profile(str(part))
+            made = [store.make_authority(lab, now)]
+            serving = serving_addresses(plain, (*addresses.values(), *(address or ())))
+            everyone = [*identities(plain), *bridges(plain)]
+            made += store.add(everyone, now, days=days, addresses=serving)
+            here = host or _this_host(plain, addresses)
+            if here is not None:
+                store.remember_host(here)
+        except VlaZenohError:
+            part.unlink()
+            raise
+    written = load_profile(str(file))
+    if as_json:
+        others = [name for name in written.hosts if name != here]
+        print_json(
+            {
+                "profile": file,
+                "certificates": made,
+                "host": here,
+                "copy": [line.strip() for line in copy_commands(written, file, store, others)],
+            }
+        )
+        return
     _print_next(written, file, store, made, here)
 
 
@@ -129,6 +143,7 @@ def add(
     address: AddressOption = None,
     days: DaysOption = CERTIFICATE_DAYS,
     renew: Annotated[bool, typer.Option("--renew", help="Replace existing ones.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Make the certificates of one more host, or of a person at a computer."""
     loaded = load_profile(profile)
@@ -155,19 +170,32 @@ def add(
         chosen, _now(), days=days, addresses=serving_addresses(loaded, address or ()), renew=renew
     )
     if new:
-        _write(profile_file(profile), new)
+        with output_file(profile_file(profile), force=True) as part:
+            part.write_text(new, "utf-8")
         loaded = load_profile(profile)
-    out = console()
-    for path in made:
-        out.print(f"made {path}", highlight=False, soft_wrap=True)
     for path, why in unused_certificates(loaded, store.entries(_now(), host)).items():
         errors().print(f"{path} {why}", style="yellow", highlight=False, soft_wrap=True)
     here, file = store.known_host(), profile_file(profile)
     routers = [name for name, part in loaded.hosts.items() if "router" in part.nodes]
     changed = [name for name in routers if new and name not in (host, here)]
-    for line in copy_commands(
-        loaded, file, store, [name for name in (host,) if name != here], changed
-    ):
+    copy = list(
+        copy_commands(loaded, file, store, [name for name in (host,) if name != here], changed)
+    )
+    if as_json:
+        restart = routers if new else []
+        print_json(
+            {
+                "profile": file,
+                "certificates": made,
+                "copy": [line.strip() for line in copy],
+                "restart_router": restart,
+            }
+        )
+        return
+    out = console()
+    for path in made:
+        out.print(f"made {path}", highlight=False, soft_wrap=True)
+    for line in copy:
         out.print(line, soft_wrap=True)
     if here is None:
         out.print(f"Is {host} this computer? Then instead: vla-zenoh secure here {host}")
@@ -271,13 +299,6 @@ def _extends(name: str, output: Path) -> str:
         return name
     path = os.path.relpath(profile_file(name), output.resolve().parent)
     return Path(path).stem if "/" not in path else path
-
-
-def _write(file: Path, text: str) -> None:
-    try:
-        file.write_text(text, "utf-8")
-    except OSError as error:
-        raise SecurityError(f"{file} cannot be written: {error.strerror}") from error
 
 
 def _warn_of_loopback(profile: Profile) -> None:

@@ -54,7 +54,10 @@ def run_in_own_environment(
         os.execvpe(python, [python, *arguments], environment)
     command = environment_command(model, extra=extra)
     # Not on stdout, where `vla-zenoh check --json` writes its result.
-    said = f"preparing an environment for {model.name}: {', '.join(model.dependencies)}"
+    said = (
+        f"preparing an environment for {model.name}: {', '.join(model.dependencies)} "
+        "(the first time takes minutes, later ones seconds)"
+    )
     print(said, file=sys.stderr, flush=True)
     os.execve(command[0], [*command, "python", *arguments], environment)
 
@@ -103,7 +106,9 @@ def environment_command(
             "uv) and it gets an environment of its own, or name a prepared one with --python"
         )
     # Isolated, because uv would put the packages of a .venv in the working directory below.
-    command = [uv, "run", "--no-project", "--isolated", "--quiet"]
+    command = [uv, "run", "--no-project", "--isolated"]
+    if not sys.stderr.isatty():  # a terminal gets its progress
+        command.append("--quiet")
     if model.requires_python:
         command += ["--python", model.requires_python]
     for requirement in (*model.dependencies, *more):

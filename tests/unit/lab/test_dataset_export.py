@@ -220,13 +220,13 @@ def test_what_cannot_become_a_dataset_is_named(run_file: Path, tmp_path: Path) -
 
 def test_the_commands_make_a_dataset_and_its_statistics(run_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "bricks"
-    done = command_line("dataset", "export", str(run_file.parent), "--out", str(out), "--json")
+    done = command_line("dataset", "export", str(run_file.parent), "--output", str(out), "--json")
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
     assert (said["episodes"], said["frames"], said["cameras"]) == (2, 40, ["front"])
     done = command_line("dataset", "stats", str(out), "--name", "mine")
     assert done.returncode == 0, done.stderr
     assert json.loads((out / "dataset_statistics.json").read_text()).keys() == {"mine"}
-    done = command_line("dataset", "export", str(run_file), "--out", str(out))
+    done = command_line("dataset", "export", str(run_file), "--output", str(out))
     assert done.returncode == 1
-    assert "there already" in done.stderr
+    assert "bricks exists; give another --output, or --force" in done.stderr

@@ -301,12 +301,9 @@ def test_what_cannot_be_evaluated_does_not_stop_the_rest(tmp_path: Path) -> None
             "eval",
             *paths,
             str(good),
-            "--json",
-            str(out),
-            "--html",
-            str(html),
-            "--csv",
-            str(table),
+            *("-o", str(out)),
+            *("-o", str(html)),
+            *("-o", str(table)),
         ],
         env={"COLUMNS": "200"},
     )
@@ -340,7 +337,7 @@ def test_the_page_needs_no_network_and_no_prompt_breaks_it(tmp_path: Path) -> No
     evil = "</script><script>alert(1)</script><b>"
     write(tmp_path / "a.csv", rows(10, prompt=evil))
     html = tmp_path / "out.html"
-    done = CliRunner().invoke(app, ["eval", str(tmp_path / "a.csv"), "--html", str(html)])
+    done = CliRunner().invoke(app, ["eval", str(tmp_path / "a.csv"), "--output", str(html)])
     assert done.exit_code == 0, done.output
     page = html.read_text()
     body = page[page.index("<body>") :]

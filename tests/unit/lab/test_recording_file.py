@@ -106,6 +106,7 @@ def chunk(index: int = 0) -> Sample:
 
 
 def written(path: Path, *samples: Sample) -> Path:
+    path.unlink(missing_ok=True)
     out = writer(path)
     for each in samples:
         out.write(each)

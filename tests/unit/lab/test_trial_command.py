@@ -197,7 +197,7 @@ def begun(tmp_path: Path) -> Path:
 
 
 def test_the_report_says_who_succeeded_how_often(begun: Path) -> None:
-    done = run("--out", str(begun), "--report")
+    done = run("--output", str(begun), "--report")
     assert done.exit_code == 0, done.output
     assert "3 of 4 episodes done: p and intervals hold where" in done.stderr
     rows = {line.split()[0]: line.split() for line in done.stdout.splitlines()[1:4]}
@@ -209,7 +209,7 @@ def test_the_report_says_who_succeeded_how_often(begun: Path) -> None:
 
 def test_the_report_as_json_has_all_of_it(begun: Path) -> None:
     TrialFolder(begun).append(judged(2, "bob", False))
-    done = run("--out", str(begun), "--report", "--json")
+    done = run("--output", str(begun), "--report", "--json")
     assert done.exit_code == 0, done.output
     assert done.stderr == ""
     found = json.loads(done.stdout)
@@ -222,7 +222,7 @@ def test_the_report_as_json_has_all_of_it(begun: Path) -> None:
 
 def test_a_trial_that_is_done_is_reported_without_a_robot(begun: Path) -> None:
     TrialFolder(begun).append(judged(2, "bob", False))
-    done = run("--out", str(begun), "--workers", "ann,bob")
+    done = run("--output", str(begun), "--workers", "ann,bob")
     assert done.exit_code == 0, done.output
     assert "4 of 4 episodes" in done.stdout
 
@@ -233,12 +233,12 @@ def test_other_arguments_than_those_it_was_begun_with_are_refused(
     setups = tmp_path / "setups.txt"
     setups.write_text("left\n\n  right \nmiddle\n")
     words = ("--workers", "bob, ann", "--setups", str(setups), "--open")
-    done = run("--out", str(begun), *words)
+    done = run("--output", str(begun), *words)
     assert done.exit_code == 1
     said = " ".join(done.stderr.split())
     assert "has another plan: workers ann, bob, not bob, ann;" in said
     assert "setups left, right, not left, right, middle; blind True, not False" in said
-    assert "give another --out" in said
+    assert "give another --output" in said
 
 
 @pytest.mark.parametrize(
@@ -254,7 +254,7 @@ def test_other_arguments_than_those_it_was_begun_with_are_refused(
 def test_what_cannot_be_begun_leaves_nothing_behind(
     tmp_path: Path, words: list[str], code: int, why: str
 ) -> None:
-    done = run("--out", str(tmp_path / "new"), *words)
+    done = run("--output", str(tmp_path / "new"), *words)
     assert done.exit_code == code
     assert why in " ".join(done.stderr.replace("│", " ").split())
     assert not (tmp_path / "new" / "plan.json").exists()

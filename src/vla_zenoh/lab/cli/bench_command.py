@@ -12,14 +12,17 @@ from vla_zenoh.cli.options import (
     SimulatedProfileOption,
     effective_profile,
     number_list,
+    options,
 )
-from vla_zenoh.cli.output import console, errors, new_table
-from vla_zenoh.lab.cli.bench_file import JsonFileOption, kept_rows
+from vla_zenoh.cli.output import errors, new_table
+from vla_zenoh.lab.cli.bench_file import ResultOptions, kept_rows
 
 SHARES = ("p50", "p95", "p99", "max")
 
 
+@options
 def command(
+    result: ResultOptions,
     rates: Annotated[
         str, typer.Option("--rates", help="Ticks per second, separated by commas.")
     ] = "250,500,1000",
@@ -31,7 +34,6 @@ def command(
         typer.Option("--busy", min=0, max=64, help="Busy processes beside it."),
     ] = 0,
     profile: SimulatedProfileOption = DEFAULT_PROFILE,
-    json_file: JsonFileOption = None,
 ) -> None:
     """Measure the time per tick of the command node while the simulated arm moves.
 
@@ -42,10 +44,10 @@ def command(
     from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
 
     rates_hz = number_list("--rates", rates, 50, 1000)
-    stop = stop_on_signals()
-    die_with_parent()
-    loaded = own_address(effective_profile(profile))
-    with kept_rows(json_file) as rows:
+    with kept_rows(result) as rows:
+        stop = stop_on_signals()
+        die_with_parent()
+        loaded = own_address(effective_profile(profile))
         for rate_hz in track(rates_hz, "command node", console=errors()):
             rows.append(measure_command(loaded, rate_hz, seconds, stop, rows.log, busy))
     times = [f"{name} {share}" for name in ("tick us", "late us", "pose ms") for share in SHARES]
@@ -66,4 +68,4 @@ def command(
     )
     realtime = all(row["realtime"] for row in rows)
     table.caption = text if realtime else f"{text} (no real-time priority here)"
-    console().print(table)
+    result.show(rows, table)

@@ -20,8 +20,8 @@ DISAGREEMENTS = 10
 
 
 def compare(
-    a: Annotated[Path, typer.Argument(help="Result of `bench task`.", metavar="A.json")],
-    b: Annotated[Path, typer.Argument(help="Another one.", metavar="B.json")],
+    a: Annotated[Path, typer.Argument(help="Result of `bench task`: folder or JSON.", metavar="A")],
+    b: Annotated[Path, typer.Argument(help="Another one.", metavar="B")],
     differ: Annotated[
         list[str] | None,
         typer.Option(
@@ -53,7 +53,7 @@ def compare(
 
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return (path / "result.json" if path.is_dir() else path).read_bytes()
     except OSError as error:
         raise ResourceError(f"{path} cannot be read: {error.strerror}") from error
 

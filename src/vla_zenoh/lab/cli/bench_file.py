@@ -1,31 +1,59 @@
-"""The result file of a benchmark, and the log lines of its nodes."""
+"""The result of a benchmark as JSON, and the log lines of its nodes."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import RenderableType
 
-from vla_zenoh.cli.output import errors
+from vla_zenoh.cli.options import JsonOption
+from vla_zenoh.cli.output import console, errors, print_json
+from vla_zenoh.cli.output_path import ForceOption, output_file
 
 if TYPE_CHECKING:
     from vla_zenoh.runtime.launch import Host
 
-JsonFileOption = Annotated[
-    Path | None, typer.Option("--json", help="Write the result to this file.")
-]
 LAST_LINES = 20
 
 
-def write_json(json_file: Path | None, result: Any) -> None:
-    """Write `result` to `json_file`, if given; creates its folder."""
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps(result, indent=2) + "\n", "utf-8")
+@dataclass(frozen=True)
+class ResultOptions:
+    """Options for where the result of a benchmark goes."""
+
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File for the result, as JSON.")
+    ] = None
+    force: ForceOption = False
+    as_json: JsonOption = False
+
+    @contextmanager
+    def open(self) -> Iterator[Path | None]:
+        """The file to write, if one is wanted; see `output_file`."""
+        if self.output is None:
+            yield None
+        else:
+            with output_file(self.output, force=self.force) as part:
+                yield part
+
+    def show(self, result: Any, *tables: RenderableType) -> None:
+        """Print `result` as JSON if that is wanted, else `tables`."""
+        if self.as_json:
+            print_json(result)
+            return
+        for table in tables:
+            console().print(table)
+
+
+def write_json(file: Path | None, result: Any) -> None:
+    """Write `result` to `file`, if there is one."""
+    if file is not None:
+        file.write_text(json.dumps(result, indent=2) + "\n", "utf-8")
 
 
 class Rows(list[dict[str, Any]]):
@@ -40,8 +68,8 @@ class Rows(list[dict[str, Any]]):
 
 
 @contextmanager
-def kept_rows(json_file: Path | None) -> Iterator[Rows]:
-    """Rows that are written to `json_file` even after a failure, which shows the last log lines.
+def kept_rows(options: ResultOptions) -> Iterator[Rows]:
+    """Rows that are written even after a failure, which shows the last log lines.
 
     Raises:
         typer.Exit: Ctrl-C.
@@ -49,15 +77,17 @@ def kept_rows(json_file: Path | None) -> Iterator[Rows]:
     from vla_zenoh.lab.episode import Interrupted
 
     rows = Rows()
-    try:
-        yield rows
-    except Interrupted:
-        raise typer.Exit(130) from None
-    except Exception:
-        errors().print("\n".join(rows.lines[-LAST_LINES:]), style="dim")
-        raise
-    finally:
-        write_json(json_file, rows)
+    with options.open() as file:
+        try:
+            yield rows
+        except Interrupted:
+            raise typer.Exit(130) from None
+        except Exception:
+            errors().print("\n".join(rows.lines[-LAST_LINES:]), style="dim")
+            raise
+        finally:
+            if rows:
+                write_json(file, rows)
 
 
 @contextmanager

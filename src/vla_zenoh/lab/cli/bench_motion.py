@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,14 +14,16 @@ from rich.progress import TaskID
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
+    JsonOption,
     SimulatedProfileOption,
     effective_profile,
     number_list,
     options,
 )
-from vla_zenoh.cli.output import console, progress_bars
+from vla_zenoh.cli.output import console, print_json, progress_bars
+from vla_zenoh.cli.output_path import ForceOption, output_folder
 from vla_zenoh.lab.bench.motion import PROTOCOL, STEPS, Conditions, MotionCase
-from vla_zenoh.lab.cli.bench_file import JsonFileOption, up_with_last_lines, write_json
+from vla_zenoh.lab.cli.bench_file import up_with_last_lines, write_json
 from vla_zenoh.profile import Profile
 
 
@@ -72,7 +75,7 @@ class _Run:
     Args:
         profile: of a simulated robot.
         measured: motions and conditions.
-        out: folder for plots.
+        out: folder for plots; it exists.
         stop: set by Ctrl-C.
     """
 
@@ -158,7 +161,6 @@ def _plot(folder: Path, profile: Profile, row: dict[str, Any], recording: Any) -
     from vla_zenoh.lab.evaluation.plot_image import write_plot
     from vla_zenoh.lab.evaluation.result import Evaluation
 
-    folder.mkdir(parents=True, exist_ok=True)
     name = f"{row['prompt']}_{row['rate_hz']:g}Hz_{row['horizon']}.png".replace(" ", "_")
     if not recording.poses:
         return
@@ -177,10 +179,12 @@ def motion(
         typer.Option("--lockstep", help="On a virtual clock, faster than real time, no nodes."),
     ] = False,
     profile: SimulatedProfileOption = DEFAULT_PROFILE,
-    json_file: JsonFileOption = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for a plot of every row.")
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="New folder for result.json and a plot of every row."),
     ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Run the thesis's ten prompts, 50 steps each, through the real nodes, and judge each.
 
@@ -189,20 +193,24 @@ def motion(
     from vla_zenoh.lab.cli.bench_motion_tables import motion_table, thesis_table
     from vla_zenoh.runtime.process import stop_on_signals
 
-    if lockstep and out is not None:
-        raise typer.BadParameter("--out plots runs of real nodes: leave out --lockstep")
-    stop = stop_on_signals()
-    run = _Run(effective_profile(profile), measured, out, stop)
-    try:
-        with run.bars:
-            run.in_lockstep() if lockstep else run.in_real_time()
-    finally:
-        write_json(json_file, run.rows)
-    thesis = thesis_table(run.rows, virtual=lockstep)
-    screen = console()
-    screen.print(motion_table(run.rows))
-    if thesis.row_count:
-        screen.print(thesis)
+    saving = nullcontext() if output is None else output_folder(output, force=force)
+    with saving as folder:
+        stop = stop_on_signals()
+        run = _Run(effective_profile(profile), measured, folder, stop)
+        try:
+            with run.bars:
+                run.in_lockstep() if lockstep else run.in_real_time()
+        finally:
+            if folder is not None and run.rows:
+                write_json(folder / "result.json", run.rows)
+    if as_json:
+        print_json(run.rows)
+    else:
+        screen = console()
+        screen.print(motion_table(run.rows))
+        thesis = thesis_table(run.rows, virtual=lockstep)
+        if thesis.row_count:
+            screen.print(thesis)
     if stop.is_set():
         raise typer.Exit(130)
     if not run.rows or not all(row["ok"] for row in run.rows):

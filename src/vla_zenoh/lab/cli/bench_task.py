@@ -16,16 +16,17 @@ import typer
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
+    JsonOption,
     ModelOptions,
     SimulatedProfileOption,
     effective_profile,
     options,
 )
-from vla_zenoh.cli.output import console, new_table, progress_bars
+from vla_zenoh.cli.output import console, new_table, print_json, progress_bars
+from vla_zenoh.cli.output_path import ForceOption, output_folder, require_free_folder
 from vla_zenoh.lab.bench.task import BASELINES, SCENE, TaskPlan, TaskScore
 from vla_zenoh.lab.cli.bench_file import (
     LAST_LINES,
-    JsonFileOption,
     up_with_last_lines,
     write_json,
 )
@@ -83,22 +84,34 @@ class EpisodeOptions:
 class TaskOutput:
     """Options for where the result goes."""
 
-    json_file: JsonFileOption = None
-    folder: Annotated[
+    output: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder for result.json, nodes.log and failures.jpg."),
+        typer.Option(
+            "--output", "-o", help="New folder for result.json, nodes.log and failures.jpg."
+        ),
     ] = None
+    force: ForceOption = False
+    as_json: JsonOption = False
 
-    def write(self, score: TaskScore) -> None:
-        """Write the result, and images of failures."""
-        from vla_zenoh.lab.bench.task_sheet import failure_sheet
+    @contextmanager
+    def open(self) -> Iterator[Path | None]:
+        """The folder to fill, if one is wanted; see `output_folder`."""
+        if self.output is None:
+            yield None
+        else:
+            with output_folder(self.output, force=self.force) as part:
+                yield part
 
-        write_json(self.json_file, score.to_dict())
-        if self.folder is not None:
-            write_json(self.folder / "result.json", score.to_dict())
-            sheet = failure_sheet(score.ended)
-            if sheet is not None:
-                (self.folder / "failures.jpg").write_bytes(sheet)
+
+def _write(folder: Path | None, score: TaskScore) -> None:
+    """Write the result, and images of failures."""
+    from vla_zenoh.lab.bench.task_sheet import failure_sheet
+
+    if folder is not None:
+        write_json(folder / "result.json", score.to_dict())
+        sheet = failure_sheet(score.ended)
+        if sheet is not None:
+            (folder / "failures.jpg").write_bytes(sheet)
 
 
 @options
@@ -144,22 +157,26 @@ def task(
     plan = episodes.plan(named)
     loaded = _with_bricks(effective_profile(profile), plan.worker, varied, path)
     chosen = model_options.choose(loaded, plan.worker)
+    if output.output is not None:  # before an environment is made, which may take minutes
+        require_free_folder(output.output, force=output.force)
     if lockstep:  # this process makes the model; returns only where that can be done
         run_in_own_environment(chosen.model, model_options.python, extra="sim")
     stop = stop_on_signals()
     mode = "lockstep" if lockstep else "real_time"
     score = TaskScore(plan, mode, loaded.name, varied, options=chosen.options)
     began_s = time.monotonic()
-    try:
-        with _bar(plan.episodes) as advance:
-            if lockstep:
-                _lockstep(loaded, profile, score, stop, processes, advance)
-            else:
-                _real_time(loaded, score, model_options, output.folder, stop, advance)
-    finally:
-        score.wall_s = time.monotonic() - began_s
-        output.write(score)
-    _print(score.to_dict())
+    with output.open() as folder:
+        try:
+            with _bar(plan.episodes) as advance:
+                if lockstep:
+                    _lockstep(loaded, profile, score, stop, processes, advance)
+                else:
+                    _real_time(loaded, score, model_options, folder, stop, advance)
+        finally:
+            score.wall_s = time.monotonic() - began_s
+            if score.ended:  # printed first: what cannot be written is not lost
+                print_json(score.to_dict()) if output.as_json else _print(score.to_dict())
+                _write(folder, score)
     if stop.is_set():
         raise typer.Exit(130)
 
@@ -266,8 +283,6 @@ def _real_time(
     from vla_zenoh.runtime.process import die_with_parent
 
     die_with_parent()
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
     plan = score.plan
     arguments = [*(["--delay", f"{plan.delay_ms:g}"] if plan.delay_ms else [])]
     arguments += ["--python", model.python] if model.python else []

@@ -18,7 +18,7 @@ from vla_zenoh.cli.options import (
     WorkerChoice,
     options,
 )
-from vla_zenoh.cli.output import console, new_table, print_json, styled
+from vla_zenoh.cli.output import console, new_table, print_json, progress, styled
 from vla_zenoh.control.policy_check import Finding, error
 from vla_zenoh.errors import WorkerError, counted
 from vla_zenoh.lab.check.examination import DEFAULT_RUNS, Examination
@@ -105,7 +105,8 @@ def check(
     against = load_profile(profile) if profile is not None else None
     chosen = model_options.choose(against, model, name)
     run_in_own_environment(chosen.model, model_options.python)
-    with contextlib.redirect_stdout(sys.stderr):  # a model's own output is not the result
+    # A model's own output is not the result.
+    with contextlib.redirect_stdout(sys.stderr), progress(f"loading and testing {chosen.name}"):
         report = plan.examine(chosen, profile, against)
     if as_json:
         print_json(report.to_dict())

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, fail, new_table, print_json
+from vla_zenoh.cli.output import console, fail, new_table, print_json, progress
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import VlaZenohError
 from vla_zenoh.lab.compare.agreement import (
@@ -103,7 +103,8 @@ def _live(
 def _recorded(path: Path, profile: Profile, a: str, b: str, tolerance_s: float) -> Disagreement:
     from vla_zenoh.lab.recording.run import load_run
 
-    run = load_run(path)
+    with progress(f"reading {path.name}"):
+        run = load_run(path)
     chunks: dict[str, list[ActionChunk]] = {a: [], b: []}
     specs: dict[str, ModelSpec] = {}
     for heard in run.chunks:

@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 import typer
 
 from vla_zenoh.cli.options import JsonOption
-from vla_zenoh.cli.output import console, errors, fail, print_json
+from vla_zenoh.cli.output import console, errors, fail, print_json, progress
+from vla_zenoh.cli.output_path import ForceOption, output_file, output_folder
 from vla_zenoh.errors import RecordingError, counted, nearest
 from vla_zenoh.lab.evaluation.evaluate import MCAP
 
@@ -21,7 +22,7 @@ dataset_app = typer.Typer(
 @dataset_app.command("export")
 def export(
     runs: Annotated[list[Path], typer.Argument(help="Recordings (.mcap), or folders of them.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="New folder for the dataset.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="New folder for the dataset.")],
     form: Annotated[
         Literal["lerobot"], typer.Option("--format", help="LeRobotDataset v3.0.")
     ] = "lerobot",
@@ -38,6 +39,7 @@ def export(
     successful: Annotated[
         bool, typer.Option("--successful", help="Only episodes known to be successful.")
     ] = False,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Export a dataset with one episode per activation of a worker."""
@@ -47,31 +49,43 @@ def export(
     from vla_zenoh.lab.recording.run import load_run
     from vla_zenoh.policy.state_vector import read_parts
 
-    parts = read_parts(state)
+    parts, files = read_parts(state), _files(runs)
     episodes, seen, workers, failed = [], None, set[str](), 0
-    for path in _files(runs):
-        run = load_run(path)
-        for problem in run.problems:
-            errors().print(f"{path.name}: {problem}", style="yellow")
-        workers |= {heard.record.worker for heard in run.chunks}
-        found = episodes_of(run, worker)
-        for episode in found:
-            episode.success = succeeded(episode)
-        kept = [each for each in found if each.success or not successful]
-        episodes += kept
-        failed += len(found) - len(kept)
-        if found:
-            seen = set(run.picture_counts) if seen is None else seen & set(run.picture_counts)
-    if worker is not None and worker not in workers:
-        known = ", ".join(sorted(workers)) or "none"
-        fail(
-            f"no episode of worker {worker!r} is in the recordings{nearest(worker, workers)} "
-            f"Workers there: {known}"
+    with (
+        output_folder(output, force=force, inputs=files) as part,
+        progress("reading the recordings") as status,
+    ):
+        for number, path in enumerate(files, 1):
+            status.update(f"reading {path.name} ({number} of {len(files)})")
+            run = load_run(path)
+            for problem in run.problems:
+                errors().print(f"{path.name}: {problem}", style="yellow")
+            workers |= {heard.record.worker for heard in run.chunks}
+            found = episodes_of(run, worker)
+            for episode in found:
+                episode.success = succeeded(episode)
+            kept = [each for each in found if each.success or not successful]
+            episodes += kept
+            failed += len(found) - len(kept)
+            if found:
+                seen = set(run.picture_counts) if seen is None else seen & set(run.picture_counts)
+        if worker is not None and worker not in workers:
+            known = ", ".join(sorted(workers)) or "none"
+            fail(
+                f"no episode of worker {worker!r} is in the recordings{nearest(worker, workers)} "
+                f"Workers there: {known}"
+            )
+        if failed and not episodes:
+            those = counted(failed, "episode")
+            fail(f"none of {those} is known to be successful; leave out --successful")
+        written = write(
+            part,
+            episodes,
+            cameras or sorted(seen or ()),
+            parts,
+            lambda doing: status.update(f"writing {doing} ({counted(len(episodes), 'episode')})"),
         )
-    if failed and not episodes:
-        those = counted(failed, "episode")
-        fail(f"none of {those} is known to be successful; leave out --successful")
-    written = write(out, episodes, cameras or sorted(seen or ()), parts)
+    written = written._replace(folder=output)
     if as_json:
         print_json(written._asdict())
         return
@@ -90,21 +104,25 @@ def stats(
         str | None,
         typer.Option("--name", help="Key of the statistics; default: the folder's name."),
     ] = None,
-    out: Annotated[
+    output: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="File; default: dataset_statistics.json in the folder."),
+        typer.Option("--output", "-o", help="File; default: dataset_statistics.json in FOLDER."),
     ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Write OpenVLA's dataset_statistics.json for a dataset."""
     from vla_zenoh.lab.dataset.openvla import openvla_statistics
 
-    content = openvla_statistics(folder, name or folder.resolve().name)
-    path = out or folder / "dataset_statistics.json"
-    try:
-        path.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
-    except OSError as error:
-        fail(f"{path} cannot be written: {error}")
-    console().print(f"{path}: key {next(iter(content))!r}")
+    path = output or folder / "dataset_statistics.json"
+    inputs = (*folder.glob("meta/*.json"), *folder.rglob("*.parquet"))
+    with output_file(path, force=force, inputs=inputs) as part:
+        content = openvla_statistics(folder, name or folder.resolve().name)
+        part.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+    if as_json:
+        print_json(content)
+    else:
+        console().print(f"{path}: key {next(iter(content))!r}")
 
 
 def _files(given: list[Path]) -> list[Path]:

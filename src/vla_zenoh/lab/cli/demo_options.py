@@ -8,6 +8,9 @@ from typing import Annotated
 
 import typer
 
+from vla_zenoh.cli.options import JsonOption
+from vla_zenoh.cli.output_path import ForceOption
+
 
 @dataclass(frozen=True)
 class DemoOptions:
@@ -28,9 +31,9 @@ class DemoOptions:
     profile: Annotated[
         str | None, typer.Option("--profile", "-p", help="Name or path of a simulated profile.")
     ] = None
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the summary to this file.")
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="New folder of the run; default: runs/demo-<time>."),
     ] = None
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Run folder; default: runs/demo-<time>.")
-    ] = None
+    force: ForceOption = False
+    as_json: JsonOption = False

@@ -7,9 +7,9 @@ from typing import Any
 
 import typer
 
-from vla_zenoh.cli.output import console, new_table, styled
+from vla_zenoh.cli.output import console, new_table, print_json, styled
 from vla_zenoh.lab.cli.demo_options import DemoOptions
-from vla_zenoh.lab.cli.demo_stage import Stage, prepare, refusals
+from vla_zenoh.lab.cli.demo_stage import Stage, open_stage, refusals, run_folder
 from vla_zenoh.lab.demo.runner import DemoResult, DemoRunner
 from vla_zenoh.lab.demo.segments import DemoSegment, SegmentOutcome, latencies
 from vla_zenoh.lab.demo.tables import write_chunks, write_commands, write_poses
@@ -25,13 +25,17 @@ KEPT = 400
 
 def run_demo(segments: list[DemoSegment], profile: str, given: DemoOptions) -> None:
     """Run fixed motions and show how far each came."""
-    stage = prepare(profile, given.out)
-    result = _run(stage, segments, given.rate_hz, given.seconds)
-    run = stage.recorded()
-    summary = _summary(stage.profile, given.rate_hz, result, run)
-    stage.write(summary, given.json_file)
-    _write_tables(stage, run)
-    _show(summary, result, stage.folder)
+    folder = run_folder(given.output)
+    with open_stage(profile, folder, force=given.force) as stage:
+        result = _run(stage, segments, given.rate_hz, given.seconds)
+        run = stage.recorded()
+        summary = _summary(stage.profile, given.rate_hz, result, run)
+        stage.write(summary)
+        _write_tables(stage, run)
+    if given.as_json:
+        print_json({**summary, "folder": folder})
+    else:
+        _show(summary, result, folder)
     if not summary["ok"]:
         raise typer.Exit(130 if result.interrupted else 1)
 

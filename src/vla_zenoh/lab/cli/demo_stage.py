@@ -18,6 +18,7 @@ from rich.progress import Progress
 
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import Screen, errors, progress_bars
+from vla_zenoh.cli.output_path import RUNS, output_folder
 from vla_zenoh.lab.cli.loopback import own_address
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.evaluation.plot_image import write_plot
@@ -34,11 +35,12 @@ MAX_LOG_LINES = 20
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A profile at an address of its own, and the run folder. Made by `prepare`.
+    """A profile at an address of its own, and the run folder. Made by `open_stage`.
 
     Args:
         profile: effective.
-        folder: of the run.
+        folder: of the run, under its temporary name.
+        name: of the folder, later.
         stop: set by Ctrl-C.
         screen: for progress; stdout is for the summary.
         facts: for the end of the recording, such as the verdicts.
@@ -46,6 +48,7 @@ class Stage:
 
     profile: Profile
     folder: Path
+    name: str
     stop: threading.Event
     screen: Screen
     facts: dict[str, Any] = field(default_factory=dict)
@@ -102,14 +105,11 @@ class Stage:
         """Load the recording."""
         return load_run(self.recording)
 
-    def write(self, summary: Mapping[str, Any], json_file: Path | None) -> None:
-        """Write profile.yaml and summary.json, the latter also to `json_file`."""
+    def write(self, summary: Mapping[str, Any]) -> None:
+        """Write profile.yaml and summary.json."""
         (self.folder / "profile.yaml").write_text(to_yaml(self.profile), "utf-8")
         text = json.dumps(summary, indent=2) + "\n"
-        for path in (self.folder / "summary.json", json_file):
-            if path is not None:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(text, "utf-8")
+        (self.folder / "summary.json").write_text(text, "utf-8")
 
     def film(self, run: Run, verdicts: Sequence[tuple[int, str, bool]] = ()) -> None:
         """Write video.mp4 with `verdicts` (ns, text, success) in it."""
@@ -129,21 +129,33 @@ class Stage:
         """Write plot.png."""
         with progress_bars(24, self.screen, counted=False) as bars:
             drawing = bars.add_task("drawing plot.png", total=1)
-            write_plot(self.folder / "plot.png", evaluate_loaded(run))
+            found = evaluate_loaded(run)
+            found.name = self.name
+            write_plot(self.folder / "plot.png", found)
             bars.update(drawing, completed=1)
 
 
-def prepare(profile: str, out: Path | None) -> Stage:
-    """Make a stage for a profile, in the folder `out` or one named by the time."""
-    stop = stop_on_signals()
-    die_with_parent()
+@contextmanager
+def open_stage(profile: str, folder: Path, *, force: bool) -> Iterator[Stage]:
+    """A stage for a profile; `folder` appears when the block has ended without an exception.
+
+    Raises:
+        OutputError: the folder cannot be had; see `output_folder`.
+    """
     loaded = own_address(effective_profile(profile))
-    folder = out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
-    folder.mkdir(parents=True, exist_ok=True)
-    screen, here = errors(), loaded.session.connect[0]
-    screen.print(f"profile {loaded.name}, router at {here}, run folder {folder}")
-    screen.print(f"watch it from another terminal: vla-zenoh status --connect {here}", style="dim")
-    return Stage(loaded, folder, stop, screen)
+    with output_folder(folder, force=force) as part:
+        stop = stop_on_signals()
+        die_with_parent()
+        screen, here = errors(), loaded.session.connect[0]
+        screen.print(f"profile {loaded.name}, router at {here}, run folder {folder}")
+        watch = f"watch it from another terminal: vla-zenoh status --connect {here}"
+        screen.print(watch, style="dim")
+        yield Stage(loaded, part, folder.name, stop, screen)
+
+
+def run_folder(given: Path | None) -> Path:
+    """`given`, else a folder named by the time."""
+    return given or RUNS / time.strftime("demo-%Y%m%d-%H%M%S")
 
 
 def refusals(statuses: Mapping[str, NodeStatus]) -> dict[str, int]:

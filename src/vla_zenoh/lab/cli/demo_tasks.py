@@ -9,16 +9,18 @@ from typing import Any
 import typer
 from rich.text import Text
 
-from vla_zenoh.cli.output import console, new_table, styled
+from vla_zenoh.cli.output import console, new_table, print_json, styled
+from vla_zenoh.errors import ResourceError, nearest
 from vla_zenoh.lab.bench.task import DemoPlan, TaskOutcome, is_judged
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
 from vla_zenoh.lab.cli.demo_options import DemoOptions
-from vla_zenoh.lab.cli.demo_stage import Stage, prepare, refusals
+from vla_zenoh.lab.cli.demo_stage import Stage, open_stage, refusals, run_folder
 from vla_zenoh.lab.demo.segments import latencies
 from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.evaluation.result import TASKS
-from vla_zenoh.lab.tasks import FAILURES, LIMIT_S
+from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, FAILURES, LIMIT_S, Order, phrase
+from vla_zenoh.lab.tasks.order import PUSH, PUT, STACK
 from vla_zenoh.sanitize import one_line, printable
 
 ROUNDS = 3
@@ -26,37 +28,48 @@ ROUNDS = 3
 
 
 def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOptions) -> None:
-    """Run tasks and show the verdict on each."""
-    stage = prepare(profile, given.out)
-    loaded, folder = stage.profile, stage.folder
-    plan = DemoPlan(
-        loaded.task.worker,
-        len(prompts) or ROUNDS,
-        seed,
-        rate_hz=given.rate_hz,
-        prompts=tuple(prompts),
-        limit_s=given.seconds or LIMIT_S,
-    )
-    ended, refused = _run(stage, plan)
-    run = stage.recorded()
-    summary = {
-        "ok": len(ended) == plan.episodes and all(_well(each) is not False for each in ended),
-        "profile": loaded.name,
-        "model": plan.model,
-        "rate_hz": given.rate_hz,
-        "seed": seed,
-        "tasks": [each.to_dict() | {"judged": is_judged(each.prompt)} for each in ended],
-        "latency_ms": latencies(run.first_commands()),
-        "refusals": refused,
-    }
-    stage.write(summary, given.json_file)
-    picture = sheet(ended)
-    if picture is not None:
-        (folder / "tasks.jpg").write_bytes(picture)
-    stage.draw(run)
-    facts = stage.facts[TASKS]
-    stage.film(run, [(fact["ended_ns"], fact["said"], fact["success"]) for fact in facts])
-    _show(ended, summary, folder)
+    """Run tasks and show the verdict on each.
+
+    Raises:
+        ResourceError: a prompt cannot be judged; the message lists what can.
+    """
+    for prompt in prompts:
+        if not is_judged(prompt):
+            raise ResourceError(_not_understood(prompt))
+    folder = run_folder(given.output)
+    with open_stage(profile, folder, force=given.force) as stage:
+        loaded = stage.profile
+        plan = DemoPlan(
+            loaded.task.worker,
+            len(prompts) or ROUNDS,
+            seed,
+            rate_hz=given.rate_hz,
+            prompts=tuple(prompts),
+            limit_s=given.seconds or LIMIT_S,
+        )
+        ended, refused = _run(stage, plan)
+        run = stage.recorded()
+        summary = {
+            "ok": len(ended) == plan.episodes and all(each.success for each in ended),
+            "profile": loaded.name,
+            "model": plan.model,
+            "rate_hz": given.rate_hz,
+            "seed": seed,
+            "tasks": [each.to_dict() for each in ended],
+            "latency_ms": latencies(run.first_commands()),
+            "refusals": refused,
+        }
+        stage.write(summary)
+        picture = sheet(ended)
+        if picture is not None:
+            (stage.folder / "tasks.jpg").write_bytes(picture)
+        stage.draw(run)
+        facts = stage.facts[TASKS]
+        stage.film(run, [(fact["ended_ns"], fact["said"], fact["success"]) for fact in facts])
+    if given.as_json:
+        print_json({**summary, "folder": folder})
+    else:
+        _show(ended, summary, folder)
     if stage.stop.is_set():
         raise typer.Exit(130)
     if not summary["ok"]:
@@ -84,24 +97,29 @@ def _run(stage: Stage, plan: DemoPlan) -> tuple[list[TaskOutcome], dict[str, int
     return ended, counted
 
 
-def _well(ended: TaskOutcome) -> bool | None:
-    """Whether it was done; None: the prompt cannot be judged, and no node failed."""
-    if is_judged(ended.prompt):
-        return ended.success
-    return None if ended.success or ended.failure in FAILURES else False
+def _not_understood(prompt: str) -> str:
+    orders = [Order(PUT, "red"), Order(STACK, "red", onto="blue")]
+    orders += [Order(PUSH, "red", direction=direction) for direction in DIRECTIONS]
+    known = [phrase(order, 0) for order in orders]
+    return "\n".join(
+        [
+            f"{one_line(prompt, 80)!r} is no task that the shipped policy understands"
+            f"{nearest(prompt, known) or '.'} Known, in any of the colours {', '.join(COLOURS)}:",
+            *(f"  {text}" for text in known),
+            "  HARD: go up, and the other fixed motions; all of them: --tour",
+            "For another prompt or model: `vla-zenoh up`, then `vla-zenoh prompt`",
+        ]
+    )
 
 
 def _word(ended: TaskOutcome) -> str:
-    done = _well(ended)
-    if done is None:
-        return "not judged: unknown wording"
-    return f"done in {ended.time_s:.1f} s" if done else ended.failure
+    return f"done in {ended.time_s:.1f} s" if ended.success else ended.failure
 
 
 def _fact(ended: TaskOutcome) -> dict[str, Any]:
     return {
         "prompt": ended.prompt,
-        "success": _well(ended),
+        "success": ended.success,
         "said": _word(ended),
         "why": ended.why,
         "time_s": round(ended.time_s, 2),
@@ -112,9 +130,8 @@ def _fact(ended: TaskOutcome) -> dict[str, Any]:
 def _show(ended: list[TaskOutcome], summary: dict[str, Any], folder: Path) -> None:
     table = new_table("prompt", "verdict", title="prompts, judged by the true poses")
     for each in ended:
-        colour = {True: "green", False: "red", None: "yellow"}[_well(each)]
-        known = is_judged(each.prompt) and each.failure in FAILURES
-        why = FAILURES[each.failure] if known else each.why
+        colour = "green" if each.success else "red"
+        why = FAILURES.get(each.failure, each.why)
         said = Text.assemble(styled(_word(each), colour), printable(f": {why}") if why else "")
         table.add_row(each.prompt, said)
     screen = console()

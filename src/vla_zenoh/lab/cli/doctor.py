@@ -20,7 +20,7 @@ from vla_zenoh.cli.options import (
     JsonOption,
     effective_profile,
 )
-from vla_zenoh.cli.output import console, errors, new_table, print_json, styled
+from vla_zenoh.cli.output import console, new_table, print_json, progress, styled
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
 from vla_zenoh.lab.doctor.access import AccessVerdict, access
@@ -73,7 +73,7 @@ def doctor(
         # The host of the certificates; a computer without nodes is no host of the profile.
         loaded = effective_profile(profile, host=host or os.environ.get(HOST_VARIABLE))
         needs, session = needs_of(loaded, host), loaded.session
-    with errors().status("Checking this computer"):
+    with progress("checking this computer"):
         findings = list(examine(needs, functools.partial(try_zenoh, session)))
         if loaded is not None:
             findings += robot(loaded, host)

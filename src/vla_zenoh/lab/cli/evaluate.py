@@ -5,22 +5,34 @@ from __future__ import annotations
 import csv
 import io
 import json
-import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.output import console, errors, fail, new_table, plain_types
+from vla_zenoh.cli.options import JsonOption
+from vla_zenoh.cli.output import (
+    console,
+    errors,
+    fail,
+    new_table,
+    plain_types,
+    print_json,
+    progress_bars,
+)
+from vla_zenoh.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.evaluation import tables
-from vla_zenoh.lab.evaluation.evaluate import combined, evaluate, to_mapping
+from vla_zenoh.lab.evaluation.evaluate import CSV, EMPTY, combined, evaluate, recordings, to_mapping
 from vla_zenoh.lab.evaluation.result import STAGES, Evaluation
 
 IMAGES = 8
 WIDE = 110
 """Width of a terminal with room for every column, in characters."""
-STDOUT = Path("-")
+HTML = ".html"
+KINDS = (HTML, CSV, ".json")
+"""Ends of the names of the files that can be written."""
 
 
 def evaluation(
@@ -31,52 +43,70 @@ def evaluation(
     first: Annotated[
         int | None, typer.Option("--first", help="Only this many requests of each run.", min=1)
     ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write everything to this file; - is stdout.")
-    ] = None,
-    csv_file: Annotated[
-        Path | None, typer.Option("--csv", help="Write one row per run to this file; - is stdout.")
-    ] = None,
-    html_file: Annotated[
-        Path | None, typer.Option("--html", help="Write a page with plots to this file.")
+    output: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="File to write; repeatable. .html: a page with plots; .csv: a row per run; "
+            ".json: everything.",
+        ),
     ] = None,
     images: Annotated[
         int, typer.Option("--images", help="Images of each camera on the page.", min=0, max=50)
     ] = IMAGES,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Evaluate recorded runs: latency, motion, drift, smoothness, rejections.
 
     Exits with 0 if at least one file could be evaluated; stderr says which could not.
     """
-    runs, faults = evaluate(paths, first, pictures=images if html_file else 0)
-    if STDOUT not in (json_file, csv_file):
-        _show(runs)
-    for run in runs:
-        for problem in run.problems:
-            errors().print(f"{run.name}: {problem}", style="yellow")
-    for why in faults.values():
-        errors().print(f"not evaluated: {why}", style="red")
-    if json_file is not None:
-        _write(json_file, json.dumps(plain_types(to_mapping(runs, faults)), indent=2) + "\n")
-    if csv_file is not None:
-        _write(csv_file, _rows(runs))
-    if html_file is not None:
-        from vla_zenoh.lab.evaluation.report import page
-
-        _write(html_file, page(runs, faults))
+    kinds = [_kind(path) for path in output or ()]
+    # Before the outputs are made, which may lie in the same folder.
+    found = {path: list(recordings([path])) for path in paths}
+    files = [file for inside in found.values() for file in inside]
+    with ExitStack() as stack:
+        parts = [
+            stack.enter_context(output_file(path, force=force, inputs=files))
+            for path in output or ()
+        ]
+        with progress_bars(24) as bars:
+            bar = bars.add_task("evaluating", total=len(files))
+            runs, faults = evaluate(
+                files,
+                first,
+                pictures=images if HTML in kinds else 0,
+                evaluated=lambda path: bars.update(bar, advance=1, description=path.name),
+            )
+        faults |= {str(path): EMPTY.format(path) for path in paths if not found[path]}
+        print_json(to_mapping(runs, faults)) if as_json else _show(runs)
+        for run in runs:
+            for problem in run.problems:
+                errors().print(f"{run.name}: {problem}", style="yellow")
+        for why in faults.values():
+            errors().print(f"not evaluated: {why}", style="red")
+        for kind, part in zip(kinds, parts, strict=True):
+            part.write_text(_text(kind, runs, faults), "utf-8")
     if not runs:
         fail("nothing could be evaluated")
 
 
-def _write(path: Path, text: str) -> None:
-    if path == STDOUT:
-        sys.stdout.write(text)
-        return
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, "utf-8")
-    except OSError as error:
-        fail(f"{path} cannot be written: {error.strerror}")
+def _kind(path: Path) -> str:
+    kind = path.suffix.lower()
+    if kind not in KINDS:
+        raise typer.BadParameter(f"--output {path}: its name must end in {', '.join(KINDS)}")
+    return kind
+
+
+def _text(kind: str, runs: Sequence[Evaluation], faults: Mapping[str, str]) -> str:
+    if kind == CSV:
+        return _rows(runs)
+    if kind == HTML:
+        from vla_zenoh.lab.evaluation.report import page
+
+        return page(runs, faults)
+    return json.dumps(plain_types(to_mapping(runs, faults)), indent=2) + "\n"
 
 
 def _rows(runs: Sequence[Evaluation]) -> str:

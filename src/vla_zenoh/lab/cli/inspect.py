@@ -16,11 +16,13 @@ from rich.table import Table
 from vla_zenoh.bus.client import Client
 from vla_zenoh.cli.options import options
 from vla_zenoh.cli.output import console, errors, fail, new_table
+from vla_zenoh.cli.output_path import ForceOption, output_folder
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
 from vla_zenoh.lab.inference_views import InferenceDebugSubscriber, InferenceView
 from vla_zenoh.policy import MAX_CAMERAS
+from vla_zenoh.runtime.process import stop_on_signals
 from vla_zenoh.sanitize import one_line
 
 POLL_S = 0.05
@@ -34,10 +36,13 @@ MAX_NUMBERS = 32
 def inspect(
     target: RobotTarget,
     worker: Annotated[str | None, typer.Argument(help="Default: all workers.")] = None,
-    out: Annotated[
+    output: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder for a JPEG of every image and a JSON file of the rest."),
+        typer.Option(
+            "--output", "-o", help="New folder for a JPEG of every image and JSON of the rest."
+        ),
     ] = None,
+    force: ForceOption = False,
     seconds: Annotated[
         float | None, typer.Option("--seconds", "-s", help="End after this time.")
     ] = None,
@@ -55,13 +60,15 @@ def inspect(
     live = console().is_terminal and not as_json
     if not live and seconds is None and count is None:
         count = 1
-    with target.client() as client:
+    saving = nullcontext() if output is None else output_folder(output, force=force)
+    received = 0
+    with saving as part, target.client() as client:
+        stop = stop_on_signals()
         subscriber = InferenceDebugSubscriber(client.session, client.keys, worker)
         began_s = time.monotonic()
-        received = 0
         newest: dict[str, InferenceView] = {}
         with Live(console=console(), auto_refresh=False) if live else nullcontext() as screen:
-            while not (count is not None and received >= count):
+            while not stop.is_set() and not (count is not None and received >= count):
                 waited_s = time.monotonic() - began_s
                 if seconds is not None and waited_s > seconds:
                     break
@@ -70,20 +77,22 @@ def inspect(
                 for view in subscriber.poll()[: None if count is None else count - received]:
                     received += 1
                     newest[view.record.worker] = view
-                    if out is not None:
-                        _save(out, view)
+                    if part is not None:
+                        _save(part, view)
                     if as_json:
                         print(json.dumps(_mapping(view)), flush=True)
                 if screen is not None:
                     screen.update(table(newest), refresh=True)
-                time.sleep(POLL_S)
+                stop.wait(POLL_S)
         subscriber.close()
+        if stop.is_set() and not received:
+            raise typer.Exit(130)
         if not received:
             _fail(target, client, worker)
     if not live and not as_json:
         console().print(table(newest))
-    if out is not None:
-        errors().print(f"{received} inferences in {out}")
+    if output is not None:
+        errors().print(f"{received} inferences in {output}")
     if left_out := subscriber.left_out:
         why = ", ".join(f"{reason} {count}" for reason, count in sorted(left_out.items()))
         errors().print(f"left out: {why}", style="yellow")

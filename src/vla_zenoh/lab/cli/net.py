@@ -13,7 +13,7 @@ from rich.table import Table
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.clock_sync import ClockSync
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, fail, new_table, print_json, styled
+from vla_zenoh.cli.output import console, fail, new_table, print_json, progress, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import NodeStatus
@@ -82,7 +82,7 @@ def net(
     as_json: JsonOption = False,
 ) -> None:
     """Show link, round trip and clock offset between hosts, and the bandwidth of each key."""
-    with target.client() as client:
+    with target.client() as client, progress(f"listening for {seconds:g} s"):
         bound_s = client.profile.timing.max_clock_offset_s
         clocks = ClockSync(client.session, client.keys, Clock(), HERE, bound_s)
         end_s = time.monotonic() + seconds

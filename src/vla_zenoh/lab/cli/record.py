@@ -10,6 +10,7 @@ import typer
 
 from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, print_json
+from vla_zenoh.cli.output_path import RUNS, ForceOption, output_file
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import counted
 from vla_zenoh.runtime.process import run_node
@@ -21,9 +22,10 @@ if TYPE_CHECKING:
 @options
 def record(
     target: RobotTarget,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File; default: runs/record-<time>.mcap.")
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File; default: runs/record-<time>.mcap.")
     ] = None,
+    force: ForceOption = False,
     keys: Annotated[
         list[str] | None,
         typer.Option(
@@ -44,32 +46,39 @@ def record(
 ) -> None:
     """Record a robot's keys into an MCAP file, until Ctrl-C.
 
-    Foxglove, Rerun and `ros2 bag` open it. The file is valid at any time, also when the recorder is
-    killed or the disk is full.
+    Foxglove, Rerun and `ros2 bag` open it. Until it is finished it is FILE.part.mcap, which is
+    valid at any time, also when the recorder is killed or the disk is full.
     """
     from vla_zenoh.lab.recording.recorder import Recorder, recorded_keys
 
     loaded = target.load()
-    path = out or Path("runs") / time.strftime("record-%Y%m%d-%H%M%S.mcap")
+    path = output or RUNS / time.strftime("record-%Y%m%d-%H%M%S.mcap")
     expressions = recorded_keys(loaded.keys, keys or (), raw=raw)
     done: list[RecordingResult] = []
 
-    def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
-        recorder = Recorder(loaded, session, path, expressions=expressions, name=name)
-        errors().print(f"recording into {path}; Ctrl-C ends it")
-        done.append(recorder.run(stop, seconds))
+    with output_file(path, force=force) as part:
 
-    run_node(loaded, run, identity=None)
-    if not done:  # interrupted before it began
-        raise typer.Exit(130)
-    _show(done[0], as_json)
+        def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
+            recorder = Recorder(loaded, session, part, expressions=expressions, name=name)
+            errors().print(f"recording into {path}; Ctrl-C ends it")
+            done.append(recorder.run(stop, seconds))
+
+        run_node(loaded, run, identity=None)
+        if not done:  # interrupted before it began
+            raise typer.Exit(130)
+        if done[0].failure:
+            _show(done[0], part, as_json)
+            fail(done[0].failure)
+    _show(done[0], path, as_json)
+    if not done[0].samples:
+        fail("nothing was published; is a robot up? (`vla-zenoh up`)")
 
 
-def _show(recorded: RecordingResult, as_json: bool) -> None:
+def _show(recorded: RecordingResult, path: Path, as_json: bool) -> None:
     if as_json:
         print_json(
             {
-                "file": recorded.path,
+                "file": path,
                 "seconds": recorded.seconds,
                 "size_bytes": recorded.size_bytes,
                 "bytes_per_s": recorded.size_bytes / max(recorded.seconds, 1e-9),
@@ -82,14 +91,10 @@ def _show(recorded: RecordingResult, as_json: bool) -> None:
         )
     else:
         console().print(
-            f"{recorded.path}: {recorded.samples.total():,} samples of "
+            f"{path}: {recorded.samples.total():,} samples of "
             f"{counted(len(recorded.samples), 'key')} in {recorded.seconds:.1f} s, "
             f"{recorded.size_bytes / 1e6:.1f} MB, {recorded.dropped.total()} dropped"
         )
     if recorded.dropped:
         worst = ", ".join(f"{key} {count}" for key, count in recorded.dropped.most_common(5))
         errors().print(f"dropped, because the disk did not keep up: {worst}", style="yellow")
-    if recorded.failure:
-        fail(recorded.failure)
-    if not recorded.samples:
-        fail("nothing was published; is a robot up? (`vla-zenoh up`)")

@@ -13,6 +13,7 @@ import typer
 
 from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, new_table, print_json
+from vla_zenoh.cli.output_path import check_folder
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.plan import TrialPlan
@@ -62,7 +63,9 @@ class PlanOptions:
 
 @options
 def trial(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder; an existing one continues.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder; that of a trial continues it.")
+    ],
     plan_options: PlanOptions,
     target: RobotTarget,
     yes_setup: Annotated[
@@ -76,15 +79,16 @@ def trial(
     Every worker does every setup, in an order that you do not see. Enter ends an episode, Ctrl-C
     the trial; the arm brakes first. The same command continues it.
     """
-    folder = TrialFolder(out)
+    folder = TrialFolder(output)
     if report:
         plan = folder.plan()
         if plan is None:
-            fail(f"{out} holds no trial")
+            fail(f"{output} holds no trial")
         found = folder.episodes()
         _warn_of_peeking(plan, found)
     else:
         asked = plan_options.asked(target.load().robot.name)
+        check_folder(output, begun=folder.begun())
         with folder.lock():
             plan = _plan(folder, asked)
             found = folder.episodes()
@@ -123,7 +127,7 @@ def _plan(folder: TrialFolder, asked: dict[str, Any]) -> TrialPlan:
         if others := plan.differences(asked):
             fail(
                 f"{folder.path} has another plan: {'; '.join(others)}. Leave that out to continue "
-                "it, or give another --out"
+                "it, or give another --output"
             )
         return plan
     for name in ("workers", "prompt"):
@@ -163,7 +167,7 @@ def _run(
     errors().print(text, markup=False)
     person = TrialPerson(plan, sys.stdin.fileno(), stop, lays=yes_setup)
     try:
-        with target.operator("lab", "trial", "--out", str(folder.path)) as client:
+        with target.operator("lab", "trial", "--output", str(folder.path)) as client:
             return TrialRunner(client, plan, folder, person, stop).run()
     except Interrupted:
         done = score(plan, folder.episodes()).done

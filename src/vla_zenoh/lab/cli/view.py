@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vla_zenoh.cli.options import options
-from vla_zenoh.cli.output import errors, fail
+from vla_zenoh.cli.output import errors, fail, progress
+from vla_zenoh.cli.output_path import ForceOption, output_file
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.errors import MissingExtraError, ProfileError, RecordingError, counted
+from vla_zenoh.errors import MissingExtraError, OutputError, ProfileError, counted
 from vla_zenoh.lab.cli.loopback import require_loopback
 from vla_zenoh.lab.view.viewer import Viewer, open_server, open_window
 from vla_zenoh.profile import Profile, read_profile
@@ -38,10 +39,13 @@ class ViewOutput:
     serve: Annotated[
         bool, typer.Option("--serve", help="Serve the view for browsers; needs no screen.")
     ] = False
-    save: Annotated[
+    output: Annotated[
         Path | None,
-        typer.Option("--save", help="Write it to this file (.rrd) for Rerun; needs no screen."),
+        typer.Option(
+            "--output", "-o", help="Write it to this file (.rrd) for Rerun; needs no screen."
+        ),
     ] = None
+    force: ForceOption = False
     bind: Annotated[
         str,
         typer.Option(
@@ -75,29 +79,24 @@ class ViewOutput:
             "look through the cameras and send data to this view, as Rerun has neither password "
             "nor encryption",
             f"leave it out, and type on the other computer `ssh {tunnel} THIS_COMPUTER`: the page "
-            "is there as it is here; or take --save FILE.rrd there",
+            "is there as it is here; or take -o FILE.rrd there",
         )
 
     @contextmanager
-    def open(self, name: str) -> Iterator[tuple[Any, Viewer | None]]:
-        """Open a stream of Rerun called `name`, and the viewer unless it goes only to a file."""
+    def open(self, name: str, file: Path | None) -> Iterator[tuple[Any, Viewer | None]]:
+        """Open a stream of Rerun called `name`, and the viewer unless it goes only to `file`."""
         import rerun as rr
 
         from vla_zenoh.lab.view.rerun_logger import APPLICATION
 
         sinks: list[Any] = []
-        if self.save is not None:
-            try:
-                self.save.parent.mkdir(parents=True, exist_ok=True)
-                self.save.open("wb").close()
-            except OSError as error:
-                raise RecordingError(f"{self.save} cannot be written: {error.strerror}") from error
-            sinks.append(rr.FileSink(str(self.save)))
+        if file is not None:
+            sinks.append(rr.FileSink(str(file)))
         viewer = None
         if self.serve:
             viewer = open_server(self.bind, self.port)
             errors().print(f"open in a browser: {viewer.page_url}", soft_wrap=True)
-        elif self.save is None:
+        elif file is None:
             viewer = open_window()
         try:
             if viewer is not None:
@@ -107,7 +106,10 @@ class ViewOutput:
             stream.send_recording_name(name)
             yield stream, viewer
             if viewer is None or not viewer.closed:
-                stream.flush(timeout_sec=FLUSH_S)
+                try:
+                    stream.flush(timeout_sec=FLUSH_S)
+                except RuntimeError as error:  # a full disk, which Rerun has printed
+                    raise OutputError(f"the view is incomplete: {error}") from error
             stream.disconnect()
         finally:
             if viewer is not None:
@@ -135,13 +137,22 @@ def view(
         import rerun  # noqa: F401  # before anything is opened
     except ImportError as error:
         raise MissingExtraError("rerun", "view") from error
-    if file is None:
-        _live(target.load(), output, seconds)
-    else:
-        _recorded(file, target.profile, output)
+    inputs = [] if file is None else [file]
+    saving = (
+        nullcontext()
+        if output.output is None
+        else output_file(output.output, force=output.force, inputs=inputs)
+    )
+    with saving as part:
+        if file is None:
+            _live(target.load(), output, part, seconds)
+        else:
+            _recorded(file, target.profile, output, part)
+    if output.output is not None:
+        errors().print(f"written: {output.output}", soft_wrap=True)
 
 
-def _live(profile: Profile, output: ViewOutput, seconds: float | None) -> None:
+def _live(profile: Profile, output: ViewOutput, part: Path | None, seconds: float | None) -> None:
     from vla_zenoh.lab.view.listener import ViewListener
     from vla_zenoh.lab.view.rerun_logger import RerunLogger
 
@@ -149,7 +160,7 @@ def _live(profile: Profile, output: ViewOutput, seconds: float | None) -> None:
     output.check(profile)
 
     def run(session: Any, stop: threading.Event) -> None:
-        with output.open(profile.robot.name) as (stream, viewer):
+        with output.open(profile.robot.name, part) as (stream, viewer):
             logger = RerunLogger(profile, stream, live=True)
             listener = ViewListener(session, profile)
             errors().print(f"viewing robot {profile.robot.name}; Ctrl-C ends it")
@@ -167,12 +178,12 @@ def _live(profile: Profile, output: ViewOutput, seconds: float | None) -> None:
     run_node(profile, run, identity=None)
     if not done:  # interrupted before it began
         raise typer.Exit(130)
-    _summarise(done[0], output.save)
+    _summarise(done[0])
     if not done[0].shown:
         fail("nothing was published; is a robot up? (`vla-zenoh up`)")
 
 
-def _recorded(path: Path, profile_name: str, output: ViewOutput) -> None:
+def _recorded(path: Path, profile_name: str, output: ViewOutput, part: Path | None) -> None:
     from vla_zenoh.lab.recording.reader import open_recording
     from vla_zenoh.lab.view.rerun_logger import RerunLogger
 
@@ -180,13 +191,14 @@ def _recorded(path: Path, profile_name: str, output: ViewOutput) -> None:
     file = open_recording(path)
     profile = _profile_of(file, profile_name)
     output.check(profile)
-    with output.open(path.stem) as (stream, viewer):
+    with output.open(path.stem, part) as (stream, viewer):
         logger = RerunLogger(profile, stream, keys=file.keys)
-        for sample in file.entries(lambda key: not key.endswith("/raw")):
-            if stop.is_set() or (viewer is not None and viewer.closed):
-                break
-            logger.log(sample)
-        _summarise(logger, output.save)
+        with progress(f"reading {path.name}"):
+            for sample in file.entries(lambda key: not key.endswith("/raw")):
+                if stop.is_set() or (viewer is not None and viewer.closed):
+                    break
+                logger.log(sample)
+        _summarise(logger)
         if file.damage:
             errors().print(f"{path} is {file.damage}", style="yellow")
         while viewer is not None and not stop.is_set() and not viewer.closed:
@@ -203,14 +215,10 @@ def _profile_of(file: Recording, name: str) -> Profile:
         return RobotTarget(name).load()
 
 
-def _summarise(logger: RerunLogger, save: Path | None) -> None:
+def _summarise(logger: RerunLogger) -> None:
     logger.close()
     screen = errors()
-    where = f" in {save}" if save is not None else ""
-    screen.print(
-        f"{logger.shown.total():,} samples of {counted(len(logger.shown), 'key')}{where}",
-        soft_wrap=True,
-    )
+    screen.print(f"{logger.shown.total():,} samples of {counted(len(logger.shown), 'key')}")
     if logger.rejected:
         worst = logger.rejected.most_common(SHOWN_REASONS)
         reasons = ", ".join(f"{why} ({count})" for why, count in worst)

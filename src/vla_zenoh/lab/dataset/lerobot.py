@@ -10,8 +10,7 @@ In addition ``meta/vla_zenoh.json`` holds the spec and the source of each episod
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -73,15 +72,20 @@ class Written(NamedTuple):
 
 
 def export(
-    folder: Path, episodes: Sequence[RecordedEpisode], cameras: Sequence[str], parts: Sequence[str]
+    folder: Path,
+    episodes: Sequence[RecordedEpisode],
+    cameras: Sequence[str],
+    parts: Sequence[str],
+    progress: Callable[[str], None] = lambda doing: None,
 ) -> Written:
-    """Write a dataset; `folder` appears only once it is complete.
+    """Write a dataset.
 
     Args:
         folder: must not exist, or be empty.
         episodes: in their order.
         cameras: whose images to export.
         parts: of the state, see `vla_zenoh.policy.state_vector`.
+        progress: called with what is being written.
 
     Raises:
         RecordingError: the folder is not empty; there are no episodes; their actions differ in
@@ -96,17 +100,8 @@ def export(
             f"the actions of the workers {whose} do not mean the same; choose one with --worker"
         )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise RecordingError(f"{folder} is there already; give --out a new folder")
-    part = folder.with_name(f"{folder.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        written = _Dataset(part, episodes, cameras, parts).write()
-        if folder.exists():
-            folder.rmdir()
-        part.rename(folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return written._replace(folder=folder)
+        raise RecordingError(f"{folder} is there already; give --output a new folder")
+    return _Dataset(folder, episodes, cameras, parts).write(progress)
 
 
 class _Dataset:
@@ -133,9 +128,12 @@ class _Dataset:
             dict.fromkeys(frame.prompt for episode in self._episodes for frame in episode.frames)
         )
 
-    def write(self) -> Written:
-        (self._root / INFO).parent.mkdir(parents=True)
-        videos = {camera: self._write_videos(camera) for camera in self._cameras}
+    def write(self, progress: Callable[[str], None]) -> Written:
+        videos: dict[str, list[EpisodeVideo]] = {}
+        for camera in self._cameras:
+            progress(f"videos of camera {camera}")
+            videos[camera] = self._write_videos(camera)
+        progress("numbers of all frames")
         rows = self._write_data()
         self._write_tasks()
         self._write_episodes(rows, videos)
@@ -164,12 +162,10 @@ class _Dataset:
         for run in runs.values():
             stamps = stamps_of(run, camera)
             mine = [at for at, episode in enumerate(self._episodes) if episode.run is run]
+            found = [chosen(self._episodes[at], camera, stamps) for at in mine]
             wanted = [
-                (
-                    self._place(VIDEOS, at, video_key=PICTURE + camera),
-                    chosen(self._episodes[at], camera, stamps),
-                )
-                for at in mine
+                (self._place(VIDEOS, at, video_key=PICTURE + camera), pictures)
+                for at, pictures in zip(mine, found, strict=True)
             ]
             out.update(zip(mine, write_videos(run, camera, wanted, self._fps), strict=True))
         sizes = {video.video.size for video in out.values()}
@@ -236,7 +232,7 @@ class _Dataset:
             "pandas_version": "2.2.0",
         }
         table = table.replace_schema_metadata({"pandas": json.dumps(pandas)})
-        self._pq.write_table(table, self._root / TASKS)
+        self._pq.write_table(table, self._place(TASKS, 0))
 
     def _write_episodes(
         self, rows: list[dict[str, NDArray[Any]]], videos: dict[str, list[EpisodeVideo]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from vla_zenoh.lab.evaluation.csv_file import evaluate_csv, has_our_columns
 from vla_zenoh.lab.evaluation.result import STAGES, Evaluation
 
 MCAP, CSV = ".mcap", ".csv"
+EMPTY = "{} holds neither recordings (.mcap) nor the thesis's CSV"
 COMBINED = "ALL"
 """``record_id`` of all runs together."""
 _IDENTITY, _SERIES = {"name", "kind", "path"}, {"request_t_s", "width_m", "width_t_s"}
@@ -28,8 +29,18 @@ _OF_ONE_RUN = (
 )
 
 
+def recordings(paths: Iterable[Path]) -> Iterator[Path]:
+    """The given files, and the recordings below given folders in the order of their names."""
+    for path in paths:
+        yield from _recordings_in(path) if path.is_dir() else [path]
+
+
 def evaluate(
-    paths: Sequence[Path], first: int | None = None, *, pictures: int = 0
+    paths: Sequence[Path],
+    first: int | None = None,
+    *,
+    pictures: int = 0,
+    evaluated: Callable[[Path], None] = lambda path: None,
 ) -> tuple[list[Evaluation], dict[str, str]]:
     """Evaluate every file, and in every folder the recordings, in the order of their names.
 
@@ -37,6 +48,7 @@ def evaluate(
         paths: files and folders.
         first: only this many requests of each.
         pictures: number of moments to show of each camera.
+        evaluated: called after each file.
 
     Returns:
         Evaluations, and the reason for each file that has none.
@@ -44,14 +56,15 @@ def evaluate(
     runs: list[Evaluation] = []
     faults: dict[str, str] = {}
     for path in paths:
-        found = _recordings_in(path) if path.is_dir() else [path]
+        found = list(recordings([path]))
         if not found:
-            faults[str(path)] = f"{path} holds neither recordings (.mcap) nor the thesis's CSV"
+            faults[str(path)] = EMPTY.format(path)
         for file in found:
             try:
                 runs.append(_evaluate(file, first, pictures))
             except RecordingError as error:
                 faults[str(file)] = str(error)
+            evaluated(file)
     return runs, faults
 
 

@@ -32,19 +32,22 @@ class CrashSafeFile:
     """Output stream of the MCAP writer: kept in memory until `commit`.
 
     Args:
-        path: of the file; an existing file is overwritten.
+        path: of the file, which must not exist or be empty.
 
     Raises:
-        RecordingError: the file cannot be created.
+        RecordingError: the file exists or cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
         self._path, self._waiting, self._done = path, BytesIO(), 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
         except OSError as error:
             raise RecordingError(f"{path} cannot be written: {error.strerror}") from error
+        if os.fstat(self._file).st_size:
+            self.close()
+            raise RecordingError(f"{path} exists and is not overwritten")
 
     # -- for the MCAP writer ------------------------------------------------------------------
     def write(self, data: bytes) -> int:

@@ -110,7 +110,7 @@ class Recorder:
         about: further metadata of the run, kept at the start of the file.
 
     Raises:
-        RecordingError: the file cannot be created.
+        RecordingError: the file exists or cannot be created.
         NodeError: a node of this name is already alive.
     """
 

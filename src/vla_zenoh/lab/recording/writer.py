@@ -52,7 +52,7 @@ class RecordingWriter:
     """Writes the samples of a run into an MCAP file that any tool can open at any time.
 
     Args:
-        path: of the file; an existing file is overwritten.
+        path: of the file, which must not exist or be empty.
         robot: its keys; other robots below the same root are written as well.
         profile_yaml: the profile in force, kept as an attachment.
         base_frame: ``frame_id`` of poses.
@@ -60,7 +60,7 @@ class RecordingWriter:
         about: further metadata of the run.
 
     Raises:
-        RecordingError: the file cannot be created.
+        RecordingError: the file exists or cannot be created.
         MissingExtraError: rosbags is not installed.
     """
 

@@ -36,7 +36,7 @@ class TrialFolder:
     """Folder of a trial.
 
     Args:
-        path: of the folder; `lock` creates it.
+        path: of the folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -45,6 +45,10 @@ class TrialFolder:
         """The last line that `episodes` read was truncated."""
 
     # -- reading ------------------------------------------------------------------------------
+    def begun(self) -> bool:
+        """The folder has files of a trial."""
+        return any((self.path / name).exists() for name in (PLAN, TRIALS))
+
     def plan(self) -> TrialPlan | None:
         """The plan of the trial; None: the folder has no trial.
 
@@ -57,7 +61,7 @@ class TrialFolder:
             if (self.path / TRIALS).exists():
                 raise RecordingError(
                     f"{self.path / TRIALS} exists without its {PLAN}; restore that file, or give "
-                    "another --out"
+                    "another --output"
                 ) from None
             return None
         except OSError as error:
@@ -102,7 +106,7 @@ class TrialFolder:
             at = ".".join(map(str, fault["loc"]))
             raise RecordingError(
                 f"{self.path / where}: {at}{': ' if at else ''}{fault['msg']}; restore it as "
-                "`vla-zenoh lab trial` wrote it, or give another --out"
+                "`vla-zenoh lab trial` wrote it, or give another --output"
             ) from error
 
     # -- writing ------------------------------------------------------------------------------
@@ -114,7 +118,7 @@ class TrialFolder:
             RecordingError: another process holds it, or the folder cannot be created.
         """
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
+            self.path.mkdir(exist_ok=True)
             folder = os.open(self.path, os.O_RDONLY)
         except OSError as error:
             raise self._cannot(self.path, error) from error

@@ -60,7 +60,7 @@ def open_window() -> Viewer:
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         raise NodeError(
             "there is no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set); look with a "
-            "browser: --serve, or write a file for later: --save FILE.rrd"
+            "browser: --serve, or write a file for later: -o FILE.rrd"
         )
     port = _free_port()
     arguments = ("--bind", HERE, "--port", str(port), "--hide-welcome-screen", "--expect-data-soon")
@@ -137,7 +137,7 @@ def _start(arguments: Sequence[str], host: str, port: int) -> subprocess.Popen[b
     process.wait()
     raise NodeError(
         f"Rerun's viewer did not start (exit code {process.returncode}); its output is above. "
-        "Look with a browser: --serve, or write a file for later: --save FILE.rrd"
+        "Look with a browser: --serve, or write a file for later: -o FILE.rrd"
     )
 
 
