@@ -136,7 +136,7 @@ WRONG: list[tuple[str, int, str]] = [
         "model.py needs the option 'checkpoint': give checkpoint=VALUE, with",
     ),
     (
-        "dataset export /absent.mcap --out out",
+        "dataset export /absent.mcap -o out",
         FAILED,
         "error: /absent.mcap cannot be read: No such",
     ),
@@ -147,7 +147,7 @@ WRONG: list[tuple[str, int, str]] = [
         "error: profile panda_sim is not secured: run `vla-zenoh secure in",
     ),
     ("lab compare", USAGE, "Missing argument 'a'"),
-    ("lab trial", USAGE, "Missing option '--out' / '-o'"),
+    ("lab trial", USAGE, "Missing option '--output' / '-o'"),
     ("doctor --host desk", USAGE, "--host names a host of a profile: give --profile too"),
 ]
 WITHOUT_A_ROUTER = (
