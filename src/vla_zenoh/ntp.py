@@ -1,8 +1,8 @@
-"""How far another host's clock is ahead of ours, from the four stamps of NTP. Pure.
+"""Offset of another host's clock from the four stamps of NTP. Pure.
 
-One exchange gives the offset up to half the time it was under way (RFC 5905, section 8): what was
-spent on the way there and what on the way back cannot be told apart. So of the last exchanges the
-quickest counts, and half its round trip is the uncertainty: a bound, no guess.
+One exchange gives the offset up to half its round trip (RFC 5905, section 8): the delays there and
+back cannot be told apart. So of the last exchanges the quickest counts, and half its round trip is
+the uncertainty: a bound, not a guess.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TypeVar
 from vla_zenoh.types import ActionChunk, Header
 
 WINDOW = 8
-"""Exchanges of which the quickest is taken, as in NTP's clock filter."""
+"""Exchanges from which the quickest is taken, as in NTP's clock filter."""
 DRIFT = 50e-6
 """Two clocks of ordinary computers run apart by this much, s per s."""
 LAST_NS = 2**63 - 1
@@ -109,7 +109,7 @@ class ClockOffsetFilter:
         return True
 
     def offset(self, wall_minus_mono_ns: int, now_mono_ns: int) -> ClockOffset | None:
-        """What is known now; None before the first exchange.
+        """The offset now; None before the first exchange.
 
         Args:
             wall_minus_mono_ns: our own wall clock minus our monotonic one, now.
@@ -125,10 +125,10 @@ class ClockOffsetFilter:
         )
 
     def applied_ns(self, wall_minus_mono_ns: int, now_mono_ns: int) -> int:
-        """What to take off the other one's stamps to have them on our clock.
+        """Offset to subtract from the peer's stamps to convert them to our clock.
 
-        It changes only when it is certain to be wrong, so that stamps do not tremble with every
-        exchange; and it is zero for a clock that is beyond the bound.
+        It changes only when it is certainly wrong, so that stamps do not jitter with every
+        exchange; it is zero for a clock beyond the bound.
         """
         best = self._best
         if best is None:

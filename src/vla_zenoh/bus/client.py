@@ -241,7 +241,7 @@ class Client:
         (``session.lease_ms``).
 
         Args:
-            what: name of this client, for people.
+            what: name of this client, for messages.
 
         Raises:
             SessionError: rejected, with every reason.

@@ -26,7 +26,7 @@ from vla_zenoh.cli.output import errors, styled
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.profile import Profile, as_robot
 from vla_zenoh.security.identity import Role, operator_role
-from vla_zenoh.security.operator_identity import local_role, operator_hosts
+from vla_zenoh.security.store import local_role, operator_hosts
 
 
 @dataclass(frozen=True)

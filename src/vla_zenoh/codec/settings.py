@@ -147,8 +147,3 @@ def decode_seed(payload: bytes) -> int | None:
 def encode_deadman_activation(holder: str) -> bytes:
     """An activation that lasts as long as the token `vla_zenoh.keys.Keys.holding` of `holder`."""
     return f"true {WHILE} {holder}".encode()
-
-
-def encode_bool(value: bool) -> bytes:
-    """What our own clients put."""
-    return b"true" if value else b"false"

@@ -14,15 +14,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_zenoh.control.actions import GRIPPER_SLACK, GRIPPER_SLACK_M
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, CameraSpec, ModelSpec
 from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
 from vla_zenoh.types import QUATERNION_NORM_TOLERANCE
 
 SHAPE_TOLERANCE = 0.02
 """An image may be stretched by this share of its aspect ratio without a note."""
-FRACTION_SLACK = 0.25
-WIDTH_SLACK_M = 0.05
-"""What the command node accepts as rounding; see `vla_zenoh.control.actions`."""
 BINARY_SPAN = 2.0
 """A number further than this from the threshold is not a choice of two but another quantity."""
 ROUNDING = 1e-6
@@ -217,7 +215,7 @@ def joints_as_pose(
     if spec.kind != "absolute" or spec.dimension not in (count, count + 1):
         return []
     first = steps[:, :count].astype(np.float64)
-    low, high = _box(limits)
+    low, high = _corners(limits)
     position_m = steps[:, :3].astype(np.float64) * spec.position_scale_m
     outside_m = np.maximum(low - position_m, position_m - high).max(axis=1)
     away_rad = float(np.abs(first[0] - joints_rad).max())
@@ -299,21 +297,10 @@ def immovable_axes(jacobian: NDArray[np.float64]) -> tuple[str, ...]:
     )
 
 
-def gripper_opening(spec: ActionSpec, steps: Steps) -> NDArray[np.float64] | None:
-    """Opening of the gripper at each step, 0 closed to 1 open; None: not given as a fraction."""
-    if spec.gripper not in ("open_fraction", "binary"):
-        return None
-    value = steps[:, -1].astype(np.float64)
-    if spec.gripper == "binary":
-        value = (value > spec.gripper_threshold).astype(np.float64)
-    return value if spec.gripper_open_is_high else 1.0 - value
-
-
-def _box(limits: Limits) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest corner of the workspace, m."""
+def _corners(limits: Limits) -> NDArray[np.float64]:
+    """Lower and upper corner (2, 3) of the workspace box, m; this module does without Ruckig."""
     box = limits.workspace
-    low, high = zip(box.x_m, box.y_m, box.z_m, strict=True)
-    return np.array(low), np.array(high)
+    return np.array([box.x_m, box.y_m, box.z_m]).T
 
 
 def _position(
@@ -330,7 +317,7 @@ def _position(
             )
             return
         box = limits.workspace
-        low, high = _box(limits)
+        low, high = _corners(limits)
         outside_m = float(np.maximum(low - position_m, position_m - high).max())
         if outside_m > limits.step_m:
             yield warning(
@@ -418,9 +405,9 @@ def _quaternion(
 
 def _gripper(spec: ActionSpec, value: NDArray[np.float64], max_width_m: float) -> Iterator[Finding]:
     bounds = {
-        "delta_m": (-max_width_m - WIDTH_SLACK_M, max_width_m + WIDTH_SLACK_M),
-        "absolute_m": (-0.01, max_width_m + WIDTH_SLACK_M),
-        "open_fraction": (-FRACTION_SLACK, 1.0 + FRACTION_SLACK),
+        "delta_m": (-max_width_m - GRIPPER_SLACK_M, max_width_m + GRIPPER_SLACK_M),
+        "absolute_m": (-0.01, max_width_m + GRIPPER_SLACK_M),
+        "open_fraction": (-GRIPPER_SLACK, 1.0 + GRIPPER_SLACK),
         "binary": (spec.gripper_threshold - BINARY_SPAN, spec.gripper_threshold + BINARY_SPAN),
     }
     if spec.gripper not in bounds:

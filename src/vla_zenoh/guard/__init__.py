@@ -1,1 +1,1 @@
-"""The robot's side of a command stream: who is followed, and how fast. Pure."""
+"""The robot's side of a command stream: which writer is followed, and how fast. Pure."""

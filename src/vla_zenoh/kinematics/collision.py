@@ -1,9 +1,9 @@
-"""How far the arm is from itself and from the table.
+"""Distances of the arm to itself and to the table.
 
-Every link is the convex hull of its collision shapes. Which pairs of links say something is found
-once, by sampling the joint space: pairs that are always near are neighbours by construction, pairs
-that never come near need no looking at, and pairs that are too near in a pose known to be good are
-a fault of the shapes. It is what MoveIt's setup assistant calls adjacent, never and default.
+Every link is the convex hull of its collision shapes. The pairs of links to check are found once,
+by sampling the joint space: pairs that are always near are neighbours by construction, pairs that
+never come near need no check, and pairs that are too near in a pose known to be good are a fault of
+the shapes: adjacent, never and default in MoveIt's setup assistant.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from vla_zenoh.types import FloatArray
 
 SAMPLES = 1000
 NEVER_SPARE_M = 0.03
-"""What a finite number of samples may have missed of a pair's smallest distance."""
+"""A pair may come nearer than in any of the samples by this much."""
 TABLE = "table"
 
 
@@ -33,7 +33,7 @@ class CollisionPair(NamedTuple):
     Args:
         first: a link.
         second: another link, or ``table``.
-        is_hand: `first` moves with the last joint of the arm, so it is what reaches for things.
+        is_hand: `first` moves with the last joint of the arm.
     """
 
     first: str
@@ -48,8 +48,8 @@ class CollisionModel:
     """Distances between the links of an arm, and to the table.
 
     Args:
-        kinematics: of the arm; other joints are where it locked them.
-        near_m: distances above this are of no interest.
+        kinematics: of the arm; its other joints are locked.
+        near_m: distances above this are ignored.
         touching_m: distances below this are a collision.
         table_z_m: height of the table in the base frame; None: no table.
         known_good_rad: configurations (n,) that are known to be free.

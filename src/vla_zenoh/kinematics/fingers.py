@@ -1,8 +1,7 @@
-"""From the joints of the fingers to the opening between them, and back, in a straight line.
+"""Linear conversion between the positions of finger joints and the opening of a gripper.
 
-Fingers that slide add up to the opening, unless the profile says at which of their positions the
-gripper is open and shut; fingers that turn need that. Where several joints are named they are told
-and moved alike, as those of one motor are.
+Sliding fingers add up to the opening, unless the profile gives their positions when open and shut;
+revolute fingers need these. Several joints move alike, as those of one motor do.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ class Fingers:
 
     Args:
         gripper: its section of the profile.
-        count: how many finger joints there are; 0: one that is commanded and not told.
+        count: number of finger joints; 0: one that is commanded and not measured.
     """
 
     def __init__(self, gripper: GripperProfile, count: int) -> None:
@@ -32,13 +31,13 @@ class Fingers:
             self._offset_m = -self._slope * ends.shut
 
     def width_m(self, positions: ArrayLike) -> float:
-        """Opening, of the positions (k,) m or rad of those joints that are told."""
+        """Opening at the measured positions (k,), m or rad."""
         return self._slope * float(np.asarray(positions, np.float64).mean()) + self._offset_m
 
     def speed_m_s(self, velocities: ArrayLike) -> float:
-        """How fast it changes, of their velocities (k,) m/s or rad/s."""
+        """Speed of the opening at joint velocities (k,), m/s or rad/s."""
         return abs(self._slope * float(np.asarray(velocities, np.float64).mean()))
 
     def position(self, width_m: float) -> float:
-        """Where each joint is at an opening, m or rad."""
+        """Position of each joint at an opening, m or rad."""
         return (width_m - self._offset_m) / self._slope

@@ -1,4 +1,4 @@
-"""Where the TCP is and how it moves, from the URDF: forward kinematics and Jacobian of the arm.
+"""Forward kinematics and Jacobian of an arm, from its URDF.
 
 One object serves one thread: it keeps Pinocchio's work space. Joint vectors are in the order of
 `Kinematics.arm_joints`, which is the order along the chain, whatever order a profile or a
@@ -23,8 +23,8 @@ from vla_zenoh.profile import JointEnds, Profile
 from vla_zenoh.types import FloatArray, JointState
 
 BEYOND_LIMITS = 0.1
-"""Of its range a finger joint may be told to end so far outside of it: drivers and descriptions of
-one gripper differ in the last digits."""
+"""A declared end of a finger joint may be outside its range by this share of it: drivers and URDFs
+of a gripper differ in the last digits."""
 
 
 class Kinematics:

@@ -14,10 +14,10 @@ from vla_zenoh.types import FloatArray, PoseState
 
 
 class _Pinocchio:
-    """Pinocchio, imported when something of it is needed first.
+    """Pinocchio, imported at first use.
 
-    The command line knows every command also where a model runs, and there is no Pinocchio there.
-    What was asked for once stays an attribute, so later calls cost nothing more.
+    The command line must load also in the environment of a model, which has no Pinocchio. Found
+    attributes are kept, so later calls cost nothing.
     """
 
     def __getattr__(self, name: str) -> Any:

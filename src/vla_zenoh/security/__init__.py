@@ -1,1 +1,1 @@
-"""Who may say what: certificates, roles, and rules for the router. Pure."""
+"""Certificates, roles and access rules of a lab. Pure."""

@@ -1,8 +1,8 @@
-"""A lab's own certificate authority: makes certificates and reads them. Bytes in, bytes out.
+"""Certificate authority of a lab: issues certificates and reads them. Bytes in, bytes out.
 
-X.509 version 3 (RFC 5280), keys on the curve P-256, signatures ECDSA with SHA-256: what every TLS
-library of today takes. Certificates of routers may serve and connect, all others only connect, so a
-stolen worker's key cannot pose as the router.
+X.509 version 3 (RFC 5280), keys on the curve P-256, ECDSA signatures with SHA-256, which every TLS
+library accepts. Certificates of routers may serve and connect, all others only connect, so a stolen
+worker's key cannot impersonate the router.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 EXTRA = "secure"
 AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 365
 WARN_DAYS = 30
-"""A certificate that ends within this is to be renewed."""
+"""A certificate that expires within this time should be renewed."""
 BACKDATE = dt.timedelta(minutes=10)
-"""Certificates begin a little in the past: the clocks of a lab's hosts differ."""
+"""Certificates are valid from a little earlier: the clocks of a lab's hosts differ."""
 MAX_COMMON_NAME = 64
 """Of RFC 5280, ub-common-name."""
 
@@ -43,12 +43,12 @@ class Certificate:
     """Contents of a certificate.
 
     Args:
-        common_name: who it is about.
-        issuer: who signed it.
+        common_name: of its subject.
+        issuer: common name of the signer.
         not_before: valid from, UTC.
         not_after: valid until, UTC.
-        addresses: names and IP addresses under which it may serve.
-        authority: it may sign others.
+        addresses: host names and IP addresses that it is valid for as a server.
+        authority: whether it may sign others.
     """
 
     common_name: str
@@ -59,11 +59,11 @@ class Certificate:
     authority: bool
 
     def days_left(self, now: dt.datetime) -> int:
-        """Whole days until it ends, negative when it has."""
+        """Whole days until it expires; negative if it has."""
         return math.floor((self.not_after - now) / dt.timedelta(days=1))
 
     def fault(self, now: dt.datetime) -> str:
-        """Why it is of no use at `now`, empty when it is good."""
+        """Why it is invalid at `now`; empty if it is valid."""
         if now < self.not_before:
             return f"is not valid before {self.not_before:%Y-%m-%d %H:%M} UTC (is the clock right?)"
         if now > self.not_after:
@@ -71,7 +71,7 @@ class Certificate:
         return ""
 
     def warning(self, now: dt.datetime) -> str:
-        """What has to be done soon; empty if nothing."""
+        """Warning of an expiry within `WARN_DAYS`; empty if there is none."""
         left = self.days_left(now)
         if self.fault(now) or left >= WARN_DAYS:
             return ""
@@ -79,16 +79,16 @@ class Certificate:
 
 
 def make_authority(name: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> KeyPair:
-    """A new authority: a key, and a certificate that it signed itself.
+    """A new authority: a key and a self-signed certificate.
 
     Args:
         name: of the lab, at most 64 characters.
         now: UTC.
-        days: how long it is valid.
+        days: validity.
 
     Raises:
         MissingExtraError: the library ``cryptography`` is not installed.
-        SecurityError: the name cannot be used.
+        SecurityError: invalid name.
     """
     x509, ec = _library()
     key = ec.generate_private_key(ec.SECP256R1())
@@ -116,12 +116,12 @@ def issue(
         authority: of the lab.
         common_name: at most 64 characters.
         now: UTC.
-        days: how long it is valid; never longer than the authority.
-        addresses: host names and IP addresses it may serve under; None: it may only connect.
+        days: validity, limited by that of the authority.
+        addresses: host names and IP addresses of a server; None: it may only connect.
 
     Raises:
         MissingExtraError: the library ``cryptography`` is not installed.
-        SecurityError: the name, an address or the authority cannot be used.
+        SecurityError: invalid name or address, or an authority that is invalid or expired.
     """
     x509, ec = _library()
     from cryptography.x509.oid import ExtendedKeyUsageOID
@@ -152,11 +152,11 @@ def issue(
 
 
 def read(pem: bytes) -> Certificate:
-    """What a certificate says.
+    """Contents of a certificate.
 
     Raises:
         MissingExtraError: the library ``cryptography`` is not installed.
-        SecurityError: it is none.
+        SecurityError: not a certificate.
     """
     x509, _ = _library()
     try:
@@ -182,7 +182,7 @@ def signed_by(pem: bytes, authority: bytes) -> bool:
     """Whether `authority` signed the certificate `pem`.
 
     Raises:
-        SecurityError: one of them is no certificate.
+        SecurityError: one of them is not a certificate.
     """
     x509, _ = _library()
     from cryptography.exceptions import InvalidSignature
@@ -199,7 +199,7 @@ def signed_by(pem: bytes, authority: bytes) -> bool:
 
 
 def key_fits(pair: KeyPair) -> bool:
-    """Whether the private key is the certificate's.
+    """Whether the private key belongs to the certificate.
 
     Raises:
         SecurityError: one of them cannot be read.

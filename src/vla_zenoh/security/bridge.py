@@ -1,7 +1,7 @@
-"""The bridge of a ROS 2 robot that is reached over a network: its certificate, and who may use it.
+"""Certificate and access rules of a ROS 2 bridge that is reached over a network.
 
-It is a router of its own: a client that talks to it bypasses our command node. So it takes
-certificates of this lab only, and of those the one of the node ``ros2`` alone.
+The bridge is a router: its clients bypass our command node. So it accepts only certificates of this
+lab, and of those serves the node ``ros2`` only.
 """
 
 from __future__ import annotations

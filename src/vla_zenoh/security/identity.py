@@ -1,6 +1,6 @@
-"""Identities of a lab: one for each node of each host, and one for the people there.
+"""Identities of a lab: one for each node of each host, and one for its operators.
 
-An identity is the common name of a certificate, ``NODE@HOST``, and what the router goes by.
+An identity is the common name of a certificate, ``NODE@HOST``; the router's rules go by it.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from vla_zenoh.profile.schema import NODE_KINDS
 class Role(Enum):
     """Role of an identity. What each may do is in `vla_zenoh.security.roles`."""
 
-    ROUTER = "router"  # carries everything, for all others
+    ROUTER = "router"  # forwards everything
     ROBOT = "robot"
     CAMERA = "camera"
     WORKER = "worker"
     COMMAND = "command"
     OPERATOR = "operator"  # a person who drives the robot
-    VIEWER = "viewer"  # a person or screen that looks on, without pictures
-    REPLAY = "replay"  # plays a recording: the part of everybody, where no robot lives
-    BRIDGE = "bridge"  # a ROS 2 robot's; serves the node ros2 alone, has no rights at our routers
+    VIEWER = "viewer"  # a person or screen that watches, without images
+    REPLAY = "replay"  # publishes a recording in place of all nodes; for routers without a robot
+    BRIDGE = "bridge"  # of a ROS 2 robot; serves the node ros2 only, has no rights at our routers
 
 
 PEOPLE = (Role.OPERATOR, Role.VIEWER, Role.REPLAY)
 TELEOP = "teleop"
-"""Worker name of an operator who drives by hand."""
+"""Worker name of an operator who teleoperates."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +38,13 @@ class Identity:
     """Holder of a certificate.
 
     Args:
-        role: what for.
-        node: its name on the bus; of people ``operator``, ``viewer`` or ``replay``.
-        host: where.
-        worker: the worker it is, if it is one.
-        cameras: the cameras it serves.
-        speaks_for: whose part it plays as well: the node of a ROS 2 robot puts what ROS people ask.
-        addresses: of a bridge: where it serves.
+        role: its rights.
+        node: name on the bus; of a person ``operator``, ``viewer`` or ``replay``.
+        host: in the profile.
+        worker: name, if it is a worker.
+        cameras: that it serves.
+        speaks_for: further roles: the node of a ROS 2 robot publishes the requests of ROS users.
+        addresses: of a bridge: at which it serves.
     """
 
     role: Role
@@ -57,7 +57,7 @@ class Identity:
 
     @property
     def roles(self) -> frozenset[Role]:
-        """Its own role, and those it plays as well."""
+        """Its own role and those in `speaks_for`."""
         return frozenset({self.role, *self.speaks_for})
 
     @property
@@ -67,7 +67,7 @@ class Identity:
 
 
 def operator_role(profile: Profile, host: str) -> Role | None:
-    """What a person at `host` may do; None: the profile does not know that computer."""
+    """Role of a person at `host`; None: the profile does not know that host."""
     security = profile.session.security
     if security is not None and host in security.people:
         return Role(security.people[host])
@@ -78,10 +78,10 @@ def operator_role(profile: Profile, host: str) -> Role | None:
 
 
 def identities_of(profile: Profile, host: str) -> list[Identity]:
-    """All identities at `host`: its nodes and its people.
+    """All identities at `host`: its nodes and its operators.
 
     Raises:
-        ProfileError: neither hosts nor session.security.people know it.
+        ProfileError: it is neither in hosts nor in session.security.people.
     """
     role = operator_role(profile, host)
     if role is None:
@@ -96,7 +96,7 @@ def identities_of(profile: Profile, host: str) -> list[Identity]:
 
 
 def operator_identities(host: str, role: Role) -> list[Identity]:
-    """Identities of the people at a computer; an operator is also a worker, to drive by hand."""
+    """Identities of a person at a host; an operator is also a worker, for teleoperation."""
     people = Identity(role, role.value, host)
     if role is not Role.OPERATOR:
         return [people]
@@ -104,7 +104,7 @@ def operator_identities(host: str, role: Role) -> list[Identity]:
 
 
 def identities(profile: Profile) -> list[Identity]:
-    """Everybody in the lab."""
+    """All identities of the lab."""
     hosts = dict.fromkeys([*profile.hosts, *_people(profile)])
     return [identity for host in hosts for identity in identities_of(profile, host)]
 

@@ -35,7 +35,7 @@ _ANY = "any"
 
 
 class Act(Enum):
-    """What is done on a key."""
+    """An operation on a key."""
 
     PUT = "put"
     DELETE = "delete"  # no role may, and nodes reject it
@@ -50,8 +50,8 @@ class Act(Enum):
 class Row:
     """Rights on one member of `Keys`.
 
-    Where a key has parameters, a node that writes fills in itself: its own name, worker, cameras.
-    Who reads may read all of them, and a replay writes what others wrote.
+    Where a key has parameters, a writer may use its own only: its name, worker, cameras. Readers
+    may read all of them, and a replay may write all of them.
     """
 
     member: str
@@ -64,7 +64,7 @@ class Row:
     watch: frozenset[Role] = NOBODY
 
     def roles(self, act: Act) -> frozenset[Role]:
-        """Who may do `act`."""
+        """Roles that may do `act`."""
         return getattr(self, act.value)
 
 
@@ -134,7 +134,7 @@ TABLE = (
 NO_KEYS = ("short", "full", "group", "on")
 """Members of `Keys` that give text and no key of their own."""
 OWN = frozenset({Act.PUT, Act.ANSWER, Act.ANNOUNCE})
-"""What a node does only in its own name."""
+"""Acts that a node may do in its own name only."""
 
 
 def key_members() -> dict[str, tuple[str, ...]]:
@@ -156,8 +156,8 @@ def expressions(keys: Keys, member: str, identity: Identity, act: Act) -> Iterat
     Args:
         keys: of the robot.
         member: of `Keys`.
-        identity: who.
-        act: what. Only in its own name, for what is in `OWN`.
+        identity: of the node or operator.
+        act: in its own name only if it is in `OWN`.
     """
     parameters = key_members()[member]
     if not parameters:

@@ -1,8 +1,8 @@
 """Rights as a configuration of Zenoh's access control.
 
-Zenoh looks at messages where they enter and leave the router, so one right takes several rules. A
-writer must be let in with its samples, and must *learn* that there are subscribers, else it never
-sends; a reader must be let in with its wish, and be handed the samples. Whatever lacks a rule is
+Zenoh checks messages where they enter and leave the router, so one right takes several rules. The
+samples of a writer must enter, and it must *learn* of subscribers, or it never sends; the
+declaration of a reader must enter, and the samples must leave. Whatever lacks a rule is
 dropped without a word.
 """
 
@@ -85,7 +85,7 @@ def _rules(identity: Identity, keys: Keys) -> list[dict[str, Any]]:
     for right in rights(keys, identity):
         for flow, message in MESSAGES[right.act]:
             wish = flow == OUT and message in WISHES
-            # Who listens may ask for more than this key: the writer is told all the same.
+            # A subscriber may ask for more than this key: the writer must learn of it all the same.
             key = "**" if wish else right.key
             granted.setdefault((flow, message), {})[key] = None
             if right.act is Act.SUBSCRIBE:

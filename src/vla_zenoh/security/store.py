@@ -2,12 +2,12 @@
 
 ::
 
-    FOLDER/ca.pem, ca.key         the authority; the key stays on the computer it was made on
+    FOLDER/ca.pem, ca.key         authority; its key never leaves this computer
     FOLDER/HOST/ca.pem            copy FOLDER/HOST to that host, into its own FOLDER
-    FOLDER/HOST/NODE.pem, .key    one pair for each node there, and for its people
-    FOLDER/.this_host             which HOST this computer is; stays here, and no host is called so
+    FOLDER/HOST/NODE.pem, .key    certificate and key of each node and operator of the host
+    FOLDER/.this_host             name of the HOST that this computer is; not copied
 
-Private keys are readable by their owner alone. Nothing is ever overwritten unless asked for.
+Private keys are readable by their owner only. Nothing is overwritten unless requested.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla_zenoh.errors import SecurityError
+from vla_zenoh.profile import Profile
 from vla_zenoh.security import authority as ca
 from vla_zenoh.security.authority import Certificate, KeyPair
-from vla_zenoh.security.identity import PEOPLE, Identity, Role
+from vla_zenoh.security.identity import PEOPLE, Identity, Role, operator_role
 
 AUTHORITY = "ca"
 THIS_HOST = ".this_host"
@@ -44,12 +45,12 @@ class Entry:
     """A certificate in the folder.
 
     Args:
-        host: whose; empty: the authority itself.
-        node: which node's, or ``operator``, ``viewer``, ``ca``.
+        host: empty: the authority itself.
+        node: or ``operator``, ``viewer``, ``ca``.
         path: of the certificate.
-        certificate: what it says; None where it cannot be read.
-        faults: why it is of no use, or unsafe.
-        warning: what is to be done soon.
+        certificate: its contents; None if it cannot be read.
+        faults: why it is unusable or unsafe.
+        warning: of its expiry.
     """
 
     host: str
@@ -75,7 +76,7 @@ class Store:
         """Make the lab's authority.
 
         Raises:
-            SecurityError: there is one, or the folder cannot be written.
+            SecurityError: it exists already, or the folder cannot be written.
         """
         path = self.folder / f"{AUTHORITY}.pem"
         self._write(self.folder, AUTHORITY, ca.make_authority(lab, now), renew=False)
@@ -93,15 +94,14 @@ class Store:
         """Make a certificate for each of `identities`; returns their files.
 
         Args:
-            identities: who.
+            identities: of nodes and operators.
             now: UTC.
-            days: how long they are valid.
-            addresses: under which routers among them serve.
-            renew: put new ones in place of those that are there; routers serve under what those
-                say as well.
+            days: validity.
+            addresses: of routers, for clients.
+            renew: replace existing ones; routers keep the addresses of those as well.
 
         Raises:
-            SecurityError: one is there already, the authority's key is not, or a file cannot be
+            SecurityError: one exists already, the authority's key is missing, or a file cannot be
                 written. Nothing is written then.
         """
         identities, serving = list(identities), tuple(addresses)
@@ -175,12 +175,12 @@ class Store:
 
     # -- using --------------------------------------------------------------------------------
     def files(self, host: str, node: str) -> Files:
-        """Where the files of one identity are to be."""
+        """Paths of the files of an identity."""
         folder = self.folder / host
         return Files(folder / f"{AUTHORITY}.pem", folder / f"{node}.pem", folder / f"{node}.key")
 
     def this_host(self, host: str | None) -> str:
-        """Which host this computer is: `host`, or what is known of it, see `known_host`.
+        """Host that this computer is: `host`, or `known_host`.
 
         Raises:
             SecurityError: there are no certificates, or those of several hosts.
@@ -211,7 +211,7 @@ class Store:
         return hosts[0] if len(hosts) == 1 else None
 
     def remember_host(self, host: str) -> Path:
-        """Write down that this computer is `host`.
+        """Note that this computer is `host`.
 
         Raises:
             SecurityError: the folder cannot be written.
@@ -221,11 +221,11 @@ class Store:
         return path
 
     def hosts(self) -> list[str]:
-        """Hosts there are certificates for."""
+        """Hosts that have certificates here."""
         return sorted(path.parent.name for path in self.folder.glob(f"*/{AUTHORITY}.pem"))
 
     def has(self, host: str, node: str) -> bool:
-        """Whether certificate and key of a node are here."""
+        """Whether certificate and key of a node exist."""
         files = self.files(host, node)
         return files.certificate.exists() and files.key.exists()
 
@@ -235,13 +235,13 @@ class Store:
         """Files of a node of this computer or, without a node, of its operator.
 
         Args:
-            host: which host this computer is; None: what is known of it.
-            node: whose.
-            people: host -> role of its people, ``session.security.people``. Where it names the
-                host, no certificate but that role's is of use: the router drops what others say.
+            host: that this computer is; None: `known_host`.
+            node: name; None: the operator.
+            people: ``session.security.people``. Where it names the host, only the certificate of
+                that role is used: the router drops messages of others.
 
         Raises:
-            SecurityError: they are not there, or others can read the key.
+            SecurityError: they are missing, or others can read the key.
         """
         host = self.this_host(host)
         role = (people or {}).get(host)
@@ -261,7 +261,7 @@ class Store:
 
     # -- looking ------------------------------------------------------------------------------
     def entries(self, now: dt.datetime, host: str | None = None) -> list[Entry]:
-        """Every certificate there is, or those of one host, with its faults.
+        """All certificates, or those of one host, with their faults.
 
         Raises:
             MissingExtraError: the library ``cryptography`` is not installed.
@@ -306,7 +306,7 @@ class Store:
 
 
 def open_to_others(key: Path) -> str:
-    """Who else can read a private key; empty if no other user can."""
+    """Sentence about a private key that other users can read; empty if none can."""
     mode = stat.S_IMODE(key.stat().st_mode)
     if mode & 0o077:
         return f"{key} can be read by others (mode {mode:o}): chmod 600 {key}"
@@ -321,7 +321,7 @@ def _get(path: Path) -> bytes:
 
 
 def _put(path: Path, content: bytes, mode: int) -> None:
-    """Write a file that has its mode from its first byte on."""
+    """Write a file atomically; it has its mode from the start."""
     beside = path.with_name(f".{path.name}.new")
     try:
         beside.unlink(missing_ok=True)
@@ -332,3 +332,51 @@ def _put(path: Path, content: bytes, mode: int) -> None:
         beside.replace(path)
     except OSError as error:
         raise SecurityError(f"{path} cannot be written: {error.strerror}") from error
+
+
+RANK = {Role.OPERATOR: 0, Role.VIEWER: 1}
+"""The role that replays recordings is chosen by name only: it may publish on every key."""
+
+
+def operator_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
+    """Hosts whose operator certificates are on this computer, the preferred one first.
+
+    Args:
+        profile: secured. Hosts that it does not know are left out: the router would silently drop
+            their messages.
+        stop: prefer an operator to this computer's own host: a viewer may not stop the arm.
+
+    Returns:
+        This computer's own host first if it is known, then operators before viewers, in the order
+        of the profile, hosts before people. Only ``session.security.host`` if it is set, except
+        for a stop. Empty if there is no operator certificate.
+    """
+    security = profile.session.security
+    if security is None:
+        return []
+    if security.host is not None and not stop:
+        return [security.host]
+    store = Store(security.folder)
+    own = security.host or store.known_host()
+    ranks: dict[str, int] = {}
+    for host in dict.fromkeys([*profile.hosts, *security.people]):
+        role = operator_role(profile, host)
+        if role in RANK and store.has(host, role.value):
+            ranks[host] = RANK[role]
+    if stop:
+        found = sorted(ranks, key=lambda host: (ranks[host], host != own))
+    else:
+        found = sorted(ranks, key=lambda host: (host != own, ranks[host]))
+    return found or ([own] if own is not None else [])
+
+
+def local_role(profile: Profile) -> Role | None:
+    """Role of the people at this computer; None: unrestricted, or unknown."""
+    security = profile.session.security
+    if security is None:
+        return None
+    try:
+        files = Store(security.folder).identity_files(security.host, None, security.people)
+    except SecurityError:
+        return None
+    return next((role for role in PEOPLE if role.value == files.certificate.stem), None)

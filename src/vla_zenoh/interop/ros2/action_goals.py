@@ -14,7 +14,7 @@ from vla_zenoh.types import GripperCommand
 
 
 class GoalStep(Enum):
-    """What is to be done now."""
+    """Next action of the sequencer."""
 
     SEND = "send"
     CANCEL = "cancel"

@@ -1,4 +1,4 @@
-"""What rmw_zenoh carries beside every sample, request and reply: 33 bytes.
+"""Attachment of rmw_zenoh's samples, requests and replies: 33 bytes.
 
 ``int64 sequence number, int64 source time (ns), uint8 16, 16 bytes gid``, little-endian. A ROS 2
 subscriber drops samples without it; a reply repeats number and gid of its request.

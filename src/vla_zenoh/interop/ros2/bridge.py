@@ -1,4 +1,4 @@
-"""The configuration of zenoh-bridge-ros2dds for a profile: what it uses is let through, by name."""
+"""Configuration of zenoh-bridge-ros2dds for a profile: an allow-list of the names it uses."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def bridge_text(profile: Profile, config: Mapping[str, Any]) -> str:
 
 
 def _json(value: Any, margin: str = "") -> str:
-    """What fits on a line is on one line: a person is to read the list."""
+    """JSON with short values on one line, so that the list stays readable."""
     flat = json.dumps(value, ensure_ascii=False)
     if len(margin) + len(flat) <= WIDTH or not isinstance(value, (dict, list)):
         return flat

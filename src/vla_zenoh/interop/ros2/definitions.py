@@ -90,7 +90,7 @@ def _message(package: str, room: str, name: str, text: str) -> Definitions:
 
 
 def _around_action(kind: str) -> Definitions:
-    """What ROS generates around goal, result and feedback."""
+    """Messages that ROS generates around goal, result and feedback."""
     package, room, name = split_type(kind)
     text = {
         "_SendGoal_Request": "unique_identifier_msgs/UUID goal_id\n{}_Goal goal\n",

@@ -98,7 +98,7 @@ def cancel(messages: Messages, goal_id: bytes) -> Any:
 
 
 def outcome(action: str, response: Any) -> GripperOutcome:
-    """What the answer of get_result means."""
+    """Outcome of a goal by the answer of get_result."""
     result = response.result
     reached = response.status == SUCCEEDED
     if action in (GRIPPER_COMMAND, PARALLEL_COMMAND):

@@ -20,7 +20,7 @@ _SLASH_OF_RMW = "%"
 
 
 class EntityRole(Enum):
-    """What we are on a topic, service or action; the value is its name in tokens."""
+    """Our end of a topic, service or action; the value is its name in liveliness tokens."""
 
     PUBLISHER = "MP"
     SUBSCRIBER = "MS"
@@ -103,7 +103,7 @@ class Ros2Dds:
         return "/".join(chunks)
 
     def node_token(self) -> str:
-        """What a bridge declares of itself."""
+        """Token that a bridge declares."""
         return f"@/{self.session_id}/@ros2_lv"
 
     def others(self) -> str:

@@ -29,7 +29,7 @@ STORES = {
 """Distribution -> rosbags' definitions of it."""
 
 NO_HASH = "TypeHashNotSupported"
-"""What stands in place of a hash where the distribution has none (Humble)."""
+"""In place of a hash where the distribution has none (Humble)."""
 
 MAX_MESSAGE_BYTES = 4 * 1024 * 1024
 MAX_PICTURE_BYTES = 128 * 1024 * 1024

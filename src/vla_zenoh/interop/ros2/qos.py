@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Qos:
-    """What matters of a ROS 2 QoS profile; history is always the last `depth`.
+    """The used part of a ROS 2 QoS profile; history is always the last `depth`.
 
     Args:
         depth: samples kept.

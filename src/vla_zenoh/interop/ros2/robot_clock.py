@@ -1,7 +1,7 @@
-"""How far the robot's clock is from ours, by the stamps of what it sends.
+"""Offset of the robot's clock from ours, by the stamps of its messages.
 
-A message cannot arrive before it was sent: the least of (arrival - stamp) over the last seconds is
-the offset of the clocks plus the shortest way, and the way of small messages is short.
+A message cannot arrive before it was sent: the minimum of (arrival - stamp) over the last seconds
+is the offset of the clocks plus the shortest delay, and that of small messages is short.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections import deque
 
 WINDOW = 1000
-"""Messages looked back on."""
+"""Number of messages."""
 TOLERATED_NS = 20_000_000
-"""Nearer than this clocks count as equal: it is what the command node's preflight allows."""
+"""Clocks that differ by less count as equal, as in the command node's preflight."""
 
 
 class RobotClock:
@@ -22,7 +22,7 @@ class RobotClock:
         self.unstamped = 0
 
     def take(self, stamp_ns: int, arrived_ns: int) -> None:
-        """A message of this stamp came; 0 is none."""
+        """Note the arrival of a message; a stamp of 0 is none."""
         if stamp_ns == 0:
             self.unstamped += 1
             return
@@ -30,11 +30,11 @@ class RobotClock:
 
     @property
     def offset_s(self) -> float | None:
-        """By how much the robot's clock is behind ours at most; negative: it is ahead."""
+        """Upper bound of how far the robot's clock is behind ours; negative: it is ahead."""
         return min(self._delays_ns) / 1e9 if self._delays_ns else None
 
     @property
     def differs(self) -> bool:
-        """The clocks are further apart than is tolerated."""
+        """Whether the clocks differ by more than `TOLERATED_NS`."""
         offset_s = self.offset_s
         return offset_s is not None and abs(offset_s) * 1e9 > TOLERATED_NS

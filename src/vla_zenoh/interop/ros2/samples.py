@@ -1,4 +1,4 @@
-"""What ROS 2 messages say, before it is known whose joints or which camera they are.
+"""Contents of ROS 2 messages, before joints and cameras are told apart.
 
 Numbers are as they came: finiteness and meaning are checked where a record is made of them.
 """
@@ -72,7 +72,7 @@ class Wrench(NamedTuple):
 
 
 class Stamp(NamedTuple):
-    """What goes into the header of a message of ours."""
+    """Stamp and frame for the header of a message."""
 
     stamp_ns: int
     frame: str

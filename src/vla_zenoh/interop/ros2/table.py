@@ -1,4 +1,4 @@
-"""ROS type -> what we make of it. A new type is one file in ``topics`` and one line here."""
+"""ROS types that are read and written. A new type is one file in ``topics`` and one line here."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ GRIPPER_WRITINGS = (
 
 
 def writings(posture_rad: FloatArray, lead_ns: int) -> tuple[Writing, ...]:
-    """What commands can be sent as.
+    """Types in which commands can be sent.
 
     Args:
         posture_rad: (n,) what a nullspace prefers.
@@ -104,7 +104,7 @@ _BY_TYPE = {reading.type: reading for reading in READINGS}
 
 
 def read(messages: Messages, kind: str, payload: bytes) -> Any:
-    """What CDR bytes of a type in `READINGS` say.
+    """Decode CDR bytes of a type in `READINGS`.
 
     Raises:
         CodecError: whatever else the bytes are.

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.control import policy_check
 from vla_zenoh.control.policy_check import Finding, error, note, warning
 from vla_zenoh.errors import SpecError
 from vla_zenoh.lab.check.examples import MAX_WIDTH_M, ExampleStyle
@@ -109,13 +108,22 @@ def behaviour(
     ]
 
 
+def _opening(spec: ActionSpec, steps: Steps) -> NDArray[np.float64] | None:
+    """Opening of the gripper at each step, 0 closed to 1 open; None: not given as a fraction."""
+    if spec.gripper not in ("open_fraction", "binary"):
+        return None
+    value = steps[:, -1].astype(np.float64)
+    if spec.gripper == "binary":
+        value = (value > spec.gripper_threshold).astype(np.float64)
+    return value if spec.gripper_open_is_high else 1.0 - value
+
+
 def _polarity(action: ActionSpec, answers: Answers) -> list[Finding]:
     """Every answer closes an open, empty gripper: probably the wrong polarity."""
     shares = [
         opening
         for style, steps in answers
-        if style.width_m == MAX_WIDTH_M
-        and (opening := policy_check.gripper_opening(action, steps)) is not None
+        if style.width_m == MAX_WIDTH_M and (opening := _opening(action, steps)) is not None
     ]
     if not shares or float(np.concatenate(shares).max()) > 0.5:
         return []

@@ -11,7 +11,7 @@ TEXT, NUMBER = "std_msgs/msg/String", "std_msgs/msg/Float64"
 
 
 def read(message: Any) -> Any:
-    """What the message holds."""
+    """Value of the message."""
     return message.data
 
 
