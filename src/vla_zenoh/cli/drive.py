@@ -15,8 +15,8 @@ from vla_zenoh.cli.options import options
 from vla_zenoh.cli.output import complain, console, errors, fail, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.settings import decode_name, decode_percent, decode_rate, decode_text
-from vla_zenoh.errors import SecurityError
-from vla_zenoh.keys import Keys
+from vla_zenoh.errors import SecurityError, nearest
+from vla_zenoh.keys import Keys, worker_node
 from vla_zenoh.profile import as_robot
 from vla_zenoh.runtime.process import stop_on_signals
 from vla_zenoh.types import Task
@@ -110,7 +110,20 @@ def use(
     """Select the worker that moves the arm; the others keep running."""
     decode_name(worker.encode())
     with target.operator("use", worker) as client:
+        _require_worker(client, worker)
         _show(target, client, f"worker: {client.set_worker(worker).worker}")
+
+
+def _require_worker(client: Client, worker: str) -> None:
+    """End with the workers that are alive where `worker` is not: it may be mistyped."""
+    found = client.wait_for(lambda: worker_node(worker) in client.alive, ABSENT_PATIENCE_S)
+    if not found and "command" in client.alive:  # otherwise that is said
+        named = worker_node("")
+        alive = sorted(name[len(named) :] for name in client.alive if name.startswith(named))
+        fail(
+            f"worker {worker!r} is not alive{nearest(worker, alive)} "
+            f"Alive are: {', '.join(alive) or 'none'}"
+        )
 
 
 @options
