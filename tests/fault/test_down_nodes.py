@@ -101,7 +101,8 @@ def test_a_worker_whose_load_raises_is_one_line_and_its_reason_is_everywhere(lab
     assert bad["why"] == why
     assert why in lab.run("status", "--once").stdout
 
-    assert lab.run("use", "bad").returncode == 0
+    assert f"worker 'bad' is not alive: {why}. Alive are: scripted" in lab.run("use", "bad").stderr
+    lab.client.publish(lab.client.keys.worker, "bad")
     refused = lab.run("activate")
     assert refused.returncode == 1
     assert f"worker 'bad' is not alive: {why}" in refused.stderr

@@ -40,7 +40,11 @@ def test_a_session_from_prompt_to_reset(chain: Chain) -> None:
     assert "'fast' is no percentage" in run(chain, "speed", "fast").stderr
     ok(chain, "speed", "100")
 
-    assert "worker: nobody" in ok(chain, "use", "nobody")
+    refused = run(chain, "use", "scripter")
+    assert refused.returncode == REFUSED
+    assert "worker 'scripter' is not alive; did you mean 'scripted'?" in refused.stderr
+    assert "Alive are: scripted" in refused.stderr
+    chain.client.set_worker("nobody")
     refused = run(chain, "activate")
     assert refused.returncode == REFUSED
     assert "activate rejected:" in refused.stderr

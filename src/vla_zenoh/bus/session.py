@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 import time
 from collections.abc import Mapping
@@ -185,14 +186,19 @@ def open_session(
             raise _explain(settings, error) from error
 
 
+_RUST_PLACE = re.compile(r"\.? at \S+\.rs:\d+\.?")
+"""Where in Zenoh's source an error was raised, on the computer that built it."""
+
+
 def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
     if settings["mode"] == "router":
         where = ", ".join(settings["listen"]["endpoints"])
         if "access_control" in settings and "Access control" in str(error):
             return SessionError(f"the router rejects its access control rules: {error}")
         return SessionError(
-            f"the router cannot listen on {where}: {error}. Is another program using that address? "
-            "Run `vla-zenoh doctor`, or choose another address with --listen or session.listen"
+            f"the router cannot listen on {where}: {_RUST_PLACE.sub('', str(error))}. Is another "
+            "program using that address? Run `vla-zenoh doctor`, or choose another address with "
+            "--listen or session.listen"
         )
     where = ", ".join(settings["connect"]["endpoints"])
     tls = settings["transport"]["link"].get("tls")

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 from vla_zenoh.cli.plain import BOLD_RED, complain, fail, say, say_marked, warn
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.errors import SecurityError
-from vla_zenoh.keys import Keys
+from vla_zenoh.errors import SecurityError, nearest
+from vla_zenoh.keys import CRASHED, Keys, worker_node
 
 if TYPE_CHECKING:
     import typer
@@ -125,7 +125,22 @@ def use(
 
     decode_name(worker.encode())
     with target.operator("use", worker) as client:
+        _require_worker(client, worker)
         _show(target, client, f"worker: {client.set_worker(worker).worker}")
+
+
+def _require_worker(client: Client, worker: str) -> None:
+    """End with the workers that are alive where `worker` is not: it may be mistyped."""
+    found = client.wait_for(lambda: worker_node(worker) in client.alive, ABSENT_PATIENCE_S)
+    if not found and "command" in client.alive:  # otherwise that is said
+        named = worker_node("")
+        alive = sorted(name[len(named) :] for name in client.alive if name.startswith(named))
+        said = client.status(worker_node(worker))
+        crashed = said is not None and said.state == CRASHED
+        why = (
+            f": {said.detail.get('complaint', '')}." if said and crashed else nearest(worker, alive)
+        )
+        fail(f"worker {worker!r} is not alive{why} Alive are: {', '.join(alive) or 'none'}")
 
 
 def rate(

@@ -62,17 +62,15 @@ def up(
 
     The profile is checked first, as `profile check` does; nothing starts if it cannot run.
     """
-    stop = stop_on_signals()
-    die_with_parent()
     loaded = effective_profile(profile, connect, listen)
     name, _ = choose_host(loaded, host)
     once = host_lock(loaded, name)
     once.take()  # says at once who runs already; the host takes it again
     once.release()
     reject_wrong(profile, host, connect, listen)
-    if stop.is_set():
-        raise typer.Exit(130)
     file, logger = log_file(log_dir or default_log_folder(), f"{loaded.robot.name}-{name}")
+    stop = stop_on_signals()
+    die_with_parent()
     out = console()
     lock = threading.Lock()
 

@@ -61,10 +61,10 @@ class PeerSnapshot:
     camera_reasons: Mapping[str, str] = field(default_factory=dict)
     down: Mapping[str, str] = field(default_factory=dict)
 
-    def not_alive(self, node: str) -> str:
-        """The end of a sentence about a node: that it is not alive, and why if that is known."""
+    def why_down(self, node: str) -> str:
+        """``: REASON``, to end a sentence about a node that is not alive; empty if unknown."""
         why = self.down.get(node)
-        return f"is not alive: {why}" if why else "is not alive"
+        return f": {why}" if why else ""
 
 
 def reasons_not_to_activate(
@@ -146,7 +146,9 @@ def _robot(
 ) -> list[str]:
     reasons: list[str] = []
     if peers.robot_node not in peers.alive:
-        reasons.append(f"the robot's node {peers.robot_node!r} {peers.not_alive(peers.robot_node)}")
+        reasons.append(
+            f"the robot's node {peers.robot_node!r} is not alive{peers.why_down(peers.robot_node)}"
+        )
     if pose is None:
         return [*reasons, "the TCP pose is not known: nothing received on state/pose"]
     reasons += _too_old("TCP pose", pose, profile, now_ns)
@@ -192,7 +194,7 @@ def _worker(worker: str, prompt: str, peers: PeerSnapshot) -> list[str]:
             name.removeprefix("worker-") for name in peers.alive if name.startswith("worker-")
         )
         alive = ", ".join(others) or "none"
-        return [f"worker {worker!r} {peers.not_alive(node)}; alive are: {alive}"]
+        return [f"worker {worker!r} is not alive{peers.why_down(node)}; alive are: {alive}"]
     spec = peers.specs.get(worker)
     if spec is None:
         return [f"worker {worker!r} has not published its spec"]
@@ -277,8 +279,8 @@ def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
         why = peers.camera_reasons.get(camera)
         if node not in peers.alive:
             reasons.append(
-                f"camera {camera!r}: its node {node!r} {peers.not_alive(node)}; `vla-zenoh up` on "
-                "its host starts it"
+                f"camera {camera!r}: its node {node!r} is not alive{peers.why_down(node)}; "
+                "`vla-zenoh up` on its host starts it"
             )
         elif age_s > CAMERA_PATIENCE_S:
             since = "yet" if math.isinf(age_s) else f"for {age_s:.1f} s"

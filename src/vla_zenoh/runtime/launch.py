@@ -24,6 +24,7 @@ from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.runtime.down_nodes import DownNodes
 from vla_zenoh.runtime.hang_detection import LastStatus, hung_nodes
 from vla_zenoh.runtime.host_lock import HostLock
+from vla_zenoh.runtime.router import reject_taken
 from vla_zenoh.runtime.supervisor import DownNode, NodeCommand, Supervisor
 from vla_zenoh.security.identity import Role, operator_role
 
@@ -229,6 +230,8 @@ class Host:
                     child for child in self.supervisor.children if child.command.kind != "router"
                 ]
             else:
+                listen = self._part.listen or self.profile.session.listen
+                reject_taken(listen)
                 self.supervisor.start(["router"])
         self.session = open_session(self.profile.session, wait_s=ROUTER_PATIENCE_S)
         self.client = Client(self.profile, self.session).subscribe()
