@@ -476,7 +476,7 @@ CHECKED: list[tuple[str, str]] = [
     (model("python.py", "size: '1'"), "python.py has no option 'size'. Its options: checkpoint"),
     (
         "workers: [scripted, openpi]\noptions: {openpi: {preset: libro}}",
-        "openpi.py: OpenPi cannot be made: ",
+        "OpenPi cannot be made: preset is 'libro', allowed: libero, droid, own, none",
     ),
     (
         "workers: [scripted, openvla]\noptions: {openvla: {chekpoint: ./weights}}",
