@@ -10,6 +10,7 @@ from benchmarks.chain.cli import chain
 from benchmarks.codec.cli import codec
 from benchmarks.load.cli import load
 from benchmarks.openvla import openvla
+from benchmarks.stop import stop
 from vla_zenoh.cli.output import complain
 from vla_zenoh.errors import VlaZenohError
 
@@ -19,7 +20,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for command in (chain, codec, load, openvla):
+for command in (chain, codec, load, openvla, stop):
     app.command()(command)
 
 if __name__ == "__main__":

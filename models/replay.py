@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vla_zenoh.errors import SpecError
+from vla_zenoh.errors import SpecError, in_words
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, check_steps
 
 
@@ -39,7 +39,7 @@ class Replay:
                 spec = ModelSpec.from_dict(json.loads(str(data["spec"])))
                 steps, length = np.array(data["steps"], np.float32), data["length"].astype(int)
         except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
-            raise SpecError(f"{path} is not a chunk file: {error}") from error
+            raise SpecError(f"{path} is not a chunk file: {in_words(error)}") from error
         if steps.ndim != 3 or length.shape != steps.shape[:1]:
             raise SpecError(f"{path}: steps {steps.shape} and length {length.shape} do not fit")
         self.spec = spec.model_copy(update={"name": "replay"})

@@ -176,10 +176,10 @@ def traced_program(out: Path, arguments: list[str]) -> None:
     threading.Thread(target=keep, daemon=True).start()
     threading.setprofile(note)
     sys.setprofile(note)
-    from vla_zenoh.cli.main import app_entry
+    from vla_zenoh.cli.entry import main
 
     sys.argv = ["vla-zenoh", *arguments]
-    app_entry()
+    main()
 
 
 def trace(src: Path) -> list[str]:

@@ -25,6 +25,7 @@ import rerun as rr
 from rerun.experimental import ViewerClient
 
 from vla_zenoh.lab.recording.reader import open_recording
+from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.view.paths import TIMELINE
 from vla_zenoh.lab.view.rerun_logger import APPLICATION, RerunLogger
 from vla_zenoh.lab.view.viewer import open_headless
@@ -33,7 +34,7 @@ from vla_zenoh.profile import read_profile
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs" / "images"
 VIEW_PX, REPORT_PX, PHONE_PX = (1600, 1000), (1500, 1330), (500, 1500)
-AT_S = 9.5
+AT_S = 4.2
 """The first brick is in the gripper."""
 MOST_BYTES = 200_000
 DARK = ("--force-dark-mode", "--blink-settings=preferredColorScheme=0")
@@ -43,19 +44,18 @@ SETTLED_S = 15.0
 
 
 def picture_view(run: Path, at_s: float, out: Path) -> None:
-    """Rerun's window with `run`, `at_s` after its beginning."""
+    """Rerun's window with `run`, `at_s` after the first activation."""
     file = open_recording(run)
     viewer = open_headless(*VIEW_PX)
     try:
         stream = rr.RecordingStream(APPLICATION)
         stream.connect_grpc(viewer.data_url)
         show = RerunLogger(read_profile(file.profile_yaml, str(run)), stream, keys=file.keys)
-        began_ns = 0
         for entry in file.entries(lambda key: not key.endswith("/raw")):
-            began_ns = began_ns or entry.received_ns
             show.log(entry)
         stream.disconnect()
-        moment = np.datetime64(began_ns + int(at_s * 1e9), "ns")
+        active_ns = next(e.received_ns for e in load_run(run).tasks if e.record.active)
+        moment = np.datetime64(active_ns + int(at_s * 1e9), "ns")
         client = ViewerClient.connect(viewer.data_url)
         insist(lambda: client.set_time(TIMELINE, timestamp=moment, play_state="paused"))
         time.sleep(SETTLED_S)
@@ -109,7 +109,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="run folder of a demo")
     parser.add_argument("what", choices=[*names, []], nargs="*")
-    parser.add_argument("--at", type=float, default=AT_S, help="moment of view, s")
+    parser.add_argument("--at", type=float, default=AT_S, help="s after activation")
     given = parser.parse_args()
     file = given.run / "run.mcap"
     with tempfile.TemporaryDirectory() as folder:

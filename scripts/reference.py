@@ -138,7 +138,7 @@ def profile_page() -> str:
     out = ["# Profile fields", MADE.strip()]
     out.append(
         "A profile is one YAML file. `vla-zenoh profile show NAME` prints one with all defaults, "
-        "`vla-zenoh profile check FILE` names what is wrong in it."
+        "`vla-zenoh profile check FILE` finds what is wrong in it."
     )
     paths = sections_of(Profile)
     for section, path in paths.items():

@@ -1,7 +1,8 @@
 """Wrong profiles: lines that are added to a good one, and the sentence that they get.
 
 `profile check` rejects every one of them, and so does `up`, by the same function. A sentence may be
-the beginning of what is said; `EXTENDED` are whole files beside a good one called ``base.yaml``.
+part of what is said. `WRONG` are wrong by themselves, `CHECKED` on a computer or with a model,
+`EXTENDED` contradict the profile that they extend.
 """
 
 from __future__ import annotations
@@ -305,4 +306,274 @@ WRONG: list[tuple[str, str]] = [
     ("session: {connect: ['tcp/a:0']}", "session.connect.0: port 0 leads nowhere"),
     ("session: {lease_ms: 10}", "session.lease_ms: must be at least 200 (given: 10)"),
     ("extends: panda_simm", "extends is given twice"),
+]
+
+UR5 = """\
+robot:
+  description: example-robot-data:ur_description/urdf/ur5_robot.urdf
+  base_frame: base_link
+  tcp_frame: tool0
+  arm_joints: [shoulder_pan_joint, shoulder_lift_joint, elbow_joint, wrist_1_joint, wrist_2_joint,
+    wrist_3_joint]
+  finger_joints: []
+  home_rad: [0.0, -1.2, 1.6, -2.0, -1.57, 0.0]
+limits: {joint: {velocity_rad_s: 1.0, acceleration_rad_s2: 3.0, jerk_rad_s3: 50.0}}
+"""
+ARM = """\
+robot: {driver: arm}
+cameras: {front: {source: "v4l2:/dev/video0"}, wrist: null}
+hosts: {here: {nodes: [router, arm, camera, command, worker]}}
+"""
+ROS2 = """\
+robot: {driver: ros2}
+cameras: {front: {source: "ros2:/front"}, wrist: null}
+hosts: {here: {nodes: [router, ros2, command, worker]}}
+"""
+FIVE = """\
+robot:
+  arm_joints: [panda_joint1, panda_joint2, panda_joint3, panda_joint4, panda_joint5]
+  home_rad: [0.0, 0.0, 0.0, -2.0, 0.0]
+limits: {joint: {velocity_rad_s: 1.0, acceleration_rad_s2: 3.0, jerk_rad_s3: 50.0}}
+"""
+ELSEWHERE = "session: {connect: [tcp/127.0.0.1:7448]}"
+POSE = "pose_command: {topic: /goal, type: geometry_msgs/msg/PoseStamped}"
+FILES = {
+    "no_urdf.urdf": "no robot",
+    "syntax.py": "def broken(:\n",
+    "nothing.py": "x = 1\n",
+    "two.py": "class A:\n    def infer(self, o): ...\nclass B:\n    def infer(self, o): ...\n",
+    "no_spec.py": "class A:\n    def infer(self, o): ...\n",
+    "wide.py": "from vla_zenoh.policy import *\nclass A:\n"
+    "    spec = ModelSpec(name='a', observation=ObservationSpec(cameras=(CameraSpec(\n"
+    "        camera='front', width=32, height=32),)), action=ActionSpec(horizon=1, dt_s=0.1))\n"
+    "    def infer(self, o): ...\n",
+    "posing.py": "from vla_zenoh.policy import *\nclass A:\n"
+    "    spec = ModelSpec(name='a', action=ActionSpec(horizon=1, dt_s=0.1, kind='absolute'))\n"
+    "    def infer(self, o): ...\n",
+    "joints.py": "from vla_zenoh.policy import *\nclass A:\n"
+    "    def __init__(self):\n"
+    "        self.spec = ModelSpec(name='a', action=ActionSpec(\n"
+    "            horizon='8', dt_s=0.1, kind='joint_position'))\n"
+    "    def infer(self, o): ...\n",
+    "needs.py": "# /// script\n# dependencies = ['no-such-package-here']\n# ///\nclass A:\n"
+    "    def __init__(self, checkpoint: str, size: str = '1', **more: str): ...\n"
+    "    def infer(self, o): ...\n",
+    "python.py": "# /// script\n# requires-python = '>=3.99'\n# ///\nclass A:\n"
+    "    def __init__(self, checkpoint: str): ...\n    def infer(self, o): ...\n",
+    "arm.py": "class Arm:\n    def __init__(self, port: str = 'x'): ...\n"
+    "    def read(self): ...\n    def move(self, command): ...\n",
+    "blind_arm.py": "class Arm:\n    def move(self, command): ...\n",
+    "Bad.msg": "this is no definition\n",
+}
+"""Beside the profile."""
+
+
+def model(file: str, options: str = "") -> str:
+    """Lines that add the model in `file` as worker m."""
+    more = f"\noptions: {{m: {{{options}}}}}" if options else ""
+    return f"workers: [scripted, m]\nmodels: {{m: ./{file}}}{more}"
+
+
+CHECKED: list[tuple[str, str]] = [
+    # Valid by themselves: `up` would start, and lose a node or refuse every activation.
+    ("sim: {scene: kitchen}", "lab.yaml:2: sim.scene: no scene called 'kitchen'. Known: bricks, t"),
+    ("sim: {scene: brick}", "sim.scene: no scene called 'brick'; did you mean 'bricks'? Known"),
+    ("sim: {vary: [table]}", "lab.yaml:2: sim.vary: the scene has no material"),
+    (
+        "cameras: {front: {source: 'sim:frnt'}}",
+        "lab.yaml:2: cameras.front.source: scene 'table' has no camera 'frnt'; did you mean "
+        "'front'? Known: front, wrist",
+    ),
+    (
+        "robot: {tcp_frame: panda_hand_tpc}",
+        "lab.yaml:2: robot: panda.urdf has no link 'panda_hand_tpc'; did you mean 'panda_hand_tcp'",
+    ),
+    ("robot: {base_frame: panda_hand}", "lab.yaml:2: robot: base_frame 'panda_hand' of panda.urdf"),
+    ("robot: {finger_joints: [panda_finger]}", "robot: panda.urdf has no joint 'panda_finger'; di"),
+    (
+        "robot: {gripper: {joint_open_rad: 0.0, joint_shut_rad: 0.8}}",
+        "slides: write gripper: {joint_open_m: ..., joint_shut_m: ...}",
+    ),
+    (
+        "robot: {description: absent.urdf}",
+        "lab.yaml:2: robot.description: robot description '{here}/absent.urdf' is not a file",
+    ),
+    (
+        "robot: {description: example-robot-data:panda/panda.urdf}",
+        "robot.description: robot description 'example-robot-data:panda/panda.urdf' is not in",
+    ),
+    ("robot: {description: no_urdf.urdf}", "robot.description: '{here}/no_urdf.urdf' cannot be r"),
+    (
+        UR5,
+        "lab.yaml:3: robot.description: the simulator (robot.driver: sim) cannot build ur5",
+    ),
+    (UR5, "It simulates the Franka Panda (extends: panda_sim); a real arm of another kind has dri"),
+    (
+        "robot: {home_rad: [0, 0, 0, -3.5, 0, 2.58, 0.78]}",
+        "lab.yaml:2: robot.home_rad: puts panda_joint4 at -3.5 rad, its range is -3.07 to -0.0698",
+    ),
+    (
+        "limits: {workspace: {x_m: [0.6, 0.75]}}",
+        "lab.yaml:2: limits.workspace: with robot.home_rad the TCP is at (0.430, -0.000, 0.160)",
+    ),
+    ("workers: [scripted, pi9]", "lab.yaml:2: workers: no model called 'pi9'. Known: brick, gro"),
+    (
+        "workers: [scripted, replay]",
+        "replay.py: Replay needs the option 'file': give file=VALUE, with --set or in the profile",
+    ),
+    (
+        "options: {scripted: {camra: front}}",
+        "lab.yaml:2: options.scripted: {models}/scripted.py: Scripted has no option 'camra'; did y"
+        "ou mean 'camera'? Its options: camera, horizon, dt_s, delay_ms, jitter",
+    ),
+    (
+        "options: {scripted: {horizon: many}}",
+        "Scripted cannot be made: horizon is 'many', wanted a number",
+    ),
+    (
+        "options: {scripted: {camera: ceiling}}",
+        "workers: worker 'scripted': needs camera 'ceiling', the profile has: front, wrist; add it",
+    ),
+    (
+        "cameras: {front: null}",
+        "workers: worker 'scripted': needs camera 'front', the profile has: wrist; add it to camer",
+    ),
+    (
+        "cameras: {front: {rate_hz: 1}}",
+        "worker 'scripted': camera 'front' gives a picture every 1.00 s, the spec allows none olde",
+    ),
+    ("models: {scripted: ./absent.py}", "models.scripted: there is no file or folder '{here}/abse"),
+    (
+        model("syntax.py"),
+        "models.m: {here}/syntax.py cannot be imported: SyntaxError: invalid",
+    ),
+    (
+        model("nothing.py"),
+        "nothing.py: wanted one class with a method infer, found: none; name",
+    ),
+    (
+        model("two.py"),
+        "two.py: wanted one class with a method infer, found: A, B; name the",
+    ),
+    (model("no_spec.py"), "no_spec.py: A needs a property `spec` (a vla_zenoh.policy.ModelSpec)"),
+    (
+        model("wide.py"),
+        "worker 'm': camera 'front' sends 640x480, the spec asks for 32x32 and",
+    ),
+    (
+        model("joints.py"),
+        "A cannot be made: ActionSpec is wrong: horizon: wants a whole number (given: '8'); kind: "
+        "'joint_position' is not an action of a model file: wants 'delta' or 'absolute' poses of",
+    ),
+    (
+        model("needs.py"),
+        "needs.py needs the option 'checkpoint': give checkpoint=VALUE, with",
+    ),
+    (
+        model("needs.py", "chekpoint: ./w"),
+        "options.m: {here}/needs.py has no option 'chekpoint'; did you mean 'checkpoint'? Its opti",
+    ),
+    (model("python.py", "size: '1'"), "python.py has no option 'size'. Its options: checkpoint"),
+    (
+        "workers: [scripted, openpi]\noptions: {openpi: {preset: libro}}",
+        "OpenPi cannot be made: preset is 'libro', allowed: libero, droid, own, none",
+    ),
+    (
+        "workers: [scripted, openvla]\noptions: {openvla: {chekpoint: ./weights}}",
+        "model.py has no option 'chekpoint'; did you mean 'checkpoint'? Its options: checkpoint, ",
+    ),
+    (
+        FIVE + model("posing.py"),
+        "worker 'm': robot 'panda' has 5 arm joints, a pose of the TCP needs six: it cannot go st",
+    ),
+    (ARM + "arm: {file: absent.py}", "lab.yaml:5: arm.file: there is no file {here}/absent.py"),
+    (ARM + "arm: {file: syntax.py}", "arm: {here}/syntax.py cannot be imported: SyntaxError"),
+    (ARM + "arm: {file: nothing.py}", "nothing.py: wanted one class with a method move, found: no"),
+    (
+        ARM + "arm: {file: arm.py, options: {prot: COM1}}",
+        "arm: {here}/arm.py: Arm has no option 'prot'; did you mean 'port'? Its options: port",
+    ),
+    (ARM + "arm: {file: blind_arm.py}", "blind_arm.py: Arm needs methods `read()` and `move(comm"),
+    (
+        ROS2 + "ros2: {pose_command: {topic: /goal, type: geometry_msgs/msg/PoseStmped}}",
+        "ros2: geometry_msgs/msg/PoseStmped is not a type of ROS 2 jazzy; did you mean 'geometry_m",
+    ),
+    (
+        ROS2 + "ros2: {pose_command: {topic: /goal, type: std_msgs/msg/String}}",
+        "ros2: std_msgs/msg/String has no field of type",
+    ),
+    (
+        ROS2 + f"ros2: {{{POSE}, messages: {{my_msgs/msg/A: absent.msg}}}}",
+        "ros2: ros2.messages.my_msgs/msg/A: {here}/absent.msg cannot be read",
+    ),
+    (
+        ROS2 + f"ros2: {{{POSE}, messages: {{my_msgs/msg/A: Bad.msg}}}}",
+        "ros2: my_msgs/msg/A.is is a my_msgs/msg/this, which is not known: give its text as well",
+    ),
+    (
+        "cameras: {front: {source: 'file:absent.mp4'}}",
+        "cameras.front.source: there is no file or folder {here}/absent.mp4",
+    ),
+    (
+        ELSEWHERE,
+        "lab.yaml:2: session.connect: leads to tcp/127.0.0.1:7448, and the router of this host "
+        "listens on tcp/127.0.0.1:7447: its nodes would not find it. Give both the same port",
+    ),
+    (
+        "hosts: {here: {nodes: [router, sim, command], connect: [tcp/127.0.0.1:9]}}",
+        "lab.yaml:2: hosts.here.connect: leads to tcp/127.0.0.1:9, and the router of this host",
+    ),
+    (
+        "session: {security: {folder: ./absent}, connect: [tls/127.0.0.1:7447], "
+        "listen: [tls/127.0.0.1:7447]}",
+        "session.security: ",
+    ),
+]
+
+BASE = """\
+extends: panda_sim
+workers: [scripted, second]
+models: {second: scripted}
+options: {second: {dt_s: "0.2"}}
+serves: {second: [panda, left]}
+task: {worker: second}
+ros2: {cameras: {wrist: {topic: /wrist}}}
+"""
+EXTENDED: list[tuple[str, str]] = [
+    # (text behind "extends: base", part of what is said): the extended file is not blamed
+    (
+        "workers: [scriptd]",
+        "lab.yaml:2: workers: lacks 'second', but task.worker ({here}/base.yaml:6) names it. List",
+    ),
+    (
+        "workers: [scripted, secnd]",
+        "lab.yaml:2: workers: lacks 'second', but task.worker ({here}/base.yaml:6) names it; is "
+        "'secnd' a slip for it? List it, or name another one there",
+    ),
+    (
+        "workers: [scripted]\ntask: {worker: scripted}",
+        "lab.yaml:2: workers: lacks 'second', but options.second ({here}/base.yaml:4) names it. "
+        "List it, or remove that too: options: {second: null}",
+    ),
+    (
+        "workers: [scripted]\ntask: {worker: scripted}",
+        "workers: lacks 'second', but models.second ({here}/base.yaml:3) names it. List it, or "
+        "remove that too: models: {second: null}",
+    ),
+    (
+        "workers: [scripted]\ntask: {worker: scripted}\nmodels: null\noptions: null",
+        "workers: lacks 'second', but serves.second ({here}/base.yaml:5) names it. List it, or re",
+    ),
+    (
+        "cameras: {wrist: null}",
+        "lab.yaml:2: cameras.wrist: is removed, but ros2.cameras.wrist ({here}/base.yaml:7) names "
+        "it: remove that too: ros2: {cameras: {wrist: null}}",
+    ),
+    (
+        "cameras: null",
+        "lab.yaml:2: cameras: leaves none for the node camera in hosts.here.nodes (",
+    ),
+    ("options: {third: {a: b}}", "lab.yaml:2: options.third: 'third' is not among workers. Known"),
+    ("task: {worker: first}", "lab.yaml:2: task.worker: 'first' is not among workers. Known: scri"),
+    ("cameras: {front: {depth: true}}", "cameras.front.depth: cameras give colour images only; de"),
 ]

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import WorkerError
+from vla_zenoh.errors import WorkerError, in_words
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -262,7 +262,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     try:
         return json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
-        raise WorkerError(f"{path} cannot be read: {error}; train and export a policy") from error
+        raise WorkerError(
+            f"{path} cannot be read: {in_words(error)}; train and export a policy"
+        ) from error
 
 
 def checked(folder: Path, name: str, sha256: dict[str, str]) -> bytes:
@@ -275,7 +277,7 @@ def checked(folder: Path, name: str, sha256: dict[str, str]) -> bytes:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise WorkerError(f"{path} cannot be read: {error}") from error
+        raise WorkerError(f"{path} cannot be read: {in_words(error)}") from error
     found = hashlib.sha256(content).hexdigest()
     if found != sha256.get(name):
         raise WorkerError(

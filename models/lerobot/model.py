@@ -39,7 +39,7 @@ from vla_zenoh_model_lerobot.mapping import (
     state_parts,
 )
 
-from vla_zenoh.errors import SpecError, WorkerError
+from vla_zenoh.errors import SpecError, WorkerError, in_words
 from vla_zenoh.interop.action_semantics import Forward, make_forward, read_action_semantics
 from vla_zenoh.policy import (
     ActionSteps,
@@ -164,9 +164,7 @@ class LeRobot:
                 postprocessor_overrides=overrides[PIPELINES[1]],
             )
         except Exception as error:  # LeRobot raises whatever its libraries do
-            raise WorkerError(
-                f"LeRobot cannot load {self._folder}: {type(error).__name__}: {str(error)[:500]}"
-            ) from error
+            raise WorkerError(f"LeRobot cannot load {self._folder}: {in_words(error)}") from error
         if self._meaning.needs_joints:
             self._forward = make_forward(self._profile)
         bad = [n for n, w in self.policy.named_parameters() if not torch.isfinite(w).all()]

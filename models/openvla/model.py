@@ -35,7 +35,7 @@ from vla_zenoh_model_openvla.picture import trained_form
 from vla_zenoh_model_openvla.statistics import AXES, Range, choose, read_range
 from vla_zenoh_model_openvla.tokens import PROMPTS, ActionBins, prompt_text, prompt_tokens
 
-from vla_zenoh.errors import SpecError, WorkerError
+from vla_zenoh.errors import SpecError, WorkerError, in_words
 from vla_zenoh.policy import ActionSteps, CameraSpec, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.policy.model_options import checkpoint_folder, one_of
 from vla_zenoh.policy.state_vector import parts_of, read_state, state_vector
@@ -154,7 +154,7 @@ class OpenVLA:
             torch.zeros(1, device=device)
         except Exception as error:  # tokenizers and torch raise plain Exception or AssertionError
             culprit = file if self._tokenizer is None else f"device {device!r}"
-            raise WorkerError(f"{culprit} cannot be used: {error}") from error
+            raise WorkerError(f"{culprit} cannot be used: {in_words(error)}") from error
         self._tokenizer.no_truncation()
         self._tokenizer.no_padding()
         network = load_network(

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from transformers import DynamicCache, LlamaConfig, LlamaForCausalLM
 from vla_zenoh_model_openvla.checkpoint import Backbone, Checkpoint
 
-from vla_zenoh.errors import WorkerError
+from vla_zenoh.errors import WorkerError, in_words
 
 PROJECTOR_GROWTH = 4
 """The first layer behind two eyes is so many times wider than what they see."""
@@ -90,7 +90,7 @@ def _encoder(backbone: Backbone) -> nn.Module:
             **backbone.arguments,
         )
     except (RuntimeError, TypeError, ValueError, AssertionError) as error:
-        raise WorkerError(f"timm cannot make {backbone.name!r}: {error}") from error
+        raise WorkerError(f"timm cannot make {backbone.name!r}: {in_words(error)}") from error
 
 
 class Projector(nn.Module):
@@ -122,7 +122,7 @@ class Network(nn.Module):
             text = LlamaConfig(**checkpoint.text)
             self.language_model = LlamaForCausalLM(text)
         except (RuntimeError, TypeError, ValueError) as error:
-            raise WorkerError(f"text_config of {checkpoint.folder}: {error}") from error
+            raise WorkerError(f"text_config of {checkpoint.folder}: {in_words(error)}") from error
         self.vision_backbone = Eyes(checkpoint.backbones)
         self.projector = Projector(
             self.vision_backbone.width, text.hidden_size, deep=len(checkpoint.backbones) > 1

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 from vla_zenoh_model_openvla.network import Network
 
-from vla_zenoh.errors import WorkerError
+from vla_zenoh.errors import WorkerError, in_words
 
 KINDS = ("none", "int8", "nf4")
 
@@ -37,7 +37,9 @@ def quantise(network: Network, kind: str) -> None:
                 if isinstance(layer, nn.Linear):
                     block.set_submodule(name, make(bitsandbytes, layer, dtype).to(device))
     except (RuntimeError, NotImplementedError) as error:
-        raise WorkerError(f"quantise={kind} does not work on {device}: {error}") from error
+        raise WorkerError(
+            f"quantise={kind} does not work on {device}: {in_words(error)}"
+        ) from error
     if device.type == "cuda":
         torch.cuda.empty_cache()
 

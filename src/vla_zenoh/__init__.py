@@ -10,6 +10,7 @@ The names below are the public ones. Each is imported when it is first used, so 
 only the libraries of what it runs.
 """
 
+from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -108,6 +109,24 @@ def __getattr__(name: str) -> Any:
     if module is None:
         raise AttributeError(f"module 'vla_zenoh' has no attribute {name!r}")
     return getattr(import_module(f"vla_zenoh.{module}"), name)
+
+
+def lazy_names(package: str, *modules: str) -> Callable[[str], Any]:
+    """A package's ``__getattr__``: imports the first of `modules` that has the name.
+
+    `vla_zenoh.types` and `vla_zenoh.profile` are such packages, so that a command which only drives
+    loads neither numpy nor the profile's schema. Light modules come first.
+    """
+
+    def find(name: str) -> Any:
+        # Names with underscores are asked for by Python itself; submodules are no names of ours.
+        for module in () if name.startswith("__") or name in modules else modules:
+            found = getattr(import_module(f"{package}.{module}"), name, find)
+            if found is not find:
+                return found
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+
+    return find
 
 
 def __dir__() -> list[str]:

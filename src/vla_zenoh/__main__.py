@@ -1,10 +1,13 @@
 """``python -m vla_zenoh``: the same as ``vla-zenoh``."""
 
-from vla_zenoh.runtime.parent_watch import die_with_parent
+import os
 
 if __name__ == "__main__":
-    die_with_parent()  # before what a node imports, which takes its time
+    if "VLA_ZENOH_PARENT" in os.environ:  # `parent_watch.PARENT_VARIABLE`; a stop has none
+        from vla_zenoh.runtime.parent_watch import die_with_parent
 
-    from vla_zenoh.cli.main import app_entry
+        die_with_parent()  # before what a node imports, which takes its time
 
-    app_entry()
+    from vla_zenoh.cli.entry import main
+
+    main()

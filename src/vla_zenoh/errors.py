@@ -141,6 +141,7 @@ _VALIDATION_WORDS = {
     "int_type": "wants a whole number",
     "int_from_float": "wants a whole number",
     "int_parsing": "wants a whole number",
+    "int_parsing_size": "has too many digits",
     "bool_type": "wants true or false",
     "bool_parsing": "wants true or false",
     "string_type": "wants text",

@@ -8,8 +8,10 @@ service. The members below are the whole wire protocol.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from vla_zenoh.errors import ProfileError
 
@@ -342,3 +344,33 @@ NO_DEADMAN_TOKEN = "is not there (a liveliness token on the key holding/NAME)"
 def worker_node(worker: str) -> str:
     """Node name of a worker."""
     return f"worker-{worker}"
+
+
+CRASHED, STARTING = "crashed", "starting"
+"""States in the status that `vla-zenoh up` publishes for a node of its host that does not run."""
+
+
+class NodeTraits(NamedTuple):
+    """A kind of node; its command is ``vla-zenoh node KIND``, or ``vla-zenoh worker``.
+
+    Args:
+        role: in a secured lab, a value of `vla_zenoh.security.identity.Role`.
+        stop_s: how long before its deadline `up` stops the next kinds; those with more stop first.
+        only_one: why a robot has no second one; empty: it may have several.
+    """
+
+    role: str
+    stop_s: float
+    only_one: str = ""
+
+
+NODE_KINDS: Mapping[str, NodeTraits] = {
+    "router": NodeTraits("router", 0.1),
+    "sim": NodeTraits("robot", 0.4, "there is one simulated robot"),
+    "ros2": NodeTraits("robot", 0.4, "the robot has one driver"),
+    "arm": NodeTraits("robot", 0.4, "the robot has one driver"),
+    "command": NodeTraits("command", 0.8, "the robot obeys one command node"),
+    "camera": NodeTraits("camera", 0.8),
+    "worker": NodeTraits("worker", 0.8),
+}
+"""Every kind of node, in the order in which `up` starts them."""

@@ -6,13 +6,13 @@ Looked through in this order, first hit wins: an explicit path, each folder in `
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
 from pathlib import Path
 
-from vla_zenoh.errors import MissingExtraError, ResourceError, nearest
+from vla_zenoh.errors import MissingExtraError, ProfileError, ResourceError, nearest
 
-KINDS = {"models": (".py", ""), "profiles": (".yaml", ".yml"), "sim": ("",)}
+PROFILE_SUFFIXES = (".yaml", ".yml")
+KINDS = {"models": (".py", ""), "profiles": PROFILE_SUFFIXES, "sim": ("",)}
 ONE = {"models": "model", "profiles": "profile", "sim": "scene"}
 SEARCH_PATH_VARIABLE = "VLA_ZENOH_PATH"
 ROBOT_DATA_PREFIX = "example-robot-data:"
@@ -82,6 +82,60 @@ def find(kind: str, name: str) -> Path:
     )
 
 
+def profile_file(name: str) -> Path:
+    """File of the profile `name`, which may be a path.
+
+    Raises:
+        ProfileError: not found; lists the profiles that exist.
+    """
+    try:
+        return find("profiles", name)
+    except ResourceError as error:
+        raise ProfileError(str(error)) from error
+    except (OSError, ValueError, RuntimeError) as error:  # too long, a NUL in it, an unknown ~user
+        raise ProfileError(f"{name[:80]!r} cannot be the name of a profile") from error
+
+
+def extended_profile(path: Path, parent: str) -> Path:
+    """File that the profile at `path` extends: beside it, or first on the search path.
+
+    A profile that extends its own name means the next one on the search path.
+
+    Raises:
+        ProfileError: there is none.
+    """
+    if parent == path.stem:
+        return _next(path, parent)
+    try:
+        names = (
+            [parent]
+            if Path(parent).suffix in PROFILE_SUFFIXES
+            else [parent + s for s in PROFILE_SUFFIXES]
+        )
+        for name in names:
+            if (path.parent / name).is_file():
+                return path.parent / name
+    except (OSError, ValueError) as error:
+        raise ProfileError(f"{parent[:80]!r} cannot be the name of a profile") from error
+    return profile_file(parent)
+
+
+def _next(path: Path, name: str) -> Path:
+    candidates = [
+        file
+        for folder in folders("profiles")
+        for suffix in PROFILE_SUFFIXES
+        if (file := folder / f"{name}{suffix}").is_file()
+    ]
+    own = [index for index, file in enumerate(candidates) if file.samefile(path)]
+    after = candidates[own[0] + 1 :] if own else candidates
+    if not after:
+        raise ProfileError(
+            f"{name!r} is this file, and no other profile of that name comes after it"
+        )
+    return after[0]
+
+
 def robot_urdf(description: str) -> Path:
     """The URDF a profile names: a path, or ``example-robot-data:<path below robots/>``.
 
@@ -108,6 +162,8 @@ def robot_urdf(description: str) -> Path:
 
 def _robot_data() -> Path | None:
     """Where the robots are: beside the package, which in a layered environment is in any layer."""
+    import importlib.metadata  # here alone: it takes 45 ms
+
     try:
         package = importlib.metadata.distribution("example-robot-data")
     except importlib.metadata.PackageNotFoundError:

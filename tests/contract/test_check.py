@@ -41,7 +41,7 @@ ERRORS = {
     "load": ("load_failed", "weights.safetensors"),
     "spec": ("spec_changed", "declare it in __init__"),
     "key": ("normalisation", "'bridge', the weights came with: libero_goal, libero_spatial"),
-    "reset": ("reset_failed", "KeyError: 'episode'"),
+    "reset": ("reset_failed", "KeyError: there is no 'episode'"),
     "raises": ("inference_failed", "colour chart: RuntimeError: device-side assert"),
     "writes": ("inference_failed", "read-only"),
     "prompt": ("inference_failed", "a strange prompt: UnicodeEncodeError"),

@@ -219,7 +219,7 @@ def test_a_directory_that_cannot_be_run_is_refused(
 
 
 def test_a_directory_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(WorkerError, match="is not a folder"):
+    with pytest.raises(WorkerError, match="is not there, wanted a folder"):
         make_policy(find_model("lerobot"), {"checkpoint": str(tmp_path / "nowhere")})
     with pytest.raises(WorkerError, match=r"--set checkpoint=DIRECTORY"):
         make_policy(find_model("lerobot"))

@@ -340,7 +340,7 @@ def test_a_config_that_is_not_of_openvla_is_refused(
 
 
 def test_a_directory_that_is_something_else_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(WorkerError, match="is not a folder"):
+    with pytest.raises(WorkerError, match="is not there, wanted a folder"):
         make(tmp_path / "nowhere")
     with pytest.raises(WorkerError, match=r"holds no config.json"):
         make(tmp_path)

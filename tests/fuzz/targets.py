@@ -22,7 +22,7 @@ import typer
 from model_wires import groot, npy, openpi, openvla_rest, origami
 
 from vla_zenoh.bus.clock_sync import decode_stamps
-from vla_zenoh.cli import status as cli_status
+from vla_zenoh.cli import status_table as cli_status
 from vla_zenoh.cli.options import model_options, number_list
 from vla_zenoh.cli.output import Screen, plain_types
 from vla_zenoh.codec import image, message, records, settings

@@ -93,7 +93,7 @@ def test_a_model_that_raises_fails_its_episode_and_its_words_are_told(tmp_path: 
     (tmp_path / "nod.py").write_text(text)
     ends = outcomes(TaskPlan("nod", 2, SEED, limit_s=LIMIT_S), str(tmp_path / "nod.py"))
     assert [end.failure for end in ends] == ["not_obeyed"] * 2
-    assert ends[0].why == "the model failed: KeyError: 'front'"
+    assert ends[0].why == "the model failed: KeyError: there is no 'front'"
 
 
 @pytest.mark.slow

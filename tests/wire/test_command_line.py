@@ -40,14 +40,18 @@ def test_a_session_from_prompt_to_reset(chain: Chain) -> None:
     assert "'fast' is no percentage" in run(chain, "speed", "fast").stderr
     ok(chain, "speed", "100")
 
-    assert "worker: nobody" in ok(chain, "use", "nobody")
+    refused = run(chain, "use", "scripter")
+    assert refused.returncode == REFUSED
+    assert "worker 'scripter' is not alive; did you mean 'scripted'?" in refused.stderr
+    assert "Alive are: scripted" in refused.stderr
+    chain.client.set_worker("nobody")
     refused = run(chain, "activate")
     assert refused.returncode == REFUSED
     assert "activate rejected:" in refused.stderr
     assert "- worker 'nobody' is not alive; alive are: scripted" in refused.stderr
     ok(chain, "use", "scripted")
 
-    assert "active: worker scripted, prompt 'HARD: go up', 5 Hz" in ok(chain, "activate")
+    assert "SIM | active: worker scripted, prompt 'HARD: go up', 5 Hz" in ok(chain, "activate")
     chain.until("it moves", chain.moves)
     assert "inactive, the arm stands: robot panda" in ok(chain, "deactivate")
     assert not chain.moves()
@@ -64,12 +68,16 @@ def test_a_session_from_prompt_to_reset(chain: Chain) -> None:
 
 
 def test_status_as_json_tells_of_every_node(chain: Chain) -> None:
-    found = json_of(chain, "status", "--json")
+    told = json_of(chain, "status", "--json")
+    assert (told["robot"], told["mode"]) == ("panda", "sim")
+    assert (told["limits"], told["hosts_down"]) == ([], {})
+    found = told["nodes"]
     assert set(found) == {"router", "sim", "camera", "command", "worker-scripted"}
     pids = chain.host.supervisor.pids()
     for name, status in found.items():
         assert status["node"] == name
         assert status["alive"] is True
+        assert status["why"] == ""
         assert status["pid"] == pids[name]
         assert 0 <= status["age_s"] < 1.5
     assert found["command"]["state"] == "inactive"

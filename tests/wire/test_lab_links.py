@@ -17,7 +17,7 @@ from camera_rig import camera_rig, free_endpoint, grey, until
 from vla_zenoh.bus.buffers import LatestSample
 from vla_zenoh.bus.clock_sync import MAX_HEARD
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.session import open_session
+from vla_zenoh.bus.session import open_session, second_link
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_not_to_activate
 from vla_zenoh.keys import Kind
@@ -28,7 +28,6 @@ from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.policy.observation import host_variant, prepare_image, size_variant
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.profile.schema import CameraProfile, HostImagesProfile, HostProfile
-from vla_zenoh.profile.session import second_link
 from vla_zenoh.security.roles import Act
 from vla_zenoh.security.rules import access_control
 from vla_zenoh.types import Header, Image, Stamped, Task

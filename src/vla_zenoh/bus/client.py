@@ -9,20 +9,22 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import zenoh
 
 from vla_zenoh.bus.buffers import bytes_of, header_of
 from vla_zenoh.bus.node_registry import MAX_STATUS_BYTES, NodeRegistry
-from vla_zenoh.bus.session import QOS
+from vla_zenoh.bus.session import put_text
 from vla_zenoh.codec import records, settings
 from vla_zenoh.codec.settings import encode_deadman_activation
 from vla_zenoh.errors import CodecError, SessionError
-from vla_zenoh.keys import NO_DEADMAN_TOKEN, Kind, last_chunk
-from vla_zenoh.profile import Profile
-from vla_zenoh.security.identity import identities
+from vla_zenoh.keys import NO_DEADMAN_TOKEN, last_chunk
+from vla_zenoh.security.identity import expected_nodes, identities
 from vla_zenoh.types import Event, Header, NodeStatus, Task
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile import Profile
 
 Value = TypeVar("Value")
 POLL_S, HOLD_PATIENCE_S = 0.02, 1.0
@@ -49,12 +51,16 @@ class Client:
     Args:
         profile: of the robot.
         session: open session.
+
+    Attributes:
+        expected: nodes that the profile assigns to hosts, each with its host.
     """
 
     def __init__(self, profile: Profile, session: zenoh.Session) -> None:
         self.profile, self.session, self.keys = profile, session, profile.keys
         self._lock = threading.Lock()
         self._nodes = NodeRegistry(one.node for one in identities(profile))
+        self.expected = expected_nodes(profile)
         self.events: deque[tuple[str, Header, Event]] = deque(maxlen=MAX_EVENTS)
         self.task: Task | None = None
         self._task_heard_s = -1e9
@@ -171,7 +177,7 @@ class Client:
     # -- settings -----------------------------------------------------------------------------
     def publish(self, key: str, text: str) -> None:
         """Put plain text on a key, as any Zenoh client could."""
-        self.session.put(key, text, encoding=zenoh.Encoding.TEXT_PLAIN, **QOS[Kind.ORDER])
+        put_text(self.session, key, text)
 
     def set_prompt(self, prompt: str, timeout_s: float = 2.0) -> Task:
         """Set the prompt, and wait until the command node has accepted it.

@@ -7,10 +7,12 @@ import socket
 import time
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from vla_zenoh.keys import key_chunk
-from vla_zenoh.profile import SessionProfile
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile import SessionProfile
 
 ADOPT_S = 0.005
 """A smaller difference to the system's wall clock is slewing, and is followed silently."""

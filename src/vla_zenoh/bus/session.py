@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 import time
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import zenoh
 
 from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.keys import Keys, Kind, last_chunk
-from vla_zenoh.profile import SessionProfile
-from vla_zenoh.profile.session import SecurityProfile, second_link
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile import SessionProfile
+    from vla_zenoh.profile.session import SecurityProfile
 
 Mode = Literal["client", "router"]
 """No peers: a router does not forward between them."""
@@ -115,6 +118,13 @@ def _listening(profile: SessionProfile) -> list[str]:
     return [link for endpoint in profile.listen for link in (endpoint, second_link(endpoint))]
 
 
+def second_link(endpoint: str) -> str:
+    """The same endpoint at the next port, for images on a link of their own."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.rpartition(":")
+    return f"{protocol}/{host}:{int(port) + 1}"
+
+
 def _tls(security: SecurityProfile, identity: str | None, routes: bool) -> dict[str, Any]:
     from vla_zenoh.security.store import Store
 
@@ -176,14 +186,19 @@ def open_session(
             raise _explain(settings, error) from error
 
 
+_RUST_PLACE = re.compile(r"\.? at \S+\.rs:\d+\.?")
+"""Where in Zenoh's source an error was raised, on the computer that built it."""
+
+
 def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
     if settings["mode"] == "router":
         where = ", ".join(settings["listen"]["endpoints"])
         if "access_control" in settings and "Access control" in str(error):
             return SessionError(f"the router rejects its access control rules: {error}")
         return SessionError(
-            f"the router cannot listen on {where}: {error}. Is another program using that address? "
-            "Run `vla-zenoh doctor`, or choose another address with --listen or session.listen"
+            f"the router cannot listen on {where}: {_RUST_PLACE.sub('', str(error))}. Is another "
+            "program using that address? Run `vla-zenoh doctor`, or choose another address with "
+            "--listen or session.listen"
         )
     where = ", ".join(settings["connect"]["endpoints"])
     tls = settings["transport"]["link"].get("tls")
@@ -197,6 +212,11 @@ def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
         f"no Zenoh router answers at {where}. Start one with `vla-zenoh node router`, or all "
         "nodes with `vla-zenoh up`; set another address with --connect or session.connect"
     )
+
+
+def put_text(session: zenoh.Session, key: str, text: str) -> None:
+    """Put plain text on a setting's key, as any Zenoh client could."""
+    session.put(key, text, encoding=zenoh.Encoding.TEXT_PLAIN, **QOS[Kind.ORDER])
 
 
 PATIENCE_S, ATTEMPTS = 1.0, 5

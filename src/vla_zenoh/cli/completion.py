@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 def _profile(context: Any) -> Any:
     """The profile on the command line, else that of the environment, else the default."""
-    from vla_zenoh.cli.options import DEFAULT_PROFILE, PROFILE_VARIABLE
+    from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE
     from vla_zenoh.errors import VlaZenohError
     from vla_zenoh.profile import load_profile
 

@@ -1,38 +1,41 @@
-"""vla-zenoh prompt, activate, deactivate, use, rate, speed, stop, reset: one setting each."""
+"""vla-zenoh prompt, activate, deactivate, use, rate, speed, stop, reset: one setting each.
+
+Typer, Rich, numpy and the profile's schema are not loaded here, see ``words.py``.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
-import typer
-
-from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.session import alive_robots
-from vla_zenoh.cli.options import options
-from vla_zenoh.cli.output import complain, console, errors, fail, styled
+from vla_zenoh.cli.plain import BOLD_RED, complain, fail, say, say_marked, warn
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.codec.settings import decode_name, decode_percent, decode_rate, decode_text
-from vla_zenoh.errors import SecurityError
-from vla_zenoh.keys import Keys
-from vla_zenoh.profile import as_robot
-from vla_zenoh.runtime.process import stop_on_signals
-from vla_zenoh.types import Task
+from vla_zenoh.errors import SecurityError, nearest
+from vla_zenoh.keys import CRASHED, Keys, worker_node
+
+if TYPE_CHECKING:
+    import typer
+
+    from vla_zenoh.bus.client import Client
+    from vla_zenoh.profile import Profile
+    from vla_zenoh.types import Task
 
 PATIENCE_S = 3.0
 DISCOVERY_S, POLL_S = 1.0, 0.05
 """A router's first answers may lack robots that are alive: `stop --all` asks for this long."""
+MODE_PATIENCE_S = 1.0
 ABSENT_PATIENCE_S = 1.5
 """A command node that is alive may take this long to appear."""
 
 
-@options
 def prompt(
     text: Annotated[str, typer.Argument(help="What the model shall do.")], target: RobotTarget
 ) -> None:
     """Set the prompt. Any Zenoh client can: put the text on <root>/<robot>/prompt."""
+    from vla_zenoh.codec.settings import decode_text
+
     decode_text(text.encode())  # rejects it before a router is asked
     with target.operator("prompt", text) as client:
         task = client.set_prompt(text)
@@ -43,7 +46,6 @@ def prompt(
         )
 
 
-@options
 def activate(
     target: RobotTarget,
     held: Annotated[
@@ -53,27 +55,40 @@ def activate(
 ) -> None:
     """Let the worker move the arm. Rejected with every reason while something is not ready."""
     with target.operator("activate") as client:
-        stop = stop_on_signals() if held else None
+        stop = _stop_on_signals() if held else None
         task = client.activate() if stop is None else client.activate_with_deadman("person")
         _show(
             target,
             client,
-            f"active: worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz",
+            f"{_mode(client)} | active: worker {task.worker}, prompt {task.prompt!r}, "
+            f"{task.rate_hz:g} Hz",
         )
         if stop is not None:
             _hold(target, client, task, stop)
 
 
+def _mode(client: Client) -> str:
+    """SIM, DRY RUN or LIVE, which stands in front of what says that the arm moves."""
+    from vla_zenoh.cli.node_rows import MODE_WORDS, mode_of
+
+    client.wait_for(lambda: client.status("command"), MODE_PATIENCE_S)
+    return MODE_WORDS[mode_of(client.snapshot())][0]
+
+
+def _stop_on_signals() -> threading.Event:
+    from vla_zenoh.runtime.process import stop_on_signals
+
+    return stop_on_signals()
+
+
 def _hold(target: RobotTarget, client: Client, activated: Task, stop: threading.Event) -> None:
     """Wait until the arm is inactive; Ctrl-C brakes it."""
-    console().print(
-        "The arm stays active while this command runs; Ctrl-C, or losing this process, brakes it."
-    )
+    say("The arm stays active while this command runs; Ctrl-C, or losing this process, brakes it.")
     while not stop.wait(POLL_S):
         if why := _inactive(client, activated):
             fail(f"the arm is no longer active: {why}; {target.named(client)}")
     _deactivate(target, client)
-    raise typer.Exit(130)
+    raise SystemExit(130)
 
 
 def _inactive(client: Client, activated: Task) -> str:
@@ -89,7 +104,6 @@ def _inactive(client: Client, activated: Task) -> str:
     return str(status.detail.get("why", "")) or status.state
 
 
-@options
 def deactivate(target: RobotTarget) -> None:
     """Brake the arm; then no worker moves it."""
     with target.client(stop=True) as client:
@@ -102,28 +116,44 @@ def _deactivate(target: RobotTarget, client: Client) -> None:
     _show(target, client, "inactive, the arm stands", ": ")
 
 
-@options
 def use(
     worker: Annotated[str, typer.Argument(help="Worker whose chunks move the arm.")],
     target: RobotTarget,
 ) -> None:
     """Select the worker that moves the arm; the others keep running."""
+    from vla_zenoh.codec.settings import decode_name
+
     decode_name(worker.encode())
     with target.operator("use", worker) as client:
+        _require_worker(client, worker)
         _show(target, client, f"worker: {client.set_worker(worker).worker}")
 
 
-@options
+def _require_worker(client: Client, worker: str) -> None:
+    """End with the workers that are alive where `worker` is not: it may be mistyped."""
+    found = client.wait_for(lambda: worker_node(worker) in client.alive, ABSENT_PATIENCE_S)
+    if not found and "command" in client.alive:  # otherwise that is said
+        named = worker_node("")
+        alive = sorted(name[len(named) :] for name in client.alive if name.startswith(named))
+        said = client.status(worker_node(worker))
+        crashed = said is not None and said.state == CRASHED
+        why = (
+            f": {said.detail.get('complaint', '')}." if said and crashed else nearest(worker, alive)
+        )
+        fail(f"worker {worker!r} is not alive{why} Alive are: {', '.join(alive) or 'none'}")
+
+
 def rate(
     rate_hz: Annotated[float, typer.Argument(help="Chunks per second.")], target: RobotTarget
 ) -> None:
     """Set how often the workers infer."""
+    from vla_zenoh.codec.settings import decode_rate
+
     decode_rate(f"{rate_hz:g}".encode())
     with target.operator("rate", f"{rate_hz:g}") as client:
         _show(target, client, f"rate: {client.set_rate(rate_hz).rate_hz:g} Hz")
 
 
-@options
 def speed(
     target: RobotTarget,
     percent: Annotated[
@@ -132,6 +162,8 @@ def speed(
     ] = None,
 ) -> None:
     """Slow the arm down on the same path. Lowering needs only the right to stop."""
+    from vla_zenoh.codec.settings import decode_percent
+
     wanted = None if percent is None else decode_percent(percent.encode())
     with target.client(stop=wanted is not None) as client:
         task = client.wait_for(lambda: client.task, PATIENCE_S)
@@ -151,28 +183,40 @@ def _show_speed(target: RobotTarget, client: Client, task: Task) -> None:
     _show(target, client, f"speed: {task.speed_percent:g} % of what is planned")
 
 
-@options
 def stop(
     target: RobotTarget,
     every: Annotated[
         bool, typer.Option("--all", help="Every robot that is visible on this router.")
     ] = False,
+    wait_key: Annotated[
+        bool,
+        typer.Option(
+            "--wait-key", help="Stay: every key stops the robot, and so does leaving (Ctrl-C)."
+        ),
+    ] = False,
 ) -> None:
     """Emergency stop: brake now and stay stopped until `vla-zenoh reset`."""
-    with target.client(stop=True) as client:
-        client.stop()
-        if every:
-            _stop_all(target, client)
-            return
-        if not _stops(client):
-            _fail(target, client, "stop", "confirm that it stopped")
-        _show_stopped(target, client, client.profile.robot.name)
-        if others := target.others(client):
-            more = f"not stopped: {', '.join(others)}; `{target.typed('stop', '--all')}` stops all"
-            errors().print(styled(more, "yellow"), soft_wrap=True)
+    if wait_key:
+        from vla_zenoh.cli.stop_key import stop_by_key
+
+        stop_by_key(target, lambda client: confirm_stop(target, client, every=every))
+        return
+    with target.client(stop_now=True) as client:
+        confirm_stop(target, client, every=every)
 
 
-@options
+def confirm_stop(target: RobotTarget, client: Client, *, every: bool) -> None:
+    """Stop the others too if wanted, and wait for the confirmation."""
+    if every:
+        _stop_all(target, client)
+        return
+    if not _stops(client):
+        _fail(target, client, "stop", "confirm that it stopped")
+    _show_stopped(target, client, client.profile.robot.name)
+    if others := target.others(client):
+        warn(f"not stopped: {', '.join(others)}; `{target.typed('stop', '--all')}` stops all")
+
+
 def reset(target: RobotTarget) -> None:
     """Clear an emergency stop or a fault. The arm stays inactive."""
     with target.operator("reset") as client:
@@ -218,6 +262,9 @@ def _fail(target: RobotTarget, client: Client, command: str, what: str) -> NoRet
 
 
 def _stop_all(target: RobotTarget, own: Client) -> None:
+    from vla_zenoh.bus.client import Client
+    from vla_zenoh.bus.session import alive_robots
+
     robots: list[str] = []
     give_up = time.monotonic() + DISCOVERY_S
     while time.monotonic() < give_up:
@@ -229,7 +276,7 @@ def _stop_all(target: RobotTarget, own: Client) -> None:
     if not robots:
         why = target.not_operator(own.profile, "stop")
         fail(f"no robot is visible on this router. {why}".rstrip(". "))
-    clients = [Client(as_robot(own.profile, robot), own.session).subscribe() for robot in robots]
+    clients = [Client(_named(own.profile, robot), own.session).subscribe() for robot in robots]
     done = [_stops(client) for client in clients]
     for client, stopped in zip(clients, done, strict=True):
         if stopped:
@@ -240,16 +287,16 @@ def _stop_all(target: RobotTarget, own: Client) -> None:
         fail(target.not_operator(own.profile, "stop", "--all") or "not every robot has stopped")
 
 
+def _named(profile: Profile, robot: str) -> Profile:
+    """The profile of another robot, as far as a client reads it."""
+    return profile.model_copy(update={"robot": profile.robot.model_copy(update={"name": robot})})
+
+
 def _show_stopped(target: RobotTarget, client: Client, own: str) -> None:
     robot = client.keys.robot
     how = target.typed("reset", robot=None if robot == own else robot)
-    console().print(
-        styled("stopped", "bold red"),
-        f": {target.named(client)}; `{how}` clears it",
-        sep="",
-        soft_wrap=True,
-    )
+    say_marked("stopped", BOLD_RED, f": {target.named(client)}; `{how}` clears it")
 
 
 def _show(target: RobotTarget, client: Client, text: str, separator: str = ", ") -> None:
-    console().print(f"{text}{separator}{target.named(client)}", soft_wrap=True)
+    say(f"{text}{separator}{target.named(client)}")

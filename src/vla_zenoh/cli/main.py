@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-import sys
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
-from typing import Any, NamedTuple, NoReturn
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import typer
 import zenoh
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from vla_zenoh import __version__
-from vla_zenoh.errors import VlaZenohError, describe_fault, how_to_install
+from vla_zenoh.cli.words import WORDS
+from vla_zenoh.errors import describe_fault
 
-EXTRA_OF = {
-    "pinocchio": "control",
-    "ruckig": "control",
-    "mujoco": "sim",
-    "matplotlib": "sim",
-    "av": "sim",
-    "mcap": "record",
-    "plotly": "record",
-    "jinja2": "record",
-    "rosbags": "record",
-    "rerun": "view",
-}
-"""Module -> extra that brings it, for the error of a missing import."""
 NODES = frozenset({"up", "worker", "node"})
 """Commands that write a log; Zenoh's own log belongs into it."""
 
@@ -141,6 +130,10 @@ def _load(path: Sequence[str], entry: str | Group) -> Any:
     else:
         module, _, attribute = entry.partition(":")
         found = getattr(import_module(f"vla_zenoh.{module}"), attribute)
+        if name in WORDS:  # their modules do not load Typer
+            from vla_zenoh.cli.options import options
+
+            found = options(found)
     around = typer.Typer(rich_markup_mode=None, add_completion=False)
     around.callback()(lambda: None)  # makes it a group even with a single command
     if isinstance(found, typer.Typer):
@@ -157,6 +150,20 @@ def _load(path: Sequence[str], entry: str | Group) -> Any:
     return command
 
 
+def _short_help(entry: str) -> str | None:
+    """Line of a command in the help of its group, from its source: importing all takes 0.5 s.
+
+    None: it is not found there.
+    """
+    from vla_zenoh.cli.help import MAX_SHORT
+
+    module, _, name = entry.partition(":")
+    file = Path(__file__).parents[1].joinpath(*module.split(".")).with_suffix(".py")
+    says = rf'(?:def {name}\(.*?^    """|{name} = typer\.Typer\([^)]*?help="\s*)(.*?)"'
+    found = re.search(f"^{says}", file.read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    return TyperCommand(None, help=found[1]).get_short_help_str(MAX_SHORT) if found else None
+
+
 def _lazy_group(
     panels: Mapping[str, Mapping[str, str | Group]], path: Sequence[str] = ()
 ) -> type[TyperGroup]:
@@ -170,8 +177,13 @@ def _lazy_group(
             for title, names in panels.items():
                 with formatter.section(title):
                     formatter.write_dl(
-                        [(f"{name:<{width}}", self.commands[name].short_help) for name in names]
+                        (f"{name:<{width}}", self._line(name, entry))
+                        for name, entry in names.items()
                     )
+
+        def _line(self, name: str, entry: str | Group) -> str:
+            line = entry.help if isinstance(entry, Group) else _short_help(entry)
+            return line or self.commands[name].short_help
 
         def invoke(self, ctx: Any) -> Any:
             try:
@@ -215,29 +227,3 @@ def _main(
 ) -> None:
     # Zenoh logs to stdout, where the other commands write what a script reads.
     zenoh.init_log_from_env_or("error" if context.invoked_subcommand in NODES else "off")
-
-
-def app_entry() -> None:
-    """Run the command line. Errors of this package become one line and exit code 1."""
-    try:
-        app()
-    except VlaZenohError as error:
-        _fail(str(error))
-    except ImportError as error:
-        extra = EXTRA_OF.get((error.name or "").partition(".")[0])
-        if extra is None and ".so" not in str(error):
-            raise
-        _fail(
-            f"{error}; install it with: {how_to_install(extra)}"
-            if extra
-            else f"{error}; `vla-zenoh doctor` names the system package"
-        )
-    except KeyboardInterrupt:
-        sys.exit(130)
-
-
-def _fail(message: str) -> NoReturn:
-    from vla_zenoh.cli.output import complain
-
-    complain(message)
-    sys.exit(1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, get_type_hints
@@ -12,11 +13,9 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from vla_zenoh.bus.clock import HOST_VARIABLE
+from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE
 from vla_zenoh.policy.loader import ConstructorOptions, ModelFile, find_worker
 from vla_zenoh.profile import Profile, load_profile, override
-
-DEFAULT_PROFILE = "panda_sim"
-PROFILE_VARIABLE = "VLA_ZENOH_PROFILE"
 
 ProfileOption = Annotated[
     str,
@@ -61,16 +60,20 @@ def options(command: Callable[..., None]) -> Callable[..., None]:
 
     Typer reads options from a function's signature. A parameter annotated with a dataclass is
     replaced there by the fields of that dataclass, in their order; the command is called with the
-    instance made of their values. Fields are annotated as parameters of a Typer command are.
+    instance made of their values. Fields are annotated as parameters of a Typer command are. The
+    annotations may use Typer and the options of this module where theirs does not import them.
     """
-    hints = get_type_hints(command, include_extras=True)
+    ours = {**globals(), "typer": typer}
+    hints = get_type_hints(command, {**ours, **command.__globals__}, include_extras=True)
     groups: dict[str, Any] = {
         name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)
     }
     parameters: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command).parameters.items():
         if name in groups:
-            parameters += inspect.signature(groups[name], eval_str=True).parameters.values()
+            names = {**ours, **vars(sys.modules[groups[name].__module__])}
+            signature = inspect.signature(groups[name], eval_str=True, globals=names)
+            parameters += signature.parameters.values()
         else:
             parameters.append(parameter.replace(annotation=hints[name]))
     # Keyword only: a field without a default may follow one that has one.

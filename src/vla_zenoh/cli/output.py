@@ -13,10 +13,9 @@ import math
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
-import typer
 from pydantic import BaseModel
 from rich import box
 from rich.cells import cell_len
@@ -27,6 +26,8 @@ from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
+from vla_zenoh.cli.plain import complain as complain
+from vla_zenoh.cli.plain import fail as fail
 from vla_zenoh.sanitize import printable
 
 ENDLESS = 100_000
@@ -168,17 +169,6 @@ def progress(doing: str) -> Status:
 def print_json(value: Any) -> None:
     """Print `value` as indented JSON on stdout, without colours; see `plain_types`."""
     print(json.dumps(plain_types(value), indent=2))
-
-
-def complain(message: str) -> None:
-    """Print ``error: message`` on stderr."""
-    errors().print(Text.assemble(("error: ", "bold red"), printable(message)), soft_wrap=True)
-
-
-def fail(message: str, code: int = 1) -> NoReturn:
-    """Print ``error: message`` on stderr and exit with `code`."""
-    complain(message)
-    raise typer.Exit(code)
 
 
 def plain_types(value: Any) -> Any:

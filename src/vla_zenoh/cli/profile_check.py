@@ -27,7 +27,7 @@ from vla_zenoh.policy import ModelSpec
 from vla_zenoh.policy.loader import ConstructorOptions, find_worker, inspect_robot, make_policy
 from vla_zenoh.profile import POSE_JOINTS, Profile, load_with_lines
 from vla_zenoh.profile.advice import advice
-from vla_zenoh.profile.section import Place, located
+from vla_zenoh.profile.section import Place, located, own_place
 from vla_zenoh.profile.session import ends_at
 
 LONG_BRAKE_S = 2.5
@@ -55,11 +55,13 @@ class _Found(NamedTuple):
         place: in the profile.
         why: continues ``PLACE: ``.
         node: the node that fails, as kind or worker; "": no computer can run this profile.
+        other: place that contradicts it, and is named where only that is in the checked file.
     """
 
     place: Place
     why: str
     node: str = ""
+    other: Place | None = None
 
 
 def check_profile(
@@ -92,9 +94,10 @@ def check_profile(
     errors: list[str] = []
     hints = advice(profile)
     for check in CHECKS:
-        for place, why, node in check(profile, name, host):
+        for place, why, node, other in check(profile, name, host):
             if not node or node in here:
-                errors.append(located(place, why, lines))
+                places = [place, *([other] if other else [])]
+                errors.append(located(own_place(places, lines), why, lines))
             else:
                 hints.append(f"{'.'.join(place)}: on this computer: {why}")
     hints += [*_joints(profile), *_braking(profile)]
@@ -145,8 +148,10 @@ def _arm(profile: Profile, name: str, host: str | None) -> Iterator[_Found]:
         box = profile.limits.workspace
         yield _Found(
             ("robot", "home_rad"),
-            f"puts the TCP at ({where}) m, {outside_m:.3f} m outside limits.workspace x {box.x_m} "
-            f"y {box.y_m} z {box.z_m}: the simulated arm starts there and could not be activated",
+            f"with robot.home_rad the TCP is at ({where}) m, {outside_m:.3f} m outside "
+            f"limits.workspace x {box.x_m} y {box.y_m} z {box.z_m}: the simulated arm starts there "
+            "and could not be activated",
+            other=("limits", "workspace"),
         )
 
 
@@ -227,9 +232,10 @@ def _not_simulated(profile: Profile, error: VlaZenohError) -> Iterator[_Found]:
     except (ValueError, VlaZenohError):
         return  # `_arm` says so
     yield _Found(
-        ("robot", "driver"),
-        f"is sim, and the simulator cannot build {urdf.name}: {error}. It simulates the Franka "
-        "Panda (extends: panda_sim); a real arm of another kind has driver arm or ros2",
+        ("robot", "description"),
+        f"the simulator (robot.driver: sim) cannot build {urdf.name}: {error}. It simulates the "
+        "Franka Panda (extends: panda_sim); a real arm of another kind has driver arm or ros2",
+        other=("robot", "driver"),
     )
 
 

@@ -7,26 +7,24 @@ import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import typer
 import zenoh
 
-from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.session import alive_robots, open_session
-from vla_zenoh.cli.options import (
-    DEFAULT_PROFILE,
-    PROFILE_VARIABLE,
-    ConnectOption,
-    HostOption,
-    ProfileOption,
-    effective_profile,
-)
-from vla_zenoh.cli.output import errors, styled
+from vla_zenoh.bus.session import open_session, put_text
+from vla_zenoh.cli.plain import warn
+from vla_zenoh.cli.profile_cache import cached_profile
+from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE
 from vla_zenoh.errors import SecurityError, SessionError
-from vla_zenoh.profile import Profile, as_robot
 from vla_zenoh.security.identity import Role, operator_role
 from vla_zenoh.security.store import local_role, operator_hosts
+
+if TYPE_CHECKING:  # Typer and the schema: the words that drive go without them
+    import typer
+
+    from vla_zenoh.bus.client import Client
+    from vla_zenoh.cli.options import ConnectOption, HostOption, ProfileOption
+    from vla_zenoh.profile import Profile
 
 
 @dataclass(frozen=True)
@@ -72,31 +70,45 @@ class RobotTarget:
         Raises:
             ProfileError: the profile is invalid.
         """
-        return self._choices(stop=False)[0]
+        return _choices(self._load(), stop=False)[0]
 
-    def _choices(self, *, stop: bool) -> list[Profile]:
-        """The profile with each certificate that this computer has for a person, best first."""
+    def _load(self) -> Profile:
+        from vla_zenoh.cli.options import effective_profile
+        from vla_zenoh.profile import as_robot
+
         profile = effective_profile(self.profile, self.connect, host=self.host)
-        if self.robot is not None:
-            profile = as_robot(profile, self.robot)
-        hosts = operator_hosts(profile, stop=stop)
-        return [_with_host(profile, host) for host in hosts] or [profile]
+        return profile if self.robot is None else as_robot(profile, self.robot)
+
+    def outline(self) -> Profile:
+        """As `load`, from what is known of the unchanged files where it was loaded before.
+
+        Its sections are read; it is no `Profile` of pydantic.
+        """
+        return cached_profile(
+            self.profile, (list(self.connect or ()), self.host, self.robot), self._load
+        )
 
     # -- sessions -----------------------------------------------------------------------------
     @contextmanager
-    def client(self, *, stop: bool = False) -> Iterator[Client]:
-        """A connected client that already knows the nodes.
+    def client(self, *, stop: bool = False, stop_now: bool = False) -> Iterator[Client]:
+        """A connected client that is about to know the nodes.
 
         Args:
             stop: prefer a certificate that may stop the robot, and try every one.
+            stop_now: put the emergency stop before anything else; includes `stop`.
 
         Raises:
             ProfileError: the profile is invalid.
             SecurityError: there is no certificate for a person.
             SessionError: no router answers.
         """
-        profile, session = _first(self._choices(stop=stop)[: None if stop else 1])
+        stop = stop or stop_now
+        profile, session = _first(_choices(self.outline(), stop=stop)[: None if stop else 1])
         with session:
+            if stop_now:
+                put_text(session, profile.keys.stop, "stop")
+            from vla_zenoh.bus.client import Client  # after the stop: it takes 20 ms to load
+
             yield Client(profile, session).subscribe()
 
     @contextmanager
@@ -141,6 +153,8 @@ class RobotTarget:
 
     def others(self, client: Client) -> list[str]:
         """Other robots whose command node is alive."""
+        from vla_zenoh.bus.session import alive_robots
+
         return [
             name for name in alive_robots(client.session, client.keys) if name != client.keys.robot
         ]
@@ -166,6 +180,12 @@ class RobotTarget:
             f"the certificate of this computer is {who}, and the router drops what a {role.value} "
             f"publishes; {what}"
         )
+
+
+def _choices(profile: Profile, *, stop: bool) -> list[Profile]:
+    """The profile with each certificate that this computer has for a person, best first."""
+    hosts = operator_hosts(profile, stop=stop)
+    return [_with_host(profile, host) for host in hosts] or [profile]
 
 
 def _with_host(profile: Profile, host: str | None) -> Profile:
@@ -199,5 +219,4 @@ def _warn_next(profile: Profile, error: SecurityError | SessionError) -> None:
     security = profile.session.security
     assert security is not None
     why = error if isinstance(error, SecurityError) else "no router accepts it"
-    text = f"not with the certificate of {security.host} ({why}); trying the next one here"
-    errors().print(styled(text, "yellow"), soft_wrap=True)
+    warn(f"not with the certificate of {security.host} ({why}); trying the next one here")

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+import logging.handlers
+import os
 import subprocess
 import sys
 import threading
 import zlib
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -21,11 +25,14 @@ from vla_zenoh.cli.options import (
 )
 from vla_zenoh.cli.output import console, errors, fail, styled
 from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import load_profile, profile_file
 from vla_zenoh.resources import is_path
-from vla_zenoh.runtime.launch import Host, choose_host
+from vla_zenoh.runtime.launch import Host, choose_host, host_lock
+from vla_zenoh.runtime.parent_watch import DETAIL, FATAL
 from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
 
+LOG_BYTES = 10 * 1024 * 1024
 COLOURS = ("cyan", "magenta", "green", "yellow", "blue", "bright_cyan", "bright_magenta")
 CHECK_PATIENCE_S = 60.0
 
@@ -41,41 +48,85 @@ def up(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Compute and check everything, command nothing.")
     ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Also show tracebacks and every restart.")
+    ] = False,
+    log_dir: Annotated[
+        Path | None,
+        typer.Option(
+            "--log-dir", help="Folder of the log file. Default: ~/.local/state/vla-zenoh."
+        ),
+    ] = None,
 ) -> None:
     """Start and supervise all nodes of this host. Ctrl-C brakes the arm, then ends them.
 
     The profile is checked first, as `profile check` does; nothing starts if it cannot run.
     """
+    loaded = effective_profile(profile, connect, listen)
+    name, _ = choose_host(loaded, host)
+    once = host_lock(loaded, name)
+    once.take()  # says at once who runs already; the host takes it again
+    once.release()
+    reject_wrong(profile, host, connect, listen)
+    file, logger = log_file(log_dir or default_log_folder(), f"{loaded.robot.name}-{name}")
     stop = stop_on_signals()
     die_with_parent()
-    loaded = effective_profile(profile, connect, listen)
-    choose_host(loaded, host)
-    reject_wrong(profile, host, connect, listen)
-    if stop.is_set():
-        raise typer.Exit(130)
     out = console()
     lock = threading.Lock()
 
-    def log(node: str, line: str, style: str = "") -> None:
+    def show(node: str, line: str, style: str = "") -> None:
         name = styled(f"{node:>16}", COLOURS[zlib.crc32(node.encode()) % len(COLOURS)])
         with lock:
             out.print(name, styled(line, style), sep=" | ", soft_wrap=True)
 
+    def log(node: str, line: str) -> None:
+        hidden = line.startswith((DETAIL, FATAL))
+        logger.log(logging.DEBUG if hidden else logging.INFO, "%s: %s", node, line)
+        if verbose or not hidden:
+            show(node, line)
+
     def tell(node: str, sentence: str) -> None:
-        log(node, sentence, "bold")
+        logger.info("%s: %s", node, sentence)
+        show(node, sentence, "bold")
 
     others = [effective_profile(name, host=host) for name in also or ()]
     with Host(loaded, host, log=log, tell=tell, also=others, dry_run=dry_run) as running:
         where = ", ".join(running.profile.session.connect)
-        tell("up", f"profile {loaded.name}, host {running.host}, router at {where}")
-        if dry_run:
-            tell("up", "dry run: the robot gets no commands")
+        more = "; the robot gets no commands" if dry_run else ""
+        place = f"profile {loaded.name}, host {running.host}, router at {where}"
+        tell("up", f"{running.mode} | {place}{more}")
+        tell("up", f"log: {file}")
         target = target_of(profile, running)
         status, activate, end = (target.typed(word) for word in ("status", "activate", "stop"))
         tell("up", f"watch: {status}; drive: {activate}, also prompt; stop: {end}; end: Ctrl-C")
         running.serve(stop)
         tell("up", "braking the arm, then ending every node")
     tell("up", "all nodes have ended")
+
+
+def default_log_folder() -> Path:
+    """Where `up` keeps its log: ``$XDG_STATE_HOME/vla-zenoh``."""
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "vla-zenoh"
+
+
+def log_file(folder: Path, name: str) -> tuple[Path, logging.Logger]:
+    """A log of everything the nodes of a host write, with times; it grows to 4 x `LOG_BYTES`.
+
+    Raises:
+        NodeError: it cannot be written.
+    """
+    path = folder / f"{name}.log"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handler = logging.handlers.RotatingFileHandler(
+            path, maxBytes=LOG_BYTES, backupCount=3, encoding="utf-8", errors="backslashreplace"
+        )
+    except OSError as error:
+        raise NodeError(f"{path} cannot be written: {error.strerror}; choose --log-dir") from error
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    logger = logging.Logger("up", logging.DEBUG)
+    logger.addHandler(handler)
+    return path, logger
 
 
 def reject_wrong(

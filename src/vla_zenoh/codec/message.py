@@ -12,13 +12,15 @@ import itertools
 import math
 import re
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgpack
-import numpy as np
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.types import shown
+
+if TYPE_CHECKING:
+    import numpy as np
 
 MAX_PAYLOAD_BYTES = 64 * 1024 * 1024
 MAX_DEPTH = 32
@@ -129,6 +131,8 @@ def _refuse_extension(code: int, data: bytes) -> Any:
 
 
 def _to_map(value: Any) -> dict[bytes, Any]:
+    import numpy as np
+
     if isinstance(value, np.ndarray):
         _check_kind(value.dtype)
         return {
@@ -152,6 +156,8 @@ def _from_map(value: dict[Any, Any]) -> Any:
 
 
 def _array(value: dict[Any, Any]) -> np.ndarray[Any, Any]:
+    import numpy as np
+
     dtype = _dtype(value)
     data, shape = value.get(b"data"), value.get(b"shape")
     if not isinstance(data, bytes) or not isinstance(shape, list):
@@ -170,6 +176,8 @@ def _array(value: dict[Any, Any]) -> np.ndarray[Any, Any]:
 
 
 def _scalar(value: dict[Any, Any]) -> np.generic:
+    import numpy as np
+
     dtype, data = _dtype(value), value.get(b"data")
     if type(data) not in _SCALARS[dtype.kind]:
         raise CodecError("malformed", f"a numpy scalar {dtype} of a {type(data).__name__}")
@@ -181,6 +189,8 @@ def _scalar(value: dict[Any, Any]) -> np.generic:
 
 
 def _dtype(value: dict[Any, Any]) -> np.dtype[Any]:
+    import numpy as np
+
     name = value.get(b"dtype")
     if not isinstance(name, str) or not _DTYPE.fullmatch(name):
         raise CodecError("malformed", f"an array with dtype {shown(name)} is not carried")

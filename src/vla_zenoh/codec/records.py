@@ -9,8 +9,7 @@ from typing import Any, TypeVar
 from vla_zenoh import keys
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, RecordError, SpecError
-from vla_zenoh.policy import ModelSpec
-from vla_zenoh.types import Cause, Header, shown
+from vla_zenoh.types import Header, shown
 
 Record = TypeVar("Record")
 
@@ -20,12 +19,13 @@ SMALL_BYTES = 1024 * 1024
 
 
 def encode(record: Any) -> bytes:
-    """Bytes of a record dataclass or a `ModelSpec`.
+    """Bytes of a record dataclass, or of a `vla_zenoh.policy.ModelSpec`.
 
     Raises:
         CodecError: larger than `MAX_RECORD_BYTES`, which every receiver rejects.
     """
-    fields = record.to_dict() if isinstance(record, ModelSpec) else _fields(record)
+    to_dict = getattr(record, "to_dict", None)  # of a ModelSpec
+    fields = _fields(record) if to_dict is None else to_dict()
     payload = message.pack(fields)
     _check_length(type(record), payload)
     return payload
@@ -51,9 +51,10 @@ def from_map(kind: type[Record], data: Any) -> Record:
     """
     if not isinstance(data, dict):
         raise CodecError("malformed", f"{kind.__name__} is a map, this is a {type(data).__name__}")
-    if kind is ModelSpec:
+    from_dict = getattr(kind, "from_dict", None)
+    if from_dict is not None:
         try:
-            return ModelSpec.from_dict(data)  # pyright: ignore[reportReturnType]
+            return from_dict(data)
         except SpecError as error:
             raise CodecError("invalid", str(error)) from error
     return _record(kind, data)
@@ -101,11 +102,13 @@ def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
         raise CodecError("malformed", f"{kind.__name__}: {error}") from error
 
 
-def _cause(value: Any) -> Cause | None:
+def _cause(value: Any) -> Any:
     if value is None:
         return None
     if not isinstance(value, dict):
         raise CodecError("malformed", "cause is a map or nothing")
+    from vla_zenoh.types import Cause  # brings numpy
+
     return _record(Cause, value)
 
 

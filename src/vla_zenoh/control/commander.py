@@ -23,6 +23,7 @@ from vla_zenoh.control.commander_io import (
 )
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
 from vla_zenoh.control.joint_monitor import JOINT_PATIENCE_S, JointMonitor, joint_state_faults
+from vla_zenoh.control.limits import Slowdown
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.plan_timeline import EpisodeProgress, Goal, Plan
 from vla_zenoh.control.preflight import (
@@ -162,6 +163,11 @@ class Commander:
     def speed(self) -> float:
         """Share of the speed limits in use; less than 1 near a bound."""
         return self._motion.speed
+
+    @property
+    def slower(self) -> Slowdown | None:
+        """What slows the arm down near a bound; None: nothing, or it is not commanded."""
+        return self._motion.slower if self._motion.streaming else None
 
     @property
     def smoothing_failures(self) -> int:

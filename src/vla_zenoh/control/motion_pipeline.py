@@ -102,6 +102,8 @@ class MotionPipeline:
         self.streaming = False
         self.speed = 1.0
         """Share of the speed limits on the way to the goal, without the speed override."""
+        self.slower: Slowdown | None = None
+        """What reduces it."""
         self._override, self._slowing = 1.0, False
         self.contact_slowdown: Slowdown | None = None
         self.joint_slowdown: Slowdown | None = None
@@ -397,7 +399,7 @@ class MotionPipeline:
 
     def _slow_down(self, slower: Slowdown | None) -> list[Event]:
         """Set the speed share; report each reason once per activation."""
-        self.speed = 1.0 if slower is None else slower.share
+        self.speed, self.slower = (1.0, None) if slower is None else (slower.share, slower)
         if slower is None or slower.name in (APPROACH, *self._slowed_by):
             return []
         self._slowed_by.add(slower.name)

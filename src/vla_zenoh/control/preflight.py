@@ -43,6 +43,7 @@ class PeerSnapshot:
         camera_reasons: camera -> why it sends no images, by its node's status.
         camera_faults: camera -> why its images are invalid, by its node's status: the rest of a
             sentence that starts with ``camera NAME``.
+        down: node of the profile that does not run -> why, by `vla-zenoh up` of its host.
     """
 
     alive: frozenset[str] = frozenset()
@@ -58,6 +59,12 @@ class PeerSnapshot:
     holders: frozenset[str] = frozenset()
     camera_faults: Mapping[str, str] = field(default_factory=dict)
     camera_reasons: Mapping[str, str] = field(default_factory=dict)
+    down: Mapping[str, str] = field(default_factory=dict)
+
+    def why_down(self, node: str) -> str:
+        """``: REASON``, to end a sentence about a node that is not alive; empty if unknown."""
+        why = self.down.get(node)
+        return f": {why}" if why else ""
 
 
 def reasons_not_to_activate(
@@ -139,7 +146,9 @@ def _robot(
 ) -> list[str]:
     reasons: list[str] = []
     if peers.robot_node not in peers.alive:
-        reasons.append(f"the robot's node {peers.robot_node!r} is not alive")
+        reasons.append(
+            f"the robot's node {peers.robot_node!r} is not alive{peers.why_down(peers.robot_node)}"
+        )
     if pose is None:
         return [*reasons, "the TCP pose is not known: nothing received on state/pose"]
     reasons += _too_old("TCP pose", pose, profile, now_ns)
@@ -184,7 +193,8 @@ def _worker(worker: str, prompt: str, peers: PeerSnapshot) -> list[str]:
         others = sorted(
             name.removeprefix("worker-") for name in peers.alive if name.startswith("worker-")
         )
-        return [f"worker {worker!r} is not alive; alive are: {', '.join(others) or 'none'}"]
+        alive = ", ".join(others) or "none"
+        return [f"worker {worker!r} is not alive{peers.why_down(node)}; alive are: {alive}"]
     spec = peers.specs.get(worker)
     if spec is None:
         return [f"worker {worker!r} has not published its spec"]
@@ -269,8 +279,8 @@ def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
         why = peers.camera_reasons.get(camera)
         if node not in peers.alive:
             reasons.append(
-                f"camera {camera!r}: its node {node!r} is not alive; `vla-zenoh up` on its host "
-                "starts it"
+                f"camera {camera!r}: its node {node!r} is not alive{peers.why_down(node)}; "
+                "`vla-zenoh up` on its host starts it"
             )
         elif age_s > CAMERA_PATIENCE_S:
             since = "yet" if math.isinf(age_s) else f"for {age_s:.1f} s"

@@ -1,27 +1,32 @@
 """Profiles: one YAML file describes a robot, its computers and its limits."""
 
-from vla_zenoh.profile.limits import (
-    REACH_M,
-    REJECT_FACTOR,
-    ContactLimits,
-    JointLimits,
-    Limits,
-    ReachLimits,
-)
-from vla_zenoh.profile.load import (
-    as_robot,
-    load_profile,
-    load_with_lines,
-    override,
-    profile_file,
-    profile_names,
-    read_profile,
-    to_yaml,
-)
-from vla_zenoh.profile.profile import Profile
-from vla_zenoh.profile.robot import POSE_JOINTS, GripperProfile, JointEnds, RobotProfile
-from vla_zenoh.profile.schema import CameraProfile, Composition, HostProfile, Timing
-from vla_zenoh.profile.session import SessionProfile
+from typing import TYPE_CHECKING
+
+from vla_zenoh import lazy_names
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile.limits import (
+        REACH_M,
+        REJECT_FACTOR,
+        ContactLimits,
+        JointLimits,
+        Limits,
+        ReachLimits,
+    )
+    from vla_zenoh.profile.load import (
+        as_robot,
+        load_profile,
+        load_with_lines,
+        override,
+        profile_file,
+        profile_names,
+        read_profile,
+        to_yaml,
+    )
+    from vla_zenoh.profile.profile import Profile
+    from vla_zenoh.profile.robot import POSE_JOINTS, GripperProfile, JointEnds, RobotProfile
+    from vla_zenoh.profile.schema import CameraProfile, Composition, HostProfile, Timing
+    from vla_zenoh.profile.session import SessionProfile
 
 __all__ = [
     "POSE_JOINTS",
@@ -49,3 +54,5 @@ __all__ = [
     "read_profile",
     "to_yaml",
 ]
+
+__getattr__ = lazy_names(__name__, "load", "profile", "session", "schema", "robot", "limits")

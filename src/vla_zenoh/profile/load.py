@@ -10,14 +10,18 @@ from typing import Any
 from pydantic import ValidationError
 
 from vla_zenoh import resources
-from vla_zenoh.errors import ProfileError, ResourceError
+from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import yaml_text
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.section import Lines, Place, explain
-from vla_zenoh.resources import ROBOT_DATA_PREFIX, is_path
+from vla_zenoh.resources import (
+    ROBOT_DATA_PREFIX,
+    extended_profile,
+    is_path,
+    profile_file,
+)
 
 MAX_EXTENDS = 8
-SUFFIXES = (".yaml", ".yml")
 REPLACED_WHOLE = {("hosts",)}
 WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("models",), ("serves",), ("options",)}
 """Maps of which null removes an inherited entry; null in place of the map: all of them."""
@@ -26,20 +30,6 @@ WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("models",), ("serves",), (
 def profile_names() -> list[str]:
     """Names of all profiles on the search path."""
     return resources.names("profiles")
-
-
-def profile_file(name: str) -> Path:
-    """File of the profile `name`, which may be a path.
-
-    Raises:
-        ProfileError: not found; lists the profiles that exist.
-    """
-    try:
-        return resources.find("profiles", name)
-    except ResourceError as error:
-        raise ProfileError(str(error)) from error
-    except (OSError, ValueError, RuntimeError) as error:  # too long, a NUL in it, an unknown ~user
-        raise ProfileError(f"{name[:80]!r} cannot be the name of a profile") from error
 
 
 def load_profile(name: str) -> Profile:
@@ -71,7 +61,7 @@ def followed(name: str) -> list[tuple[Path, str]]:
         parent = yaml_text.read(_bytes(path), str(path))[0].get("extends")
         if not isinstance(parent, str):
             return out
-        out.append((_parent(path, parent), parent))
+        out.append((extended_profile(path, parent), parent))
 
 
 def read_profile(text: str, where: str) -> Profile:
@@ -140,7 +130,7 @@ def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], Lines]:
     if not isinstance(parent, str) or not parent:
         raise ProfileError(f"{where}: extends: wants the name of one profile")
     try:
-        parent_path = _parent(path, parent)
+        parent_path = extended_profile(path, parent)
     except ProfileError as error:
         raise ProfileError(f"{where}: extends: {error}") from error
     base, base_lines = _read(parent_path, (*seen, path.resolve()))
@@ -156,39 +146,6 @@ def _bytes(path: Path) -> bytes:
             return file.read(yaml_text.MAX_PROFILE_BYTES + 1)
     except OSError as error:
         raise ProfileError(f"{path} cannot be read: {error.strerror}") from error
-
-
-def _parent(path: Path, parent: str) -> Path:
-    """File that the profile at `path` extends: beside it, or first on the search path.
-
-    A profile that extends its own name means the next one on the search path.
-    """
-    if parent == path.stem:
-        return _next(path, parent)
-    try:
-        names = [parent] if Path(parent).suffix in SUFFIXES else [parent + s for s in SUFFIXES]
-        for name in names:
-            if (path.parent / name).is_file():
-                return path.parent / name
-    except (OSError, ValueError) as error:
-        raise ProfileError(f"{parent[:80]!r} cannot be the name of a profile") from error
-    return profile_file(parent)
-
-
-def _next(path: Path, name: str) -> Path:
-    candidates = [
-        file
-        for folder in resources.folders("profiles")
-        for suffix in SUFFIXES
-        if (file := folder / f"{name}{suffix}").is_file()
-    ]
-    own = [index for index, file in enumerate(candidates) if file.samefile(path)]
-    after = candidates[own[0] + 1 :] if own else candidates
-    if not after:
-        raise ProfileError(
-            f"{name!r} is this file, and no other profile of that name comes after it"
-        )
-    return after[0]
 
 
 def _merge(

@@ -11,12 +11,11 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import Keys
+from vla_zenoh.keys import NODE_KINDS, Keys
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import ArmProfile, Options, RobotProfile
 from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Gripper, Ros2Profile
 from vla_zenoh.profile.schema import (
-    NODE_KINDS,
     SIMULATED,
     CameraProfile,
     Composition,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -19,32 +18,6 @@ from vla_zenoh.profile.section import (
 from vla_zenoh.profile.session import Endpoints
 
 NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker"]
-
-
-class NodeTraits(NamedTuple):
-    """A kind of node; its command is ``vla-zenoh node KIND``, or ``vla-zenoh worker``.
-
-    Args:
-        role: in a secured lab, a value of `vla_zenoh.security.identity.Role`.
-        stop_s: how long before its deadline `up` stops the next kinds; those with more stop first.
-        only_one: why a robot has no second one; empty: it may have several.
-    """
-
-    role: str
-    stop_s: float
-    only_one: str = ""
-
-
-NODE_KINDS: Mapping[str, NodeTraits] = {
-    "router": NodeTraits("router", 0.1),
-    "sim": NodeTraits("robot", 0.4, "there is one simulated robot"),
-    "ros2": NodeTraits("robot", 0.4, "the robot has one driver"),
-    "arm": NodeTraits("robot", 0.4, "the robot has one driver"),
-    "command": NodeTraits("command", 0.8, "the robot obeys one command node"),
-    "camera": NodeTraits("camera", 0.8),
-    "worker": NodeTraits("worker", 0.8),
-}
-"""Every kind of node, in the order in which `up` starts them."""
 SIMULATED: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")
 CAMERA_SOURCES = {
     "sim": "sim:CAMERA",

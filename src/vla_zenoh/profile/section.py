@@ -99,6 +99,12 @@ def explain(error: ValidationError, lines: Lines, model: type[Section]) -> list[
     return lines_out
 
 
+def own_place(places: Sequence[Place], lines: Lines) -> Place:
+    """The first of several places that the loaded file itself gives, else the first."""
+    own = _file(line_of((), lines))
+    return next((each for each in places if _file(line_of(each, lines)) == own), places[0])
+
+
 def line_of(place: Place, lines: Lines) -> str:
     """``file:line`` of a value, or of what it is in; empty if unknown."""
     while place not in lines and place:
@@ -118,15 +124,16 @@ def unknown_name(place: Place, name: str, section: str, known: Iterable[str]) ->
     near, listed = nearest(name, known, ""), ", ".join(known) or "none"
     why = f"{name!r} is not among {section}{near or '.'} Known: {listed}"
     # Of a map the entry goes, of any other value only its content can change.
-    to_do = ": {".join((*place, "null")) + "}" * (len(place) - 1) if place[-1] == name else ""
-    remedy = f"Or remove that too: {to_do}" if to_do else "Or name another one there"
+    entry = place[-1] == name
+    to_do = ": {".join(place) + ": null" + "}" * (len(place) - 1) if entry else ""
+    remedy = f"remove that too: {to_do}" if to_do else "name another one there"
     slip = f"; is {near.split(chr(39))[1]!r} a slip for it?" if near else "."
     return (
         place,
         why,
         (
-            ((section, name), f"is removed, but {{}} names it. {remedy}"),
-            ((section,), f"lacks {name!r}, but {{}} names it{slip} {remedy}"),
+            ((section, name), f"is removed, but {{}} names it: {remedy}"),
+            ((section,), f"lacks {name!r}, but {{}} names it{slip} List it, or {remedy}"),
         ),
     )
 
@@ -139,7 +146,8 @@ def _located(fault: Fault, lines: Lines, above: Place) -> str:
     if rest and _file(first) != own:
         for other, sentence in rest[0]:
             if other in lines and _file(lines[other]) == own:
-                return located(other, sentence.format(f"{'.'.join(place)} ({first})"), lines)
+                named = f"{'.'.join(place)} ({first})"
+                return located(other, sentence.replace("{}", named, 1), lines)
     return located(place, why, lines)
 
 

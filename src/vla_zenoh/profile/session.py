@@ -78,13 +78,6 @@ def host_of(endpoint: str) -> str:
     return match["host"].strip("[]") if match else ""
 
 
-def second_link(endpoint: str) -> str:
-    """The same endpoint at the next port, for images on a link of their own."""
-    protocol, _, address = endpoint.partition("/")
-    host, _, port = address.rpartition(":")
-    return f"{protocol}/{host}:{int(port) + 1}"
-
-
 def endpoint_faults(
     endpoints: Sequence[str], session: SessionProfile, *, listen: bool
 ) -> list[tuple[int, str]]:

@@ -74,6 +74,7 @@ class RobotNode:
                 self._loop(driver.pace(), stop)
         finally:
             self._close()
+            gc.unfreeze()  # so that the interpreter frees everything at its end
 
     def _close(self) -> None:
         try:

@@ -11,7 +11,7 @@ from typing import Any
 
 from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
-from vla_zenoh.errors import NodeError, ProfileError
+from vla_zenoh.errors import NodeError, ProfileError, in_words
 from vla_zenoh.interop.python_reading import MAX_WORDS, Fault, PythonReading
 from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import Profile
@@ -77,7 +77,7 @@ class PythonDriver(RobotDriver):
         try:
             return method(*given)
         except Exception as error:
-            words = one_line(f"{type(error).__name__}: {error}", MAX_WORDS)
+            words = one_line(in_words(error), MAX_WORDS)
             raise NodeError(f"{self._file}: {name}: {words}") from error
 
     def connect(self) -> None:

@@ -18,12 +18,14 @@ from vla_zenoh.bus.client import DROPPED_HINT, Client
 from vla_zenoh.bus.clock import HOST_VARIABLE, own_boot_id
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import NodeError, ProfileError, SessionError
-from vla_zenoh.keys import worker_node
+from vla_zenoh.keys import NODE_KINDS, worker_node
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
-from vla_zenoh.profile.schema import NODE_KINDS
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
+from vla_zenoh.runtime.down_nodes import DownNodes
 from vla_zenoh.runtime.hang_detection import LastStatus, hung_nodes
-from vla_zenoh.runtime.supervisor import NodeCommand, Supervisor
+from vla_zenoh.runtime.host_lock import HostLock
+from vla_zenoh.runtime.router import reject_taken
+from vla_zenoh.runtime.supervisor import DownNode, NodeCommand, Supervisor
 from vla_zenoh.security.identity import Role, operator_role
 
 EXPENDABLE = ("worker",)
@@ -52,6 +54,13 @@ def choose_host(profile: Profile, host: str | None) -> tuple[str, HostProfile]:
             f"profile {profile.name} has no host {host!r}; it has: {', '.join(profile.hosts)}"
         )
     return host, profile.hosts[host]
+
+
+def host_lock(profile: Profile, host: str) -> HostLock:
+    """What a running `Host` holds, so that there is only one."""
+    router = (profile.hosts[host].connect or profile.session.connect)[0]
+    what = f"host {host} of robot {profile.robot.name}"
+    return HostLock("-".join((profile.root, profile.robot.name, host, router)), what)
 
 
 def node_commands(
@@ -129,7 +138,8 @@ class Host:
         dry_run: the command node computes and checks everything and commands nothing.
 
     Raises:
-        NodeError: a router answers although `own_router`, or does not know who is in `also`.
+        NodeError: this host runs already, a router answers although `own_router`, or does not know
+            who is in `also`.
         ProfileError: there is no such host, or it has no router for `also`, or no command node
             for `dry_run`.
     """
@@ -180,6 +190,9 @@ class Host:
             variables={HOST_VARIABLE: self.host},
         )
         self._own_router = own_router
+        self._once = host_lock(profile, self.host)
+        self._down: DownNodes | None = None
+        self._ready, self._dry_run = False, dry_run
         self._expiry = CertificateExpiry(profile.session.security)
         self._left_out, self._strangers_told_s = 0, -1e9
         self.session: zenoh.Session | None = None
@@ -200,6 +213,7 @@ class Host:
         return self
 
     def _start(self) -> None:
+        self._once.take()
         answers = self._router_answers()
         if answers and self._own_router:
             where = ", ".join(self.profile.session.connect)
@@ -216,10 +230,20 @@ class Host:
                     child for child in self.supervisor.children if child.command.kind != "router"
                 ]
             else:
+                listen = self._part.listen or self.profile.session.listen
+                reject_taken(listen)
                 self.supervisor.start(["router"])
         self.session = open_session(self.profile.session, wait_s=ROUTER_PATIENCE_S)
         self.client = Client(self.profile, self.session).subscribe()
         self.supervisor.start()
+        self._down = DownNodes(self.profile, self.session, self.host, self._nodes_down)
+
+    def _nodes_down(self) -> list[DownNode]:
+        client = self.client
+        if client is None:
+            return []
+        # A router may be a program that publishes no status.
+        return [each for each in self.supervisor.down(client.alive) if each.name in client.expected]
 
     def _router_answers(self) -> bool:
         # Where this host runs a router it names that one first; the others stand in for it.
@@ -253,10 +277,14 @@ class Host:
         client = self.client
         if may and client is not None and "command" in client.alive and self._takes_part(client):
             self._brake(client)
+        if self._down is not None:
+            self._down.close()
+            self._down = None
         if self.session is not None:
             self.session.close()
             self.session = self.client = None
         self.supervisor.stop(deadline_s)
+        self._once.release()
         self._folder.cleanup()
         if self._lock is not None:
             os.close(self._lock)
@@ -299,6 +327,7 @@ class Host:
             for sentence in self._expiry.due():
                 self._tell("up", sentence)
             self._tell_of_strangers()
+            self._tell_when_ready()
             self.poll(spare=EXPENDABLE)
 
     def poll(self, spare: Sequence[str] = ()) -> None:
@@ -313,7 +342,26 @@ class Host:
         if not self.supervisor.poll(spare=spare):
             given_up = self.supervisor.given_up
             name = given_up.command.name if given_up else "a node"
-            raise NodeError(f"{name} dies again and again; its last lines above say why")
+            why = given_up.why if given_up else ""
+            raise NodeError(
+                f"{name} dies again and again{f': {why}' if why else '; its last lines say why'}"
+            )
+
+    def _tell_when_ready(self) -> None:
+        if self._ready or self.client is None:
+            return
+        names = {child.command.name for child in self.supervisor.children}
+        names &= self.client.expected.keys()
+        if not self._nodes_down() and names <= self.client.snapshot().keys():
+            self._ready = True
+            self._tell("up", f"{self.mode} | ready: {', '.join(sorted(names))}")
+
+    @property
+    def mode(self) -> str:
+        """SIM, DRY RUN or LIVE, which stands in front of what says that the arm moves."""
+        if self._dry_run:
+            return "DRY RUN"
+        return "SIM" if self.profile.robot.driver == "sim" else "LIVE"
 
     def _tell_of_strangers(self) -> None:
         left_out = self.client.dropped if self.client is not None else 0

@@ -15,6 +15,8 @@ PARENT_VARIABLE = "VLA_ZENOH_PARENT"
 """Process id of the supervisor; a child ends itself when that is gone."""
 RUN_FOLDER_VARIABLE = "VLA_ZENOH_RUN_FOLDER"
 """Folder where a node may leave what it has to know after a restart."""
+FATAL, DETAIL = "fatal: ", "detail: "
+"""Begin the lines in which a node says to its supervisor why it ends, and the traceback of it."""
 PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 WATCH = "watch over the supervisor"
 LOOK_PERIOD_S = 0.25

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
+import socket
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -16,7 +18,7 @@ from vla_zenoh.bus.session import open_session, session_config
 from vla_zenoh.bus.tcp_user_timeout import TcpUserTimeout
 from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.session import is_loopback
+from vla_zenoh.profile.session import address_of, is_loopback
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.security.rules import access_control
 
@@ -68,6 +70,34 @@ def run_router(
                 detail["certificates"] = asdict(expiry.outlook)
             node.publish_status("routing", detail={**detail, "links": links_now})
         node.close()
+
+
+def reject_taken(endpoints: Sequence[str]) -> None:
+    """Make sure that a router can listen on TCP endpoints.
+
+    Raises:
+        NodeError: another program has the port, or this computer lacks the address.
+    """
+    for endpoint in endpoints:
+        host, _, port = address_of(endpoint).rpartition(":")
+        if endpoint.partition("/")[0] not in ("tcp", "tls") or not port.isdigit() or port == "0":
+            continue
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        try:
+            with socket.socket(family) as free:
+                free.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                free.bind((host.strip("[]"), int(port)))
+        except OSError as error:
+            hint = (
+                f"another program has port {port} (`ss -ltnp 'sport = :{port}'` names it), and it "
+                "is not a Zenoh router that this profile can use. End it, or choose another port"
+                if error.errno == errno.EADDRINUSE
+                else f"{error.strerror or error}. Choose another address"
+            )
+            raise NodeError(
+                f"the router cannot listen on {endpoint}: {hint} with session.listen and "
+                "session.connect"
+            ) from error
 
 
 def run_zenohd(

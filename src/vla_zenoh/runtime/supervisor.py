@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
-from vla_zenoh.profile.schema import NODE_KINDS
-from vla_zenoh.runtime.parent_watch import PARENT_VARIABLE, RUN_FOLDER_VARIABLE
+from vla_zenoh.keys import NODE_KINDS
+from vla_zenoh.runtime.parent_watch import DETAIL, FATAL, PARENT_VARIABLE, RUN_FOLDER_VARIABLE
 
 BACKOFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 STABLE_S = 60.0
@@ -28,6 +30,10 @@ STOP_ORDER = tuple(
 )
 """Kinds in the order they are stopped, and how long before the deadline the next follow."""
 POLL_S = 0.05
+LAST_LINES_S = 0.5
+"""A process that ended may have started another one, which keeps its output open."""
+RUST_SOURCE = re.compile(r" at /\S+\.rs:\d+(?=\.?$)")
+"""Where in its sources Zenoh wrote a line of its log: a path of the computer it was built on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +63,31 @@ class Child:
     restarts: int = 0
     start_again_s: float = 0.0
     threads: list[threading.Thread] = field(default_factory=list)
+    pid: int = 0
+    why: str = ""
+    """Why it ended, if it said so."""
+    told: str = ""
+    """The same, of its last end."""
+    end: str = ""
+    """How it ended."""
+
+
+class DownNode(NamedTuple):
+    """A node that crashed, or was just started.
+
+    Args:
+        name: of the node.
+        pid: of its last process.
+        crashes: in a row.
+        why: it crashed; empty if it did not.
+        left_alone: it is not started again.
+    """
+
+    name: str
+    pid: int
+    crashes: int
+    why: str
+    left_alone: bool
 
 
 class Supervisor:
@@ -66,7 +97,8 @@ class Supervisor:
 
     Args:
         commands: in the order to start them.
-        log: called with (node name, line) for every line a node writes.
+        log: called with (node name, line) for every line a node writes; what begins with `DETAIL`
+            or `FATAL` is for a log file, `tell` says what people need of it.
         tell: called with (node name, sentence) for what the supervisor does.
         folder: where nodes may leave what they have to know after a restart.
         variables: of the nodes' environment, beside ours.
@@ -112,15 +144,16 @@ class Supervisor:
             if child.deaths_in_a_row < GIVE_UP_AFTER or child.left_alone:
                 continue
             said = f"crashed {GIVE_UP_AFTER} times in a row"
+            why = f": {child.told}" if child.told else ""
             child.left_alone = child.command.kind in spare
             if not child.left_alone or all(each.left_alone for each in self.children):
                 self.given_up = child
-                self._tell(child.command.name, f"{said}; giving up")
+                self._tell(child.command.name, f"{said}; giving up{why}")
                 return False
             child.start_again_s = 0.0
             self._tell(
                 child.command.name,
-                f"{said}; not restarting it. The other nodes keep running; see its output above",
+                f"{said}; not restarting it. The other nodes keep running{why}",
             )
         return True
 
@@ -173,6 +206,20 @@ class Supervisor:
         except (ProcessLookupError, OverflowError):
             return False
 
+    def down(self, alive: Collection[str]) -> list[DownNode]:
+        """Nodes that do not run, or run and are not in `alive` yet."""
+        return [
+            DownNode(
+                child.command.name,
+                child.pid,
+                child.deaths_in_a_row,
+                child.told or child.end,
+                child.left_alone or child is self.given_up,
+            )
+            for child in self.children
+            if child.pid and child.command.name not in alive
+        ]
+
     def terminate(self, name: str, why: str) -> None:
         """End a node at once; `watch` starts it again."""
         for child in self.children:
@@ -200,18 +247,24 @@ class Supervisor:
             start_new_session=True,
         )
         child.started_s, child.start_again_s = time.monotonic(), 0.0
-        thread = threading.Thread(
-            target=self._forward, args=(child.command.name, child.process), daemon=True
-        )
+        child.pid, child.why = child.process.pid, ""
+        thread = threading.Thread(target=self._forward, args=(child, child.process), daemon=True)
         thread.start()
         child.threads = [thread]
-        self._tell(child.command.name, f"started (pid {child.process.pid})")
+        started = f"started (pid {child.process.pid})"
+        if child.told:  # again, after what was told
+            self._log(child.command.name, f"{DETAIL}{started}")
+        else:
+            self._tell(child.command.name, started)
 
-    def _forward(self, name: str, process: subprocess.Popen[str]) -> None:
+    def _forward(self, child: Child, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
         with process.stdout as lines:
             for line in lines:
-                self._log(name, line.rstrip("\n"))
+                text = RUST_SOURCE.sub("", line.rstrip("\n"))
+                if text.startswith(FATAL):
+                    child.why = text.removeprefix(FATAL)
+                self._log(child.command.name, text)
 
     def _mourn(self, child: Child, code: int, now: float) -> None:
         stable = now - child.started_s > STABLE_S
@@ -220,10 +273,19 @@ class Supervisor:
         if child.process is not None:
             _kill_group(child.process)
         child.process, child.start_again_s = None, now + wait_s
+        for thread in child.threads:
+            thread.join(LAST_LINES_S)
         how = f"killed by {_signal_name(-code)}" if code < 0 else f"ended with code {code}"
+        sentence = how
         if child.deaths_in_a_row < GIVE_UP_AFTER:
-            how += f"; starting again in {wait_s:g} s"
-        self._tell(child.command.name, how)
+            sentence += f"; starting again in {wait_s:g} s"
+        if child.why:
+            sentence += f": {child.why}"
+        if child.why and child.why == child.told:  # said already
+            self._log(child.command.name, f"{DETAIL}{sentence}")
+        else:
+            self._tell(child.command.name, sentence)
+        child.told, child.end = child.why, how
 
     def _signal(self, kinds: Sequence[str], number: signal.Signals) -> None:
         for process in self._running(kinds):

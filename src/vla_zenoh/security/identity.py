@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import worker_node
-from vla_zenoh.profile import Profile
-from vla_zenoh.profile.schema import NODE_KINDS
+from vla_zenoh.keys import NODE_KINDS, worker_node
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile import Profile
 
 
 class Role(Enum):
@@ -107,6 +109,18 @@ def identities(profile: Profile) -> list[Identity]:
     """All identities of the lab."""
     hosts = dict.fromkeys([*profile.hosts, *_people(profile)])
     return [identity for host in hosts for identity in identities_of(profile, host)]
+
+
+def expected_nodes(profile: Profile) -> dict[str, str]:
+    """Nodes that publish a status where the profile runs -> their hosts.
+
+    A router that is the only one is left out: who hears anything has reached it, and it may be a
+    ``zenohd``, which publishes none.
+    """
+    found = {one.node: host for host in profile.hosts for one in _nodes(profile, host)}
+    if "router" in found or profile.session.router == "zenohd":
+        found = {name: host for name, host in found.items() if not name.startswith("router")}
+    return found
 
 
 def _people(profile: Profile) -> tuple[str, ...]:

@@ -18,12 +18,15 @@ import stat
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.profile import Profile
 from vla_zenoh.security import authority as ca
 from vla_zenoh.security.authority import Certificate, KeyPair
 from vla_zenoh.security.identity import PEOPLE, Identity, Role, operator_role
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile import Profile
 
 AUTHORITY = "ca"
 THIS_HOST = ".this_host"

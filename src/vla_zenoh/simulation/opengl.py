@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import NodeError
+from vla_zenoh.errors import NodeError, in_words
 
 MAX_GEOMS = 1000
 PROBE_SIZE = 16
@@ -57,7 +57,7 @@ class OpenGlCanvas:
             self._context.make_current()
             self._gl = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         except Exception as error:  # drivers raise exceptions of many types here
-            raise NodeError(f"no OpenGL through {platform}: {error}") from error
+            raise NodeError(f"no OpenGL through {platform}: {in_words(error)}") from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._gl)
         self._scene = mujoco.MjvScene(model, MAX_GEOMS)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):

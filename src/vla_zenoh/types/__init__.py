@@ -9,33 +9,40 @@ Frames: poses are those of the tool centre point (TCP) in the robot's base frame
 frame's axes and the TCP's origin. Quaternions are stored ``x, y, z, w``.
 """
 
-from vla_zenoh.types.checks import (
-    MAX_NAMES,
-    MAX_TEXT,
-    QUATERNION_NORM_TOLERANCE,
-    FloatArray,
-    shown,
-    unit_quaternion,
-    vector,
-)
-from vla_zenoh.types.chunk import ActionChunk, InferenceDebug
-from vla_zenoh.types.commands import (
-    LATENCY_STAGES,
-    Cause,
-    GripperCommand,
-    JointCommand,
-    PoseCommand,
-)
-from vla_zenoh.types.reports import Event, NodeStatus, Task
-from vla_zenoh.types.states import (
-    GripperState,
-    Image,
-    JointState,
-    ObjectPoses,
-    PoseState,
-    SceneState,
-)
-from vla_zenoh.types.stream import Header, Stamped
+from typing import TYPE_CHECKING
+
+from vla_zenoh import lazy_names
+
+if TYPE_CHECKING:
+    from vla_zenoh.types.arrays import (
+        QUATERNION_NORM_TOLERANCE,
+        FloatArray,
+        unit_quaternion,
+        vector,
+    )
+    from vla_zenoh.types.checks import (
+        MAX_NAMES,
+        MAX_TEXT,
+        shown,
+    )
+    from vla_zenoh.types.chunk import ActionChunk, InferenceDebug
+    from vla_zenoh.types.commands import (
+        LATENCY_STAGES,
+        Cause,
+        GripperCommand,
+        JointCommand,
+        PoseCommand,
+    )
+    from vla_zenoh.types.reports import Event, NodeStatus, Task
+    from vla_zenoh.types.states import (
+        GripperState,
+        Image,
+        JointState,
+        ObjectPoses,
+        PoseState,
+        SceneState,
+    )
+    from vla_zenoh.types.stream import Header, Stamped
 
 __all__ = [
     "LATENCY_STAGES",
@@ -64,3 +71,7 @@ __all__ = [
     "unit_quaternion",
     "vector",
 ]
+
+__getattr__ = lazy_names(
+    __name__, "checks", "stream", "reports", "commands", "states", "chunk", "arrays"
+)

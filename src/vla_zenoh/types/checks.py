@@ -1,29 +1,25 @@
-"""Checks of record fields: each returns the value in its final form, or raises a `RecordError`."""
+"""Checks of record fields: each returns the value in its final form, or raises a `RecordError`.
+
+Those of arrays are in ``arrays.py``: without them a command that only drives loads no numpy.
+"""
 
 from __future__ import annotations
 
 import math
 import reprlib
+import sys
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
 from vla_zenoh.errors import RecordError
 
-FloatArray = NDArray[np.float64]
-
-QUATERNION_NORM_TOLERANCE = 1e-3
 MAX_TEXT = 4096
 MAX_SHOWN = 300
-MAX_VECTOR = 10_000
 MAX_CHUNK_NUMBERS = 100_000
 MAX_NAMES = 1024
 MAX_ENTRIES = 1024
 MAX_DETAIL_TEXT = 65_536
 MAX_DETAIL_DEPTH = 4
-_NUMBER_KINDS = "iuf"
 
 
 def shown(value: Any) -> str:
@@ -33,56 +29,17 @@ def shown(value: Any) -> str:
     return reprlib.repr(value)[:MAX_SHOWN]
 
 
-def numbers(name: str, value: ArrayLike) -> NDArray[Any]:
-    """`value` as an array that numpy did not have to read out of text, truth values or objects."""
-    if isinstance(value, np.ndarray) and value.dtype.kind in _NUMBER_KINDS:
-        return value
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise RecordError(f"{name} is not a list of numbers: {error}") from error
-    if array.dtype.kind not in _NUMBER_KINDS or _holds_bool(value):
-        raise RecordError(f"{name} is not a list of numbers: {shown(value)}")
-    return array
-
-
-def _holds_bool(value: Any) -> bool:
-    """Whether a list that became an array of numbers had a truth value among them."""
-    if isinstance(value, (list, tuple)):
-        return any(_holds_bool(item) for item in value)
-    return isinstance(value, (bool, np.bool_))
-
-
-def vector(name: str, value: ArrayLike, size: int | None) -> FloatArray:
-    """Copy `value` into a finite, read-only float64 vector of `size` (None: any size)."""
-    array = numbers(name, value)
-    if array.ndim != 1 or (size is not None and array.shape[0] != size):
-        wanted = "(n,)" if size is None else f"({size},)"
-        raise RecordError(f"{name} has shape {array.shape}, wanted {wanted}")
-    if len(array) > MAX_VECTOR:
-        raise RecordError(f"{name} has {len(array)} numbers, at most {MAX_VECTOR} are allowed")
-    array = np.array(array, dtype=np.float64, order="C")
-    # Records are made at every tick: on a few numbers this is five times as fast as numpy.
-    if not all(map(math.isfinite, array.tolist())):
-        raise RecordError(f"{name} is not finite: {shown(array.tolist())}")
-    array.setflags(write=False)
-    return array
-
-
-def unit_quaternion(name: str, value: ArrayLike) -> FloatArray:
-    """Like `vector` for four numbers x, y, z, w; normalised, refused when far from unit."""
-    array = vector(name, value, 4)
-    norm = math.hypot(*array.tolist())
-    if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
-        raise RecordError(f"{name} has norm {norm:.6g}, wanted a unit quaternion x, y, z, w")
-    array = array / norm
-    array.setflags(write=False)
-    return array
+def is_numpy(value: Any, *kinds: str) -> bool:
+    """Whether `value` is a numpy scalar of one of these types, without importing numpy."""
+    numpy = sys.modules.get("numpy")
+    return numpy is not None and isinstance(value, tuple(getattr(numpy, kind) for kind in kinds))
 
 
 def number(name: str, value: Any, minimum: float = -math.inf, maximum: float = math.inf) -> float:
     """A finite float within ``[minimum, maximum]``."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+    if isinstance(value, bool) or not (
+        isinstance(value, (int, float)) or is_numpy(value, "integer", "floating")
+    ):
         raise RecordError(f"{name} is not a number: {shown(value)}")
     try:
         result = float(value)
@@ -97,7 +54,7 @@ def number(name: str, value: Any, minimum: float = -math.inf, maximum: float = m
 
 def integer(name: str, value: Any, minimum: int = 0, maximum: int = 2**63 - 1) -> int:
     """An int within ``[minimum, maximum]``."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+    if isinstance(value, bool) or not (isinstance(value, int) or is_numpy(value, "integer")):
         raise RecordError(f"{name} is not a whole number: {shown(value)}")
     if not minimum <= value <= maximum:
         raise RecordError(
@@ -139,7 +96,7 @@ def joint_names(value: Any) -> tuple[str, ...]:
 
 def boolean(name: str, value: Any) -> bool:
     """A bool; 0 and 1 are rejected."""
-    if not isinstance(value, (bool, np.bool_)):
+    if not (isinstance(value, bool) or is_numpy(value, "bool_")):
         raise RecordError(f"{name} is not true or false: {shown(value)}")
     return bool(value)
 
@@ -155,14 +112,16 @@ def entries(name: str, value: Any) -> dict[str, Any]:
 
 def details(name: str, value: Any, depth: int = MAX_DETAIL_DEPTH) -> Any:
     """Text, finite numbers, bools and None, in lists and maps that are not nested deep."""
-    if value is None or isinstance(value, (bool, np.bool_)):
-        return value if value is None else bool(value)
+    if value is None or isinstance(value, bool):
+        return value
     if isinstance(value, str):
         return text(name, value, MAX_DETAIL_TEXT)
-    if isinstance(value, (int, np.integer)):
+    if isinstance(value, int) or is_numpy(value, "integer"):
         return integer(name, value, -(2**63))
-    if isinstance(value, (float, np.floating)):
+    if isinstance(value, float) or is_numpy(value, "floating"):
         return number(name, value)
+    if is_numpy(value, "bool_"):
+        return bool(value)
     if depth == 0:
         raise RecordError(f"{name} is nested too deep")
     if isinstance(value, Mapping):

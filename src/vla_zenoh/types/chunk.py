@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import RecordError
+from vla_zenoh.types.arrays import numbers
 from vla_zenoh.types.checks import (
     MAX_CHUNK_NUMBERS,
     MAX_ENTRIES,
@@ -20,7 +21,6 @@ from vla_zenoh.types.checks import (
     entries,
     integer,
     number,
-    numbers,
     set_field,
     shown,
     text,

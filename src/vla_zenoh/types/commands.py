@@ -8,16 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vla_zenoh.errors import RecordError
+from vla_zenoh.types.arrays import FloatArray, unit_quaternion, vector
 from vla_zenoh.types.checks import (
-    FloatArray,
     integer,
     joint_names,
     number,
     set_field,
     shown,
     text,
-    unit_quaternion,
-    vector,
 )
 
 LATENCY_STAGES = (

@@ -16,7 +16,6 @@ from vla_zenoh.types.checks import (
     set_field,
     shown,
     text,
-    vector,
 )
 
 EVENT_LEVELS = ("info", "warning", "error")
@@ -74,8 +73,9 @@ class NodeStatus:
 
 
 def _pair(name: str, value: Any) -> tuple[float, float]:
-    low, high = vector(name, value, 2).tolist()
-    return low, high
+    if not isinstance(value, (list, tuple)) or len(value) != 2:
+        raise RecordError(f"{name} is not a pair of numbers: {shown(value)}")
+    return number(name, value[0]), number(name, value[1])
 
 
 @dataclass(frozen=True, slots=True)

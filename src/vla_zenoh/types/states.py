@@ -8,18 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import RecordError
+from vla_zenoh.types.arrays import FloatArray, numbers, unit_quaternion, vector
 from vla_zenoh.types.checks import (
-    FloatArray,
     boolean,
     integer,
     joint_names,
     number,
-    numbers,
     set_field,
     text,
     texts,
-    unit_quaternion,
-    vector,
 )
 
 

@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 import vla_zenoh
-from vla_zenoh.cli import status
+from vla_zenoh.cli import status_table
 from vla_zenoh.cli.output import Screen, styled
 from vla_zenoh.lab.cli import net
 from vla_zenoh.sanitize import one_line
@@ -128,7 +128,7 @@ PEER = {"round_trip_ms": 1.0, "offset_ms": 1.0, "uncertainty_ms": 1.0}
 @pytest.mark.parametrize("name", ["command", EVIL])
 def test_no_status_breaks_or_steers_what_people_look_at(found: NodeStatus, name: str) -> None:
     out = screen()
-    out.print(status.render("panda", {name: (found, 0.1, True)}, []))
+    out.print(status_table.render("panda", {name: (found, 0.1, True)}, []))
     nodes = {name: found, "other": said_by(host="elsewhere")}
     for table in net.tables("panda", net.pairs_of(nodes, []), net.lines_of(nodes), 100.0):
         out.print(table)
@@ -149,7 +149,7 @@ def test_a_link_is_shown_with_its_brackets() -> None:
 def test_only_the_node_of_that_key_is_shown_as_the_command_node() -> None:
     out = screen()
     liar = said_by("command", detail={"prompt": "HARD: go up"})
-    out.print(status.render("panda", {"worker-a": (liar, 0.1, True)}, []))
+    out.print(status_table.render("panda", {"worker-a": (liar, 0.1, True)}, []))
     assert "carried out" not in printed(out)
 
 
@@ -163,7 +163,7 @@ def test_no_table_pushes_the_red_line_from_the_screen() -> None:
     event = Event("info", "notice", "\n" * MANY, "\n" * MANY)
     out = screen()
     happened = [("n", Header(1, 2, "n#1"), event)] * 20
-    out.print(status.render("panda", {"n": (tall, 0.1, True)}, happened, insecure=True))
+    out.print(status_table.render("panda", {"n": (tall, 0.1, True)}, happened, insecure=True))
     lines = printed(out).splitlines()
     assert lines[0].startswith("insecure: anyone on the network can command this robot")
     assert len(lines) < 40
@@ -235,6 +235,7 @@ def fault(node: ast.AST, rich: set[str]) -> str:
 
 PRINTS = {
     "cli/main.py": "the version",
+    "cli/plain.py": "lines made printable there",
     "cli/nodes.py": "the profile's name, for a program that waits for it",
     "cli/profile.py": "a profile as a file",
     "cli/bridge_config.py": "a bridge's configuration as a file",

@@ -59,7 +59,7 @@ def near(one: Any, other: Any) -> bool:
 def test_every_kind_of_record_is_tested_here() -> None:
     kinds = {
         kind
-        for kind in vars(types).values()
+        for kind in (getattr(types, name) for name in types.__all__)
         if dataclasses.is_dataclass(kind) and kind.__module__.startswith(f"{types.__name__}.")
     }
     beside = {types.Header, types.Stamped, types.Image, types.Cause}
@@ -196,7 +196,7 @@ HEADER_REASONS = {"schema", "invalid", "malformed"}
         (STATUS, {"rates_hz": {"a": float("nan")}}, "rates_hz.a is nan"),
         (STATUS, {"counters": {"a": 1.5}}, "counters.a is not a whole number"),
         (STATUS, {"counters": {b"a": 1}}, "a name in counters is not text"),
-        (STATUS, {"latency_ms": {"a": [1]}}, r"latency_ms.a has shape \(1,\)"),
+        (STATUS, {"latency_ms": {"a": [1]}}, "latency_ms.a is not a pair of numbers"),
         (STATUS, {"detail": {"a": b"x"}}, "detail.a is not text, a number"),
         (STATUS, {"detail": {"a": {"b": {"c": {"d": {}}}}}}, "detail.a.b.c.d is nested too deep"),
         (STATUS, {"detail": {"a": np.zeros(2)}}, "detail.a is not text, a number"),

@@ -155,6 +155,13 @@ def test_when_all_is_well_there_is_no_reason() -> None:
         ),
         ("camera 'front': its node 'camera' is not alive; `vla-zenoh up` on its", gone("camera")),
         (
+            "worker 'scripted' is not alive: crashed 6 times: weights.pt not found; alive",
+            peers(
+                alive=frozenset({"sim", "camera"}),
+                down={"worker-scripted": "crashed 6 times: weights.pt not found"},
+            ),
+        ),
+        (
             "camera 'front' has sent no image for 1.5 s: it gives no reason",
             peers(camera_ages_s={"front": 1.5}),
         ),

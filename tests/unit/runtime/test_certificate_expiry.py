@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from vla_zenoh.cli import status
+from vla_zenoh.cli import status_table
 from vla_zenoh.cli.output import Screen
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.profile.session import SecurityProfile
@@ -160,7 +160,7 @@ def test_up_tells_of_certificates_while_its_nodes_run(tmp_path: Path) -> None:
 def shown(detail: dict[str, object]) -> str:
     router = NodeStatus("router", "routing", "robot", 1, 2, detail=detail)
     screen = Screen(file=io.StringIO(), width=200)
-    screen.print(status.render("panda", {"router": (router, 0.1, True)}, []))
+    screen.print(status_table.render("panda", {"router": (router, 0.1, True)}, []))
     assert isinstance(screen.file, io.StringIO)
     return screen.file.getvalue()
 

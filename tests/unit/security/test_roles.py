@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import Keys, covers
+from vla_zenoh.keys import NODE_KINDS, Keys, covers
 from vla_zenoh.lab.doctor.access_rules import Passage, allows, missing, passages
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.profile.schema import NODE_KINDS
 from vla_zenoh.security.identity import (
     Identity,
     Role,

@@ -11,6 +11,7 @@ import pytest
 
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types import (
+    QUATERNION_NORM_TOLERANCE,
     ActionChunk,
     Event,
     GripperCommand,
@@ -26,7 +27,9 @@ from vla_zenoh.types import (
     Task,
     checks,
     reports,
+    vector,
 )
+from vla_zenoh.types.arrays import MAX_VECTOR
 
 UNIT = np.array([0.0, 0.0, 0.0, 1.0])
 QUATERNION_TOLERANCE = 1e-15
@@ -64,10 +67,10 @@ def test_a_record_cannot_be_changed() -> None:
 
 
 def test_a_quaternion_that_is_nearly_unit_is_made_so() -> None:
-    pose = PoseState(np.zeros(3), UNIT * (1 + 0.9 * checks.QUATERNION_NORM_TOLERANCE), np.zeros(6))
+    pose = PoseState(np.zeros(3), UNIT * (1 + 0.9 * QUATERNION_NORM_TOLERANCE), np.zeros(6))
     assert abs(np.linalg.norm(pose.quat_xyzw) - 1) < QUATERNION_TOLERANCE
     with pytest.raises(RecordError, match=r"quat_xyzw has norm 1\.0011"):
-        PoseState(np.zeros(3), UNIT * (1 + 1.1 * checks.QUATERNION_NORM_TOLERANCE), np.zeros(6))
+        PoseState(np.zeros(3), UNIT * (1 + 1.1 * QUATERNION_NORM_TOLERANCE), np.zeros(6))
 
 
 def test_an_image_does_not_lock_the_array_it_was_made_of() -> None:
@@ -120,13 +123,13 @@ def test_what_is_no_image_is_refused(rgb: Any, said: str) -> None:
 )
 def test_what_is_no_vector_is_refused(value: Any, said: str) -> None:
     with pytest.raises(RecordError, match=said):
-        checks.vector("v", value, 3)
+        vector("v", value, 3)
 
 
 def test_a_vector_has_a_bound_even_where_any_size_will_do() -> None:
-    assert SceneState("table", np.zeros(checks.MAX_VECTOR)).qpos.shape == (checks.MAX_VECTOR,)
+    assert SceneState("table", np.zeros(MAX_VECTOR)).qpos.shape == (MAX_VECTOR,)
     with pytest.raises(RecordError, match="qpos has 10001 numbers, at most 10000"):
-        SceneState("table", np.zeros(checks.MAX_VECTOR + 1))
+        SceneState("table", np.zeros(MAX_VECTOR + 1))
 
 
 @pytest.mark.parametrize(

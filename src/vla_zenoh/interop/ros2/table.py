@@ -10,7 +10,6 @@ from vla_zenoh.interop.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES
 from vla_zenoh.interop.ros2.samples import Joints, RosImage, Stamp, Transform, Wrench
 from vla_zenoh.interop.ros2.topics import (
     compressed_image,
-    float_array,
     image,
     joint_state,
     joint_trajectory,
@@ -72,7 +71,7 @@ READINGS = (
 
 
 GRIPPER_WRITINGS = (
-    Writing(float_array.TYPE, "command_gripper", float, float_array.write_position),
+    Writing(plain.NUMBERS, "command_gripper", float, plain.write_position),
     Writing(plain.NUMBER, "command_gripper", float, plain.write_position),
 )
 
@@ -95,7 +94,7 @@ def writings(posture_rad: FloatArray, lead_ns: int) -> tuple[Writing, ...]:
             poses,
         ),
         Writing(joint_trajectory.TYPE, "command_joint", JointCommand, joints),
-        Writing(float_array.TYPE, "command_joint", JointCommand, float_array.write_joints),
+        Writing(plain.NUMBERS, "command_joint", JointCommand, plain.write_joints),
         *GRIPPER_WRITINGS,
     )
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.control.reachability import make_reachability_filter
-from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError
+from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError, in_words
 from vla_zenoh.lab.bench.task import (
     ARM_LOST,
     TaskOutcome,
@@ -266,4 +266,4 @@ def _model_errors(what: str) -> Iterator[None]:
 
 
 def _message(error: Exception) -> str:
-    return str(error) if isinstance(error, VlaZenohError) else f"{type(error).__name__}: {error}"
+    return in_words(error)

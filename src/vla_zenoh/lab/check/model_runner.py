@@ -10,6 +10,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
+from vla_zenoh.errors import in_words
+
 Result = TypeVar("Result")
 
 
@@ -17,7 +19,7 @@ class ModelFailed(Exception):
     """The model raised."""
 
     def __init__(self, error: BaseException) -> None:
-        super().__init__(f"{type(error).__name__}: {error}")
+        super().__init__(in_words(error))
         self.error = error
 
 

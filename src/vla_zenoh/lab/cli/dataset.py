@@ -93,7 +93,7 @@ def export(
     console().print(
         f"{written.folder}: {written.episodes} episodes{known}, {written.frames} frames at "
         f"{written.fps} Hz, cameras {', '.join(written.cameras) or 'none'}, "
-        f"{len(written.tasks)} prompts"
+        f"{counted(len(written.tasks), 'prompt')}"
     )
 
 

@@ -10,9 +10,9 @@ import typer
 from vla_zenoh.cli.output import console, new_table, print_json, styled
 from vla_zenoh.lab.cli.demo_options import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, open_stage, refusals, run_folder
+from vla_zenoh.lab.demo.chunk_file import write_chunks
 from vla_zenoh.lab.demo.runner import DemoResult, DemoRunner
 from vla_zenoh.lab.demo.segments import DemoSegment, SegmentOutcome, latencies
-from vla_zenoh.lab.demo.tables import write_chunks, write_commands, write_poses
 from vla_zenoh.lab.evaluation.result import TASKS
 from vla_zenoh.lab.recording.run import Run
 from vla_zenoh.lab.recording.stream_listener import StreamListener
@@ -31,7 +31,7 @@ def run_demo(segments: list[DemoSegment], profile: str, given: DemoOptions) -> N
         run = stage.recorded()
         summary = _summary(stage.profile, given.rate_hz, result, run)
         stage.write(summary)
-        _write_tables(stage, run)
+        _write_files(stage, run)
     if given.as_json:
         print_json({**summary, "folder": folder})
     else:
@@ -118,10 +118,8 @@ def _counter(result: DemoResult, node: str, name: str) -> int:
     return int(status.counters.get(name, 0)) if status else 0
 
 
-def _write_tables(stage: Stage, run: Run) -> None:
+def _write_files(stage: Stage, run: Run) -> None:
     folder, profile = stage.folder, stage.profile
-    write_commands(folder / "commands.csv", run.commands)
-    write_poses(folder / "poses.csv", run.poses)
     worker = profile.task.worker
     spec = make_policy(find_worker(worker, profile.models)[1], profile.options.get(worker)).spec
     first = run.first_commands()
@@ -137,9 +135,9 @@ def _write_tables(stage: Stage, run: Run) -> None:
 
 
 def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
-    columns = ("prompt", "steps", "asked", "reached", "drift", "rotation drift", "")
+    columns = ("prompt", "steps", "asked", "reached", "drift", "rotation drift", "verdict")
     title = "asked and reached, measured at rest"
-    table = new_table(*columns, title=title, left=("prompt", ""))
+    table = new_table(*columns, title=title, left=("prompt", "verdict"))
     for outcome in result.outcomes:
         asked, reached = _amounts(outcome)
         faults = outcome.faults()
@@ -167,10 +165,7 @@ def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
     rates = ", ".join(f"{name} {value:.1f} Hz" for name, value in summary["rates_hz"].items())
     refused = ", ".join(f"{reason} {count}" for reason, count in summary["refusals"].items())
     screen.print(f"rates: {rates}; refusals: {refused or 'none'}")
-    screen.print(
-        f"run folder: {folder} (run.mcap, summary.json, commands.csv, poses.csv, chunks.npz, "
-        "plot.png, video.mp4)"
-    )
+    screen.print(f"run folder: {folder} (run.mcap, summary.json, chunks.npz, plot.png, video.mp4)")
     if result.interrupted:
         screen.print("interrupted; the arm braked", style="yellow")
     elif summary["ok"]:

@@ -157,8 +157,9 @@ def _show_latency(runs: Sequence[Evaluation]) -> None:
 
 
 def _show_segments(run: Evaluation) -> None:
-    title = "asked and reached"
-    table = new_table(*tables.SEGMENT_COLUMNS, title=title, left=("prompt",))
-    for row in tables.segment_rows(run):
+    columns, rows = tables.filled(tables.SEGMENT_COLUMNS, tables.segment_rows(run))
+    table = new_table(*columns, title="asked and reached", left=("prompt",))
+    for row in rows:
         table.add_row(*row)
-    console().print(table)
+    if rows:
+        console().print(table)

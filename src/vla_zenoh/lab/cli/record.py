@@ -12,6 +12,7 @@ from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.cli.output_path import RUNS, ForceOption, output_file
 from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.errors import counted
 from vla_zenoh.runtime.process import run_node
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def _show(recorded: RecordingResult, path: Path, as_json: bool) -> None:
     else:
         console().print(
             f"{path}: {recorded.samples.total():,} samples of "
-            f"{len(recorded.samples)} keys in {recorded.seconds:.1f} s, "
+            f"{counted(len(recorded.samples), 'key')} in {recorded.seconds:.1f} s, "
             f"{recorded.size_bytes / 1e6:.1f} MB, {recorded.dropped.total()} dropped"
         )
     if recorded.dropped:

@@ -10,6 +10,7 @@ import typer
 from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.errors import counted
 from vla_zenoh.profile import Profile, as_robot
 from vla_zenoh.runtime.process import run_node
 from vla_zenoh.security.identity import Role
@@ -58,7 +59,7 @@ def replay(
     else:
         error = replayed.interval_error_ms
         console().print(
-            f"{replayed.samples.total():,} samples of {len(replayed.samples)} keys in "
+            f"{replayed.samples.total():,} samples of {counted(len(replayed.samples), 'key')} in "
             f"{replayed.seconds:.1f} s"
             + (f", time between samples off by {error['p95']:.2f} ms (p95)" if error else "")
         )

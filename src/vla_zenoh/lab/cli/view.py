@@ -16,7 +16,7 @@ from vla_zenoh.cli.options import options
 from vla_zenoh.cli.output import errors, fail, progress
 from vla_zenoh.cli.output_path import ForceOption, output_file
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.errors import MissingExtraError, OutputError, ProfileError
+from vla_zenoh.errors import MissingExtraError, OutputError, ProfileError, counted
 from vla_zenoh.lab.cli.loopback import require_loopback
 from vla_zenoh.lab.view.viewer import Viewer, open_server, open_window
 from vla_zenoh.profile import Profile, read_profile
@@ -218,7 +218,7 @@ def _profile_of(file: Recording, name: str) -> Profile:
 def _summarise(logger: RerunLogger) -> None:
     logger.close()
     screen = errors()
-    screen.print(f"{logger.shown.total():,} samples of {len(logger.shown)} keys")
+    screen.print(f"{logger.shown.total():,} samples of {counted(len(logger.shown), 'key')}")
     if logger.rejected:
         worst = logger.rejected.most_common(SHOWN_REASONS)
         reasons = ", ".join(f"{why} ({count})" for why, count in worst)

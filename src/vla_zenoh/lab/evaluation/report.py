@@ -45,16 +45,10 @@ def page(runs: Sequence[Evaluation], faults: Mapping[str, str]) -> str:
         hints=tables.HINTS,
         table=lambda columns, rows: Markup(cells.render(columns=columns, rows=rows)),
         latency_columns=("stage", *tables.LATENCY_COLUMNS),
-        segment_columns=("prompt", *tables.SEGMENT_COLUMNS[1:]),
         summary_columns=(*tables.SUMMARY_COLUMNS, "tasks done"),
-        summary=[(*tables.summary_row(run), _done(run)) for run in (*runs, *together)],
+        summary=[(*tables.summary_row(run), tables.tasks_done(run)) for run in (*runs, *together)],
         runs=[_shown(run, Markup) for run in runs],
     )
-
-
-def _done(run: Evaluation) -> str:
-    judged = [verdict.success for verdict in run.verdicts if verdict.success is not None]
-    return f"{sum(judged)} of {len(judged)}" if judged else tables.NONE
 
 
 def _shown(run: Evaluation, markup: Any) -> dict[str, Any]:
@@ -66,10 +60,13 @@ def _shown(run: Evaluation, markup: Any) -> dict[str, Any]:
         "problems": run.problems,
         "figures": tables.figures(run),
         "latency": [(f"{row[0]}: {STAGES[row[0]]}", *row[1:]) for row in tables.latency_rows(run)],
-        "segments": [
-            (f"{number}. {row[0]}", *row[1:])
-            for number, row in enumerate(tables.segment_rows(run), 1)
-        ],
+        "segments": tables.filled(
+            tables.SEGMENT_COLUMNS,
+            [
+                (f"{number}. {row[0]}", *row[1:])
+                for number, row in enumerate(tables.segment_rows(run), 1)
+            ],
+        ),
         "film": b64encode(run.film).decode(),
         "strips": _strips(run.views),
         "timeline": markup(plots.timeline(run)),

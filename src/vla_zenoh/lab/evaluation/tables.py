@@ -66,6 +66,20 @@ def latency_rows(run: Evaluation) -> list[tuple[str, ...]]:
     ]
 
 
+def tasks_done(run: Evaluation) -> str:
+    """How many of the judged tasks were done."""
+    judged = [verdict.success for verdict in run.verdicts if verdict.success is not None]
+    return f"{sum(judged)} of {len(judged)}" if judged else NONE
+
+
+def filled(
+    columns: Sequence[str], rows: Sequence[Sequence[str]]
+) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """The columns of a table in which any row has something, and their rows."""
+    kept = [at for at in range(len(columns)) if any(row[at] != NONE for row in rows)]
+    return tuple(columns[at] for at in kept), [tuple(row[at] for at in kept) for row in rows]
+
+
 def segment_rows(run: Evaluation) -> list[tuple[str, ...]]:
     """Prompt, steps, asked, reached along it, furthest off it, gripper."""
     rows: list[tuple[str, ...]] = []
@@ -120,6 +134,7 @@ def figures(run: Evaluation) -> list[tuple[str, str]]:
     """Name and value of every figure; docs/how-to/recording.md says what they mean."""
     jerk_unit = run.jerk_unit.replace("_s3", "/s³")
     rows = [
+        ("tasks done", tasks_done(run)),
         ("requests", str(run.requests)),
         ("succeeded", NONE if run.success_rate is None else f"{run.success_rate:.1%}"),
         ("time", number(run.seconds, "s", 1)),

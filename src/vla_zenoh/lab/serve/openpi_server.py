@@ -13,7 +13,7 @@ import time
 from http import HTTPStatus
 from typing import Any
 
-from vla_zenoh.errors import MissingExtraError, PeerError, SpecError
+from vla_zenoh.errors import MissingExtraError, PeerError, SpecError, in_words
 from vla_zenoh.lab.serve import openpi_frames
 from vla_zenoh.lab.serve.served_policy import ServedPolicy
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
@@ -109,7 +109,7 @@ class OpenPiServer:
             except Exception as error:  # sent to the client as openpi does; it may reconnect
                 why = error if isinstance(error, (PeerError, SpecError)) else repr(error)
                 self._log.warning("request rejected: %s", why)
-                connection.send(f"{type(error).__name__}: {error}"[:MAX_ERROR])
+                connection.send(in_words(error)[:MAX_ERROR])
                 connection.close(INTERNAL_ERROR, "the reason is in the frame before")
                 return
             infer_ms = (time.monotonic() - began_s) * 1e3

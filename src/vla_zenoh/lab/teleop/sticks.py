@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from vla_zenoh.errors import MissingExtraError, NodeError, PeerError
+from vla_zenoh.errors import MissingExtraError, NodeError, PeerError, in_words
 from vla_zenoh.lab.teleop.policy import OperatorInput, clipped_twist, without_dead_zone
 
 MAX_READS = 64
@@ -101,7 +101,7 @@ class SpaceMouse:
             self._mouse: Any = pyspacemouse.open(axis_convention=pyspacemouse.AxisConvention.ROS)
         except Exception as error:  # of the system's HID library too
             raise NodeError(
-                f"no SpaceMouse can be used: {error} It needs the system's hidapi "
+                f"no SpaceMouse can be used: {in_words(error)}. It needs the system's hidapi "
                 "(Debian: libhidapi-hidraw0) and read access to /dev/hidraw*; or leave --device "
                 "out and use the keyboard"
             ) from error
@@ -118,7 +118,7 @@ class SpaceMouse:
                 if state.t == before:
                     break
         except Exception as error:
-            raise PeerError("device_lost", f"{self.name} is gone: {error}") from error
+            raise PeerError("device_lost", f"{self.name} is gone: {in_words(error)}") from error
         down = bool(state.buttons and state.buttons[0])
         self._toggles += down and not self._was_down
         self._was_down = down

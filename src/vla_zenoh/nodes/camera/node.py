@@ -11,7 +11,7 @@ import zenoh
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, ZenohRing
 from vla_zenoh.bus.node import Node
-from vla_zenoh.errors import NodeError, VlaZenohError
+from vla_zenoh.errors import NodeError, in_words
 from vla_zenoh.keys import last_chunk
 from vla_zenoh.nodes.camera.camera_publisher import ENDED, OK, CameraPublisher
 from vla_zenoh.nodes.camera.fitted_streams import MAX_MODELS, RequestedSizes
@@ -97,8 +97,7 @@ class Grabber:
             except Exception as error:  # whatever a driver raises must not end the other cameras
                 if stop.is_set():
                     return
-                known = isinstance(error, VlaZenohError)
-                self._publisher.lose(str(error) if known else f"{type(error).__name__}: {error}")
+                self._publisher.lose(in_words(error))
             else:
                 if not stop.is_set():
                     self._publisher.set_state(ENDED, "the last image was shown, and loop is false")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
-from vla_zenoh.errors import MissingExtraError, NodeError, RecordError, VlaZenohError
+from vla_zenoh.errors import MissingExtraError, NodeError, RecordError, VlaZenohError, in_words
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
 from vla_zenoh.nodes.camera.source import STALL_S
 from vla_zenoh.profile import Profile
@@ -103,8 +103,7 @@ class SimCameras:
             except Exception as error:  # drivers raise anything, and none of it may end the thread
                 if stop.is_set():
                     return
-                known = isinstance(error, VlaZenohError)
-                why = str(error) if known else f"{type(error).__name__}: {error}"
+                why = in_words(error)
                 self.renderer = f"none: {why}"
                 for _, publisher in self._views:
                     publisher.lose(why)

@@ -31,7 +31,9 @@ from vla_zenoh.types import LATENCY_STAGES, Cause, Event
 TASK_PERIOD_S = 0.2
 BRAKE_BEFORE_EXIT_S = 1.0
 SWITCH_INTERVAL_S = 5e-4
-MAX_WHY = 2000
+MAX_WHY, MAX_LIMIT = 2000, 200
+ACTING_S = 1.0
+"""Limits that shorten steps act once for each chunk."""
 SPREAD_S = 8.0
 """Window of the distributions of tick cost and lateness in status."""
 CHUNKS = 128
@@ -105,6 +107,7 @@ class CommandNode:
             self._latch.close()
         self.node.publish_status("stopped", now=True)
         self.node.close()
+        gc.unfreeze()  # so that the interpreter frees everything at its end
 
     def _loop(self, stop: threading.Event) -> None:
         loop = FixedRate(self.node.profile.timing.command_hz)
@@ -193,6 +196,9 @@ class CommandStatus:
         self._pose_age_ms = Percentiles(ticks)
         self._rate = RateMeter()
         self._was_at_rest = True
+        self._limits: dict[str, tuple[str, float]] = {}
+        simulated = node.profile.robot.driver == "sim"
+        self._mode = "dry_run" if commander.dry_run else "sim" if simulated else "live"
         self.realtime = False
 
     def add_tick(self, now_ns: int, late_s: float, cost_s: float) -> None:
@@ -213,6 +219,9 @@ class CommandStatus:
     def publish(self, out: Outputs, chunks_dropped: int) -> None:
         """Publish status when it is due, and at once after a change."""
         commander = self._commander
+        for event in out.events:
+            if event.kind == "limit":
+                self._limits[event.what] = (event.why, time.monotonic())
         now = any(event.kind == "transition" for event in out.events) or out.task_changed
         now = now or commander.at_rest != self._was_at_rest
         self._was_at_rest = commander.at_rest
@@ -252,7 +261,8 @@ class CommandStatus:
                 "late_us": self._late_us.spread(),
                 "pose_age_ms": self._pose_age_ms.spread(),
                 "realtime": self.realtime,
-                "dry_run": commander.dry_run,
+                "mode": self._mode,
+                "limits": self._acting_limits(),
                 **self._goal(),
                 **self._margins(),
                 **self._contact(),
@@ -262,6 +272,16 @@ class CommandStatus:
             latency_ms={name: values for name, values in latency.items() if values},
             now=now,
         )
+
+    def _acting_limits(self) -> list[str]:
+        """Limits that acted in the last `ACTING_S`, and what slows the arm down now."""
+        oldest_s = time.monotonic() - ACTING_S
+        self._limits = {name: hit for name, hit in self._limits.items() if hit[1] > oldest_s}
+        slower = self._commander.slower
+        acting = {name: why for name, (why, _) in self._limits.items()}
+        if slower is not None:
+            acting[slower.name] = f"{slower.share:.0%} of the speed{slower.at}"
+        return [f"{name}: {why}"[:MAX_LIMIT] for name, why in sorted(acting.items())]
 
     def _goal(self) -> dict[str, Any]:
         goal = self._commander.goal

@@ -13,8 +13,9 @@ from vla_zenoh.bus.clock import HostId
 from vla_zenoh.bus.node import Node
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.errors import CodecError
-from vla_zenoh.keys import worker_node
+from vla_zenoh.keys import CRASHED, worker_node
 from vla_zenoh.policy import ModelSpec
+from vla_zenoh.security.identity import expected_nodes
 from vla_zenoh.types import Header, NodeStatus
 
 MAX_WORKERS, MAX_HOLDERS = 32, 32
@@ -41,6 +42,8 @@ class PeerMonitor:
         self._cameras: dict[str, tuple[float, int]] = {}
         self._camera_faults: dict[str, str] = {}
         self._camera_reasons: dict[str, str] = {}
+        self._expected = frozenset(expected_nodes(node.profile))
+        self._down: dict[str, str] = {}
         self._hosts: dict[str, HostId] = {}
         self._next_clocks_s = 0.0
         self._statuses = node.subscribe(node.keys.all_status, ZenohRing(STATUSES_A_TICK))
@@ -53,7 +56,9 @@ class PeerMonitor:
         with self._lock:
             (self._alive.add if alive else self._alive.discard)(name)
             self._changed = True
-            if not alive:
+            if alive:
+                self._down.pop(name, None)
+            else:
                 self._status_sources.pop(name, None)
                 self._hosts.pop(name, None)
             if not alive and name.startswith("worker-"):
@@ -104,6 +109,7 @@ class PeerMonitor:
                 frozenset(self._holders),
                 dict(self._camera_faults),
                 dict(self._camera_reasons),
+                dict(self._down),
             )
 
     def _track_clocks(self) -> None:
@@ -131,6 +137,10 @@ class PeerMonitor:
         source = header.source
         with self._lock:
             ours = name in self._alive and self._status_sources.get(name, source) == source
+            down = name in self._expected and name not in self._alive
+        if down:
+            self._receive_on_behalf(name, arrival, header)
+            return
         stamped = self._node.decode(NodeStatus, arrival, header=header) if ours else None
         if ours and stamped is None:
             return  # rejected and counted already
@@ -147,6 +157,16 @@ class PeerMonitor:
         for camera, fields in cameras.items() if isinstance(cameras, dict) else ():
             if camera in self._servers and isinstance(fields, dict):
                 self._update_camera(name, camera, fields, now_ns)
+
+    def _receive_on_behalf(self, name: str, arrival: ReceivedSample, header: Header) -> None:
+        """Keep why a node does not run, by the `up` of its host; it is for people alone."""
+        stamped = self._node.decode(NodeStatus, arrival, header=header)
+        why = None if stamped is None else stamped.record.detail.get("complaint")
+        if stamped is None or stamped.record.state != CRASHED or not isinstance(why, str):
+            return
+        with self._lock:
+            if name not in self._alive and self._down.get(name) != why[:MAX_WHY]:
+                self._down[name], self._changed = why[:MAX_WHY], True
 
     def _receive_spec(self, arrival: ReceivedSample) -> None:
         """Accept a worker's spec on its own key, while it is alive, from the first source of it."""

@@ -16,7 +16,7 @@ from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.codec.records import SMALL_BYTES
-from vla_zenoh.errors import CodecError, PeerError, SpecError
+from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
 from vla_zenoh.keys import Kind, worker_node
 from vla_zenoh.nodes.worker.camera_subscriber import (
     STREAM_PATIENCE_S,
@@ -278,8 +278,7 @@ class RobotSession:
                 reason = "contract"
             else:
                 reason = error.reason if isinstance(error, PeerError) else "inference_failed"
-        expected = isinstance(error, (SpecError, PeerError))
-        why = str(error) if expected else f"{type(error).__name__}: {error}"
+        why = in_words(error)
         self.complaint = f"{reason}: {why}"
         self.node.reject(reason, why)
         self.due_s = time.monotonic() + AFTER_A_FAILURE_S

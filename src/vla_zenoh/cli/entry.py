@@ -1,0 +1,101 @@
+"""Entry of ``vla-zenoh``. The words that drive a robot start at once; all others go by Typer.
+
+Typer, Rich and the profile's schema take half a second to load, in which an arm that shall stop
+moves on.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from importlib import import_module
+
+from vla_zenoh.cli.words import WORDS, parse
+
+EXTRA_OF = {
+    "pinocchio": "control",
+    "ruckig": "control",
+    "mujoco": "sim",
+    "matplotlib": "sim",
+    "av": "sim",
+    "mcap": "record",
+    "plotly": "record",
+    "jinja2": "record",
+    "rosbags": "record",
+    "rerun": "view",
+}
+"""Module -> extra that brings it, for the error of a missing import."""
+
+
+HASTE = -20
+"""Niceness of a stop."""
+
+
+def main() -> None:
+    """Run the command line. Errors of this package become one line and exit code 1.
+
+    Under a supervisor every error becomes one line for it, and the traceback lines for its log.
+    """
+    if sys.argv[1:2] == ["stop"]:  # goes before other programs, where that is allowed
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, HASTE)
+    try:
+        _chosen(sys.argv[1:])()
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except Exception as error:
+        from vla_zenoh.runtime.parent_watch import PARENT_VARIABLE
+
+        sentence = _sentence(error)
+        if PARENT_VARIABLE in os.environ:
+            _tell_supervisor(error, sentence)
+            sys.exit(1)
+        if sentence is None:
+            raise
+        from vla_zenoh.cli.plain import fail
+
+        fail(sentence)
+
+
+def _sentence(error: Exception) -> str | None:
+    """What a person is told of an expected error; None: it is a mistake in a program."""
+    from vla_zenoh.errors import VlaZenohError, how_to_install
+
+    if isinstance(error, VlaZenohError):
+        return str(error)
+    if not isinstance(error, ImportError):
+        return None
+    extra = EXTRA_OF.get((error.name or "").partition(".")[0])
+    if extra:
+        return f"{error}; install it with: {how_to_install(extra)}"
+    return f"{error}; `vla-zenoh doctor` names the system package" if ".so" in str(error) else None
+
+
+def _tell_supervisor(error: Exception, sentence: str | None) -> None:
+    import traceback
+
+    from vla_zenoh.cli.plain import say
+    from vla_zenoh.runtime.parent_watch import DETAIL, FATAL
+
+    for line in "".join(traceback.format_exception(error)).splitlines():
+        say(f"{DETAIL}{line}")
+    what = sentence or f"{type(error).__name__}: {error}"
+    say(f"{FATAL}{'; '.join(what.splitlines())}")
+
+
+def _chosen(words: Sequence[str]) -> Callable[[], None]:
+    parsed = parse(words)
+    if parsed is None:
+        from vla_zenoh.cli.main import app
+
+        return app
+    import zenoh
+
+    from vla_zenoh.cli.target import RobotTarget
+
+    zenoh.init_log_from_env_or("off")  # as main.py does
+    name, arguments, target = parsed
+    function = getattr(import_module(WORDS[name].module), name)
+    return lambda: function(target=RobotTarget(**target), **arguments)

@@ -1,0 +1,110 @@
+"""State of every node of a robot: of those that live, and of those that the profile expects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from vla_zenoh.keys import CRASHED, STARTING
+from vla_zenoh.sanitize import one_line
+from vla_zenoh.types import NodeStatus
+
+Statuses = Mapping[str, tuple[NodeStatus, float, bool]]
+"""Node -> (its last status, seconds since it came, alive)."""
+UNKNOWN = "unknown"
+MODE_WORDS = {
+    "sim": ("SIM", "a simulated robot moves", "bold black on cyan"),
+    "dry_run": ("DRY RUN", "everything is computed; the robot gets no commands", "black on yellow"),
+    "live": ("LIVE", "a real robot moves", "bold white on red"),
+    UNKNOWN: ("MODE UNKNOWN", "no command node says whether a robot moves", "bold"),
+}
+"""Mode -> (word in front of what moves, sentence, style)."""
+MISSING, DEAD = "missing", "dead"
+ON_BEHALF = frozenset({CRASHED, STARTING})
+
+
+class NodeRow(NamedTuple):
+    """A node.
+
+    Args:
+        name: on the bus.
+        host: where it runs, or is to run.
+        state: by its status, or ``missing``, ``starting``, ``crashed``, ``dead``.
+        why: of the latter, with what to do; else empty.
+        status: its last one.
+        age_s: of that.
+        alive: it has a liveliness token.
+    """
+
+    name: str
+    host: str
+    state: str
+    why: str
+    status: NodeStatus | None
+    age_s: float | None
+    alive: bool
+
+
+def node_rows(
+    said: Statuses, expected: Mapping[str, str], alive: frozenset[str] = frozenset()
+) -> list[NodeRow]:
+    """Every node that was heard, and those expected on hosts that run, by name.
+
+    Args:
+        said: by the nodes.
+        expected: nodes of the profile, each with its host.
+        alive: nodes that have a liveliness token.
+    """
+    down = hosts_down(said, expected, alive)
+    names = {*said, *(name for name, host in expected.items() if host not in down)}
+    rows: list[NodeRow] = []
+    for name in sorted(names):
+        host = expected.get(name, "")
+        if name not in said:
+            rows.append(_unheard(name, host, lives=name in alive))
+            continue
+        status, age_s, lives = said[name]
+        state, why = status.state, ""
+        if not lives and state in ON_BEHALF:
+            why = str(status.detail.get("complaint", ""))
+        elif not lives:
+            state, why = DEAD, "it ended, or lost its connection; the output of `up` there says why"
+        rows.append(NodeRow(name, status.host, state, why, status, age_s, lives))
+    return rows
+
+
+def _unheard(name: str, host: str, *, lives: bool) -> NodeRow:
+    if lives:
+        return NodeRow(
+            name, host, STARTING, "it has not published its status yet", None, None, True
+        )
+    why = f"not running; see the output of `vla-zenoh up` on host {host}, which is to start it"
+    return NodeRow(name, host, MISSING, why, None, None, False)
+
+
+def hosts_down(
+    said: Statuses, expected: Mapping[str, str], alive: frozenset[str] = frozenset()
+) -> dict[str, list[str]]:
+    """Host of which no node was heard -> its nodes."""
+    hosts: dict[str, list[str]] = {}
+    for name, host in expected.items():
+        hosts.setdefault(host, []).append(name)
+    return {
+        host: sorted(names)
+        for host, names in hosts.items()
+        if not any(name in said or name in alive for name in names)
+    }
+
+
+def mode_of(said: Statuses) -> str:
+    """``sim``, ``dry_run`` or ``live`` by the command node; ``unknown`` without one."""
+    status, _, lives = said.get("command", (None, 0.0, False))
+    mode = status.detail.get("mode") if status is not None and lives else None
+    return mode if isinstance(mode, str) and mode in MODE_WORDS else UNKNOWN
+
+
+def acting_limits(said: Statuses) -> list[str]:
+    """Limits that act on the arm now, by the command node."""
+    status, _, lives = said.get("command", (None, 0.0, False))
+    limits = status.detail.get("limits") if status is not None and lives else None
+    return [one_line(limit) for limit in limits] if isinstance(limits, (list, tuple)) else []

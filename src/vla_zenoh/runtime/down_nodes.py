@@ -1,0 +1,117 @@
+"""Publishes, for the nodes of this host that do not run, that they crashed or are starting.
+
+A node that cannot start cannot say so; without this its reason would be in one terminal alone. It
+is published in the node's name and with its certificate, on its own keys, which no other role may
+put.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+import zenoh
+
+from vla_zenoh.bus.clock import Clock, own_host_id
+from vla_zenoh.bus.node import Publisher
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.errors import VlaZenohError
+from vla_zenoh.keys import CRASHED, STARTING, Kind
+from vla_zenoh.profile import Profile
+from vla_zenoh.runtime.supervisor import DownNode
+from vla_zenoh.types import Event, NodeStatus
+
+PERIOD_S = 0.5
+MAX_WHY = 1000
+
+
+class DownNodes:
+    """Publishes the status of nodes that are down, in a thread, until `close`.
+
+    Args:
+        profile: the effective profile.
+        session: of the people at this computer; nodes of a secured lab get one each.
+        host: of the profile.
+        down: the nodes that are down now.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        session: zenoh.Session,
+        host: str,
+        down: Callable[[], Sequence[DownNode]],
+    ) -> None:
+        self._profile, self._session, self._down = profile, session, down
+        self._host_id = own_host_id(profile.session, host)
+        self._voices: dict[str, _Voice] = {}
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="down nodes", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread and its sessions."""
+        self._ended.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._ended.wait(PERIOD_S):
+            try:
+                self._publish(self._down())
+            except (VlaZenohError, zenoh.ZError):
+                continue  # the router is away, and with it all who could hear
+        self._forget(())
+
+    def _publish(self, down: Sequence[DownNode]) -> None:
+        self._forget([node.name for node in down])
+        for node in down:
+            if node.name not in self._voices:
+                secured = self._profile.session.security is not None
+                own = open_session(self._profile.session, identity=node.name) if secured else None
+                self._voices[node.name] = _Voice(self._profile, node.name, self._session, own)
+            self._voices[node.name].publish(node, self._host_id.host, self._host_id.boot)
+
+    def _forget(self, names: Sequence[str]) -> None:
+        for name in [name for name in self._voices if name not in names]:
+            self._voices.pop(name).close()
+
+
+class _Voice:
+    """Publishers of one node that is down."""
+
+    def __init__(
+        self, profile: Profile, name: str, session: zenoh.Session, own: zenoh.Session | None
+    ) -> None:
+        keys, clock, used = profile.keys, Clock(), own or session
+        source = f"up-{name}#{secrets.token_hex(4)}"
+        self._own, self._since_wall_ns, self._crashes = own, time.time_ns(), 0
+        self._status = Publisher(used, keys.status(name), Kind.TELEMETRY, source, clock)
+        self._event = Publisher(used, keys.event(name), Kind.TELEMETRY, source, clock)
+
+    def publish(self, node: DownNode, host: str, boot: str) -> None:
+        state, why = _state(node)
+        if node.crashes > self._crashes:
+            self._event.publish(Event("error", "fault", CRASHED, why))
+        self._crashes = node.crashes
+        detail = {"complaint": why, "crashes": node.crashes, "given_up": node.left_alone}
+        since_ns = self._since_wall_ns
+        self._status.publish(
+            NodeStatus(node.name, state, host, node.pid, since_ns, detail=detail, boot=boot)
+        )
+
+    def close(self) -> None:
+        self._status.close()
+        self._event.close()
+        if self._own is not None:
+            self._own.close()
+
+
+def _state(node: DownNode) -> tuple[str, str]:
+    if not node.crashes:
+        return STARTING, ""
+    times = "once" if node.crashes == 1 else f"{node.crashes} times"
+    then = "correct that and restart `up` there" if node.left_alone else "it is started again"
+    why = node.why.encode("utf-8", "replace").decode()[:MAX_WHY]
+    return CRASHED, f"crashed {times}: {why}; {then}"

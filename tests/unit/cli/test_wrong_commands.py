@@ -1,0 +1,189 @@
+"""Wrong command lines and inputs: one sentence, the right status, nothing on stdout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typed import typed
+
+USAGE, FAILED = 2, 1
+NOWHERE = ("--connect", "tcp/127.0.0.1:9")
+
+WRONG: list[tuple[str, int, str]] = [
+    # (words, exit status, part of what is said)
+    ("rate abc", USAGE, "Invalid value for 'rate_hz': wants a number (given: 'abc')"),
+    (
+        "rate 1000",
+        FAILED,
+        "error: rate '1000' Hz is out of range: give 0.05 to 100 chunks per second",
+    ),
+    ("rate 0", FAILED, "error: rate '0' Hz is out of range: give 0.05 to 100 chunks per second"),
+    ("speed fast", FAILED, "error: 'fast' is no percentage: give a number from 0 to 100, such as"),
+    ("speed 120", FAILED, "error: speed '120' percent is out of range: give 0 to 100 percent"),
+    ("use a/b", FAILED, "error: worker name 'a/b' cannot be part of a key"),
+    ("use", USAGE, "Missing argument 'worker'"),
+    ("prompt", USAGE, "Missing argument 'text'"),
+    ("stop --now", USAGE, "No such option: --now"),
+    ("stpo", USAGE, "No such command 'stpo'."),
+    ("demo --rate abc", USAGE, "Invalid value for '--rate': wants a number (given: 'abc')"),
+    ("demo --rate -1", USAGE, "Invalid value for '--rate': must be at least 0.2 (given: '-1')"),
+    ("demo --steps 1.5", USAGE, "Invalid value for '--steps': wants a whole number (given: '1.5')"),
+    (
+        "demo --profile nosuch",
+        FAILED,
+        "error: no profile called 'nosuch'. Known: panda_bricks, pan",
+    ),
+    (
+        "demo --profile panda_sin",
+        FAILED,
+        "no profile called 'panda_sin'; did you mean 'panda_sim'?",
+    ),
+    (
+        "up nosuch",
+        FAILED,
+        "error: no profile called 'nosuch'. Known: panda_bricks, panda_ros2, pan",
+    ),
+    ("up ./absent.yaml", FAILED, "error: there is no file or folder './absent.yaml'"),
+    ("up --listen x", FAILED, "session.listen.0: 'x' is not an endpoint: write tcp/HOST:PORT"),
+    ("up --connect tpc/a:1", FAILED, "unknown protocol; did you mean 'tcp'? Known: tcp, udp, tls"),
+    (
+        "up --listen tcp/10.0.0.2:7447",
+        FAILED,
+        "lets anyone on that network command the robot. Make",
+    ),
+    ("up panda_sim_two_hosts", FAILED, "has hosts robot, gpu: say which one this is with --host"),
+    ("up panda_sim --host desk", FAILED, "profile panda_sim has no host 'desk'; it has: here"),
+    (
+        "up panda_sim --connect tcp/127.0.0.1:7448",
+        FAILED,
+        "session.connect: leads to tcp/127.0.0.1:7448, and the router of this host listens on",
+    ),
+    ("profile check", USAGE, "Missing argument 'NAME'"),
+    ("profile check nosuch", FAILED, "no profile called 'nosuch'. Known: "),
+    ("profile check panda_sim --host desk", FAILED, "hosts: has no 'desk'. It has: here"),
+    ("profile show nosuch", FAILED, "error: no profile called 'nosuch'. Known: "),
+    (
+        "worker nosuch",
+        FAILED,
+        "error: no model called 'nosuch'. Known: brick, groot, lerobot, open",
+    ),
+    ("worker scriptd", FAILED, "error: no model called 'scriptd'; did you mean 'scripted'? Known"),
+    ("worker ./absent.py", FAILED, "error: there is no file or folder './absent.py'"),
+    ("worker scripted --set foo", USAGE, "Invalid value: --set wants name=value, not 'foo'"),
+    (
+        "worker scripted --set camra=x",
+        FAILED,
+        "Scripted has no option 'camra'; did you mean 'camera'? Its options: camera, horizon, dt_s",
+    ),
+    (
+        "worker replay",
+        FAILED,
+        "Replay needs the option 'file': give file=VALUE, with --set or in t",
+    ),
+    ("worker openvla", FAILED, "model.py needs the option 'checkpoint': give checkpoint=VALUE, wi"),
+    (
+        "worker openvla --set chekpoint=a",
+        FAILED,
+        "model.py has no option 'chekpoint'; did you mean 'checkpoint'? Its options: checkpoint,",
+    ),
+    ("worker lerobot", FAILED, "model.py needs the option 'checkpoint': give checkpoint=VALUE, wi"),
+    (
+        "worker scripted --delay -1",
+        USAGE,
+        "Invalid value for '--delay': must be at least 0 (given:",
+    ),
+    ("worker scripted --images png", USAGE, "Invalid value for '--images': 'png' is not one of"),
+    ("worker scripted --robots a/b", USAGE, "--robots: robot name 'a/b' cannot be part of a key"),
+    ("worker scripted --robots a,a", USAGE, "--robots names one twice: a,a"),
+    (
+        "worker scripted --python no-such-python",
+        FAILED,
+        "error: --python 'no-such-python' is not a program: give the interpreter of an environment",
+    ),
+    (
+        "worker scripted --python /bin/true2",
+        FAILED,
+        "error: --python '/bin/true2' is not a program",
+    ),
+    (
+        "worker scripted --python /bin/false",
+        FAILED,
+        "error: --python '/bin/false' has no vla-zenoh; install it there: pip install",
+    ),
+    ("node camera nosuch", USAGE, "no camera 'nosuch' in profile panda_sim; it has: front, wrist"),
+    ("node", USAGE, ""),
+    ("teleop --frame foo", USAGE, "Invalid value for '--frame': 'foo' is not one of 'base', 'tcp'"),
+    ("eval /absent.mcap", FAILED, "/absent.mcap cannot be read: No such file or directory"),
+    (
+        "replay /absent.mcap",
+        FAILED,
+        "error: /absent.mcap cannot be read: No such file or directory",
+    ),
+    ("view /absent.mcap", FAILED, "error: /absent.mcap cannot be read: No such file or directory"),
+    ("bench compare /a /b", FAILED, "error: /a cannot be read: No such file or directory"),
+    ("bench task --model nosuch", FAILED, "error: no model called 'nosuch'. Known: brick, groot,"),
+    ("check nosuch", FAILED, "error: no model called 'nosuch'. Known: brick, groot, lerobot, open"),
+    (
+        "check scripted --runs 0",
+        USAGE,
+        "Invalid value for '--runs': must be at least 1 (given: '0')",
+    ),
+    ("check scripted --rate x", USAGE, "Invalid value for '--rate': wants a number (given: 'x')"),
+    (
+        "check openvla",
+        FAILED,
+        "model.py needs the option 'checkpoint': give checkpoint=VALUE, with",
+    ),
+    (
+        "dataset export /absent.mcap -o out",
+        FAILED,
+        "error: /absent.mcap cannot be read: No such",
+    ),
+    ("dataset export", USAGE, "Missing "),
+    (
+        "secure add desk",
+        FAILED,
+        "error: profile panda_sim is not secured: run `vla-zenoh secure in",
+    ),
+    ("lab compare", USAGE, "Missing argument 'a'"),
+    ("lab trial", USAGE, "Missing option '--output' / '-o'"),
+    ("doctor --host desk", USAGE, "--host names a host of a profile: give --profile too"),
+]
+WITHOUT_A_ROUTER = (
+    "status --once",
+    "prompt hold",
+    "activate",
+    "stop",
+    "reset",
+    "keys",
+    "echo task",
+)
+
+
+@pytest.fixture(autouse=True)
+def wide(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("COLUMNS", "300")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize(("line", "code", "said"), WRONG, ids=[line for line, *_ in WRONG])
+def test_what_is_typed_wrong_gets_one_sentence(
+    capsys: pytest.CaptureFixture[str], line: str, code: int, said: str
+) -> None:
+    done = typed(capsys, *line.split())
+    assert done.code == code, done.stderr
+    assert said in done.said
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
+    assert "pydantic" not in done.stderr
+
+
+@pytest.mark.parametrize("line", WITHOUT_A_ROUTER)
+def test_without_a_router_it_is_said_where_one_was_looked_for(
+    capsys: pytest.CaptureFixture[str], line: str
+) -> None:
+    done = typed(capsys, *line.split(), *NOWHERE)
+    assert done.code == FAILED
+    assert done.stdout == ""
+    assert "no Zenoh router answers at tcp/127.0.0.1:9. Start one with `vla-zenoh" in done.said
