@@ -76,7 +76,7 @@ def keys(context: Any) -> Iterable[str]:
     return [word for word in words if "*" not in word]
 
 
-class Word(NamedTuple):
+class Candidate(NamedTuple):
     """A word for the shell; the fields are those that Typer reads."""
 
     value: str
@@ -118,8 +118,8 @@ def add_completion(parameter: Any, command: str) -> None:
     if words is None or name == NO_HOST_OF_A_LAB:
         return
 
-    def complete(context: Any, incomplete: str) -> list[Word]:
+    def complete(context: Any, incomplete: str) -> list[Candidate]:
         found = sorted({word for word in words(context) if word.startswith(incomplete)})
-        return [Word(word) for word in found]
+        return [Candidate(word) for word in found]
 
     parameter.shell_complete = complete

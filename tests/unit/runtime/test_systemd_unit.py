@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import configparser
+import shlex
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from vla_zenoh.cli.main import app
 from vla_zenoh.runtime.systemd_unit import systemd_unit
 
 COMMAND = [sys.executable, "-m", "vla_zenoh", "up", "/home/lab/my arm.yaml", "--host", "robot"]
@@ -69,3 +72,20 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
     )
     assert str(path.name) not in done.stderr, done.stderr
     assert done.returncode == 0, done.stderr
+
+
+def test_up_prints_a_unit_that_runs_this_profile_from_any_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "lab.yaml").write_text("extends: panda_sim\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("VLA_ZENOH_PATH", "/srv/lab")
+    result = CliRunner().invoke(app, ["up", "./lab.yaml", "--print-unit", "--dry-run"])
+    assert result.exit_code == 0, result.output
+    service = parsed(result.stdout)["Service"]
+    words = shlex.split(service["ExecStart"])
+    assert words[:4] == [sys.executable, "-m", "vla_zenoh", "up"]
+    assert Path(words[4]) == tmp_path / "lab.yaml"
+    assert words[5] == "--host"
+    assert words[-1] == "--dry-run"
+    assert service["Environment"] == "VLA_ZENOH_PATH=/srv/lab"
