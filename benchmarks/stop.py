@@ -86,6 +86,11 @@ class _Lab:
         self._folder = tempfile.TemporaryDirectory()
         self._file = Path(self._folder.name) / "robot.yaml"
         self._file.write_text(to_yaml(profile), "utf-8")
+        # So that the outline of the profile is known, as where `activate` was typed before.
+        subprocess.run(self._typed("status", "--json"), stdout=subprocess.DEVNULL, check=False)
+
+    def _typed(self, *words: str) -> list[str]:
+        return [sys.executable, "-m", "vla_zenoh", *words, "--profile", str(self._file)]
 
     def _on_pose(self, sample: zenoh.Sample) -> None:
         pose = records.decode(PoseState, bytes_of(sample.payload))
@@ -119,8 +124,9 @@ class _Lab:
         self._until("0.2 m/s", lambda: self._speed_m_s > 0.9 * SPEED_M_S, PATIENCE_S)
         client.pop_events()
         self._sample_s, began_s = 0.0, time.time()
-        words = [sys.executable, "-m", "vla_zenoh", "stop", "--profile", str(self._file)]
-        typed = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        typed = subprocess.Popen(
+            self._typed("stop"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         stopped_s = self._until("a transition", self._stopped_s, PATIENCE_S)
         self._until(
             "rest",
