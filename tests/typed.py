@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pytest
 
-from vla_zenoh.cli.main import app_entry
+from vla_zenoh.cli.entry import main
 
 HANDLED = (signal.SIGINT, signal.SIGTERM)
 
@@ -33,7 +33,7 @@ def typed(capsys: pytest.CaptureFixture[str], *words: str) -> Typed:
     capsys.readouterr()
     code = 0
     try:
-        app_entry()
+        main()
     except SystemExit as ended:
         code = ended.code if isinstance(ended.code, int) else 1
     finally:

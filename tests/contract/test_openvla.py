@@ -350,7 +350,7 @@ def test_a_directory_that_is_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text("{")
     with pytest.raises(WorkerError, match=r"config.json cannot be read"):
         make(tmp_path)
-    with pytest.raises(WorkerError, match=r"--set checkpoint=DIRECTORY"):
+    with pytest.raises(WorkerError, match="give checkpoint=VALUE, with --set"):
         make_policy(find_model("openvla"))
 
 

@@ -14,8 +14,8 @@ from pydantic import BaseModel, ValidationError
 
 from vla_zenoh import resources
 from vla_zenoh.bus.session import session_config
+from vla_zenoh.lab.profile.advice import advice
 from vla_zenoh.profile import Profile, load_profile, to_yaml
-from vla_zenoh.profile.advice import advice
 
 SHIPPED = sorted(path.stem for path in resources.shipped("profiles").glob("*.y*ml"))
 HOME_MARGIN_M = 0.02  # from the workspace's walls, of the TCP in its home pose

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.profile import profile_app
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.interop.ros2.gripper_actions import position
 from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import load_profile
 from vla_zenoh.resources import robot_urdf

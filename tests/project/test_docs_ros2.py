@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.profile import profile_app
-from vla_zenoh.cli.secure import secure_app
+from vla_zenoh.lab.cli.profile import profile_app
+from vla_zenoh.lab.cli.secure import secure_app
 
 TEXT = (Path(__file__).parents[2] / "docs" / "how-to" / "ros2.md").read_text("utf-8")
 RUNNER = CliRunner()

@@ -24,8 +24,8 @@ from teleop_rig import Screen, teleop
 from typer.testing import CliRunner
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.cli.secure import secure_app
 from vla_zenoh.keys import Keys
+from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.profile import load_profile
 

@@ -72,8 +72,8 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
     "Check and measure": {
         "check": "lab.cli.check:check",
         "doctor": "lab.cli.doctor:doctor",
-        "profile": "cli.profile:profile_app",
-        "secure": "cli.secure:secure_app",
+        "profile": "lab.cli.profile:profile_app",
+        "secure": "lab.cli.secure:secure_app",
         "dataset": "lab.cli.dataset:dataset_app",
         "bench": Group(
             "Measure this computer, and how well models do tasks.",

@@ -79,7 +79,7 @@ def up(
         words += ["--log-dir", str(log_dir.absolute())] if log_dir else []
         kept = {key: os.environ[key] for key in KEPT if key in os.environ}
         what = f"robot {loaded.robot.name}, host {name}"
-        typer.echo(systemd_unit(what, words, getpass.getuser(), kept), nl=False)
+        print(systemd_unit(what, words, getpass.getuser(), kept), end="")
         return
     once = host_lock(loaded, name)
     once.take()  # says at once who runs already; the host takes it again

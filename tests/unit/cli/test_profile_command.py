@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from vla_zenoh import resources
-from vla_zenoh.cli.profile import profile_app
+from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.profile import load_profile, profile_names
 from vla_zenoh.resources import robot_urdf
 

@@ -32,6 +32,8 @@ READ = {
     "profile bridge-config certificates",  # a name on another computer
 }
 """Files and folders that commands read."""
+LOGS = {"up log_dir"}
+"""Folders of files that are appended to, and turned over."""
 CERTIFICATES = {"secure init folder", "secure here folder", "secure show folder"}
 """Folders whose files only ``secure add --renew`` replaces; see `tests/unit/security`."""
 NAMED = ("file", "folder", "out", "save", "into", "directory")
@@ -137,7 +139,9 @@ def test_every_path_of_a_command_is_read_or_is_its_output() -> None:
         for each in command.params:
             path = "Path" in str(each.type_descriptor.annotation) or each.name in NAMED
             if path and "--output" not in each.opts:
-                assert f"{name} {each.name}" in READ | CERTIFICATES, "outputs are called --output"
+                assert f"{name} {each.name}" in READ | CERTIFICATES | LOGS, (
+                    "outputs are called --output"
+                )
 
 
 def test_every_command_that_writes_is_tried_here() -> None:

@@ -12,12 +12,12 @@ import yaml
 import zenoh
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.profile import profile_app
-from vla_zenoh.cli.secure import secure_app
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.interop.ros2.bridge import bridge_command, bridge_config, bridge_text
 from vla_zenoh.interop.ros2.graph import camera_topics
 from vla_zenoh.interop.ros2.keys import Ros2Dds
+from vla_zenoh.lab.cli.profile import profile_app
+from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.lab.doctor.access_rules import Passage, allows, passages
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.security import authority as ca

@@ -12,8 +12,8 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.secure import secure_app
 from vla_zenoh.errors import SecurityError
+from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.security import authority as ca
 from vla_zenoh.security.identity import Identity, Role, operator_identities

@@ -13,7 +13,7 @@ from typed import typed
 from wrong_profiles import BASE, CHECKED, EXTENDED, FILES, WRONG
 
 from vla_zenoh import resources
-from vla_zenoh.cli.profile_check import check_profile
+from vla_zenoh.lab.profile.check import check_profile
 
 LEAST_PROFILES = 60
 

@@ -23,10 +23,10 @@ from vla_zenoh.errors import (
     VlaZenohError,
     nearest,
 )
+from vla_zenoh.lab.profile.advice import advice
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.policy.loader import ConstructorOptions, find_worker, inspect_robot, make_policy
 from vla_zenoh.profile import POSE_JOINTS, Profile, load_with_lines
-from vla_zenoh.profile.advice import advice
 from vla_zenoh.profile.section import Place, located, own_place
 from vla_zenoh.profile.session import ends_at
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from vla_zenoh.lab.profile.advice import advice
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.profile.advice import advice
 
 SIM = load_profile("panda_sim")
 ROBOT = {"robot": {"nodes": ["router", "sim", "camera", "command"]}}
