@@ -187,3 +187,16 @@ def test_without_a_router_it_is_said_where_one_was_looked_for(
     assert done.code == FAILED
     assert done.stdout == ""
     assert "no Zenoh router answers at tcp/127.0.0.1:9. Start one with `vla-zenoh" in done.said
+
+
+def test_a_demo_is_refused_a_prompt_that_it_cannot_judge_and_lists_those_it_can(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = typed(capsys, "demo", "--prompt", "make me a sandwich")
+    assert done.code == FAILED
+    assert "'make me a sandwich' is no task that the shipped policy understands" in done.said
+    assert "HARD: go up" in done.said
+    assert "push the red brick" in done.said
+    assert done.stdout == ""
+    assert not list(tmp_path.iterdir())

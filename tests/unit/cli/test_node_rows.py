@@ -1,0 +1,80 @@
+"""What `status` says of nodes that live, ended, or never came, and of what moves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from vla_zenoh.cli.node_rows import (
+    MODE_WORDS,
+    Statuses,
+    acting_limits,
+    hosts_down,
+    mode_of,
+    node_rows,
+)
+from vla_zenoh.types import NodeStatus
+
+EXPECTED = {"command": "robot", "sim": "robot", "worker-brick": "gpu"}
+
+
+def status(node: str, state: str = "running", host: str = "robot", **detail: Any) -> NodeStatus:
+    return NodeStatus(
+        node=node, state=state, host=host, pid=1, started_wall_ns=1, ages_s={}, rates_hz={},
+        counters={}, detail=detail,
+    )  # fmt: skip
+
+
+def alive(*statuses: NodeStatus) -> Statuses:
+    return {each.node: (each, 0.1, True) for each in statuses}
+
+
+@pytest.mark.parametrize("mode", ["sim", "dry_run", "live"])
+def test_the_command_node_s_mode_stands_in_front_of_what_moves(mode: str) -> None:
+    assert mode_of(alive(status("command", mode=mode))) == mode
+    assert MODE_WORDS[mode][0] == {"sim": "SIM", "dry_run": "DRY RUN", "live": "LIVE"}[mode]
+
+
+def test_the_mode_of_a_command_node_that_ended_is_unknown() -> None:
+    ended = {"command": (status("command", mode="live"), 5.0, False)}
+    assert mode_of(ended) == mode_of({}) == "unknown"
+
+
+def test_a_mode_that_no_version_knows_is_unknown() -> None:
+    assert mode_of(alive(status("command", mode="\x1b[31mlive"))) == "unknown"
+    assert mode_of(alive(status("command", mode=["live"]))) == "unknown"
+
+
+def test_a_node_that_the_profile_expects_on_a_running_host_is_missing() -> None:
+    rows = {row.name: row for row in node_rows(alive(status("command")), EXPECTED)}
+    assert rows["sim"].state == "missing"
+    assert "`vla-zenoh up` on host robot" in rows["sim"].why
+
+
+def test_nodes_of_a_host_that_is_down_are_told_as_that_host() -> None:
+    said = alive(status("command"), status("sim"))
+    assert hosts_down(said, EXPECTED) == {"gpu": ["worker-brick"]}
+    assert "worker-brick" not in {row.name for row in node_rows(said, EXPECTED)}
+
+
+def test_a_node_with_a_token_and_no_status_yet_is_starting() -> None:
+    rows = {r.name: r for r in node_rows(alive(status("command")), EXPECTED, frozenset({"sim"}))}
+    assert rows["sim"].state == "starting"
+
+
+def test_a_node_that_crashed_says_why_and_one_that_ended_is_dead() -> None:
+    crashed = status("worker-brick", "crashed", "gpu", complaint="weights.pt not found")
+    said = {"worker-brick": (crashed, 1.0, False), "sim": (status("sim"), 9.0, False)}
+    rows = {row.name: row for row in node_rows(said, EXPECTED)}
+    assert (rows["worker-brick"].state, rows["worker-brick"].why) == (
+        "crashed",
+        "weights.pt not found",
+    )
+    assert rows["sim"].state == "dead"
+
+
+def test_limits_that_act_are_those_of_a_living_command_node() -> None:
+    said = alive(status("command", limits=["elbow: joint_velocity", "slower: table"]))
+    assert acting_limits(said) == ["elbow: joint_velocity", "slower: table"]
+    assert acting_limits(alive(status("command", limits=3))) == []
