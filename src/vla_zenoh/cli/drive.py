@@ -8,9 +8,11 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from contextlib import nullcontext
+from functools import wraps
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
-from vla_zenoh.cli.plain import BOLD_RED, complain, fail, say, say_marked, warn
+from vla_zenoh.cli.plain import BOLD_RED, complain, fail, json_answer, say, say_marked, warn
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, nearest
 from vla_zenoh.keys import CRASHED, Keys, worker_node
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from vla_zenoh.profile import Profile
     from vla_zenoh.types import Task
 
+JSON_HELP = "Print the answer as JSON on stdout."
 PATIENCE_S = 3.0
 DISCOVERY_S, POLL_S = 1.0, 0.05
 """A router's first answers may lack robots that are alive: `stop --all` asks for this long."""
@@ -30,8 +33,22 @@ ABSENT_PATIENCE_S = 1.5
 """A command node that is alive may take this long to appear."""
 
 
+def _answered(command: Callable[..., None]) -> Callable[..., None]:
+    """A command that prints its answer as JSON if its `as_json` is true."""
+
+    @wraps(command)
+    def run(*positional: Any, as_json: bool = False, **named: Any) -> None:
+        with json_answer() if as_json else nullcontext():
+            command(*positional, **named)
+
+    return run
+
+
+@_answered
 def prompt(
-    text: Annotated[str, typer.Argument(help="What the model shall do.")], target: RobotTarget
+    text: Annotated[str, typer.Argument(help="What the model shall do.")],
+    target: RobotTarget,
+    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
 ) -> None:
     """Set the prompt. Any Zenoh client can: put the text on <root>/<robot>/prompt."""
     from vla_zenoh.codec.settings import decode_text
@@ -46,12 +63,14 @@ def prompt(
         )
 
 
+@_answered
 def activate(
     target: RobotTarget,
     held: Annotated[
         bool,
         typer.Option("--hold", help="Stay: the arm is active only while this runs (deadman)."),
     ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
 ) -> None:
     """Let the worker move the arm. Rejected with every reason while something is not ready."""
     with target.operator("activate") as client:
@@ -104,7 +123,11 @@ def _inactive(client: Client, activated: Task) -> str:
     return str(status.detail.get("why", "")) or status.state
 
 
-def deactivate(target: RobotTarget) -> None:
+@_answered
+def deactivate(
+    target: RobotTarget,
+    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
+) -> None:
     """Brake the arm; then no worker moves it."""
     with target.client(stop=True) as client:
         _deactivate(target, client)
@@ -116,9 +139,11 @@ def _deactivate(target: RobotTarget, client: Client) -> None:
     _show(target, client, "inactive, the arm stands", ": ")
 
 
+@_answered
 def use(
     worker: Annotated[str, typer.Argument(help="Worker whose chunks move the arm.")],
     target: RobotTarget,
+    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
 ) -> None:
     """Select the worker that moves the arm; the others keep running."""
     from vla_zenoh.codec.settings import decode_name
@@ -143,8 +168,11 @@ def _require_worker(client: Client, worker: str) -> None:
         fail(f"worker {worker!r} is not alive{why} Alive are: {', '.join(alive) or 'none'}")
 
 
+@_answered
 def rate(
-    rate_hz: Annotated[float, typer.Argument(help="Chunks per second.")], target: RobotTarget
+    rate_hz: Annotated[float, typer.Argument(help="Chunks per second.")],
+    target: RobotTarget,
+    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
 ) -> None:
     """Set how often the workers infer."""
     from vla_zenoh.codec.settings import decode_rate
@@ -154,12 +182,14 @@ def rate(
         _show(target, client, f"rate: {client.set_rate(rate_hz).rate_hz:g} Hz")
 
 
+@_answered
 def speed(
     target: RobotTarget,
     percent: Annotated[
         str | None,
         typer.Argument(help="0 to 100; at 0 the arm stands, still active. Default: show it."),
     ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
 ) -> None:
     """Slow the arm down on the same path. Lowering needs only the right to stop."""
     from vla_zenoh.codec.settings import decode_percent
@@ -183,6 +213,7 @@ def _show_speed(target: RobotTarget, client: Client, task: Task) -> None:
     _show(target, client, f"speed: {task.speed_percent:g} % of what is planned")
 
 
+@_answered
 def stop(
     target: RobotTarget,
     every: Annotated[
@@ -194,6 +225,7 @@ def stop(
             "--wait-key", help="Stay: every key stops the robot, and so does leaving (Ctrl-C)."
         ),
     ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
 ) -> None:
     """Emergency stop: brake now and stay stopped until `vla-zenoh reset`."""
     if wait_key:
@@ -217,7 +249,11 @@ def confirm_stop(target: RobotTarget, client: Client, *, every: bool) -> None:
         warn(f"not stopped: {', '.join(others)}; `{target.typed('stop', '--all')}` stops all")
 
 
-def reset(target: RobotTarget) -> None:
+@_answered
+def reset(
+    target: RobotTarget,
+    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
+) -> None:
     """Clear an emergency stop or a fault. The arm stays inactive."""
     with target.operator("reset") as client:
         client.reset()

@@ -28,16 +28,17 @@ class Word(NamedTuple):
     module: str = "vla_zenoh.cli.drive"
 
 
+JSON = {"--json": "as_json"}
 WORDS: Mapping[str, Word] = {
-    "prompt": Word(("text",)),
-    "activate": Word(flags={"--hold": "held"}),
-    "deactivate": Word(),
-    "use": Word(("worker",)),
-    "rate": Word(("rate_hz",)),
-    "speed": Word(("percent?",)),
-    "stop": Word(flags={"--all": "every", "--wait-key": "wait_key"}),
-    "reset": Word(),
-    "status": Word(flags={"--json": "as_json", "--once": "once"}, module="vla_zenoh.cli.status"),
+    "prompt": Word(("text",), JSON),
+    "activate": Word(flags={"--hold": "held", **JSON}),
+    "deactivate": Word(flags=JSON),
+    "use": Word(("worker",), JSON),
+    "rate": Word(("rate_hz",), JSON),
+    "speed": Word(("percent?",), JSON),
+    "stop": Word(flags={"--all": "every", "--wait-key": "wait_key", **JSON}),
+    "reset": Word(flags=JSON),
+    "status": Word(flags={"--once": "once", **JSON}, module="vla_zenoh.cli.status"),
 }
 OPTIONS = {
     **dict.fromkeys(("--profile", "-p"), "profile"),

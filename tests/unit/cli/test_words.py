@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -9,12 +10,15 @@ from typing import Any
 
 import pytest
 import typer
+from typed import typed
 from typer.testing import CliRunner
 
 from vla_zenoh.cli import drive, status
 from vla_zenoh.cli import words as table
 from vla_zenoh.cli.main import app
+from vla_zenoh.cli.plain import json_answer, say, warn
 from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.errors import SessionError
 
 COMMANDS: Any = typer.main.get_command(app)
 VARIABLES = tuple(table.VARIABLES)
@@ -129,3 +133,42 @@ def test_a_word_that_drives_loads_nothing_that_it_does_not_need() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ
     )
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("line", ["prompt go", "activate", "stop", "reset", "use brick", "rate 5"])
+def test_with_json_a_failure_is_one_object_and_nothing_else(
+    capsys: pytest.CaptureFixture[str], line: str
+) -> None:
+    done = typed(capsys, *line.split(), "--json", "--connect", "tcp/127.0.0.1:9")
+    assert done.code == 1
+    assert done.stderr == ""
+    answer = json.loads(done.stdout)
+    assert answer["ok"] is False
+    assert "no Zenoh router answers" in answer["errors"][0]
+
+
+def test_with_json_every_reason_of_a_rejection_is_an_entry(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as ended, json_answer():
+        raise SessionError("activate rejected:\n  - no prompt is set\n  - the router is gone")
+    assert ended.value.code == 1
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["reasons"] == ["no prompt is set", "the router is gone"]
+
+
+def test_with_json_the_lines_of_a_command_are_its_messages(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with json_answer():
+        say("rate: 5 Hz")
+        warn("not stopped: b")
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert json.loads(captured.out) == {
+        "ok": True,
+        "messages": ["rate: 5 Hz"],
+        "warnings": ["not stopped: b"],
+        "errors": [],
+        "reasons": [],
+    }
