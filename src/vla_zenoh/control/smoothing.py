@@ -25,6 +25,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from ruckig import (
     ControlInterface,
     InputParameter,
@@ -189,6 +190,7 @@ class Smoother:
         self._elapsed_s = 0.0
         self._jerk, self._sign = zeros, zeros
         self._slowing_to: tuple[Pose, Shares, bool] | None = None
+        self._too_fast = zeros > 0.0
         self.braking = False
         self.motion = Motion(
             Pose(np.array(pose.position_m, dtype=np.float64), self._anchor),
@@ -217,9 +219,9 @@ class Smoother:
         way[np.abs(way) < QUIET[0]] = 0.0
         plan, enough = self._towards(way, limits, unreversed, all_to_stop)
         self._begin(plan)
-        _, velocity, acceleration = self._state
-        slows = (velocity * acceleration < 0) & (np.abs(velocity) > limits[0])
-        self._slowing_to = (pose, shares, all_to_stop) if slows.any() and not self.braking else None
+        self._too_fast = self._slows() & (np.abs(self._state.velocity) > limits[0])
+        again = self._too_fast.any() and not self.braking
+        self._slowing_to = (pose, shares, all_to_stop) if again else None
         return enough
 
     def brake(self, shares: Shares | None = None) -> None:
@@ -273,9 +275,7 @@ class Smoother:
         attempts += [unreversed] * bool((limits < unreversed).any())
         attempts += [hardest] * bool((unreversed < hardest).any())
         for most in attempts:
-            may_take = self._input(
-                basis, hardest if all_to_stop else np.maximum(most, unreversed), parts
-            )
+            may_take = hardest if all_to_stop or most is hardest else unreversed
             for synchronization, slowly in _WAYS:
                 ask = self._input(basis, most, parts, slowly=slowly)
                 ask.target_position = (basis.T @ way).tolist()
@@ -287,7 +287,8 @@ class Smoother:
                 if path is None:
                     continue
                 found = _Plan(self._state.position, basis, path)
-                if not self._overshoots(path, basis.T @ way, may_take) and not self._leaves(found):
+                overshoots = self._overshoots(path, basis.T @ way, (basis, may_take, parts))
+                if not overshoots and not self._leaves(found):
                     if most is not limits:
                         self._jerk = most[2] / self.box[2]
                     return found, most is not hardest
@@ -355,24 +356,30 @@ class Smoother:
             return np.stack([along, *others], axis=1), [1.0 - 2 * BESIDE, BESIDE, BESIDE]
         return np.eye(3), [1.0] * 3
 
-    def _overshoots(self, path: Trajectory, target: FloatArray, ask: InputParameter) -> bool:
+    def _overshoots(
+        self,
+        path: Trajectory,
+        target: FloatArray,
+        stop: tuple[FloatArray, FloatArray, list[float]],
+    ) -> bool:
         """Whether a coordinate leaves the range between its start, its target and its stop.
 
         Args:
             path: the plan.
             target: (k,).
-            ask: input for the stop, with its limits.
+            stop: basis, limits and parts of the stop, see `_input`.
         """
         least, most = np.minimum(target, 0.0) - OVERSHOOT, np.maximum(target, 0.0) + OVERSHOOT
         low, high = _extrema(path)
         if (low >= least).all() and (high <= most).all():
             return False
+        ask = self._input(*stop)
         ask.control_interface = ControlInterface.Velocity
         ask.synchronization = Synchronization.No
-        stop = self._calculated(ask)
-        if stop is None:
+        stopped = self._calculated(ask)
+        if stopped is None:
             return True
-        stop_low, stop_high = _extrema(stop)
+        stop_low, stop_high = _extrema(stopped)
         return bool(
             (low < np.minimum(least, stop_low - OVERSHOOT)).any()
             or (high > np.maximum(most, stop_high + OVERSHOOT)).any()
@@ -444,15 +451,18 @@ class Smoother:
         room = np.maximum(np.where(slows, speed, self.box[0] - speed), REST_VELOCITY)
         needed = np.minimum(acceleration**2 / (2 * room) / self.box[2], 1.0)
         kept = np.where(acceleration * self._sign > 0.0, self._jerk, 0.0)
-        self._jerk, self._sign = (
-            np.maximum(np.where(slows, 0.0, needed), kept),
-            np.sign(acceleration),
-        )
+        self._jerk = np.maximum(np.where(slows, 0.0, needed), kept)
+        self._sign = np.sign(acceleration)
         limits = self.box * np.array(shares)[:, None]
         limits[2] = np.maximum(limits[2], self.box[2] * self._jerk)
         unreversed = limits.copy()
         unreversed[2] = np.maximum(limits[2], self.box[2] * needed)
         return limits, unreversed
+
+    def _slows(self) -> NDArray[np.bool_]:
+        """(6,) which axes slow down, by more than rounding noise."""
+        _, velocity, acceleration = self._state
+        return (velocity * acceleration < 0) & (np.abs(acceleration) > QUIET[2])
 
     def resting_pose(self) -> Pose:
         """Brake, and return where the brake will end."""
@@ -486,8 +496,8 @@ class Smoother:
             pace: part of the tick by which the motion advances, for a slow follower. Twist and
                 acceleration are those at full pace.
         """
-        if self._slowing_to is not None and not (self._state[1] * self._state[2] < 0).any():
-            # It was too fast for its shares, and may go as fast again by the plan it has.
+        if self._slowing_to is not None and not (self._slows() & self._too_fast).any():
+            # They were too fast for their shares, and may go as fast again by the plan there is.
             pose, shares, all_to_stop = self._slowing_to
             self.target(pose, shares, all_to_stop=all_to_stop)
         if self._plan is None:
@@ -532,15 +542,14 @@ def _line(way: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> Fl
     That of the way if there is one; the motion's own where the target is about to be passed, and
     so near that its direction is rounding. Zero where there is neither way nor motion.
     """
-    all_ = np.stack([way, velocity, acceleration])
-    lengths = np.sqrt((all_ * all_).sum(axis=1))
+    motion = np.stack([way, velocity, acceleration])
+    lengths = np.sqrt((motion * motion).sum(axis=1))
     if not lengths.any():
         return way
-    for value, length in zip(all_, lengths.tolist(), strict=True):
+    for value, length in zip(motion, lengths.tolist(), strict=True):
         if length > 0.0:
             line = value / length
-            beside = np.abs(all_ - np.outer(all_ @ line, line))
-            if (beside <= _ASIDE).all():
+            if (np.abs(motion - np.outer(motion @ line, line)) <= _ASIDE).all():
                 return line
     return None
 
