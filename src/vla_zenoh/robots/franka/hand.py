@@ -15,7 +15,7 @@ NO_STOP_S = 2.0
 """A hand that has not ended a motion this long after it was told to is asked again."""
 
 
-class Request(NamedTuple):
+class GripRequest(NamedTuple):
     """A request of the gripper: opening, speed and force."""
 
     width_m: float
@@ -46,8 +46,8 @@ class Hand:
 
     def __init__(self, gripper: Any) -> None:
         self._gripper = gripper
-        self._newest: Request | None = None
-        self._running: Request | None = None
+        self._newest: GripRequest | None = None
+        self._running: GripRequest | None = None
         self._changed, self._end = threading.Condition(), threading.Event()
         self.fault = ""
         first = gripper.state
@@ -62,7 +62,7 @@ class Hand:
     def ask(self, width_m: float, speed_m_s: float, force_n: float) -> None:
         """Replace the newest request; returns at once."""
         with self._changed:
-            self._newest = Request(width_m, speed_m_s, force_n)
+            self._newest = GripRequest(width_m, speed_m_s, force_n)
             self._changed.notify()
 
     def state(self) -> HandState:
@@ -99,7 +99,7 @@ class Hand:
                 self._carry_out(self._running)
             self._running = None
 
-    def _carry_out(self, request: Request) -> None:
+    def _carry_out(self, request: GripRequest) -> None:
         """Move until the fingers arrive, or a newer request ends it."""
         try:
             if request.width_m < self._width_m - CLEARLY_M:
