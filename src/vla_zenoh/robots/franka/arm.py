@@ -17,16 +17,21 @@ import numpy as np
 
 from vla_zenoh.errors import MissingExtraError, NodeError
 from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.kinematics.so3 import exp3, log3, quat_from_rotation, rotation_from_quat
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import FrankaLoad
 from vla_zenoh.robot import Command, Reading
 from vla_zenoh.robots.franka.hand import Hand
 from vla_zenoh.robots.franka.published import flange_pose
+from vla_zenoh.runtime.scheduling import realtime_children
 from vla_zenoh.types import FloatArray, JointCommand
 
 REST_S = 1.0
 """The loop ends when there was no set-point for this long."""
 CLOSE_S = 1.0
+TRIM_S, LONGEST_S = 0.5, 0.02
+TRIM_M, TRIM_RAD, TRIM_JOINT_RAD = 0.004, 0.015, 0.005
+"""What is left of a set-point by friction in the joints is integrated, up to these."""
 READY = frozenset({"Idle", "Move"})
 STOPPED = frozenset({"Reflex", "UserStopped"})
 """Robot modes that are a fault. In the others the robot is well, but follows no commands."""
@@ -43,6 +48,7 @@ class FrankaArm:
         self._robot: Any = None
         self._hand: Hand | None = None
         self._motion: Any = None
+        self._trim: FloatArray = np.zeros(0)
         self._configured = self._was_in_control = False
         self._ended = ""
         self._time: Any = None
@@ -180,13 +186,17 @@ class FrankaArm:
         """Give the loop its set-point, and start it where it does not run."""
         if self._ended or not self._configured:
             return  # reported as a fault; only `recover` ends it
-        self._moved_ns = time.monotonic_ns()
+        now_ns = time.monotonic_ns()
+        elapsed_s = min((now_ns - self._moved_ns) / 1e9, LONGEST_S)
+        self._moved_ns = now_ns
         starts = self._motion is None
         if starts:
-            self._motion = self._new_motion()
-        self._motion.set_reference(self._reference(command))
+            self._motion, elapsed_s = self._new_motion(), 0.0
+            self._trim = np.zeros(7 if isinstance(command, JointCommand) else 6)
+        self._motion.set_reference(self._reference(command, elapsed_s / TRIM_S))
         if starts:
-            self._robot.move(self._motion, asynchronous=True)
+            with realtime_children():
+                self._robot.move(self._motion, asynchronous=True)
             self._was_in_control = True
 
     def _new_motion(self) -> Any:
@@ -202,13 +212,29 @@ class FrankaArm:
             posture_task=posture,
         )
 
-    def _reference(self, command: Command) -> Any:
-        franky = self._franky
+    def _reference(self, command: Command, share: float) -> Any:
+        """The set-point for the loop, trimmed by `share` of what is left of it."""
+        franky, state = self._franky, self._state
         if isinstance(command, JointCommand):
-            return franky.JointReference(command.position_rad, command.velocity_rad_s)
+            self._trim = np.clip(
+                self._trim + share * (command.position_rad - state.q),
+                -TRIM_JOINT_RAD,
+                TRIM_JOINT_RAD,
+            )
+            return franky.JointReference(command.position_rad + self._trim, command.velocity_rad_s)
+        rotation = rotation_from_quat(command.quat_xyzw)
+        measured = state.O_T_EE.matrix
+        left = np.concatenate(
+            (command.position_m - measured[:3, 3], log3(rotation @ measured[:3, :3].T))
+        )
+        trim = self._trim + share * left
+        self._trim = np.concatenate((_bounded(trim[:3], TRIM_M), _bounded(trim[3:], TRIM_RAD)))
         twist, acceleration = command.twist, command.acceleration
         return franky.CartesianReference(
-            franky.Affine(command.position_m, command.quat_xyzw),
+            franky.Affine(
+                command.position_m + self._trim[:3],
+                quat_from_rotation(exp3(self._trim[3:]) @ rotation),
+            ),
             franky.Twist(twist[:3], twist[3:]),
             franky.TwistAcceleration(acceleration[:3], acceleration[3:]),
         )
@@ -254,6 +280,11 @@ class FrankaArm:
             float(np.linalg.norm(own[:3, 3] - ours[:3, 3])),
             float(np.arccos(np.clip(cosine, -1.0, 1.0))),
         )
+
+
+def _bounded(vector: FloatArray, most: float) -> FloatArray:
+    """`vector` (3,), shortened to a length of `most`."""
+    return vector * min(1.0, most / max(float(np.linalg.norm(vector)), 1e-12))
 
 
 def load_franky() -> Any:
