@@ -21,7 +21,7 @@ from vla_zenoh.cli.node_rows import (
     node_rows,
 )
 from vla_zenoh.cli.output import console, new_table, styled
-from vla_zenoh.sanitize import one_line
+from vla_zenoh.sanitize import one_line, printable
 from vla_zenoh.types import Event, Header, NodeStatus
 
 if TYPE_CHECKING:
@@ -104,10 +104,10 @@ def render(
         expected: nodes of the profile, each with its host.
         alive: nodes that have a liveliness token.
     """
-    mode = mode_of(nodes)
-    word = MODE_WORDS[mode][0]
+    word, sentence, style = MODE_WORDS[mode_of(nodes)]
     columns = ("node", "state", "age", "rate", "rejected", "message")
-    table = new_table(*columns, title=f"{word} robot {robot}")
+    title = Text.assemble((word, style), printable(f" robot {robot}: {sentence}"))
+    table = new_table(*columns, title=title, title_style="")
     for row in node_rows(nodes, expected or {}, alive):
         table.add_row(*_cells(row, word))
     lines = [_latency(name, found) for name, (found, _, _) in nodes.items()]
@@ -122,14 +122,7 @@ def render(
     for host, missing in hosts_down(nodes, expected or {}, alive).items():
         text = f"host {host} does not run ({', '.join(missing)}): `vla-zenoh up` there starts it"
         below.append(styled(one_line(text, MAX_WORDS), "bold yellow"))
-    if nodes:
-        warnings.append(_mode(mode))
     return Group(*warnings, table, *below, *(line for line in lines if line), *happened)
-
-
-def _mode(mode: str) -> Text:
-    word, sentence, style = MODE_WORDS[mode]
-    return Text.assemble((f" {word} ", style), f" {sentence}")
 
 
 def _cells(row: NodeRow, mode: str) -> tuple[str | Text, ...]:
@@ -237,7 +230,7 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
         return _lines([one_line(each, MAX_WORDS) for each in bad])
     text = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
     if not text and "obeyed" in detail:
-        return f"{mode} moves the arm" if detail["obeyed"] else "shadow mode"
+        return f"{mode}: in control" if detail["obeyed"] else "shadow mode"
     return one_line(text or _days_left(detail.get("certificates")), MAX_WORDS)
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import getpass
+import json
 import logging
 import logging.handlers
 import os
 import subprocess
 import sys
 import threading
+import time
 import zlib
 from pathlib import Path
 from typing import Annotated
@@ -21,6 +23,7 @@ from vla_zenoh.cli.options import (
     AlsoOption,
     ConnectOption,
     HostOption,
+    JsonOption,
     ListenOption,
     effective_profile,
 )
@@ -61,6 +64,7 @@ def up(
             "--log-dir", help="Folder of the log file. Default: ~/.local/state/vla-zenoh."
         ),
     ] = None,
+    as_json: JsonOption = False,
     print_unit: Annotated[
         bool, typer.Option("--print-unit", help="Print a systemd unit that does this, and end.")
     ] = False,
@@ -75,7 +79,7 @@ def up(
         words = [sys.executable, "-m", "vla_zenoh", "up", absolute(profile), "--host", name]
         for option, values in (("--connect", connect), ("--listen", listen), ("--also", also)):
             words += [word for value in values or () for word in (option, value)]
-        words += ["--dry-run"] * dry_run + ["--verbose"] * verbose
+        words += ["--dry-run"] * dry_run + ["--verbose"] * verbose + ["--json"] * as_json
         words += ["--log-dir", str(log_dir.absolute())] if log_dir else []
         kept = {key: os.environ[key] for key in KEPT if key in os.environ}
         what = f"robot {loaded.robot.name}, host {name}"
@@ -92,6 +96,11 @@ def up(
     lock = threading.Lock()
 
     def show(node: str, line: str, style: str = "") -> None:
+        if as_json:
+            said = {"time_s": time.time(), "node": node, "from": "up" if style else "node"}
+            with lock:
+                print(json.dumps({**said, "text": line}), flush=True)
+            return
         name = styled(f"{node:>16}", COLOURS[zlib.crc32(node.encode()) % len(COLOURS)])
         with lock:
             out.print(name, styled(line, style), sep=" | ", soft_wrap=True)

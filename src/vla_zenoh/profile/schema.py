@@ -234,7 +234,7 @@ class HostProfile(Section):
             cameras.
     """
 
-    nodes: Annotated[tuple[NodeKind, ...], Field(strict=False, min_length=1), Distinct]
+    nodes: Annotated[tuple[NodeKind, ...], Field(strict=False), Distinct]
     connect: Endpoints | None = None
     listen: Endpoints | None = None
     link: Endpoints | None = None
