@@ -493,7 +493,7 @@ def test_a_wrench_is_taken_in_the_base_frame_and_the_gripper_may_take_widths(
 
         rig.wait("a target", order)
         assert targets[0].header.frame_id == "base"
-        assert targets[0].pose.position.x == 0.5
+        assert targets[0].pose.position.x == pytest.approx(pose.position_m[0], abs=1e-6)
 
 
 JOINTS = """\
