@@ -213,7 +213,8 @@ def test_a_face_of_the_box_holds_where_the_easiest_joint_brakes_as_hard_as_it_ca
     reached, low, high = np.array([0.1, 0.2, -0.1]), np.array([0.1, 0.0, -0.3]), np.full(3, 0.4)
     slower = JointFollower._slower_along(row, easiest, 0.04, reached, low, high)
     assert float(row @ slower) == pytest.approx(0.04)
-    assert (slower >= low).all() and (slower <= high).all()
+    assert (slower >= low).all()
+    assert (slower <= high).all()
 
 
 def test_an_arm_that_begins_outside_of_the_box_is_led_in() -> None:
