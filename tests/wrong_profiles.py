@@ -247,14 +247,6 @@ WRONG: list[tuple[str, str]] = [
         "session.security.people.desk: wants 'operator', 'viewer' or 'replay'",
     ),
     (
-        "hosts: {a: {nodes: [router, sim, camera, command], pictures: {rate_hz: 5}}}",
-        "hosts.a.pictures: is for workers, and this host runs none",
-    ),
-    (
-        "hosts: {a: {nodes: [router, sim, camera, command, worker], pictures: {}}}",
-        "hosts.a.pictures: is for cameras elsewhere, and this host has its own",
-    ),
-    (
         "session: {separate_links: true, connect: [tcp/127.0.0.1:65535]}",
         "session.connect.0: separate_links needs PROTOCOL/HOST:PORT, and the next port too",
     ),
