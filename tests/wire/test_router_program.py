@@ -23,9 +23,9 @@ from vla_zenoh.errors import NodeError, SecurityError
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.router import router_config, run_router, run_zenohd
 from vla_zenoh.security.identity import identities
+from vla_zenoh.security.lab_certificates import LabCertificates
 from vla_zenoh.security.rules import access_control
 from vla_zenoh.security.secure_profile import profile_text, serving_addresses
-from vla_zenoh.security.store import Store
 
 LIMIT_S = 20.0
 STAND_IN = """\
@@ -42,7 +42,11 @@ def secured(folder: Path, more: str = "") -> Path:
     plain.write_text(
         f"extends: panda_sim\nsession: {{listen: [{endpoint}], connect: [{endpoint}]}}\n"
     )
-    profile, store, now = load_profile(str(plain)), Store(folder / "keys"), dt.datetime.now(dt.UTC)
+    profile, store, now = (
+        load_profile(str(plain)),
+        LabCertificates(folder / "keys"),
+        dt.datetime.now(dt.UTC),
+    )
     store.make_authority("test lab", now)
     store.add(identities(profile), now, addresses=serving_addresses(profile))
     file = folder / "lab.yaml"

@@ -9,7 +9,6 @@ import shutil
 import socket
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -67,7 +66,7 @@ def run_router(
             impatience.apply()
             links_now = len(list(session.info.links()))
             if profile.session.security is not None:
-                detail["certificates"] = asdict(expiry.outlook)
+                detail["certificates"] = expiry.outlook._asdict()
             node.publish_status("routing", detail={**detail, "links": links_now})
         node.close()
 
