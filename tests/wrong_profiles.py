@@ -83,10 +83,6 @@ WRONG: list[tuple[str, str]] = [
         "session: {shared_memory: yes}",
         "session.shared_memory: wants true or false (given: 'yes')",
     ),
-    (
-        "session: {router: zenod}",
-        "wants 'own' or 'zenohd'; did you mean 'zenohd'? (given: 'zenod')",
-    ),
     ("session: {mode: peer}", "session.mode: "),
     ("root: lab/*", "lab.yaml:2: root: root '*' cannot be part of a key"),
     (
