@@ -310,12 +310,11 @@ def _workers(profile: Profile, name: str, host: str | None) -> Iterator[_Found]:
 
 
 def _spec_faults(profile: Profile, worker: str, spec: ModelSpec) -> Iterator[_Found]:
-    from vla_zenoh.control.policy_check import check_spec
+    from vla_zenoh.control.policy_check import spec_errors
 
     place = ("models", worker) if worker in profile.models else ("workers",)
-    for level, _, why in check_spec(profile, spec, worker=worker):
-        if level == "error":
-            yield _Found(place, f"worker {worker!r}: {why}")
+    for _, _, why in spec_errors(profile, spec):
+        yield _Found(place, f"worker {worker!r}: {why}")
 
 
 # -- network ----------------------------------------------------------------------------------
