@@ -428,7 +428,7 @@ CHECKED: list[tuple[str, str]] = [
     ),
     (
         "cameras: {front: {rate_hz: 1}}",
-        "worker 'scripted': camera 'front' gives a picture every 1.00 s, the spec allows none olde",
+        "worker 'scripted': camera 'front' gives an image every 1.00 s, the spec allows none olde",
     ),
     ("models: {scripted: ./absent.py}", "models.scripted: there is no file or folder '{here}/abse"),
     (
