@@ -26,7 +26,6 @@ from vla_zenoh.lab.evaluation.result import Evaluation, PlotTrace
 from vla_zenoh.lab.evaluation.segments import segment
 from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.run import RecordedSample, Run, load_run
-from vla_zenoh.lab.recording.stream_listener import Streams
 from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray, NodeStatus
 
 FILM, MAX_FILM_S = Film(height_px=270, rate_hz=10, quality=30), 180.0
@@ -85,7 +84,7 @@ def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) ->
         wanted = {(entry.record.worker, entry.header.seq) for entry in obeyed}
         causes = [each for each in causes if (each[0].worker, each[0].chunk_seq) in wanted]
     _requests(out, obeyed, causes, zero_ns)
-    measured = add_motion(out, run, zero_ns, until_ns)
+    measured = _add_motion(out, run, zero_ns, until_ns)
     _seams(out, until(run.commands, until_ns))
     _joint_jerk(out, until(run.joint_commands, until_ns))
     active = _active(run, until_ns, zero_ns)
@@ -113,7 +112,7 @@ def _film(run: Run) -> bytes:
             return b""
 
 
-def add_motion(out: Evaluation, run: Run | Streams, zero_ns: int, until_ns: int) -> MeasuredMotion:
+def _add_motion(out: Evaluation, run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
     """Add what the arm and the gripper did; returns the measured motion."""
     measured, commanded = _measured(run, zero_ns, until_ns), _commanded(run, zero_ns, until_ns)
     _motion(out, measured, commanded)
@@ -157,7 +156,7 @@ def _stream(entries: Iterable[Any], zero_ns: int) -> MeasuredMotion:
     return MeasuredMotion(t_s[order], position[order], quat[order], twist[order])
 
 
-def _measured(run: Run | Streams, zero_ns: int, until_ns: int) -> MeasuredMotion:
+def _measured(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
     return _stream(
         (
             (e.header.stamp_wall_ns, e.record.position_m, e.record.quat_xyzw, e.record.twist)
@@ -167,7 +166,7 @@ def _measured(run: Run | Streams, zero_ns: int, until_ns: int) -> MeasuredMotion
     )
 
 
-def _commanded(run: Run | Streams, zero_ns: int, until_ns: int) -> MeasuredMotion:
+def _commanded(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
     """Pose commands; for joint commands the reference pose of the controller."""
     if run.commands:
         return _stream(
