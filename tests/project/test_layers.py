@@ -58,7 +58,6 @@ ALLOWED = {
             "lab/bench/task_lockstep.py",
             "lab/bench/task_runner.py",
             "lab/check/model_runner.py",
-            "lab/compare/listener.py",
             "lab/demo/runner.py",
             "lab/doctor/access_check.py",
             "lab/episode.py",

@@ -25,7 +25,7 @@ def in_processes(
     stop: threading.Event,
     *,
     processes: int | None = None,
-    prepare: Callable[..., None] = lambda *_: None,
+    prepare: Callable[..., None] | None = None,
     prepared: tuple[Any, ...] = (),
 ) -> Iterator[Result]:
     """``work(*job)`` for every job, in the order of the jobs.
@@ -35,7 +35,7 @@ def in_processes(
         jobs: its arguments.
         stop: set by Ctrl-C; jobs that have not ended are dropped.
         processes: at once; None: one per core.
-        prepare: called first in every process.
+        prepare: called first in every process, a function of a module.
         prepared: its arguments.
 
     Raises:
@@ -65,7 +65,8 @@ def in_processes(
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _begin(prepare: Callable[..., None], prepared: tuple[Any, ...]) -> None:
+def _begin(prepare: Callable[..., None] | None, prepared: tuple[Any, ...]) -> None:
     die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    prepare(*prepared)
+    if prepare is not None:
+        prepare(*prepared)

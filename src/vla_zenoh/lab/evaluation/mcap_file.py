@@ -67,7 +67,7 @@ def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) ->
     """`evaluate_run` of a run in memory."""
     zero_ns = run.began_ns
     name = run.path.parent.name if run.path.stem == "run" else run.path.stem
-    out = Evaluation(name, "mcap", run.path, problems=list(run.problems))
+    out = Evaluation(name, run.path, problems=list(run.problems))
     if run.file.ended is None and not run.file.damage:
         out.problems.append("its recorder was ended before it could finish the file")
     if run.file.dropped:
@@ -137,7 +137,6 @@ def _requests(
         out.seconds = (last.stamp_wall_ns - first.stamp_wall_ns) / 1e9
     rows = [cause.latency_ms(stamp_ns) for cause, stamp_ns in causes]
     out.stages_ms = {name: np.array([row[name] for row in rows]) for name in LATENCY_STAGES}
-    # Names of the thesis, which its CSV has as well.
     out.stages_ms["outbound"] = out.stages_ms.pop("capture_to_worker")
     out.stages_ms["inbound"] = out.stages_ms["worker_to_command"] + out.stages_ms["command_to_pose"]
     out.request_t_s = np.array([(stamp - zero_ns) / 1e9 for _, stamp in causes])
