@@ -27,7 +27,7 @@ from vla_zenoh.cli.options import model_options, number_list
 from vla_zenoh.cli.output import Screen, plain_types
 from vla_zenoh.codec import image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
-from vla_zenoh.interop.ros2 import attachment, table
+from vla_zenoh.interop.ros2 import attachment, readers
 from vla_zenoh.interop.ros2.definitions import parse
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Keys
@@ -387,12 +387,12 @@ def _targets() -> Iterator[Target]:
     yield Target(
         "ros2-attachment", attachment.decode, codec, lambda: [bytes(16) + b"\x10" + bytes(16)]
     )
-    for reading in table.READINGS:
+    for kind in readers.READERS:
         yield Target(
-            f"ros2-{reading.type.rsplit('/', 1)[-1]}",
-            lambda data, kind=reading.type: table.read(_messages(), kind, data),
+            f"ros2-{kind.rsplit('/', 1)[-1]}",
+            lambda data, kind=kind: readers.read(_messages(), kind, data),
             codec,
-            lambda kind=reading.type: _cdr_seed(kind),
+            lambda kind=kind: _cdr_seed(kind),
         )
     yield Target(
         "ros2-definition",
