@@ -114,19 +114,6 @@ class Turns:
             self.turn()
         assert self.arm.follower.following
 
-    def transform(self, height_m: float, *, clock_s: float = 0.0) -> None:
-        """On /tf: how high the TCP is above the base."""
-        shift = self.peer.message("geometry_msgs/msg/Vector3", z=height_m)
-        turn = self.peer.message("geometry_msgs/msg/Quaternion", w=1.0)
-        way = self.peer.message("geometry_msgs/msg/Transform", translation=shift, rotation=turn)
-        entry = self.peer.message(
-            "geometry_msgs/msg/TransformStamped",
-            header=self.peer.header(self.wall_ns + round(clock_s * 1e9), "panda_link0"),
-            child_frame_id="panda_hand_tcp",
-            transform=way,
-        )
-        self.peer.put("/tf", self.peer.message("tf2_msgs/msg/TFMessage", transforms=[entry]))
-
     @property
     def heights_m(self) -> FloatArray:
         return np.array([goal.pose.position.z for goal in self.goals])

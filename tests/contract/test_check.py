@@ -14,7 +14,7 @@ from chain import command_line
 from peer_rig import KINDS, free_port, reachable
 
 from vla_zenoh import resources
-from vla_zenoh.control import policy_check
+from vla_zenoh.lab.check import fit
 from vla_zenoh.lab.check.examination import Examination
 from vla_zenoh.lab.check.examples import chart, example_styles
 from vla_zenoh.lab.check.model_runner import ModelRunner
@@ -289,12 +289,12 @@ def test_what_does_not_fit_a_profile_is_named(
     declared: ModelSpec, changes: dict[str, Any], wanted: set[tuple[str, str]]
 ) -> None:
     profile = override(load_profile("panda_sim"), {"workers": ["scripted", "m"], **changes})
-    found = policy_check.check_spec(profile, declared, worker="m")
+    found = fit.check_spec(profile, declared, worker="m")
     assert {finding[:2] for finding in found} == wanted
 
 
 def test_a_worker_that_the_profile_does_not_run_is_noted() -> None:
-    found = policy_check.check_spec(load_profile("panda_sim"), spec(FRONT), worker="m")
+    found = fit.check_spec(load_profile("panda_sim"), spec(FRONT), worker="m")
     assert [finding[:2] for finding in found] == [("note", "not_listed")]
 
 
@@ -306,7 +306,7 @@ DOWN_XYZW = [1.0, 0.0, 0.0, 0.0]
 
 def found_in(action: ActionSpec, row: list[float]) -> set[tuple[str, str]]:
     steps = check_steps(action, [row])
-    return {f[:2] for f in policy_check.check_chunk(action, steps, Limits(), MAX_WIDTH_M)}
+    return {f[:2] for f in fit.check_chunk(action, steps, Limits(), MAX_WIDTH_M)}
 
 
 @pytest.mark.parametrize(

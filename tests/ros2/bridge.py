@@ -10,7 +10,7 @@ from types import ModuleType
 
 from ros_node import LOOPBACK_XML
 
-from vla_zenoh.interop.ros2.bridge import bridge_config, bridge_text
+from vla_zenoh.lab.profile.ros2_bridge import bridge_config, bridge_text
 from vla_zenoh.profile import load_profile
 
 ROOT = Path(__file__).resolve().parents[2]

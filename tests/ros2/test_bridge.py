@@ -14,7 +14,7 @@ import zenoh
 from camera_rig import free_endpoint, until
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.interop.ros2 import table
+from vla_zenoh.interop.ros2 import readers, writers
 from vla_zenoh.interop.ros2.keys import Endpoint, EntityRole, Ros2Dds
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.qos import SENSOR
@@ -93,7 +93,7 @@ def test_pictures_of_a_dds_camera_are_read_to_the_pixel(border: Border) -> None:
     header = ros.Header(ros.Time.of(STAMP_NS), "camera_color_optical_frame")
     picture = ros.Image(header, 480, 640, "rgb8", 0, 1920, rgb.tobytes())
     until("a picture", lambda: writer.write(picture) or heard, PATIENCE_S)
-    read = table.read(border.messages, endpoint.type, heard[0])
+    read = readers.read(border.messages, endpoint.type, heard[0])
     assert (read.stamp_ns, read.frame) == (STAMP_NS, "camera_color_optical_frame")
     assert np.array_equal(read.rgb, rgb)
     subscriber.undeclare()
@@ -108,7 +108,7 @@ def test_joint_states_of_a_dds_robot_are_read_to_the_bit(border: Border) -> None
     names = [f"panda_joint{k + 1}" for k in range(7)]
     state = ros.JointState(ros.Header(ros.Time.of(STAMP_NS), ""), names, position, [], position)
     until("a state", lambda: writer.write(state) or heard, PATIENCE_S)
-    read = table.read(border.messages, endpoint.type, heard[0])
+    read = readers.read(border.messages, endpoint.type, heard[0])
     assert (read.stamp_ns, read.names) == (STAMP_NS, tuple(names))
     assert read.position.tolist() == position
     assert read.velocity is None
@@ -126,11 +126,8 @@ def test_a_pose_command_arrives_in_dds_to_the_bit(border: Border, kind: str) -> 
     zero = np.zeros(6)
     command = PoseCommand(position, quat, zero, zero, position, quat, "active")
     posture = np.linspace(0.0, 1.0, 7)
-    write = {row.type: row.write for row in table.writings(posture, 0) if row.key == "command_pose"}
-    made = write[endpoint.type](
-        border.messages, endpoint.type, command, table.Stamp(STAMP_NS, "panda_link0")
-    )
-    payload = border.messages.encode(made)
+    write = writers.pose_writer(border.messages, endpoint.type, posture)
+    payload = border.messages.encode(write(command, writers.Stamp(STAMP_NS, "panda_link0")))
     arrived: list[Any] = []
 
     def try_once() -> list[Any]:

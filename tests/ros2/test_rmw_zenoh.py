@@ -28,9 +28,8 @@ from ros2_rig import write_profile
 from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
-from vla_zenoh.interop.ros2 import table
 from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.topics import image, joint_state
+from vla_zenoh.interop.ros2.readers import IMAGE, JOINT_STATE, read
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.ros2 import Ros2Profile
 from vla_zenoh.robots.node import RobotNode
@@ -47,14 +46,14 @@ POSE, TEXT = "geometry_msgs/msg/PoseStamped", "std_msgs/msg/String"
 SET_BOOL = "std_srvs/srv/SetBool"
 HEADER = {"stamp": {"sec": 5, "nanosec": 7}, "frame_id": "base"}
 FIELDS: dict[str, dict[str, Any]] = {
-    joint_state.TYPE: {
+    JOINT_STATE: {
         "header": HEADER,
         "name": ["a", "b"],
         "position": [0.5, -1.0],
         "velocity": [0.0, 1.0],
         "effort": [],
     },
-    image.TYPE: {
+    IMAGE: {
         "header": HEADER,
         "height": 2,
         "width": 3,
@@ -247,7 +246,7 @@ def test_what_the_other_side_writes_is_read_by_us(
     found = JAZZY.decode(kind, sample.payload.to_bytes())
     assert JAZZY.encode(found) == JAZZY.encode(message(kind, FIELDS[kind]))
     if kind != POSE:
-        table.read(JAZZY, kind, sample.payload.to_bytes())
+        read(JAZZY, kind, sample.payload.to_bytes())
 
 
 def test_our_service_answers_the_other_side(lab: tuple[Profile, Sdk], link: RosGraph) -> None:
@@ -302,7 +301,7 @@ def test_the_node_drives_a_robot_of_the_other_side(lab: tuple[Profile, Sdk]) -> 
         thread = threading.Thread(target=node.run, args=(stop,))
         thread.start()
         try:
-            sdk.do("advertise", name="/joint_states", kind=joint_state.TYPE)
+            sdk.do("advertise", name="/joint_states", kind=JOINT_STATE)
             assert sdk.wait("done")
 
             def state() -> bool:
@@ -315,7 +314,7 @@ def test_the_node_drives_a_robot_of_the_other_side(lab: tuple[Profile, Sdk]) -> 
                     "velocity": [0.0] * 7,
                     "effort": [0.0] * 7,
                 }
-                sdk.do("publish", name="/joint_states", kind=joint_state.TYPE, fields=fields)
+                sdk.do("publish", name="/joint_states", kind=JOINT_STATE, fields=fields)
                 time.sleep(0.02)
                 return bool(poses)
 

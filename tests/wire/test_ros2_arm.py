@@ -11,7 +11,6 @@ from panda_arm import ARM_JOINTS, HOME_RAD, panda
 from ros2_turns import RAMP_S, SPEED_M_S, TICK_NS, TICK_S, Turns, ros2_turns
 
 from vla_zenoh.guard.arm_guard import UNHEEDED_NS
-from vla_zenoh.interop.joint_reading import RESTARTED_NS
 from vla_zenoh.robots.command_follower import STALLED_NS
 from vla_zenoh.types import GripperState, JointCommand, JointState, PoseCommand, PoseState
 
@@ -23,7 +22,6 @@ JOINT_GOALS = """\
   joint_command: {topic: /goal, type: trajectory_msgs/msg/JointTrajectory}
 robot: {command: joint}
 """
-BY_TF = "  tcp: tf\n"
 
 
 @pytest.fixture
@@ -105,37 +103,6 @@ def test_a_wall_clock_that_is_set_silences_nobody(turns: Turns, step_s: float) -
     for _ in range(90):
         turns.turn()
     assert turns.arm.state == "braking", "and silence is noticed in time"
-
-
-def followed(turns: Turns, height_m: float) -> bool:
-    """The TCP is told to be where /tf says."""
-    since = len(turns.states[PoseState])
-    for _ in range(5):
-        turns.transform(height_m)
-        turns.turn()
-    told = turns.states[PoseState][since:]
-    return bool(told) and told[-1].position_m[2] == height_m
-
-
-@pytest.mark.parametrize("turns", [BY_TF], indirect=True)
-def test_a_robot_whose_clock_is_set_back_is_where_its_transforms_say(turns: Turns) -> None:
-    assert followed(turns, 0.25)
-    turns.wall_ns -= 3600 * 10**9
-    heard = len(turns.states[PoseState])
-    for _ in range(5):
-        turns.turn()
-    assert len(turns.states[PoseState]) == heard, "what is of another time is not told"
-    assert turns.refused("stale") > 0
-    assert "s ahead of the joints" in turns.told("stale")[0].why
-    assert followed(turns, 0.3)
-
-
-@pytest.mark.parametrize("turns", [BY_TF], indirect=True)
-def test_one_transform_from_the_future_does_not_stop_the_tcp(turns: Turns) -> None:
-    assert followed(turns, 0.25)
-    turns.transform(0.5, clock_s=2 * RESTARTED_NS / 1e9)
-    turns.turn()
-    assert followed(turns, 0.3)
 
 
 # -- what is taken ----------------------------------------------------------------------------

@@ -18,7 +18,6 @@ SLASH = "§"
 PLAIN = ""
 EVERYTHING = """\
   finger_states: /fingers
-  tcp: tf
   wrench: {topic: /wrench}
   gripper: {grasp: /panda_gripper/grasp}
 """

@@ -287,8 +287,10 @@ class JointFollower:
             # Joints at their bound cannot contribute.
             free = np.where(np.where(way > 0, reached > low, reached < high), way, 0.0)
             gain = float(row @ free)
-            if excess <= 0 or gain <= 0:
+            if excess <= 0:
                 break
+            if gain <= 0:  # what is left of this way leads nearer
+                continue
             reached = np.minimum(np.maximum(reached - excess / gain * free, low), high)
         return reached
 

@@ -84,7 +84,7 @@ def reasons_not_to_activate(
         profile: the effective profile.
         worker: the worker that gets the lease.
         prompt: the prompt in force.
-        around: see `PeerSnapshot`.
+        peers: see `PeerSnapshot`.
         pose: newest TCP pose.
         gripper: newest gripper state.
         chunk: newest chunk of that worker, published without the lease.
@@ -95,7 +95,7 @@ def reasons_not_to_activate(
         *_robot(profile, peers, pose, now_ns),
         *_gripper(profile, gripper, now_ns),
         *_worker(worker, prompt, peers),
-        *_spec(profile, worker, peers, rate_hz),
+        *_spec(profile, worker, peers),
         *_chunk(profile, worker, peers, chunk, now_ns, rate_hz),
         *_cameras(profile, worker, peers),
         *_clocks(profile, worker, peers),
@@ -207,17 +207,14 @@ def _worker(worker: str, prompt: str, peers: PeerSnapshot) -> list[str]:
     return reasons
 
 
-def _spec(profile: Profile, worker: str, peers: PeerSnapshot, rate_hz: float) -> list[str]:
+def _spec(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
     """Requirements of its spec that the profile does not meet."""
     spec = peers.specs.get(worker)
     if spec is None:
         return []
     return [
         f"worker {worker!r} {why}" if name == "camera" else f"worker {worker!r}: {name}: {why}"
-        for level, name, why in policy_check.check_spec(
-            profile, spec, worker=worker, rate_hz=rate_hz
-        )
-        if level == "error"
+        for _, name, why in policy_check.spec_errors(profile, spec)
     ]
 
 
@@ -255,13 +252,11 @@ def _chunk(
         steps = check_steps(spec.action, chunk.record.steps)
     except SpecError as error:
         return [f"worker {worker!r}: its newest chunk is not sane: {error}"]
-    found = policy_check.check_chunk(
+    found = policy_check.chunk_errors(
         spec.action, steps, profile.limits, profile.robot.gripper.max_width_m
     )
     return [
-        f"worker {worker!r}: its newest chunk is not sane: {name}: {why}"
-        for level, name, why in found
-        if level == "error"
+        f"worker {worker!r}: its newest chunk is not sane: {name}: {why}" for _, name, why in found
     ]
 
 

@@ -53,6 +53,10 @@ LEAST_JERK = 1e-3
 SLACK, LEAST = 0.1, 0.25
 """Shares of the stream's limits. The difference is replanned when the commanded path takes `SLACK`
 more of them; it always has `LEAST`."""
+REVERSAL = 0.15
+"""Share of the jerk that the difference leaves unused. Where the commanded path's jerk reverses
+within a tick, a third-order finite difference weighs its parts unevenly: by up to 1/8 of the jerk
+more than the mean that is known here."""
 GRID = 8
 
 Reference = TypeVar("Reference")
@@ -293,7 +297,9 @@ class ReferenceGovernor(Generic[Reference]):
         needed = _jerk(way, SETTLE_S)
         self._taken = taken + self._slack
         self._known = self._taken[1:] * self._own[1:]
-        left = np.maximum(BRAKE_MARGIN - self._taken, LEAST)
+        left = BRAKE_MARGIN - self._taken
+        left[2] -= REVERSAL
+        left = np.maximum(left, LEAST)
         velocity, acceleration, jerk = left * self._own * self._axis
         cramped = _jerk(way, LONG_S) > (BRAKE_MARGIN - ORDINARY) * self._own[2] * self._axis
         self._cramped = cramped if cramped.any() else None

@@ -280,6 +280,13 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
     runs: dict[tuple[str, str], list[str]] = defaultdict(list)
     for name, host in profile.hosts.items():
         place = ("hosts", name)
+        if not host.nodes:
+            yield (
+                (*place, "nodes"),
+                "is empty: give the host a node, or remove it. A computer that only drives or "
+                f"watches is no host: `vla-zenoh secure add {name} --role operator` (or viewer) "
+                "gives it a certificate",
+            )
         yield from _unknown((*place, "cameras"), host.cameras or (), "cameras", profile.cameras)
         yield from _unknown((*place, "workers"), host.workers or (), "workers", profile.workers)
         for kind in ("sim", "arm"):
@@ -287,10 +294,6 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
                 yield (*place, "nodes"), f"has {kind}, and robot.driver is {profile.robot.driver}"
         if "ros2" in host.nodes and profile.ros2 is None:
             yield (*place, "nodes"), "has ros2, which needs a section ros2"
-        if host.pictures is not None and not profile.workers_of(host):
-            yield (*place, "pictures"), "is for workers, and this host runs none"
-        elif host.pictures is not None and "camera" in host.nodes:
-            yield (*place, "pictures"), "is for cameras elsewhere, and this host has its own"
         named = set(host.cameras or ()) & set(profile.cameras) if "camera" in host.nodes else set()
         for camera in sorted(named - set(profile.served_cameras(host))):
             yield (*place, "cameras"), f"has {camera}, of ROS 2: the node ros2 serves it"

@@ -125,7 +125,6 @@ class Ros2Profile(Section):
         domain: ROS domain id.
         joint_states: topic of sensor_msgs/JointState with the arm's joints.
         finger_states: topic with the finger joints, if they are on another one.
-        tcp: source of the TCP pose: ``kinematics``: our own; ``tf``: the topic /tf.
         wrench: external wrench at the TCP; ``limits.contact`` has no effect without it.
         cameras: camera of the profile -> topic.
         pose_command: topic for poses.
@@ -142,7 +141,6 @@ class Ros2Profile(Section):
     domain: int = Field(default=0, ge=0, le=232)
     joint_states: Topic = "/joint_states"
     finger_states: Topic | None = None
-    tcp: Literal["kinematics", "tf"] = "kinematics"
     wrench: Ros2Wrench | None = None
     cameras: dict[Name, Ros2Camera] = Field(default_factory=dict)
     pose_command: Ros2Output | None = None

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vla_zenoh.control.joint_follower import JointFollower
 from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.pose_to_joint import FAR, NEAR_M, NEAR_RAD, PoseToJoint
 from vla_zenoh.control.reachability import make_reachability_filter
@@ -205,6 +206,15 @@ def test_a_pose_that_leaves_the_box_is_not_followed_out_of_it(way_m: list[float]
         furthest_m = max(furthest_m, beyond_box_m(KINEMATICS.forward(arm.joints_rad).position_m))
     assert beyond_box_m(arm.smoother.motion.pose.position_m) > 0.01
     assert -0.001 < furthest_m <= BEYOND_BOX_M
+
+
+def test_a_face_of_the_box_holds_where_the_easiest_joint_brakes_as_hard_as_it_can() -> None:
+    row, easiest = np.array([0.3, 0.2, -0.1]), np.array([4.0, -0.5, 1.0])
+    reached, low, high = np.array([0.1, 0.2, -0.1]), np.array([0.1, 0.0, -0.3]), np.full(3, 0.4)
+    slower = JointFollower._slower_along(row, easiest, 0.04, reached, low, high)
+    assert float(row @ slower) == pytest.approx(0.04)
+    assert (slower >= low).all()
+    assert (slower <= high).all()
 
 
 def test_an_arm_that_begins_outside_of_the_box_is_led_in() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -62,6 +64,27 @@ def test_twenty_millimetres_are_gone_soon_and_a_tenth_of_one_sooner() -> None:
     for step, after_s in ((0.02, SOON_S), (1e-4, SOON_S / 3)):
         path = led(governor(), standing(step), round(SOON_S / DT_S))
         np.testing.assert_array_equal(path[round(after_s / DT_S) :], step)
+
+
+@given(at=st.floats(0.2, 0.8), step=st.sampled_from([-0.1, 0.1]), ticks=st.integers(40, 90))
+@settings(max_examples=40, deadline=None)
+def test_beside_a_path_whose_jerk_reverses_within_a_tick_no_difference_exceeds_the_jerk(
+    at: float, step: float, ticks: int
+) -> None:
+    side, jerk = governor(2), OWN[2]
+    path = np.zeros((2 * ticks + 3, 2))
+    for tick in range(2 * ticks):
+        # One axis reverses its jerk `ticks + at` ticks after it began; the other begins then.
+        time_s, after_s = (max(tick + 1 - begin, 0.0) * DT_S for begin in (0.0, ticks + at))
+        told = [
+            jerk / math.factorial(n) * np.array([time_s**n - 2 * after_s**n, after_s**n])
+            for n in (3, 2, 1)
+        ]
+        told[0] = told[0] + (step if tick >= ticks - 10 else 0.0)
+        side.follow(JointReference(*told), steady=tick not in (0, ticks - 10))
+        path[tick + 3] = side.motion.position_rad
+    third = np.diff(path, 3, axis=0) / DT_S**3
+    assert np.abs(third).max() <= BRAKE_MARGIN * jerk * (1 + RTOL)
 
 
 @given(st.floats(-1e-15, 1e-15))

@@ -13,18 +13,18 @@ import zenoh
 from typer.testing import CliRunner
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.interop.ros2.bridge import bridge_command, bridge_config, bridge_text
 from vla_zenoh.interop.ros2.graph import camera_topics
 from vla_zenoh.interop.ros2.keys import Ros2Dds
 from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.lab.doctor.access_rules import Passage, allows, passages
+from vla_zenoh.lab.profile.ros2_bridge import bridge_command, bridge_config, bridge_text
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.security import authority as ca
 from vla_zenoh.security.bridge import bridge_locks, bridges
 from vla_zenoh.security.identity import Role
+from vla_zenoh.security.lab_certificates import LabCertificates
 from vla_zenoh.security.roles import Act
-from vla_zenoh.security.store import Store
 
 RUNNER = CliRunner()
 HOSTS = """\
@@ -96,7 +96,6 @@ def test_every_part_of_the_section_is_let_through_and_only_where_it_is_used(
         """\
 ros2:
   finger_states: /fingers
-  tcp: tf
   wrench: {topic: /wrench}
   joint_command: {topic: /joints, type: trajectory_msgs/msg/JointTrajectory}
   gripper: {grasp: /panda_gripper/grasp}
@@ -104,7 +103,7 @@ ros2:
 """,
     )
     found = allowed(profile)
-    assert {"/fingers", "/tf", "/tf_static", "/wrench"} <= set(found["publishers"])
+    assert {"/fingers", "/wrench"} <= set(found["publishers"])
     assert found["action_servers"] == ["/panda_gripper/grasp", "/panda_gripper/move"]
     assert found["service_clients"] == []
     assert not any("/vla/" in name for names in found.values() for name in names)
@@ -273,7 +272,7 @@ def test_a_renewed_host_has_a_new_certificate_for_its_bridge(tmp_path: Path) -> 
     done = RUNNER.invoke(secure_app, ["add", "robot", "--profile", str(file), "--renew"])
     assert done.exit_code == 0, done.output
     assert pem.read_bytes() != before
-    entries = Store(tmp_path / "certificates").entries(dt.datetime.now(dt.UTC), "robot")
+    entries = LabCertificates(tmp_path / "certificates").entries(dt.datetime.now(dt.UTC), "robot")
     assert "bridge" in {entry.node for entry in entries if not entry.faults}
     (bridge,) = bridges(load_profile(str(file)))
     assert (bridge.role, bridge.common_name) == (Role.BRIDGE, "bridge@robot")

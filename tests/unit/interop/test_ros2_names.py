@@ -11,7 +11,7 @@ from vla_zenoh.interop.ros2 import attachment as attachments
 from vla_zenoh.interop.ros2.attachment import Attachment
 from vla_zenoh.interop.ros2.keys import Endpoint, EntityRole, RmwZenoh, Ros2Dds, parts_of
 from vla_zenoh.interop.ros2.names import dds_type
-from vla_zenoh.interop.ros2.qos import COMMAND, DEFAULT, SENSOR, STATIC_TRANSFORMS
+from vla_zenoh.interop.ros2.qos import COMMAND, DEFAULT, SENSOR
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ZID = "f9980ee0495eaafb3e38f0d19e2eae12"
@@ -43,12 +43,6 @@ def test_a_bridges_key_is_the_name_without_its_first_slash() -> None:
         (
             Endpoint(EntityRole.SUBSCRIBER, "/a/b", "sensor_msgs/msg/Image", SENSOR),
             f"MS/a§b/sensor_msgs§msg§Image/:0:0:0,5:typehash={HASH};",
-        ),
-        (
-            Endpoint(
-                EntityRole.SUBSCRIBER, "/tf_static", "tf2_msgs/msg/TFMessage", STATIC_TRANSFORMS
-            ),
-            f"MS/tf_static/tf2_msgs§msg§TFMessage/:1:1:0,100:typehash={HASH};",
         ),
         (
             Endpoint(EntityRole.SERVER, "/vla/stop", "std_srvs/srv/Trigger"),
@@ -94,7 +88,6 @@ def test_tokens_of_two_endpoints_differ() -> None:
         (DEFAULT, "::,10:,:,:,,"),
         (COMMAND, "::,1:,:,:,,"),
         (SENSOR, "2::,5:,:,:,,"),
-        (STATIC_TRANSFORMS, ":1:,100:,:,:,,"),
     ],
 )
 def test_what_is_the_default_is_left_out_of_rmw_zenohs_qos(qos: object, text: str) -> None:

@@ -16,21 +16,14 @@ from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.arm_guard import MOVED_M, MOVED_RAD, SETTLE_NS, HeldReference, Measured
 from vla_zenoh.interop.joint_reading import (
     BEYOND,
-    RESTARTED_NS,
     JointReading,
     StampFilter,
     pose_state,
 )
 from vla_zenoh.interop.ros2.action_goals import GoalSequencer, GoalStep
 from vla_zenoh.interop.ros2.robot_clock import RobotClock
-from vla_zenoh.interop.ros2.samples import Joints, Transform
-from vla_zenoh.interop.ros2.transform_buffer import (
-    FURTHEST_M,
-    MAX_CHAIN,
-    MAX_FRAMES,
-    TransformBuffer,
-)
-from vla_zenoh.kinematics.so3 import Pose, exp3, quat_from_rotation
+from vla_zenoh.interop.ros2.samples import Joints
+from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperCommand
 
@@ -204,93 +197,6 @@ def test_fingers_that_move_are_seen(arm: JointReading) -> None:
 def test_a_gripper_of_which_nothing_was_heard_has_no_state(arm: JointReading) -> None:
     arm.take(joints(names=ARM_JOINTS), 1)
     assert arm.gripper(busy=False, wanted_m=0.01, held=False) is None
-
-
-# -- frames ---------------------------------------------------------------------------------------
-def transform(
-    parent: str, child: str, stamp_ns: int = 1, shift: Any = (0.1, 0, 0), turn: Any = (0, 0, 0)
-) -> Transform:
-    quat = quat_from_rotation(exp3(np.array(turn, float)))
-    return Transform(stamp_ns, parent, child, np.array(shift, float), quat)
-
-
-def test_a_chain_of_frames_is_followed_up_and_dated_by_its_oldest() -> None:
-    frames = TransformBuffer()
-    half_turn = (0, 0, math.pi)
-    frames.take([transform("base", "arm", 7, turn=half_turn), transform("arm", "hand", 5)],
-                static=False)  # fmt: skip
-    frames.take([transform("hand", "tcp", 0)], static=True)
-    found = frames.find("base", "tcp")
-    assert found is not None
-    pose, oldest_ns, newest_ns = found
-    assert (oldest_ns, newest_ns) == (5, 7)
-    assert pose.position_m == pytest.approx([0.1 - 0.1 - 0.1, 0, 0], abs=POSITION_TOLERANCE_M)
-    assert pose.rotation == pytest.approx(exp3(np.array(half_turn)))
-
-
-def test_frames_that_are_not_connected_are_not_found() -> None:
-    frames = TransformBuffer()
-    frames.take([transform("base", "arm"), transform("a", "b"), transform("b", "a")], static=False)
-    assert frames.find("base", "tcp") is None
-    assert frames.find("base", "a") is None
-    assert frames.find("base", "base") is None
-
-
-def test_an_older_transform_does_not_replace_a_newer_one() -> None:
-    frames = TransformBuffer()
-    frames.take([transform("base", "tcp", 9)], static=False)
-    frames.take([transform("base", "tcp", 8, shift=(5, 0, 0))], static=False)
-    found = frames.find("base", "tcp")
-    assert found is not None
-    assert found[0].position_m[0] == 0.1
-
-
-def test_a_transform_that_is_older_by_far_is_of_a_clock_that_was_set() -> None:
-    frames = TransformBuffer()
-    now_ns = 10**18
-    frames.take([transform("base", "tcp", now_ns)], static=False)
-    before_ns = now_ns - RESTARTED_NS
-    frames.take([transform("base", "tcp", before_ns + 1, shift=(5, 0, 0))], static=False)
-    found = frames.find("base", "tcp")
-    assert found is not None
-    assert found[1] == now_ns, "that one was overtaken"
-    frames.take([transform("base", "tcp", before_ns, shift=(5, 0, 0))], static=False)
-    frames.take([transform("base", "tcp", before_ns + 1, shift=(6, 0, 0))], static=False)
-    found = frames.find("base", "tcp")
-    assert found is not None
-    assert found[1] == before_ns + 1
-    assert found[0].position_m[0] == 6
-
-
-def test_transforms_that_are_none_and_floods_of_frames_are_refused() -> None:
-    frames = TransformBuffer()
-    bad = transform("base", "tcp")
-    for entry in (
-        bad._replace(quat_xyzw=np.zeros(4)),
-        bad._replace(position_m=np.array([math.nan, 0, 0])),
-        bad._replace(position_m=np.array([0, 1.5 * FURTHEST_M, 0])),
-    ):
-        with pytest.raises(CodecError) as caught:
-            frames.take([entry], static=False)
-        assert caught.value.reason == "invalid"
-    with pytest.raises(CodecError) as caught:
-        frames.take([transform("a", f"f{n}") for n in range(MAX_FRAMES + 1)], static=False)
-    assert caught.value.reason == "flood"
-
-
-def test_the_longest_chain_of_the_furthest_frames_is_finite() -> None:
-    frames = TransformBuffer()
-    turned = (0.3, 0.2, 0.1)
-    frames.take(
-        [
-            transform(f"f{n}", f"f{n + 1}", shift=(0, 0, FURTHEST_M), turn=turned)
-            for n in range(MAX_CHAIN)
-        ],
-        static=False,
-    )
-    found = frames.find("f0", f"f{MAX_CHAIN}")
-    assert found is not None
-    pose_state(found[0], np.zeros(6), None, None)
 
 
 # -- the robot's clock ----------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.interop.ros2 import diagnostics, table
+from vla_zenoh.interop.ros2 import diagnostics, readers
 from vla_zenoh.interop.ros2.gripper_actions import (
     GRASP,
     GRIPPER_COMMAND,
@@ -22,7 +22,7 @@ from vla_zenoh.interop.ros2.gripper_actions import (
 )
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.samples import RosImage, Stamp
-from vla_zenoh.interop.ros2.topics import pose
+from vla_zenoh.interop.ros2.writers import Write, joint_writer, pose_writer, position_message
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.profile.ros2 import Ros2Gripper
 from vla_zenoh.types import GripperCommand, JointCommand, NodeStatus, PoseCommand
@@ -47,7 +47,7 @@ def header(stamp_ns: int = 5_000_000_007, frame: str = "cam") -> Any:
 
 
 def read(message: Any) -> Any:
-    return table.read(M, message.__msgtype__, M.encode(message))
+    return readers.read(M, message.__msgtype__, M.encode(message))
 
 
 def refused(message: Any) -> str:
@@ -147,7 +147,7 @@ def test_a_compressed_image_that_is_none_is_refused(said: str, data: bytes, reas
     assert refused(M.new(kind, header=header(), format=said, data=payload)) == reason
 
 
-# -- joints and transforms ------------------------------------------------------------------------
+# -- joints ---------------------------------------------------------------------------------------
 def joints(**fields: Any) -> Any:
     given = {"name": ["a", "b"], "position": np.array([1.0, 2.0])} | fields
     return M.new("sensor_msgs/msg/JointState", header=header(), **given)
@@ -199,14 +199,20 @@ WIDTH = GripperCommand(0.04, 0.1, 20.0)
 ROBOTIQ = {"joint_open_rad": 0.0, "joint_shut_rad": 0.7929}
 
 
-def written(kind: str, key: str, record: Any) -> Any:
-    row = next(r for r in table.writings(POSTURE_RAD, 8_000_000) if (r.type, r.key) == (kind, key))
-    assert isinstance(record, row.record)
-    return M.decode(kind, M.encode(row.write(M, kind, record, STAMP)))
+def written(kind: str, write: Write, command: Any) -> Any:
+    return M.decode(kind, M.encode(write(command, STAMP)))
+
+
+def pose_written(kind: str) -> Any:
+    return written(kind, pose_writer(M, kind, POSTURE_RAD), POSE)
+
+
+def joints_written(kind: str) -> Any:
+    return written(kind, joint_writer(M, kind, 8_000_000), JOINTS)
 
 
 def test_a_pose_is_written_with_stamp_and_frame() -> None:
-    message = written("geometry_msgs/msg/PoseStamped", "command_pose", POSE)
+    message = pose_written("geometry_msgs/msg/PoseStamped")
     assert message.header.frame_id == "panda_link0"
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1_700_000_000, 123_456_789)
     at, turn = message.pose.position, message.pose.orientation
@@ -216,16 +222,14 @@ def test_a_pose_is_written_with_stamp_and_frame() -> None:
 
 def test_an_impedance_goal_carries_the_posture() -> None:
     kind = "multi_mode_control_msgs/msg/CartesianImpedanceGoal"
-    message = written(kind, "command_pose", POSE)
+    message = pose_written(kind)
     assert message.pose.position.x == 0.4
     assert message.q_n.tolist() == POSTURE_RAD.tolist()
 
 
 def test_a_type_of_ones_own_is_filled_by_what_its_fields_are() -> None:
     kind = "lab_msgs/msg/Target"
-    pose.check(M, kind)
-    message = pose.writer(POSTURE_RAD)(M, kind, POSE, STAMP)
-    message = M.decode(kind, M.encode(message))
+    message = pose_written(kind)
     assert message.header.frame_id == message.at.header.frame_id == "panda_link0"
     assert message.at.pose.position.z == 0.3
     assert message.feed.angular.z == 0.5
@@ -235,13 +239,13 @@ def test_a_type_of_ones_own_is_filled_by_what_its_fields_are() -> None:
 
 def test_a_type_without_a_pose_is_told() -> None:
     with pytest.raises(ProfileError, match="no field of type geometry_msgs/msg/Pose"):
-        pose.check(M, "lab_msgs/msg/Nothing")
+        pose_writer(M, "lab_msgs/msg/Nothing", POSTURE_RAD)
     with pytest.raises(ProfileError, match=r"did you mean .*Target"):
-        pose.check(M, "lab_msgs/msg/Targets")
+        pose_writer(M, "lab_msgs/msg/Targets", POSTURE_RAD)
 
 
 def test_joints_are_written_as_a_trajectory_of_one_point_from_now_on() -> None:
-    message = written("trajectory_msgs/msg/JointTrajectory", "command_joint", JOINTS)
+    message = joints_written("trajectory_msgs/msg/JointTrajectory")
     (point,) = message.points
     assert tuple(message.joint_names) == NAMES
     assert point.positions.tolist() == JOINTS.position_rad.tolist()
@@ -251,13 +255,13 @@ def test_joints_are_written_as_a_trajectory_of_one_point_from_now_on() -> None:
 
 
 def test_joints_are_written_as_plain_numbers() -> None:
-    message = written("std_msgs/msg/Float64MultiArray", "command_joint", JOINTS)
+    message = joints_written("std_msgs/msg/Float64MultiArray")
     assert message.data.tolist() == JOINTS.position_rad.tolist()
 
 
 def test_openings_are_written_as_plain_numbers() -> None:
-    assert written("std_msgs/msg/Float64", "command_gripper", 0.04).data == 0.04
-    array = written("std_msgs/msg/Float64MultiArray", "command_gripper", 0.04)
+    assert position_message(M, "std_msgs/msg/Float64", 0.04).data == 0.04
+    array = position_message(M, "std_msgs/msg/Float64MultiArray", 0.04)
     assert array.data.tolist() == [0.04]
 
 

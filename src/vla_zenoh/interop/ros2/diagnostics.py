@@ -7,7 +7,7 @@ from typing import Any
 
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.samples import Stamp
-from vla_zenoh.interop.ros2.topics import header
+from vla_zenoh.interop.ros2.writers import header
 from vla_zenoh.types import NodeStatus
 
 TYPE = "diagnostic_msgs/msg/DiagnosticArray"
@@ -34,7 +34,7 @@ def write(
     """
     return messages.new(
         TYPE,
-        header=header.write(messages, stamp),
+        header=header(messages, stamp),
         status=[
             _entry(messages, robot, status, age_s, alive) for status, age_s, alive in nodes.values()
         ],

@@ -7,14 +7,13 @@ from collections.abc import Iterator
 from vla_zenoh.interop.ros2 import diagnostics
 from vla_zenoh.interop.ros2.gripper_actions import GRASP
 from vla_zenoh.interop.ros2.keys import Endpoint, EntityRole
+from vla_zenoh.interop.ros2.readers import JOINT_STATE, TEXT, WRENCH
 from vla_zenoh.interop.ros2.services import PROMPT_TOPIC, SERVICES, STATUS_TOPIC
-from vla_zenoh.interop.ros2.topics import joint_state, plain, transforms, wrench
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Camera, Ros2Gripper, Ros2Profile
 
 SOURCE = "ros2:"
 """Prefix of a camera source that is a ROS topic."""
-TF, TF_STATIC = "/tf", "/tf_static"
 
 
 def camera_topics(profile: Profile) -> dict[str, Ros2Camera]:
@@ -48,12 +47,9 @@ def endpoints(profile: Profile) -> tuple[Endpoint, ...]:
 
 def _arm(ros2: Ros2Profile, command: str) -> Iterator[Endpoint]:
     for topic in (ros2.joint_states, ros2.finger_states or ros2.joint_states):
-        yield Endpoint(EntityRole.SUBSCRIBER, topic, joint_state.TYPE)
-    if ros2.tcp == "tf":
-        for topic in (TF, TF_STATIC):
-            yield Endpoint(EntityRole.SUBSCRIBER, topic, transforms.TYPE)
+        yield Endpoint(EntityRole.SUBSCRIBER, topic, JOINT_STATE)
     if ros2.wrench is not None:
-        yield Endpoint(EntityRole.SUBSCRIBER, ros2.wrench.topic, wrench.TYPE)
+        yield Endpoint(EntityRole.SUBSCRIBER, ros2.wrench.topic, WRENCH)
     output = ros2.joint_command if command == "joint" else ros2.pose_command
     if output is not None:
         yield Endpoint(EntityRole.PUBLISHER, output.topic, output.type)
@@ -71,5 +67,5 @@ def _gripper(gripper: Ros2Gripper) -> Iterator[Endpoint]:
 def _services(prefix: str) -> Iterator[Endpoint]:
     for service in SERVICES:
         yield Endpoint(EntityRole.SERVER, f"{prefix}/{service.name}", service.type)
-    yield Endpoint(EntityRole.SUBSCRIBER, f"{prefix}/{PROMPT_TOPIC}", plain.TEXT)
+    yield Endpoint(EntityRole.SUBSCRIBER, f"{prefix}/{PROMPT_TOPIC}", TEXT)
     yield Endpoint(EntityRole.PUBLISHER, f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)

@@ -12,23 +12,20 @@ class Qos:
     Args:
         depth: samples kept.
         reliable: they must arrive.
-        transient_local: late joiners get the last ones.
     """
 
     depth: int = 10
     reliable: bool = True
-    transient_local: bool = False
 
     def as_ros2dds(self, type_hash: str | None) -> str:
         """As in the bridge's tokens: key-less, DDS's numbers, and the hash as user data."""
-        text = f":{int(self.reliable)}:{int(self.transient_local)}:0,{self.depth}"
+        text = f":{int(self.reliable)}:0:0,{self.depth}"
         return text if type_hash is None else f"{text}:typehash={type_hash};"
 
     def as_rmw_zenoh(self) -> str:
         """As in rmw_zenoh's tokens: what is the default (reliable, volatile) is left out."""
         reliability = "" if self.reliable else "2"
-        durability = "1" if self.transient_local else ""
-        return f"{reliability}:{durability}:,{self.depth}:,:,:,,"
+        return f"{reliability}::,{self.depth}:,:,:,,"
 
 
 DEFAULT = Qos()
@@ -36,4 +33,3 @@ SENSOR = Qos(depth=5, reliable=False)
 """rclcpp's SensorDataQoS: matches both reliable and best-effort publishers."""
 COMMAND = Qos(depth=1)
 """Setpoints: reliable, so that it matches every subscriber; the newest replaces older ones."""
-STATIC_TRANSFORMS = Qos(depth=100, transient_local=True)

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from vla_zenoh.types import FloatArray
 
+SECOND_NS = 1_000_000_000
+
 
 class Joints(NamedTuple):
     """A sensor_msgs/JointState.
@@ -43,24 +45,6 @@ class RosImage(NamedTuple):
     stamp_ns: int
     frame: str
     rgb: NDArray[np.uint8]
-
-
-class Transform(NamedTuple):
-    """Where `child` is in `parent`.
-
-    Args:
-        stamp_ns: of its header.
-        parent: frame.
-        child: frame.
-        position_m: (3,).
-        quat_xyzw: (4,).
-    """
-
-    stamp_ns: int
-    parent: str
-    child: str
-    position_m: FloatArray
-    quat_xyzw: FloatArray
 
 
 class Wrench(NamedTuple):

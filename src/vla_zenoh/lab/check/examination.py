@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vla_zenoh.control import policy_check
-from vla_zenoh.control.policy_check import error, note
+from vla_zenoh.control.policy_check import error, joints_as_pose
 from vla_zenoh.errors import SpecError
 from vla_zenoh.lab.check import judge
 from vla_zenoh.lab.check.examples import (
@@ -18,6 +17,7 @@ from vla_zenoh.lab.check.examples import (
     example_styles,
     noise,
 )
+from vla_zenoh.lab.check.fit import check_chunk, check_spec, note
 from vla_zenoh.lab.check.judge import Steps
 from vla_zenoh.lab.check.model_runner import ModelFailed, ModelHung, ModelRunner
 from vla_zenoh.lab.check.report import CheckReport, distinct
@@ -88,7 +88,7 @@ class Examination:
     def _run(self) -> None:
         report = self.report
         if self._profile is not None:
-            report.findings += policy_check.check_spec(
+            report.findings += check_spec(
                 self._profile, self._policy.spec, worker=report.worker, rate_hz=self._rate_hz
             )
         before_kib = self._runner.memory_kib()
@@ -259,10 +259,10 @@ class Examination:
         except SpecError as fault:
             findings.append(error(fault.reason, f"{style.name}: {fault}"))
             return None
-        findings += policy_check.check_chunk(action, steps, self._limits, self._width_m)
+        findings += check_chunk(action, steps, self._limits, self._width_m)
         if self._profile is not None:
             home_rad = np.array(self._profile.robot.home_rad)
-            findings += policy_check.joints_as_pose(action, steps, home_rad, self._limits)
+            findings += joints_as_pose(action, steps, home_rad, self._limits)
         self._answers.append((style, steps))
         # A model with real-time chunking gets committed steps at the next inference.
         arrival_ns = observation.stamp_wall_ns + round(took_s * 1e9)

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.control.policy_check import Finding, error, note, warning
+from vla_zenoh.control.policy_check import Finding, error
 from vla_zenoh.errors import SpecError
 from vla_zenoh.lab.check.examples import MAX_WIDTH_M, ExampleStyle
+from vla_zenoh.lab.check.fit import note, warning
 from vla_zenoh.policy import ActionSpec, ActionSteps, Observation, Policy, check_steps
 
 GROWTH_KIB, GROWTH_TOTAL_KIB = 32.0, 4096.0

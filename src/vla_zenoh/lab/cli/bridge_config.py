@@ -36,7 +36,7 @@ def bridge_config(
 
     Redirect stdout into a file; stderr says how to start the bridge with it.
     """
-    from vla_zenoh.interop.ros2 import bridge
+    from vla_zenoh.lab.profile import ros2_bridge as bridge
 
     profile = node.load()
     start = bridge.bridge_command(profile, FILE)

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from vla_zenoh.cli.options import JsonOption
-from vla_zenoh.cli.output_path import ForceOption
+from vla_zenoh.lab.cli.output_path import ForceOption
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class DemoOptions:
         float | None,
         typer.Option(
             "--seconds",
-            help="Duration of a fixed motion; time limit of a task.",
+            help="Time for the steps of a fixed motion; time limit of a task.",
             min=0.5,
             max=3600,
         ),

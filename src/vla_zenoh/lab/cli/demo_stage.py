@@ -18,8 +18,8 @@ from rich.progress import Progress
 
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import Screen, errors, progress_bars
-from vla_zenoh.cli.output_path import RUNS, output_folder
 from vla_zenoh.lab.cli.loopback import own_address
+from vla_zenoh.lab.cli.output_path import RUNS, output_folder
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.evaluation.plot_image import write_plot
 from vla_zenoh.lab.recording.film import Film, write_film
@@ -156,6 +156,21 @@ def open_stage(profile: str, folder: Path, *, force: bool) -> Iterator[Stage]:
 def run_folder(given: Path | None) -> Path:
     """`given`, else a folder named by the time."""
     return given or RUNS / time.strftime("demo-%Y%m%d-%H%M%S")
+
+
+def latency_line(latency: Mapping[str, Any]) -> str:
+    """The latency of a run, see `vla_zenoh.lab.demo.segments.latencies`, in one line."""
+    if latency.get("p50") is None:
+        return "latency: no chunk was carried out"
+    stages = ", ".join(
+        f"{name.replace('_', ' ')} {values['p50']:.1f}"
+        for name, values in latency["stages"].items()
+        if values
+    )
+    return (
+        f"latency, camera stamp to pose command: p50 {latency['p50']:.1f} ms, "
+        f"p95 {latency['p95']:.1f} ms ({stages})"
+    )
 
 
 def refusals(statuses: Mapping[str, NodeStatus]) -> dict[str, int]:

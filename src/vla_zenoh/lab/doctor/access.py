@@ -7,6 +7,7 @@ import re
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from vla_zenoh.errors import MissingExtraError, SecurityError, VlaZenohError
 from vla_zenoh.lab.doctor.finding import HostFinding
@@ -14,8 +15,10 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import is_loopback
 from vla_zenoh.security.bridge import NODE as BRIDGE
 from vla_zenoh.security.identity import Identity
-from vla_zenoh.security.store import Entry, Store
 from vla_zenoh.security.unused_certificates import unused_certificates
+
+if TYPE_CHECKING:
+    from vla_zenoh.security.lab_certificates import Entry
 
 SHOWN_FAULTS = 6
 SERVERS = ("router", BRIDGE)
@@ -24,7 +27,7 @@ SERVERS = ("router", BRIDGE)
 
 @dataclass(frozen=True, slots=True)
 class AccessVerdict:
-    """Result of the access test for one identity.
+    """Result of the access check for one identity.
 
     Args:
         identity: that verdict.
@@ -50,7 +53,7 @@ def access(
     Args:
         profile: the lab.
         now: UTC.
-        check_access: the access test.
+        check_access: see `vla_zenoh.lab.doctor.access_check`.
         try_identity: presents the certificate of a node of this computer to the running router;
             returns what is wrong.
     """
@@ -59,7 +62,9 @@ def access(
         yield _without(profile)
         return
     try:
-        store = Store(security.folder)
+        from vla_zenoh.security.lab_certificates import LabCertificates
+
+        store = LabCertificates(security.folder)
         host = store.this_host(security.host)
         entries = store.entries(now, host)
     except (MissingExtraError, SecurityError) as error:
@@ -71,7 +76,7 @@ def access(
     try:
         yield from map(rules, check_access())
     except VlaZenohError as error:
-        yield HostFinding("access", "fail", f"the access test failed: {error}")
+        yield HostFinding("access", "fail", f"the rules could not be checked: {error}")
     for entry in entries:
         if entry.node not in SERVERS and not entry.faults:
             yield _accepted(entry, try_identity)

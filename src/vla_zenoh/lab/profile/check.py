@@ -7,7 +7,6 @@ Nothing is connected, and no weights are loaded.
 from __future__ import annotations
 
 import contextlib
-import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -311,12 +310,11 @@ def _workers(profile: Profile, name: str, host: str | None) -> Iterator[_Found]:
 
 
 def _spec_faults(profile: Profile, worker: str, spec: ModelSpec) -> Iterator[_Found]:
-    from vla_zenoh.control.policy_check import check_spec
+    from vla_zenoh.control.policy_check import spec_errors
 
     place = ("models", worker) if worker in profile.models else ("workers",)
-    for level, _, why in check_spec(profile, spec, worker=worker):
-        if level == "error":
-            yield _Found(place, f"worker {worker!r}: {why}")
+    for _, _, why in spec_errors(profile, spec):
+        yield _Found(place, f"worker {worker!r}: {why}")
 
 
 # -- network ----------------------------------------------------------------------------------
@@ -324,9 +322,6 @@ def _router(profile: Profile, name: str, host: str | None) -> Iterator[_Found]:
     """The router of this host, and whether its own nodes find it."""
     part = profile.hosts.get(host or "")
     session = profile.session
-    if session.router == "zenohd" and shutil.which("zenohd") is None:
-        why = "is zenohd, and no such program is on PATH: install Zenoh's router, or write own"
-        yield _Found(("session", "router"), why, "router")
     if part is None or "router" not in part.nodes:
         return
     listen = session.listen if part.listen is None else part.listen

@@ -10,9 +10,9 @@ from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.joint_reading import StampFilter
-from vla_zenoh.interop.ros2 import table
 from vla_zenoh.interop.ros2.messages import MAX_PICTURE_BYTES, Messages
 from vla_zenoh.interop.ros2.qos import SENSOR
+from vla_zenoh.interop.ros2.readers import read
 from vla_zenoh.interop.ros2.samples import RosImage
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher, resize
 from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S
@@ -101,7 +101,7 @@ class Camera:
 
     def _decode(self, arrival: ReceivedSample) -> RosImage:
         payload = arrival.sample.payload.to_bytes()
-        image: RosImage = table.read(self._messages, self._topic.type, payload)
+        image: RosImage = read(self._messages, self._topic.type, payload)
         if self._topic.frame is not None and image.frame != self._topic.frame:
             raise CodecError(
                 "frame", f"in frame {image.frame[:60]!r}, wanted {self._topic.frame!r}"

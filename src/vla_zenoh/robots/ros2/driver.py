@@ -19,12 +19,11 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import ProfileError, RecordError
 from vla_zenoh.interop.joint_reading import pose_state
-from vla_zenoh.interop.ros2 import table
 from vla_zenoh.interop.ros2.graph import camera_topics
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.qos import COMMAND
 from vla_zenoh.interop.ros2.samples import Stamp
-from vla_zenoh.interop.ros2.topics import pose
+from vla_zenoh.interop.ros2.writers import Write, joint_writer, pose_writer
 from vla_zenoh.profile import Profile, SessionProfile
 from vla_zenoh.profile.ros2 import Ros2Output, Ros2Profile
 from vla_zenoh.profile.session import TRUSTED_PROTOCOLS
@@ -127,21 +126,17 @@ class Ros2Driver(RobotDriver):
         self._write = self.writing(output)
         self._writer = graph.publisher(output.topic, output.type, COMMAND)
 
-    def writing(self, output: Ros2Output) -> table.Write:
+    def writing(self, output: Ros2Output) -> Write:
         """Function that fills a message of the output's type.
 
         Raises:
             ProfileError: the type cannot carry the commands.
         """
         posture_rad = np.array(self.profile.robot.home_rad)
-        key = f"command_{self.profile.robot.command}"
-        for row in table.writings(posture_rad, round(LEAD_PERIODS * self.period_s * 1e9)):
-            if (row.type, row.key) == (output.type, key):
-                return row.write
-        if key == "command_joint":
-            raise ProfileError(f"joint positions cannot be sent as {output.type}")
-        pose.check(self._messages, output.type)
-        return pose.writer(posture_rad)
+        if self.profile.robot.command == "joint":
+            lead_ns = round(LEAD_PERIODS * self.period_s * 1e9)
+            return joint_writer(self._messages, output.type, lead_ns)
+        return pose_writer(self._messages, output.type, posture_rad)
 
     # -- for the threads ----------------------------------------------------------------------
     def _emit(self, event: Event) -> None:
@@ -198,9 +193,7 @@ class Ros2Driver(RobotDriver):
         joints, stamp_ns = states.state.joints, states.state.stamp_ns
         assert joints is not None
         try:
-            tcp, twist = states.tcp(stamp_ns)
-            if tcp is None:
-                return None
+            tcp, twist = states.state.tcp()
             record = pose_state(tcp, twist, states.wrench(stamp_ns), None)
         except RecordError as error:  # finite, but too large for a record
             topic = self._ros2.joint_states
@@ -212,8 +205,7 @@ class Ros2Driver(RobotDriver):
         """Publish a set-point."""
         command = command_of(reference, self.profile.robot.arm_joints)
         stamp = Stamp(now_ns, self._frame)
-        message = self._write(self._messages, self._output.type, command, stamp)
-        self._writer.publish(self._messages.encode(message))
+        self._writer.publish(self._messages.encode(self._write(command, stamp)))
         self._node.counters["ros2.commands_sent"] += 1
 
     def grip(self, command: GripperCommand, now_ns: int) -> None:

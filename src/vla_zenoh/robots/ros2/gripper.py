@@ -10,13 +10,13 @@ from typing import Any
 
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
-from vla_zenoh.interop.ros2 import gripper_actions, table
+from vla_zenoh.interop.ros2 import gripper_actions
 from vla_zenoh.interop.ros2.action_goals import ActionGoal, GoalSequencer, GoalStep
 from vla_zenoh.interop.ros2.gripper_actions import GRASP
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.names import get_result_of, request_of, response_of, send_goal_of
 from vla_zenoh.interop.ros2.qos import COMMAND
-from vla_zenoh.interop.ros2.samples import Stamp
+from vla_zenoh.interop.ros2.writers import position_message
 from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Gripper
 from vla_zenoh.robots.ros2.ros_graph import RosGraph, ServiceClient
 from vla_zenoh.types import Event, GripperCommand
@@ -24,8 +24,6 @@ from vla_zenoh.types import Event, GripperCommand
 GOAL_TIMEOUT_S = 5.0
 """A goal is given up after this long without an answer, beyond the time that its fingers need."""
 ID_BYTES = 16
-
-_NUMBERS: dict[str, table.Write] = {row.type: row.write for row in table.GRIPPER_WRITINGS}
 
 
 class Gripper:
@@ -131,9 +129,7 @@ class Gripper:
             self._goals.want(command)
             self._advance()
             return
-        message = _NUMBERS[self._profile.type](
-            self._messages, self._profile.type, self._position(command), Stamp(now_ns, "")
-        )
+        message = position_message(self._messages, self._profile.type, self._position(command))
         self._topic.publish(self._messages.encode(message))
 
     def _position(self, command: GripperCommand) -> float:

@@ -197,16 +197,7 @@ class RosGraph:
         key, _ = self._declare(Endpoint(EntityRole.SUBSCRIBER, name, kind, qos))
         self.buffers.append(buffer)
         handler = zenoh.handlers.Callback(buffer, indirect=False)
-        if qos.transient_local:
-            subscriber = zenoh.ext.declare_advanced_subscriber(
-                self.session,
-                key,
-                handler,
-                history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
-            )
-        else:
-            subscriber = self.session.declare_subscriber(key, handler)
-        self._declared.append(subscriber)
+        self._declared.append(self.session.declare_subscriber(key, handler))
         return buffer
 
     def publisher(self, name: str, kind: str, qos: Qos = DEFAULT) -> RosPublisher:

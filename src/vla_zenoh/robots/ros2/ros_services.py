@@ -19,9 +19,10 @@ from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.client import Client
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError, SessionError
-from vla_zenoh.interop.ros2 import diagnostics, table
+from vla_zenoh.interop.ros2 import diagnostics
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.names import request_of, response_of
+from vla_zenoh.interop.ros2.readers import TEXT, read
 from vla_zenoh.interop.ros2.samples import Stamp
 from vla_zenoh.interop.ros2.services import (
     PROMPT_TOPIC,
@@ -34,7 +35,6 @@ from vla_zenoh.interop.ros2.services import (
     STOP,
     Service,
 )
-from vla_zenoh.interop.ros2.topics import plain
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
 
@@ -135,7 +135,7 @@ class RosServices:
         for service in SERVICES:
             graph.serve(f"{prefix}/{service.name}", service.type, self._enqueue(service))
         self._prompt_topic, self._prompt = f"{prefix}/{PROMPT_TOPIC}", ""
-        self._prompts = graph.subscribe(self._prompt_topic, plain.TEXT, CallbackRing(MAX_WAITING))
+        self._prompts = graph.subscribe(self._prompt_topic, TEXT, CallbackRing(MAX_WAITING))
         self._status = graph.publisher(f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)
 
     def _enqueue(self, service: Service) -> Callable[[Request], None]:
@@ -165,7 +165,7 @@ class RosServices:
         for arrival in self._prompts.drain():
             try:
                 payload = arrival.sample.payload.to_bytes()
-                prompt = prompt_text(table.read(self._messages, plain.TEXT, payload))
+                prompt = prompt_text(read(self._messages, TEXT, payload))
             except CodecError as error:
                 self._reject(error.reason, f"{self._prompt_topic}: {error}", PROMPT_TOPIC)
                 continue

@@ -1,4 +1,4 @@
-"""Subscribes to a ROS 2 robot's joint states, transforms and external wrench."""
+"""Subscribes to a ROS 2 robot's joint states and external wrench."""
 
 from __future__ import annotations
 
@@ -11,16 +11,12 @@ from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.joint_reading import JointReading
-from vla_zenoh.interop.ros2 import table
-from vla_zenoh.interop.ros2.graph import TF, TF_STATIC
 from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.qos import SENSOR, STATIC_TRANSFORMS
+from vla_zenoh.interop.ros2.qos import SENSOR
+from vla_zenoh.interop.ros2.readers import JOINT_STATE, WRENCH, read
 from vla_zenoh.interop.ros2.robot_clock import RobotClock
 from vla_zenoh.interop.ros2.samples import Wrench
-from vla_zenoh.interop.ros2.topics import joint_state, transforms, wrench
-from vla_zenoh.interop.ros2.transform_buffer import TransformBuffer
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile.ros2 import Ros2Profile
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.types import FloatArray
@@ -62,37 +58,16 @@ class StateSubscriber:
         self._wrench: Wrench | None = None
         topics = dict.fromkeys((ros2.joint_states, ros2.finger_states or ros2.joint_states))
         self._joint_states = [
-            graph.subscribe(topic, joint_state.TYPE, CallbackRing(BUFFER), SENSOR)
-            for topic in topics
+            graph.subscribe(topic, JOINT_STATE, CallbackRing(BUFFER), SENSOR) for topic in topics
         ]
-        self._transforms = TransformBuffer()
-        self._tf = []
-        if ros2.tcp == "tf":
-            self._tf = [
-                (graph.subscribe(TF, transforms.TYPE, CallbackRing(BUFFER), SENSOR), False),
-                (
-                    graph.subscribe(
-                        TF_STATIC, transforms.TYPE, CallbackRing(BUFFER), STATIC_TRANSFORMS
-                    ),
-                    True,
-                ),
-            ]
         self._wrenches = None
         if ros2.wrench is not None:
-            self._wrenches = graph.subscribe(
-                ros2.wrench.topic, wrench.TYPE, CallbackRing(4), SENSOR
-            )
+            self._wrenches = graph.subscribe(ros2.wrench.topic, WRENCH, CallbackRing(4), SENSOR)
 
     def update(self) -> bool:
         """Process the messages that arrived; whether there is a new state of the arm's joints."""
-        self._update_transforms()
         self._update_wrench()
         return self._update_joints()
-
-    def tcp(self, stamp_ns: int) -> tuple[Pose | None, FloatArray]:
-        """TCP pose and its (6,) twist; the pose is None where tf has none of that time."""
-        tcp, twist = self.state.tcp()
-        return (self._tcp_by_tf(stamp_ns) if self._tf else tcp), twist
 
     def wrench(self, stamp_ns: int) -> FloatArray | None:
         """(6,) external wrench in N and Nm, None where there is none of that time."""
@@ -106,14 +81,14 @@ class StateSubscriber:
         self._node.reject(error.reason, f"{topic}: {error}", topic)
 
     def _decode(self, kind: str, arrival: ReceivedSample) -> Any:
-        return table.read(self._messages, kind, arrival.sample.payload.to_bytes())
+        return read(self._messages, kind, arrival.sample.payload.to_bytes())
 
     def _update_joints(self) -> bool:
         fresh = False
         for buffer in self._joint_states:
             for arrival in buffer.drain():
                 try:
-                    joints = self._decode(joint_state.TYPE, arrival)
+                    joints = self._decode(JOINT_STATE, arrival)
                     arrived_ns = self._node.arrival_wall_ns(arrival)
                     if self.state.take(joints, joints.stamp_ns or arrived_ns) is None:
                         continue  # of the fingers alone, or of another robot
@@ -126,21 +101,13 @@ class StateSubscriber:
                 self.rate.tick()
         return fresh
 
-    def _update_transforms(self) -> None:
-        for buffer, static in self._tf:
-            for arrival in buffer.drain():
-                try:
-                    self._transforms.take(self._decode(transforms.TYPE, arrival), static=static)
-                except CodecError as error:
-                    self._reject(TF_STATIC if static else TF, error)
-
     def _update_wrench(self) -> None:
         if self._wrenches is None or self._ros2.wrench is None:
             return
         frame = self._ros2.wrench.frame or self._node.profile.robot.base_frame
         for arrival in self._wrenches.drain():
             try:
-                found: Wrench = self._decode(wrench.TYPE, arrival)
+                found: Wrench = self._decode(WRENCH, arrival)
                 if found.frame != frame:
                     raise CodecError("frame", f"in frame {found.frame[:60]!r}, wanted {frame!r}")
                 if not np.isfinite(found.wrench).all():
@@ -150,22 +117,3 @@ class StateSubscriber:
             else:
                 stamp_ns = found.stamp_ns or self._node.arrival_wall_ns(arrival)
                 self._wrench = found._replace(stamp_ns=stamp_ns)
-
-    def _tcp_by_tf(self, stamp_ns: int) -> Pose | None:
-        profile = self._node.profile
-        base, tip = profile.robot.base_frame, profile.robot.tcp_frame
-        found = self._transforms.find(base, tip)
-        if found is None:
-            self._reject(TF, CodecError("no_transform", f"{base} -> {tip} is not known"))
-            return None
-        pose, oldest_ns, newest_ns = found
-        behind_s, ahead_s = (stamp_ns - oldest_ns) / 1e9, (newest_ns - stamp_ns) / 1e9
-        if max(behind_s, ahead_s) > profile.timing.state_timeout_s:
-            why = (
-                f"{behind_s:.3f} s behind the joints"
-                if behind_s > ahead_s
-                else f"{ahead_s:.3f} s ahead of the joints: was a clock set?"
-            )
-            self._reject(TF, CodecError("stale", f"the TCP is {why}"))
-            return None
-        return pose

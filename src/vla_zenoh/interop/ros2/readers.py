@@ -1,0 +1,151 @@
+"""Decoders of received ROS messages. A new type is a function and a row in `READERS`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.codec.image import MAX_JPEG_BYTES, MAX_PIXELS, MAX_SIDE, decode_jpeg
+from vla_zenoh.errors import CodecError
+from vla_zenoh.interop.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, Messages
+from vla_zenoh.interop.ros2.samples import SECOND_NS, Joints, RosImage, Wrench
+from vla_zenoh.types import MAX_NAMES, FloatArray
+
+JOINT_STATE, WRENCH = "sensor_msgs/msg/JointState", "geometry_msgs/msg/WrenchStamped"
+IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+TEXT = "std_msgs/msg/String"
+CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+
+
+def read(messages: Messages, kind: str, payload: bytes) -> Any:
+    """Decode CDR bytes of a type in `READERS`.
+
+    Raises:
+        CodecError: whatever else the bytes are.
+    """
+    limit = MAX_PICTURE_BYTES if kind in (IMAGE, COMPRESSED_IMAGE) else MAX_MESSAGE_BYTES
+    message = messages.decode(kind, payload, limit)
+    try:
+        return READERS[kind](message)
+    except (ValueError, OverflowError) as error:
+        if isinstance(error, CodecError):
+            raise
+        raise CodecError("malformed", f"{kind}: {str(error)[:200]}") from error
+
+
+def _stamp_ns(header: Any) -> int:
+    """Nanoseconds since the epoch of a header's stamp."""
+    stamp = header.stamp
+    if stamp.sec < 0 or stamp.nanosec >= SECOND_NS:
+        raise CodecError("invalid", f"a stamp of {stamp.sec} s and {stamp.nanosec} ns")
+    return stamp.sec * SECOND_NS + stamp.nanosec
+
+
+# -- state ----------------------------------------------------------------------------------------
+def _joints(message: Any) -> Joints:
+    """Joints of a message; velocities and efforts may be missing, positions may not."""
+    names = tuple(message.name)
+    if not 0 < len(names) <= MAX_NAMES or len(set(names)) != len(names):
+        raise CodecError("invalid", f"{len(names)} joint names, or one of them twice")
+    position, velocity, effort = (
+        _values(name, getattr(message, name), len(names))
+        for name in ("position", "velocity", "effort")
+    )
+    if position is None:
+        raise CodecError("invalid", "joints without positions")
+    return Joints(_stamp_ns(message.header), names, position, velocity, effort)
+
+
+def _values(what: str, given: Any, count: int) -> FloatArray | None:
+    if len(given) == 0:
+        return None
+    if len(given) != count:
+        raise CodecError("invalid", f"{len(given)} numbers of {what} for {count} joints")
+    return np.asarray(given, np.float64)
+
+
+def _wrench(message: Any) -> Wrench:
+    force, torque = message.wrench.force, message.wrench.torque
+    return Wrench(
+        _stamp_ns(message.header),
+        message.header.frame_id,
+        np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z]),
+    )
+
+
+# -- images ---------------------------------------------------------------------------------------
+def _image(message: Any) -> RosImage:
+    """A raw image; of ``rgb8`` a view into the message."""
+    channels = CHANNELS.get(message.encoding)
+    if channels is None:
+        deep = message.encoding in ("16UC1", "32FC1", "mono16")
+        raise CodecError(
+            "encoding",
+            f"an image of encoding {message.encoding[:40]!r}; read are: {', '.join(CHANNELS)}"
+            + (". This one holds distances, which no model here takes" if deep else ""),
+        )
+    height, width, step = message.height, message.width, message.step
+    _check_size(height, width)
+    if step < width * channels:
+        raise CodecError("invalid", f"rows of {step} bytes for {width} pixels {message.encoding}")
+    data = np.asarray(message.data, np.uint8)
+    # The last row may come without its padding.
+    if len(data) < step * (height - 1) + width * channels:
+        raise CodecError("truncated", f"{len(data)} bytes of {step * height}")
+    rows = np.lib.stride_tricks.as_strided(
+        data, (height, width, channels), (step, channels, 1), writeable=False
+    )
+    rgb: NDArray[np.uint8] = rows
+    if message.encoding != "rgb8":
+        code = cv2.COLOR_BGR2RGB if message.encoding == "bgr8" else cv2.COLOR_GRAY2RGB
+        rgb = np.asarray(cv2.cvtColor(np.ascontiguousarray(rows), code), np.uint8)
+    return RosImage(_stamp_ns(message.header), message.header.frame_id, rgb)
+
+
+def _compressed_image(message: Any) -> RosImage:
+    """A JPEG or PNG, told apart by its bytes: drivers write many things into ``format``."""
+    payload = np.asarray(message.data, np.uint8).tobytes()
+    if "compressedDepth" in message.format or not payload.startswith((_PNG, _JPEG)):
+        raise CodecError(
+            "encoding", f"a compressed image {message.format[:40]!r}; read are: jpeg, png"
+        )
+    rgb = decode_jpeg(payload).rgb if payload.startswith(_JPEG) else _png(payload)
+    return RosImage(_stamp_ns(message.header), message.header.frame_id, rgb)
+
+
+def _png(payload: bytes) -> NDArray[np.uint8]:
+    if len(payload) > MAX_JPEG_BYTES:
+        raise CodecError("oversize", f"a PNG of {len(payload)} bytes, at most {MAX_JPEG_BYTES}")
+    width, height = (int.from_bytes(payload[at : at + 4], "big") for at in (16, 20))
+    _check_size(height, width)
+    try:
+        bgr = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error as error:
+        raise CodecError("malformed", f"not a PNG file: {error.err}") from error
+    if bgr is None:
+        raise CodecError("malformed", "not a PNG file that can be decoded")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB, dst=bgr), np.uint8)
+
+
+def _check_size(height: int, width: int) -> None:
+    if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE and height * width <= MAX_PIXELS):
+        raise CodecError("invalid", f"an image of {height}x{width}")
+
+
+def _text(message: Any) -> str:
+    return message.data
+
+
+READERS: dict[str, Callable[[Any], Any]] = {
+    JOINT_STATE: _joints,
+    WRENCH: _wrench,
+    IMAGE: _image,
+    COMPRESSED_IMAGE: _compressed_image,
+    TEXT: _text,
+}
+"""Type -> decoder: message -> sample; raises `CodecError` or `ValueError`."""

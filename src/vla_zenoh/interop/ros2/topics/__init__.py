@@ -1,1 +1,0 @@
-"""One file a topic type: what it says, or how it is written."""

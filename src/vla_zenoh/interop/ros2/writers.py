@@ -1,0 +1,160 @@
+"""Messages that command a ROS 2 robot: poses, joint positions, gripper openings.
+
+A pose can be sent as any message with a pose in it, your own too, which is filled by what its
+fields are: ``geometry_msgs/Pose`` (or ``PoseStamped``) gets the pose, ``std_msgs/Header`` stamp and
+frame, ``geometry_msgs/Twist`` the feed-forward velocity, and an array of as many numbers as the arm
+has joints the posture of its nullspace. The rest stays zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.interop.ros2.samples import SECOND_NS, Stamp
+from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
+
+POSE, POSE_STAMPED = "geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseStamped"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+NUMBER, NUMBERS = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray"
+_HEADER, _TWIST = "std_msgs/msg/Header", "geometry_msgs/msg/Twist"
+NOW_NS = 0
+"""A trajectory's stamp of zero means: from now on, whatever the robot's clock says."""
+
+Write = Callable[[Any, Stamp], Any]
+"""Command and stamp -> message."""
+
+
+def header(messages: Messages, stamp: Stamp) -> Any:
+    """A std_msgs/Header with this stamp and frame."""
+    time = messages.new("builtin_interfaces/msg/Time", **_time_fields(stamp.stamp_ns))
+    return messages.new(_HEADER, stamp=time, frame_id=stamp.frame)
+
+
+def _time_fields(time_ns: int) -> dict[str, int]:
+    """Fields of a builtin_interfaces/Time or Duration."""
+    sec, nanosec = divmod(time_ns, SECOND_NS)
+    return {"sec": sec, "nanosec": nanosec}
+
+
+# -- joints and gripper ---------------------------------------------------------------------------
+def joint_writer(messages: Messages, kind: str, lead_ns: int) -> Write:
+    """How joint positions are written as `kind`.
+
+    Args:
+        messages: of the robot's distribution.
+        kind: a trajectory of one point, or plain numbers, which the position controllers of
+            ros2_control take in the order of the profile's arm_joints.
+        lead_ns: how far ahead the trajectory's point lies.
+
+    Raises:
+        ProfileError: it is another type.
+    """
+
+    def trajectory(command: JointCommand, stamp: Stamp) -> Any:
+        lead = messages.new("builtin_interfaces/msg/Duration", **_time_fields(lead_ns))
+        point = messages.new(
+            "trajectory_msgs/msg/JointTrajectoryPoint",
+            positions=np.array(command.position_rad),
+            velocities=np.array(command.velocity_rad_s),
+            accelerations=np.array(command.acceleration_rad_s2),
+            time_from_start=lead,
+        )
+        return messages.new(
+            kind,
+            header=header(messages, Stamp(NOW_NS, stamp.frame)),
+            joint_names=list(command.names),
+            points=[point],
+        )
+
+    def numbers(command: JointCommand, stamp: Stamp) -> Any:
+        return messages.new(kind, data=np.array(command.position_rad))
+
+    found = {TRAJECTORY: trajectory, NUMBERS: numbers}.get(kind)
+    if found is None:
+        raise ProfileError(f"joint positions cannot be sent as {kind}")
+    return found
+
+
+def position_message(messages: Messages, kind: str, position: float) -> Any:
+    """The opening of a gripper as its driver takes it, as `NUMBER` or `NUMBERS`."""
+    return messages.new(kind, data=np.array([position]) if kind == NUMBERS else position)
+
+
+# -- poses ----------------------------------------------------------------------------------------
+def pose_writer(messages: Messages, kind: str, posture_rad: FloatArray) -> Write:
+    """How poses are written as `kind`.
+
+    Args:
+        messages: of the robot's distribution.
+        kind: any type with a pose in it.
+        posture_rad: (n,) what the nullspace prefers.
+
+    Raises:
+        ProfileError: it is no type, or has no field for a pose.
+    """
+    messages.require(kind)
+    named = [what for node, what in messages.fields(kind).values() if node == Nodetype.NAME]
+    if kind != POSE and not {POSE, POSE_STAMPED} & set(named):
+        raise ProfileError(
+            f"{kind} has no field of type {POSE} or {POSE_STAMPED} to put a pose into"
+        )
+
+    def write(command: PoseCommand, stamp: Stamp) -> Any:
+        if kind == POSE:
+            return _pose(messages, command)
+        values = {
+            name: value
+            for name, described in messages.fields(kind).items()
+            if (value := _fill(messages, described, command, stamp, posture_rad)) is not None
+        }
+        return messages.new(kind, **values)
+
+    return write
+
+
+def _fill(
+    messages: Messages, described: Any, command: PoseCommand, stamp: Stamp, posture: FloatArray
+) -> Any:
+    node, what = described
+    if node == Nodetype.ARRAY:
+        (inner, of), size = what
+        is_posture = inner == Nodetype.BASE and of[0] == "float64" and size == len(posture)
+        return np.array(posture) if is_posture else None
+    if node != Nodetype.NAME:
+        return None
+    if what == _HEADER:
+        return header(messages, stamp)
+    if what == POSE:
+        return _pose(messages, command)
+    if what == POSE_STAMPED:
+        pose = _pose(messages, command)
+        return messages.new(POSE_STAMPED, header=header(messages, stamp), pose=pose)
+    return _twist(messages, command) if what == _TWIST else None
+
+
+def _pose(messages: Messages, command: PoseCommand) -> Any:
+    x, y, z, w = command.quat_xyzw.tolist()
+    return messages.new(
+        POSE,
+        position=_xyz(messages, "geometry_msgs/msg/Point", command.position_m),
+        orientation=messages.new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+    )
+
+
+def _twist(messages: Messages, command: PoseCommand) -> Any:
+    linear, angular = (
+        _xyz(messages, "geometry_msgs/msg/Vector3", part)
+        for part in (command.twist[:3], command.twist[3:])
+    )
+    return messages.new(_TWIST, linear=linear, angular=angular)
+
+
+def _xyz(messages: Messages, kind: str, values: FloatArray) -> Any:
+    x, y, z = values.tolist()
+    return messages.new(kind, x=x, y=y, z=z)

@@ -1,0 +1,173 @@
+"""Fit of a model to a profile, and plausibility of its chunks: errors, warnings and notes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from vla_zenoh.control.policy_check import (
+    Finding,
+    Steps,
+    beyond_gripper,
+    chunk_errors,
+    few_joints,
+    largest_step,
+    outside_workspace_m,
+    spec_errors,
+)
+from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec
+from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
+
+SHAPE_TOLERANCE = 0.02
+"""An image may be stretched by this share of its aspect ratio without a note."""
+ROUNDING = 1e-6
+
+
+def warning(name: str, why: str) -> Finding:
+    """A finding to look at before the model gets the arm."""
+    return Finding("warning", name, why)
+
+
+def note(name: str, why: str) -> Finding:
+    """A finding that is good to know."""
+    return Finding("note", name, why)
+
+
+# -- the spec -------------------------------------------------------------------------------------
+def check_spec(
+    profile: Profile, spec: ModelSpec, *, worker: str, rate_hz: float | None = None
+) -> list[Finding]:
+    """Findings about a spec on a profile.
+
+    Args:
+        profile: the effective profile.
+        spec: what the model declares.
+        worker: name of the worker.
+        rate_hz: chunks per second requested; None: by the profile.
+    """
+    return [
+        *spec_errors(profile, spec),
+        *_cameras(profile, spec),
+        *_timing(profile, spec, rate_hz or profile.task.rate_hz),
+        *_robot(profile, spec, worker),
+    ]
+
+
+def _cameras(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
+    wanted = spec.observation
+    known = [camera for camera in wanted.cameras if camera.camera in profile.cameras]
+    for camera in known:
+        yield from _shape(profile, camera)
+    slowest = min((profile.cameras[camera.camera].rate_hz for camera in known), default=0.0)
+    if len(known) > 1 and wanted.max_skew_s * slowest < 1.0:
+        yield warning(
+            "camera_rate",
+            f"at {slowest:g} Hz images may lie {1 / slowest:.3f} s apart, the spec allows "
+            f"{wanted.max_skew_s:g} s: many observations will be rejected",
+        )
+
+
+def _shape(profile: Profile, camera: CameraSpec) -> Iterator[Finding]:
+    source = profile.cameras[camera.camera]
+    if camera.resize != "stretch" or camera.width is None or camera.height is None:
+        return
+    stretch = (source.width * camera.height) / (source.height * camera.width)
+    if abs(stretch - 1.0) > SHAPE_TOLERANCE:
+        yield note(
+            "picture_shape",
+            f"camera {camera.camera!r}: {source.width}x{source.height} is stretched to "
+            f"{camera.width}x{camera.height}, out of shape by {abs(stretch - 1.0):.0%}; right if "
+            "it was trained so",
+        )
+
+
+def _timing(profile: Profile, spec: ModelSpec, rate_hz: float) -> Iterator[Finding]:
+    chunk_s = spec.action.horizon * spec.action.dt_s
+    if chunk_s * rate_hz < 1.0 - 1e-9:
+        yield note(
+            "gaps",
+            f"a chunk lasts {chunk_s:g} s and one is asked for every {1 / rate_hz:g} s: the arm "
+            "waits in between",
+        )
+    oldest_s = profile.timing.max_observation_age_s
+    if spec.observation.max_age_s > oldest_s:
+        yield warning(
+            "camera_rate",
+            f"the spec takes observations {spec.observation.max_age_s:g} s old, the command node "
+            f"rejects chunks of those over {oldest_s:g} s (timing.max_observation_age_s)",
+        )
+
+
+def _robot(profile: Profile, spec: ModelSpec, worker: str) -> Iterator[Finding]:
+    if spec.action.kind == "delta" and len(profile.robot.arm_joints) < POSE_JOINTS:
+        yield warning(
+            "too_few_joints",
+            f"{few_joints(profile)}: steps that it has no joint for are shortened, to nothing at "
+            "worst (limit reach); `vla-zenoh profile check` names the axes",
+        )
+    if spec.action.gripper == "none" and profile.robot.finger_joints:
+        yield note("no_gripper", f"robot {profile.robot.name!r} has a gripper, the model none")
+    if spec.observation.prompt and not profile.task.prompt:
+        yield warning("no_prompt", "needs a prompt; task.prompt of the profile is empty")
+    if worker not in profile.workers:
+        yield note(
+            "not_listed",
+            f"the profile's workers are {', '.join(profile.workers)}; `vla-zenoh up` will not "
+            f"start {worker!r}",
+        )
+
+
+# -- a chunk --------------------------------------------------------------------------------------
+def check_chunk(
+    spec: ActionSpec, steps: Steps, limits: Limits, max_width_m: float
+) -> list[Finding]:
+    """Findings about the numbers of one chunk.
+
+    Args:
+        spec: the declared meaning of the numbers.
+        steps: (H, D), as `vla_zenoh.policy.check_steps` gives them.
+        limits: of the robot.
+        max_width_m: of its gripper.
+    """
+    found = list(chunk_errors(spec, steps, limits, max_width_m))
+    if spec.kind == "absolute":
+        found += _targets(spec, steps, limits)
+    else:
+        found += _steps(spec, steps, limits)
+    if spec.gripper == "binary":
+        value = steps[:, -1].astype(np.float64)
+        found += (warning("gripper_range", why) for why in beyond_gripper(spec, value, max_width_m))
+    return found
+
+
+def _targets(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Finding]:
+    longest_m, _ = largest_step(spec, steps)
+    outside_m = float(outside_workspace_m(spec, steps, limits).max())
+    if longest_m <= REACH_M and outside_m > limits.step_m:
+        box = limits.workspace
+        yield warning(
+            "workspace",
+            f"a pose {outside_m:.3f} m outside the workspace x {box.x_m} y {box.y_m} "
+            f"z {box.z_m}: is it in the base frame?",
+        )
+
+
+def _steps(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Finding]:
+    longest_m, most_rad = largest_step(spec, steps)
+    for step, unit, most, speed in (
+        (longest_m, "m", limits.step_m, limits.translation.velocity_m_s),
+        (most_rad, "rad", limits.step_rad, limits.rotation.velocity_rad_s),
+    ):
+        if step > REJECT_FACTOR * most:
+            continue  # an error
+        if step > most * (1 + ROUNDING):
+            yield warning(
+                "step_limit", f"a step of {step:.4g} {unit}, the limit is {most:g} {unit}"
+            )
+        if step / spec.dt_s > speed * (1 + 1e-3):
+            yield warning(
+                "speed_limit",
+                f"a step of {step:.4g} in {spec.dt_s:g} s is {step / spec.dt_s:.3g} {unit}/s, the "
+                f"limit is {speed:g}: the arm will come later than asked",
+            )
