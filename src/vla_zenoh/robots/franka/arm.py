@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.errors import MissingExtraError, NodeError
+from vla_zenoh.errors import MissingExtraError, NodeError, in_words
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import exp3, log3, quat_from_rotation, rotation_from_quat
 from vla_zenoh.profile import Profile
@@ -71,12 +71,12 @@ class FrankaArm:
             self._hand = Hand(franky.Gripper(address)) if self._settings.hand else None
         except franky.IncompatibleVersionException as error:
             raise NodeError(
-                f"{address}: {error} The profile has franka.fci: {self._settings.fci}; a Panda "
+                f"{address}: {in_words(error)}. The profile has franka.fci: {self._settings.fci}; a Panda "
                 "needs a franky built with libfranka 0.9"
             ) from error
         except franky.Exception as error:
             raise NodeError(
-                f"{address}: {error} Are the joints unlocked, and is FCI activated in Desk? Is no "
+                f"{address}: {in_words(error)}. Are the joints unlocked, and is FCI activated in Desk? Is no "
                 "other program connected?"
             ) from error
         self._update(self._robot.state)
@@ -165,7 +165,7 @@ class FrankaArm:
         try:
             self._robot.poll_motion()
         except self._franky.Exception as error:
-            return str(error)
+            return in_words(error)
         return ""
 
     def status(self) -> Mapping[str, Any]:
@@ -259,7 +259,7 @@ class FrankaArm:
             if mode == "Reflex":
                 self._robot.recover_from_errors()
         except self._franky.Exception as error:
-            self._ended = f"recovery: {error}"
+            self._ended = f"recovery: {in_words(error)}"
         else:
             self._ended = ""
 
@@ -269,17 +269,10 @@ class FrankaArm:
         if self._hand is not None:
             self._hand.ask(width_m, speed_m_s, force_n)
 
-    # -- check --------------------------------------------------------------------------------
-    def flange_apart(self) -> tuple[float, float]:
-        """Distance (m) and angle (rad) between the robot's own flange and the published one."""
-        state = self._state
-        own = state.O_T_EE.matrix @ np.linalg.inv(state.F_T_EE.matrix)
-        ours = flange_pose(np.array(state.q))
-        cosine = (np.trace(own[:3, :3].T @ ours[:3, :3]) - 1) / 2
-        return (
-            float(np.linalg.norm(own[:3, 3] - ours[:3, 3])),
-            float(np.arccos(np.clip(cosine, -1.0, 1.0))),
-        )
+    @property
+    def robot(self) -> Any:
+        """franky's robot, once connected."""
+        return self._robot
 
 
 def _bounded(vector: FloatArray, most: float) -> FloatArray:

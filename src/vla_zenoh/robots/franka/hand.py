@@ -6,6 +6,8 @@ import threading
 import time
 from typing import Any, NamedTuple
 
+from vla_zenoh.errors import in_words
+
 CLEARLY_M = 0.002
 """A smaller change of the width closes nothing, and fingers this much apart hold something."""
 WAIT_S = 0.02
@@ -84,7 +86,7 @@ class Hand:
             try:
                 state = self._gripper.state  # waits for the next one
             except Exception as error:
-                self.fault = str(error)
+                self.fault = in_words(error)
                 self._end.wait(RETRY_S)
                 continue
             self.fault = ""
@@ -116,7 +118,7 @@ class Hand:
             motion.get()
         except Exception as error:  # a motion that was ended raises; the state says where it stands
             if not self._superseded():
-                self.fault = str(error)
+                self.fault = in_words(error)
 
     def _superseded(self) -> bool:
         return self._newest is not None or self._end.is_set()
