@@ -71,13 +71,13 @@ class FrankaArm:
             self._hand = Hand(franky.Gripper(address)) if self._settings.hand else None
         except franky.IncompatibleVersionException as error:
             raise NodeError(
-                f"{address}: {in_words(error)}. The profile has franka.fci: {self._settings.fci}; a Panda "
-                "needs a franky built with libfranka 0.9"
+                f"{address}: {in_words(error)}. The profile has franka.fci: {self._settings.fci}; "
+                "a Panda needs a franky built with libfranka 0.9"
             ) from error
         except franky.Exception as error:
             raise NodeError(
-                f"{address}: {in_words(error)}. Are the joints unlocked, and is FCI activated in Desk? Is no "
-                "other program connected?"
+                f"{address}: {in_words(error)}. Are the joints unlocked, and is FCI activated in "
+                "Desk? Is no other program connected?"
             ) from error
         self._update(self._robot.state)
 
@@ -179,6 +179,7 @@ class FrankaArm:
             "tau_j_nm": [round(float(torque), 2) for torque in state.tau_J],
             "in_control": self._was_in_control,
             "configured": self._configured,
+            "hand_failed": "" if self._hand is None else self._hand.failed,
         }
 
     # -- motion -------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from vla_zenoh.errors import in_words
 
 CLEARLY_M = 0.002
 """A smaller change of the width closes nothing, and fingers this much apart hold something."""
+SHUT_M, STROKE_M = 0.005, 0.08
 WAIT_S = 0.02
 JOIN_S = 0.3
 RETRY_S = 0.5
@@ -44,6 +45,7 @@ class Hand:
 
     Attributes:
         fault: why the hand does not answer; empty: it does.
+        failed: why the last motion that failed did.
     """
 
     def __init__(self, gripper: Any) -> None:
@@ -51,9 +53,8 @@ class Hand:
         self._newest: GripRequest | None = None
         self._running: GripRequest | None = None
         self._changed, self._end = threading.Condition(), threading.Event()
-        self.fault = ""
-        first = gripper.state
-        self._width_m, self._grasped = float(first.width), bool(first.is_grasped)
+        self.fault = self.failed = ""
+        self._read()
         self._threads = [
             threading.Thread(target=body, name=f"hand {name}", daemon=True)
             for name, body in (("motions", self._run), ("state", self._watch))
@@ -79,18 +80,18 @@ class Hand:
             self._changed.notify()
         for thread in self._threads:
             thread.join(JOIN_S)
+        self._gripper = None  # the hand serves one client
 
     # -- threads ------------------------------------------------------------------------------
     def _watch(self) -> None:
         while not self._end.is_set():
             try:
-                state = self._gripper.state  # waits for the next one
+                self._read()
             except Exception as error:
                 self.fault = in_words(error)
                 self._end.wait(RETRY_S)
                 continue
             self.fault = ""
-            self._width_m, self._grasped = float(state.width), bool(state.is_grasped)
 
     def _run(self) -> None:
         while not self._end.is_set():
@@ -102,23 +103,35 @@ class Hand:
             self._running = None
 
     def _carry_out(self, request: GripRequest) -> None:
-        """Move until the fingers arrive, or a newer request ends it."""
+        """Move until the fingers arrive, or a newer request ends it.
+
+        A grasp closes until the fingers meet resistance, whatever its width: it is for fingers that
+        are to shut, and for those that something kept from getting where they were sent.
+        """
+        closes = request.width_m < self._width_m - CLEARLY_M
         try:
-            if request.width_m < self._width_m - CLEARLY_M:
+            if not (closes and request.width_m < SHUT_M):
+                self._wait(self._gripper.move_async(request.width_m, request.speed_m_s))
+                self._read()
+                closes = closes and self._width_m > request.width_m + CLEARLY_M
+            if closes and not self._superseded():
                 # Succeeds on whatever is between the fingers, whose thickness nobody knows.
-                motion = self._gripper.grasp_async(*request, self._width_m, self._width_m)
-            else:
-                motion = self._gripper.move_async(request.width_m, request.speed_m_s)
-            stop_s: float | None = None
-            while not motion.wait(WAIT_S):
-                now_s = time.monotonic()
-                if self._superseded() and (stop_s is None or now_s - stop_s > NO_STOP_S):
-                    stop_s = now_s
-                    self._gripper.stop_async()
-            motion.get()
+                self._wait(self._gripper.grasp_async(*request, STROKE_M, STROKE_M))
         except Exception as error:  # a motion that was ended raises; the state says where it stands
             if not self._superseded():
-                self.fault = in_words(error)
+                self.failed = in_words(error)
+
+    def _wait(self, motion: Any) -> None:
+        stop_s = -NO_STOP_S
+        while not motion.wait(WAIT_S):
+            if self._superseded() and time.monotonic() - stop_s > NO_STOP_S:
+                stop_s = time.monotonic()
+                self._gripper.stop_async()
+        motion.get()
+
+    def _read(self) -> None:
+        state = self._gripper.state  # waits for the next one
+        self._width_m, self._grasped = float(state.width), bool(state.is_grasped)
 
     def _superseded(self) -> bool:
         return self._newest is not None or self._end.is_set()
