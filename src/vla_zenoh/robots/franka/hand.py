@@ -49,7 +49,7 @@ class Hand:
     """
 
     def __init__(self, gripper: Any) -> None:
-        self._gripper = gripper
+        self._gripper: Any = gripper
         self._newest: GripRequest | None = None
         self._running: GripRequest | None = None
         self._changed, self._end = threading.Condition(), threading.Event()
