@@ -28,7 +28,7 @@ from vla_zenoh.simulation.appearance import (
 )
 from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
 from vla_zenoh.simulation.objects import draw_places, footprint_m, objects_of
-from vla_zenoh.simulation.render import Backend, Renderer, why_not
+from vla_zenoh.simulation.render import Backend, Renderer, why_no_opengl
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import build_model
 from vla_zenoh.simulation.world import World
@@ -131,7 +131,7 @@ def test_bricks_rest_where_a_reset_has_put_them() -> None:
 
 
 def skip_without(backend: str) -> None:
-    if backend != "raycast" and (why := why_not(backend)):
+    if backend != "raycast" and (why := why_no_opengl()):
         pytest.skip(f"{backend}: {why}")
 
 

@@ -185,7 +185,7 @@ class SimProfile(Section):
         Field(strict=False),
         Distinct,
     ] = ()
-    renderer: Literal["auto", "egl", "osmesa", "raycast"] = "auto"
+    renderer: Literal["auto", "egl", "raycast"] = "auto"
 
 
 class TaskProfile(Section):
