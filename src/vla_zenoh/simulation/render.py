@@ -171,9 +171,7 @@ class Renderer:
         Raises:
             ResourceError: an unknown name in `vary`, or the scene lacks what it varies.
         """
-        from vla_zenoh.simulation.appearance import Appearance, draw_appearance
-
-        self._appearance.apply(Appearance() if seed is None else draw_appearance(seed, vary))
+        self._appearance.apply(seed, vary)
         self._canvas.refresh()
         self._update()
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import Profile
-from vla_zenoh.simulation.appearance import DISTRACTORS, draw_appearance
+from vla_zenoh.simulation.appearance import DISTRACTORS, check_variations
 from vla_zenoh.simulation.cartesian_impedance import (
     ArmDynamics,
     CartesianImpedance,
@@ -71,7 +71,7 @@ class World:
         seed: int | None = None,
         vary: Collection[str] = (),
     ) -> None:
-        draw_appearance(0, vary)  # an unknown name fails here, not in the renderer
+        check_variations(vary)  # an unknown name fails here, not in the renderer
         self._vary = frozenset(vary)
         self.seed: int | None = None
         self.robot = robot
