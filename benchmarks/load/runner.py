@@ -83,9 +83,9 @@ class Load:
             NodeError: Ctrl-C.
         """
         names = [f"r{number}" for number in range(1, max(counts) + 1)]
-        file = self._file(self._profile)
-        arguments = ("worker", WORKER, "--profile", str(file), "--robots", ",".join(names))
-        self._start("worker", (*arguments, "--set", "camera="))
+        served = {"robot": {"name": names[0]}, "serves": {WORKER: names}}
+        file = self._file(override(self._profile, served))
+        self._start("worker", ("worker", WORKER, "--profile", str(file), "--set", "camera="))
         for count in sorted(counts):
             for name in names[len(self._clients) : count]:
                 self._add(name)
@@ -98,7 +98,7 @@ class Load:
         profile = as_robot(self._profile, name)
         file = self._file(profile)
         self._servers[name] = self._stack.enter_context(Server("follower", str(file)))
-        self._start(f"command {name}", ("command", "--profile", str(file)))
+        self._start(f"command {name}", ("node", "command", "--profile", str(file)))
         self._clients[name] = Client(profile, self._session).subscribe()
 
     def _activate(self, name: str, give_up_s: float) -> bool:
@@ -184,7 +184,7 @@ class Load:
                 "hosts": {"here": {"nodes": ["camera"]}},
             }
             profile = override(as_robot(self._profile, f"cameras{count}"), changes)
-            self._start("camera", ("camera", "--profile", str(self._file(profile))))
+            self._start("camera", ("node", "camera", "--profile", str(self._file(profile))))
             row = self._measure_cameras(profile, names, seconds)
             self._supervisors.pop("camera").kill()
             yield {"robots": 0, "cameras": count, **row}

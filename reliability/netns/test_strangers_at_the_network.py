@@ -22,7 +22,7 @@ from netns.site import HERE, Site, secured_site
 from vla_zenoh.bus.session import session_config
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.security.identity import Identity, Role
-from vla_zenoh.security.store import Store
+from vla_zenoh.security.lab_certificates import LabCertificates
 
 pytestmark = [pytest.mark.netns, pytest.mark.slow, needs_namespaces, pytest.mark.timeout(240)]
 
@@ -72,7 +72,7 @@ def plain_tcp(site: Site) -> dict[str, Any]:
     return session_config(profile.session, connect=(f"tcp/{site.hosts['robot'].address}:{PORT}",))
 
 
-def with_files(site: Site, store: Store, host: str, node: str) -> dict[str, Any]:
+def with_files(site: Site, store: LabCertificates, host: str, node: str) -> dict[str, Any]:
     """The configuration that shows this certificate."""
     lab_profile = load_profile(str(site.folder / "plain_secure.yaml"))
     changes = {"session": {"security": {"folder": str(store.folder), "host": host}}}
@@ -89,7 +89,7 @@ def no_certificate(site: Site) -> dict[str, Any]:
 
 def another_authority(site: Site) -> dict[str, Any]:
     """An operator, says a certificate that somebody else's lab made."""
-    other, now = Store(site.folder / "other"), dt.datetime.now(dt.UTC)
+    other, now = LabCertificates(site.folder / "other"), dt.datetime.now(dt.UTC)
     other.make_authority("vla-zenoh lab", now)
     other.add([Identity(Role.OPERATOR, "operator", "desk")], now)
     found = with_files(site, other, "desk", "operator")
@@ -100,7 +100,7 @@ def another_authority(site: Site) -> dict[str, Any]:
 
 def expired(site: Site) -> dict[str, Any]:
     """An operator of this lab, until two days ago."""
-    old, now = Store(site.folder / "old"), dt.datetime.now(dt.UTC)
+    old, now = LabCertificates(site.folder / "old"), dt.datetime.now(dt.UTC)
     for name in ("ca.pem", "ca.key"):
         old.folder.mkdir(exist_ok=True)
         shutil.copy(site.store.folder / name, old.folder / name)
@@ -111,7 +111,7 @@ def expired(site: Site) -> dict[str, Any]:
 
 def unknown_name(site: Site) -> dict[str, Any]:
     """A certificate of this lab about somebody whom the profile does not name."""
-    more, now = Store(site.folder / "more"), dt.datetime.now(dt.UTC)
+    more, now = LabCertificates(site.folder / "more"), dt.datetime.now(dt.UTC)
     for name in ("ca.pem", "ca.key"):
         more.folder.mkdir(exist_ok=True)
         shutil.copy(site.store.folder / name, more.folder / name)

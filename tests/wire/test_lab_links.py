@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import zenoh
 from camera_rig import camera_rig, free_endpoint, grey, until
 
 from vla_zenoh.bus.buffers import LatestSample
@@ -22,12 +21,10 @@ from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_not_to_activate
 from vla_zenoh.keys import Kind
 from vla_zenoh.lab.doctor.access_check import check_access
-from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
-from vla_zenoh.policy.loader import find_model, make_policy
-from vla_zenoh.policy.observation import host_variant, prepare_image, size_variant
+from vla_zenoh.policy.observation import prepare_image, size_variant
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.profile.schema import CameraProfile, HostImagesProfile, HostProfile
+from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.security.roles import Act
 from vla_zenoh.security.rules import access_control
 from vla_zenoh.types import Header, Image, Stamped, Task
@@ -176,55 +173,6 @@ def test_jpeg_between_hosts_is_thinned_and_narrowed_as_the_profile_says(tmp_path
         assert decode_jpeg(jpegs[-1].payload).rgb.shape == (120, 160, 3)
         numbers = [frame.header.seq for frame in jpegs]
         assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-
-
-def listened_to(publisher: zenoh.Publisher) -> bool:
-    return publisher.matching_status.matching  # pyright: ignore  # stub says bool
-
-
-def test_each_host_gets_pictures_as_its_link_bears(tmp_path: Path) -> None:
-    camera = CameraProfile(source=f"file:{chart(tmp_path)}", rate_hz=50)
-    hosts = {
-        "near": HostProfile(nodes=("worker",)),
-        "far": HostProfile(
-            nodes=("worker",), pictures=HostImagesProfile(quality=30, rate_hz=5, width=160)
-        ),
-    }
-    with camera_rig({"front": camera}, hosts=hosts) as rig:
-        jpegs, _jpeg = rig.listen(rig.profile.keys.camera_jpeg("front"))
-        fars, _far = rig.listen(rig.profile.keys.camera_fitted("front", host_variant("far")))
-        until("pictures of both", lambda: len(fars) >= 6 and len(jpegs) >= 30)
-        stamps = [frame.header.stamp_wall_ns for frame in fars]
-        assert (len(stamps) - 1) / ((stamps[-1] - stamps[0]) / 1e9) < 6.0  # of 50
-        assert decode_jpeg(fars[-1].payload).rgb.shape == (120, 160, 3)
-        assert decode_jpeg(jpegs[-1].payload).rgb.shape == (480, 640, 3)
-        assert len(fars[-1].payload) < len(jpegs[-1].payload) / 4
-
-
-def test_a_worker_listens_to_what_travels_to_its_host() -> None:
-    profile = override(
-        load_profile("panda_sim_two_hosts"),
-        {"hosts": {"gpu": {"nodes": ["worker"], "pictures": {"rate_hz": 5}}}},
-    )
-    endpoint = free_endpoint()
-    here = {"session": {"listen": [endpoint], "connect": [endpoint]}}
-    profile = override(profile, here)
-    with (
-        open_session(profile.session, mode="router"),
-        open_session(profile.session) as camera,
-        open_session(profile.session) as session,
-    ):
-        out = {
-            form: camera.declare_publisher(profile.keys.camera_fitted("front", form))
-            for form in (host_variant("gpu"), host_variant("robot"))
-        }
-        policy = make_policy(find_model("scripted"), {})
-        worker = WorkerNode(profile, session, policy, "scripted", images="jpeg", host="gpu")
-        heard = out[host_variant("gpu")]
-        until("a worker that listens", lambda: listened_to(heard))
-        assert not listened_to(out[host_variant("robot")])
-        for seat in worker.sessions:
-            seat.close()
 
 
 def test_a_model_on_another_host_gets_pictures_in_its_own_size(tmp_path: Path) -> None:

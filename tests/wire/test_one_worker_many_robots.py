@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from camera_rig import await_match, free_endpoint, until
 from vla_zenoh.bus.buffers import bytes_of, header_of
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.cli.worker import robot_names
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, WorkerError
 from vla_zenoh.nodes.worker.node import WorkerNode
@@ -314,14 +312,3 @@ def test_a_model_that_cannot_say_whose_episode_begins_is_refused(
         pytest.raises(WorkerError, match=r"reset\(robot\)"),
     ):
         WorkerNode(profile, session, Forgetful(), "forgetful", robots=ROBOTS)
-
-
-@pytest.mark.parametrize("text", ["a,b,a", "a/b", "a,,b", ""])
-def test_names_of_robots_that_cannot_be_are_refused(text: str) -> None:
-    with pytest.raises(Exception, match=r"--robots"):
-        robot_names(text)
-
-
-def test_names_of_robots_are_separated_by_commas(tmp_path: Path) -> None:
-    assert robot_names("a, b,c") == ["a", "b", "c"]
-    assert robot_names(None) == []

@@ -23,7 +23,7 @@ from vla_zenoh.nodes.camera import node as camera_node
 from vla_zenoh.nodes.camera.fitted_streams import MAX_SIZES
 from vla_zenoh.nodes.worker.camera_subscriber import CameraSubscriber, subscribe_to_camera
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
-from vla_zenoh.policy.observation import host_variant, size_variant
+from vla_zenoh.policy.observation import size_variant
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Image
@@ -142,22 +142,13 @@ def test_who_changes_his_mind_takes_one_place(
 
 @contextmanager
 def two_nodes() -> Iterator[tuple[Node, Node]]:
-    """A camera node's and a worker's, on a host with a say in what travels there."""
+    """A camera node's and a worker's, each with a session of its own."""
     endpoint = free_endpoint()
     profile = override(
         load_profile("panda_sim_two_hosts"),
         {
             "session": {"listen": [endpoint], "connect": [endpoint]},
             "cameras": {"front": {"source": "sim:front", "fit_for_workers": True}},
-            "workers": ["scripted", "replay"],
-            "hosts": {
-                "gpu": {"nodes": ["worker"], "workers": ["scripted"]},
-                "edge": {
-                    "nodes": ["worker"],
-                    "workers": ["replay"],
-                    "pictures": {"rate_hz": 10},
-                },
-            },
         },
     )
     with (
@@ -203,30 +194,18 @@ def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer(
         until("plain ones once more", lambda: comes(plain))
 
 
-@pytest.mark.parametrize(
-    ("host", "own", "plain"),
-    [
-        ("gpu", "32x32-pad", None),
-        ("edge", host_variant("edge", "32x32-pad"), host_variant("edge")),
-    ],
-)
-def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all(
-    host: str, own: str, plain: str | None
-) -> None:
+def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all() -> None:
     with two_nodes() as (camera, worker):
         keys = worker.keys
-        sizes = [own, "32x32-pad", host_variant("edge", "32x32-pad")]
-        outs = {
-            size: camera.declare_publisher(keys.camera_fitted("front", size), Kind.FRAME)
-            for size in sizes
-        }
-        key = keys.camera_jpeg("front") if plain is None else keys.camera_fitted("front", plain)
-        for_all = camera.declare_publisher(key, Kind.FRAME)
+        own, other = (
+            camera.declare_publisher(keys.camera_fitted("front", size), Kind.FRAME)
+            for size in ("32x32-pad", "64x64-pad")
+        )
+        for_all = camera.declare_publisher(keys.camera_jpeg("front"), Kind.FRAME)
         wanted = CameraSpec(camera="front", width=32, height=32, resize="pad")
-        changed = threading.Condition()
-        ears = subscribe_to_camera(wanted, worker, jpeg=True, host=host, changed=changed)
-        until("its own", lambda: outs[own].has_subscribers)
-        assert not any(out.has_subscribers for size, out in outs.items() if size != own)
+        ears = subscribe_to_camera(wanted, worker, jpeg=True, changed=threading.Condition())
+        until("its own", lambda: own.has_subscribers)
+        assert not other.has_subscribers
 
         def takes_plain() -> bool:
             assert ears.pop() is None

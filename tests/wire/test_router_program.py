@@ -1,13 +1,11 @@
-"""``vla-zenoh node router``: ours, or the program zenohd with the same configuration."""
+"""``vla-zenoh node router``: ours, and its configuration for the program zenohd."""
 
 from __future__ import annotations
 
 import datetime as dt
 import json
-import os
 import shutil
 import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -19,35 +17,33 @@ from typer.testing import CliRunner
 from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.main import app
-from vla_zenoh.errors import NodeError, SecurityError
+from vla_zenoh.errors import SecurityError
 from vla_zenoh.profile import load_profile
-from vla_zenoh.runtime.router import router_config, run_router, run_zenohd
+from vla_zenoh.runtime.router import router_config, run_router
 from vla_zenoh.security.identity import identities
+from vla_zenoh.security.lab_certificates import LabCertificates
 from vla_zenoh.security.rules import access_control
 from vla_zenoh.security.secure_profile import profile_text, serving_addresses
-from vla_zenoh.security.store import Store
 
 LIMIT_S = 20.0
-STAND_IN = """\
-#!/bin/sh
-test "$1" = --config && cat "$2"
-"""
-"""In the place of zenohd: shows the configuration it was given."""
 
 
-def secured(folder: Path, more: str = "") -> Path:
+def secured(folder: Path) -> Path:
     """A lab with certificates, at a free port of this computer."""
     plain = folder / "plain.yaml"
     endpoint = free_endpoint()
     plain.write_text(
         f"extends: panda_sim\nsession: {{listen: [{endpoint}], connect: [{endpoint}]}}\n"
     )
-    profile, store, now = load_profile(str(plain)), Store(folder / "keys"), dt.datetime.now(dt.UTC)
+    profile, store, now = (
+        load_profile(str(plain)),
+        LabCertificates(folder / "keys"),
+        dt.datetime.now(dt.UTC),
+    )
     store.make_authority("test lab", now)
     store.add(identities(profile), now, addresses=serving_addresses(profile))
     file = folder / "lab.yaml"
-    text = profile_text(profile, "plain", store.folder)
-    file.write_text(text.replace("session:\n", f"session:\n{more}"))
+    file.write_text(profile_text(profile, "plain", store.folder))
     return file
 
 
@@ -61,29 +57,19 @@ def test_the_configuration_is_one_that_zenoh_takes(tmp_path: Path) -> None:
     assert tls["listen_certificate"].endswith("here/router.pem")
 
 
-def test_zenohd_gets_the_configuration_that_our_own_router_has(tmp_path: Path) -> None:
-    file = secured(tmp_path, "  router: zenohd\n")
-    programs = tmp_path / "bin"
-    programs.mkdir()
-    (programs / "zenohd").write_text(STAND_IN)
-    (programs / "zenohd").chmod(0o755)
-    given = subprocess.run(
-        [sys.executable, "-m", "vla_zenoh", "node", "router", "--profile", str(file)],
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-        check=False,
-        env={**os.environ, "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"},
-    )
-    assert given.returncode == 0, given.stderr
-    assert json.loads(given.stdout) == router_config(load_profile(str(file)))
+def test_the_command_prints_the_configuration_that_our_own_router_has(tmp_path: Path) -> None:
+    file = secured(tmp_path)
+    shown = CliRunner().invoke(app, ["node", "router", "--profile", str(file), "--config"])
+    assert shown.exit_code == 0, shown.output
+    assert json.loads(shown.stdout) == router_config(load_profile(str(file)))
 
 
 @pytest.mark.skipif(shutil.which("zenohd") is None, reason="there is no zenohd on PATH")
 def test_a_real_zenohd_lets_each_do_its_part_and_no_more(tmp_path: Path) -> None:
-    file = secured(tmp_path, "  router: zenohd\n")
-    profile = load_profile(str(file))
-    words = [sys.executable, "-m", "vla_zenoh", "node", "router", "--profile", str(file)]
+    profile = load_profile(str(secured(tmp_path)))
+    file = tmp_path / "zenohd.json5"
+    file.write_text(json.dumps(router_config(profile)))
+    words = ["zenohd", "--config", str(file)]
     program = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     keys, heard = profile.keys, CallbackRing(16)
     try:
@@ -108,19 +94,9 @@ def test_a_real_zenohd_lets_each_do_its_part_and_no_more(tmp_path: Path) -> None
             assert said == ["mine"]
             own.undeclare()
             reader.undeclare()
-        assert Path(f"/proc/{program.pid}/comm").read_text().strip() == "zenohd"
     finally:
         program.terminate()
         program.wait(LIMIT_S)
-
-
-def test_a_zenohd_that_is_not_there_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    profile = load_profile(str(secured(tmp_path)))
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(NodeError, match="there is no zenohd on PATH: install Zenoh's router"):
-        run_zenohd(profile, tmp_path)
 
 
 def test_a_router_without_its_certificate_says_how_to_get_one(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from vla_zenoh.cli.main import app
 from vla_zenoh.nodes.command.node import CommandNode
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.runtime.router import run_router
-from vla_zenoh.security.store import Store
+from vla_zenoh.security.lab_certificates import LabCertificates
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
 
@@ -72,9 +72,9 @@ class Lab:
         until("nobody is stopped", lambda: not self.stopped(), PATIENCE_S)
 
     @contextmanager
-    def only(self, *hosts: str) -> Iterator[Store]:
+    def only(self, *hosts: str) -> Iterator[LabCertificates]:
         """The certificates of these alone are here; the router and the nodes have theirs open."""
-        store, away = Store(self.folder), self.folder.with_name("away")
+        store, away = LabCertificates(self.folder), self.folder.with_name("away")
         away.mkdir()
         gone = [host for host in store.hosts() if host not in hosts]
         for host in gone:
@@ -161,7 +161,7 @@ def test_a_stop_where_the_certificates_of_all_hosts_lie_stops_the_robot(lab: Lab
 def test_a_computer_of_viewers_stops_with_the_certificate_of_an_operator_that_lies_there(
     lab: Lab,
 ) -> None:
-    Store(lab.folder).remember_host("gpu")
+    LabCertificates(lab.folder).remember_host("gpu")
     done = lab.at("stop")
     assert done.exit_code == 0, done.stderr
     assert lab.stopped() == ["panda"]
@@ -179,7 +179,7 @@ def test_a_computer_of_viewers_stops_with_the_certificate_of_an_operator_that_li
 
 
 def test_a_stop_goes_on_to_the_next_certificate_where_one_is_of_no_use(lab: Lab) -> None:
-    Store(lab.folder).remember_host("desk")
+    LabCertificates(lab.folder).remember_host("desk")
     key = lab.folder / "desk/operator.key"
     key.chmod(0o644)
     try:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import key_chunk
@@ -19,15 +18,6 @@ MAX_OTHERS = 256
 """Names beside those of the profile."""
 MAX_STATUS_BYTES = 64 * 1024
 """Of one status; ours have a few thousand bytes."""
-MAX_OTHERS_BYTES = 4 * 1024 * 1024
-"""Of all statuses of other names."""
-
-
-@dataclass(slots=True)
-class _LastStatus:
-    status: NodeStatus
-    size: int
-    received_s: float
 
 
 class NodeRegistry:
@@ -45,9 +35,7 @@ class NodeRegistry:
         self._clock = clock
         self._lock = threading.Lock()
         self._alive: set[str] = set()
-        self._ours: dict[str, _LastStatus] = {}
-        self._others: dict[str, _LastStatus] = {}
-        self._others_bytes = 0
+        self._statuses: dict[str, tuple[NodeStatus, float]] = {}  # the newest comes last
         self._dropped = 0
 
     @property
@@ -87,30 +75,24 @@ class NodeRegistry:
             if not self._fit(name) or size > MAX_STATUS_BYTES:
                 self._dropped += 1
                 return
-            said = _LastStatus(status, size, self._clock())
-            if name in self._expected:
-                self._ours[name] = said
-                return
-            self._forget(name)
-            if self._make_room(size):
-                self._others[name] = said
-                self._others_bytes += size
+            self._statuses.pop(name, None)
+            if name in self._expected or self._make_room():
+                self._statuses[name] = (status, self._clock())
             else:
                 self._dropped += 1
 
     def status(self, name: str) -> tuple[NodeStatus, float] | None:
         """The last status of a node and when it was received; None before the first."""
         with self._lock:
-            found = self._ours.get(name) or self._others.get(name)
-            return None if found is None else (found.status, found.received_s)
+            return self._statuses.get(name)
 
     def snapshot(self) -> dict[str, tuple[NodeStatus, float, bool]]:
         """Node -> (status, age in s, alive), by name."""
         now_s = self._clock()
         with self._lock:
             return {
-                name: (said.status, now_s - said.received_s, name in self._alive)
-                for name, said in sorted({**self._others, **self._ours}.items())
+                name: (status, now_s - received_s, name in self._alive)
+                for name, (status, received_s) in sorted(self._statuses.items())
             }
 
     @staticmethod
@@ -120,17 +102,14 @@ class NodeRegistry:
         except ProfileError:
             return False
 
-    def _make_room(self, size: int) -> bool:
-        """Whether `size` more bytes fit, after dropping the statuses of nodes that are gone."""
-        while len(self._others) >= MAX_OTHERS or self._others_bytes + size > MAX_OTHERS_BYTES:
-            oldest = next((name for name in self._others if name not in self._alive), None)
-            if oldest is None:
-                return False
-            self._forget(oldest)
-            self._dropped += 1
+    def _make_room(self) -> bool:
+        """Whether one more status fits, after dropping the oldest of a node that is gone."""
+        others = [name for name in self._statuses if name not in self._expected]
+        if len(others) < MAX_OTHERS:
+            return True
+        oldest = next((name for name in others if name not in self._alive), None)
+        if oldest is None:
+            return False
+        del self._statuses[oldest]
+        self._dropped += 1
         return True
-
-    def _forget(self, name: str) -> None:
-        said = self._others.pop(name, None)
-        if said is not None:
-            self._others_bytes -= said.size

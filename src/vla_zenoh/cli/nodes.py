@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -41,7 +40,7 @@ def router(
     ] = False,
 ) -> None:
     """Run the Zenoh router that connects all nodes of a lab."""
-    from vla_zenoh.runtime.router import router_config, run_router, run_zenohd
+    from vla_zenoh.runtime.router import router_config, run_router
     from vla_zenoh.runtime.scheduling import prefer_this_process, realtime_links
 
     loaded = effective_profile(profile, listen=listen, host=host)
@@ -52,9 +51,6 @@ def router(
     die_with_parent()
     prefer_this_process()
     with realtime_links():
-        if loaded.session.router == "zenohd":
-            folder = _run_folder() or Path(tempfile.mkdtemp(prefix="vla-zenoh-"))
-            run_zenohd(loaded, folder, host=host, also=others)
         stop = stop_on_signals()
         print(f"routing, {loaded.name}", flush=True)
         run_router(loaded, stop, host=host, also=others)
@@ -142,17 +138,11 @@ def command(
     from vla_zenoh.nodes.command.node import CommandNode
 
     profile = node.load()
-    folder = _run_folder()
-    latch = folder / "stopped" if folder else None
+    folder = os.environ.get(RUN_FOLDER_VARIABLE)
+    latch = Path(folder) / "stopped" if folder else None
     run_node(
         profile,
         lambda session, stop: CommandNode(profile, session, dry_run=dry_run, latch=latch).run(stop),
         identity="command",
         preferred=True,
     )
-
-
-def _run_folder() -> Path | None:
-    """Folder of the `up` that started this node."""
-    given = os.environ.get(RUN_FOLDER_VARIABLE)
-    return Path(given) if given else None

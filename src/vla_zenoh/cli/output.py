@@ -7,16 +7,13 @@ Colours come from `styled`. A `Screen` is made for each call, for the terminal a
 
 from __future__ import annotations
 
-import dataclasses
 import json
-import math
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic_core import to_jsonable_python
 from rich import box
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
@@ -172,28 +169,14 @@ def print_json(value: Any) -> None:
 
 
 def plain_types(value: Any) -> Any:
-    """`value` in types of JSON.
+    """`value` in types of JSON: records, profiles and arrays as what they hold, NaN as null."""
+    return to_jsonable_python(value, inf_nan_mode="null", bytes_mode="hex", fallback=_plain)
 
-    Records, profiles, arrays, paths, sets and numpy numbers become what they hold; NaN and infinity
-    become null.
-    """
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json")
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = dataclasses.fields(value)
-        return {field.name: plain_types(getattr(value, field.name)) for field in fields}
+
+def _plain(value: Any) -> Any:
+    """What Pydantic does not know."""
     if isinstance(value, Mapping):
-        return {str(key): plain_types(item) for key, item in value.items()}
+        return {str(key): item for key, item in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):
-        return plain_types(value.tolist())
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [plain_types(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, (str, int, bool)):
-        return value
-    if isinstance(value, bytes):
-        return value.hex()
-    if isinstance(value, Path):
-        return str(value)
+        return value.tolist()
     raise TypeError(f"{type(value).__name__} has no JSON form")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Group
 from rich.live import Live
@@ -36,25 +36,13 @@ MAX_WORDS = 400
 STALE_S = 1.5
 STYLES = {
     "active": "bold green",
-    "inferring": "green",
-    "running": "green",
-    "routing": "green",
-    "ok": "green",
     "inactive": "cyan",
-    "holding": "yellow",
-    "waiting": "yellow",
-    "braking": "yellow",
-    "silent": "yellow",
-    "stalled": "yellow",
-    "unheeded": "yellow",
-    "stopped": "bold red",
-    "fault": "bold red",
-    "dead": "bold red",
-    "missing": "bold red",
-    "crashed": "bold red",
-    "starting": "yellow",
-    "degraded": "yellow",
+    **dict.fromkeys(("inferring", "running", "routing", "ok"), "green"),
+    **dict.fromkeys(("holding", "waiting", "braking", "silent", "stalled", "unheeded"), "yellow"),
+    **dict.fromkeys(("starting", "degraded"), "yellow"),
+    **dict.fromkeys(("stopped", "fault", "dead", "missing", "crashed"), "bold red"),
 }
+LEVELS = {"warning": "yellow", "error": "red"}
 
 
 def show_live(robot: Client) -> None:
@@ -104,32 +92,58 @@ def render(
         expected: nodes of the profile, each with its host.
         alive: nodes that have a liveliness token.
     """
-    mode = mode_of(nodes)
-    word = MODE_WORDS[mode][0]
-    columns = ("node", "state", "age", "rate", "rejected", "message")
-    table = new_table(*columns, title=f"{word} robot {robot}")
+    mode, sentence, style = MODE_WORDS[mode_of(nodes)]
+    table = new_table(
+        *("node", "state", "age", "rate", "rejected", "message"), title=f"{mode} robot {robot}"
+    )
     for row in node_rows(nodes, expected or {}, alive):
-        table.add_row(*_cells(row, word))
-    lines = [_latency(name, found) for name, (found, _, _) in nodes.items()]
-    happened = [_event(*each) for each in events[-MAX_EVENTS:]]
-    warnings = [*_insecure(nodes, insecure=insecure), *_bad_certificates(nodes)]
-    if left_out:
-        warnings.append(styled(f"{left_out} {DROPPED_HINT}", "yellow"))
-    below = [
-        styled(one_line(f"limit acting now: {limit}", MAX_WORDS), "yellow")
-        for limit in acting_limits(nodes)
-    ]
+        table.add_row(*_cells(row, mode))
+    above = [_line(*each) for each in _warnings(nodes, insecure=insecure, left_out=left_out)]
+    if nodes:
+        above.append(Text.assemble((f" {mode} ", style), f" {sentence}"))
+    below = [_line(f"limit acting now: {limit}", "yellow") for limit in acting_limits(nodes)]
     for host, missing in hosts_down(nodes, expected or {}, alive).items():
         text = f"host {host} does not run ({', '.join(missing)}): `vla-zenoh up` there starts it"
-        below.append(styled(one_line(text, MAX_WORDS), "bold yellow"))
-    if nodes:
-        warnings.append(_mode(mode))
-    return Group(*warnings, table, *below, *(line for line in lines if line), *happened)
+        below.append(_line(text, "bold yellow"))
+    for name, (found, _, _) in nodes.items():
+        stages = ", ".join(
+            f"{stage.replace('_', ' ')} {values[0]:.1f}/{values[1]:.1f}"
+            for stage, values in found.latency_ms.items()
+        )
+        below += [_line(f"{one_line(name)}, ms p50/p95: {stages}", "dim")] if stages else []
+    return Group(*above, table, *below, *(_event(*each) for each in events[-MAX_EVENTS:]))
 
 
-def _mode(mode: str) -> Text:
-    word, sentence, style = MODE_WORDS[mode]
-    return Text.assemble((f" {word} ", style), f" {sentence}")
+def _line(text: str, style: str) -> Text:
+    return styled(one_line(text, MAX_WORDS), style)
+
+
+def _fields(value: object) -> Mapping[str, Any]:
+    """A map in the detail of a status; empty if a node put something else there."""
+    return value if isinstance(value, Mapping) else {}
+
+
+def _warnings(nodes: Statuses, *, insecure: bool, left_out: int) -> Iterator[tuple[str, str]]:
+    """Sentences and their styles: open routers, bad certificates, strangers."""
+    details = {name: found.detail for name, (found, _, _) in nodes.items()}
+    routers = {
+        n: one.get("listen") for n, one in details.items() if one.get("security") == "insecure"
+    }
+    if insecure or routers:
+        where = "; ".join(
+            f"{name} listens on {', '.join(map(str, listen))}"
+            for name, listen in routers.items()
+            if isinstance(listen, (list, tuple))
+        )
+        more = f" ({where})" if where else ""
+        yield f"insecure: anyone on the network can command this robot{more}", "bold red"
+    for name, detail in details.items():
+        wrong = _fields(detail.get("certificates")).get("wrong")
+        if isinstance(wrong, (list, tuple)) and wrong:
+            host = nodes[name][0].host
+            yield f"certificates of {name} on {host}: {'; '.join(map(str, wrong))}", "bold yellow"
+    if left_out:
+        yield f"{left_out} {DROPPED_HINT}", "yellow"
 
 
 def _cells(row: NodeRow, mode: str) -> tuple[str | Text, ...]:
@@ -139,114 +153,59 @@ def _cells(row: NodeRow, mode: str) -> tuple[str | Text, ...]:
     style = STYLES.get(state, "white")
     if row.name == "command" and row.alive:
         state = f"{mode} {state}"
-    age = "" if age_s is None else f"{age_s:.1f} s"
     late = age_s is not None and age_s > STALE_S
+    rates = found.rates_hz.items() if found is not None and row.alive else ()
+    refused = sorted(found.counters.items()) if found is not None else ()
     return (
         one_line(row.name),
         styled(state, style),
-        styled(age, "red" if late else "white"),
-        _lines(_rates(found)) if found is not None and row.alive else "",
-        _lines(_rejected(found)) if found is not None else "",
+        styled("" if age_s is None else f"{age_s:.1f} s", "red" if late else "white"),
+        _cell([f"{key} {value:.0f} Hz" for key, value in rates]),
+        _cell(
+            [
+                f"{name.removeprefix('refused.')} {count}"
+                for name, count in refused
+                if name.startswith("refused.")
+            ]
+        ),
         one_line(row.why, MAX_WORDS) if row.why or found is None else _message(row, found, mode),
     )
 
 
-def _insecure(nodes: Statuses, *, insecure: bool) -> list[Text]:
-    """Warning in red that anyone may command the robot, by the profile or a router's status."""
-    open_routers = {
-        name: found.detail.get("listen")
-        for name, (found, _, _) in nodes.items()
-        if found.detail.get("security") == "insecure"
-    }
-    if not open_routers and not insecure:
-        return []
-    where = "; ".join(
-        f"{name} listens on {', '.join(map(str, listen))}"
-        for name, listen in open_routers.items()
-        if isinstance(listen, (list, tuple))
-    )
-    words = "insecure: anyone on the network can command this robot"
-    more = f" ({one_line(where, MAX_WORDS)})" if where else ""
-    return [styled(f"{words}{more}", "bold red")]
-
-
-def _bad_certificates(nodes: Statuses) -> list[Text]:
-    """Warnings of routers about certificates that are invalid, or soon will be."""
-    out: list[Text] = []
-    for name, (found, _, _) in nodes.items():
-        certificates = found.detail.get("certificates")
-        wrong = certificates.get("wrong") if isinstance(certificates, dict) else None
-        if isinstance(wrong, (list, tuple)) and wrong:
-            words = f"certificates of {name} on {found.host}: {'; '.join(map(str, wrong))}"
-            out.append(styled(one_line(words, MAX_WORDS), "bold yellow"))
-    return out
-
-
-def _days_left(certificates: object) -> str:
-    """How long a router's certificates last."""
-    if not isinstance(certificates, dict):
-        return ""
-    days, unknown = certificates.get("days"), certificates.get("unknown")
-    if isinstance(days, (int, float)):
-        return f"certificates last {days:g} days"
-    return one_line(unknown, MAX_WORDS) if isinstance(unknown, str) else ""
-
-
-def _latency(name: str, found: NodeStatus) -> Text | None:
-    if not found.latency_ms:
-        return None
-    stages = ", ".join(
-        f"{stage.replace('_', ' ')} {values[0]:.1f}/{values[1]:.1f}"
-        for stage, values in found.latency_ms.items()
-    )
-    return styled(f"{one_line(name)}, ms p50/p95: {one_line(stages, MAX_WORDS)}", "dim")
-
-
-def _lines(lines: list[str]) -> str:
+def _cell(lines: list[str], most: int = MAX_LINE) -> str:
     more = [f"and {len(lines) - MAX_LINES} more"] if len(lines) > MAX_LINES else []
-    return "\n".join([*lines[:MAX_LINES], *more])
-
-
-def _rates(found: NodeStatus) -> list[str]:
-    return [one_line(f"{key} {value:.0f} Hz", MAX_LINE) for key, value in found.rates_hz.items()]
-
-
-def _rejected(found: NodeStatus) -> list[str]:
-    counts = {
-        name.removeprefix("refused."): count
-        for name, count in found.counters.items()
-        if name.startswith("refused.")
-    }
-    return [one_line(f"{reason} {count}", MAX_LINE) for reason, count in sorted(counts.items())]
+    return "\n".join([*(one_line(line, most) for line in lines[:MAX_LINES]), *more])
 
 
 def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
     detail = found.detail
     if row.name == "command":
-        rate_hz = detail.get("rate_hz")
+        rate_hz, speed = detail.get("rate_hz"), detail.get("speed_percent")
         rate = f"{rate_hz:g}" if isinstance(rate_hz, (int, float)) else "?"
-        speed = detail.get("speed_percent")
         slowed = isinstance(speed, (int, float)) and speed < 100
         task = (
             f"prompt {detail.get('prompt', '')!r}, worker {detail.get('worker', '')}, {rate} Hz, "
             f"{detail.get('accepted_chunks', 0)} chunks carried out"
             f"{f', speed {speed:g} %' if slowed else ''}"
         )
-        return f"{one_line(detail.get('why', ''), MAX_WORDS)}\n{one_line(task, MAX_WORDS)}"
-    if bad := _bad_cameras(detail.get("cameras")):
-        return _lines([one_line(each, MAX_WORDS) for each in bad])
+        return _cell([str(detail.get("why", "")), task], MAX_WORDS)
+    if bad := _bad_cameras(_fields(detail.get("cameras"))):
+        return _cell(bad, MAX_WORDS)
     text = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
     if not text and "obeyed" in detail:
         return f"{mode} moves the arm" if detail["obeyed"] else "shadow mode"
-    return one_line(text or _days_left(detail.get("certificates")), MAX_WORDS)
+    certificates = _fields(detail.get("certificates"))
+    days, unknown = certificates.get("days"), certificates.get("unknown")
+    if not text and isinstance(days, (int, float)):
+        text = f"certificates last {days:g} days"
+    return one_line(text or (unknown if isinstance(unknown, str) else ""), MAX_WORDS)
 
 
-def _bad_cameras(cameras: object) -> list[str]:
+def _bad_cameras(cameras: Mapping[str, Any]) -> list[str]:
     """What is wrong with each camera of a node."""
     out: list[str] = []
-    for name, fields in cameras.items() if isinstance(cameras, Mapping) else ():
-        bad = fields.get("bad") if isinstance(fields, Mapping) else None
-        why = fields.get("why") if isinstance(fields, Mapping) else None
+    for name, camera in cameras.items():
+        bad, why = _fields(camera).get("bad"), _fields(camera).get("why")
         if isinstance(bad, Mapping):
             out.append(f"camera {name!r} {bad.get('why', '')}")
         elif isinstance(why, str) and why:
@@ -256,7 +215,6 @@ def _bad_cameras(cameras: object) -> list[str]:
 
 def _event(node: str, header: Header, event: Event) -> Text:
     when = time.strftime("%H:%M:%S", time.localtime(header.stamp_wall_ns / 1e9))
-    style = {"info": "white", "warning": "yellow", "error": "red"}.get(event.level, "white")
     again = f" (x{event.count})" if event.count > 1 else ""
     text = f"{one_line(event.what)}{again}: {one_line(event.why, 160)}"
-    return styled(f"{when} {one_line(node):>16} {text}", style)
+    return styled(f"{when} {one_line(node):>16} {text}", LEVELS.get(event.level, "white"))

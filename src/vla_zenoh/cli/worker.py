@@ -7,9 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from vla_zenoh import keys
 from vla_zenoh.cli.options import HostOption, ModelOptions, NodeOptions, effective_profile, options
-from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy.loader import make_policy
@@ -35,16 +33,11 @@ def worker(
     delay_ms: Annotated[
         float, typer.Option("--delay", min=0, help="Milliseconds added to every inference.")
     ] = 0.0,
-    robots: Annotated[
-        str | None,
-        typer.Option(help="Robots to serve, separated by commas; default: those of the profile."),
-    ] = None,
     host: HostOption = None,
 ) -> None:
     """Run a model: observations in, action chunks out on its delta key."""
     profile = effective_profile(node.profile, node.connect, host=host)
     chosen = model_options.choose(profile, model, name)
-    served = robot_names(robots) or profile.serves.get(chosen.name, ())
     # Returns only where this environment has what the model's header asks for.
     run_in_own_environment(chosen.model, model_options.python)
     policy = make_policy(chosen.model, chosen.options, profile=node.profile)
@@ -59,7 +52,7 @@ def worker(
             images=form,
             host=host,
             delay_s=delay_ms / 1e3,
-            robots=served,
+            robots=profile.serves.get(chosen.name, ()),
             another=lambda: make_policy(chosen.model, chosen.options, profile=node.profile),
         ).run(stop),
         identity=worker_node(chosen.name),
@@ -72,20 +65,3 @@ def _image_form(profile: Profile, host: str | None) -> Literal["raw", "jpeg"]:
     if host is None or host not in profile.hosts:
         return "raw"
     return "raw" if "camera" in profile.hosts[host].nodes else "jpeg"
-
-
-def robot_names(text: str | None) -> list[str]:
-    """Parse robot names separated by commas; none of None.
-
-    Raises:
-        typer.BadParameter: a name cannot be part of a key, or is there twice.
-    """
-    names = [part.strip() for part in text.split(",")] if text is not None else []
-    try:
-        for name in names:
-            keys.key_chunk(name, "robot name")
-    except ProfileError as error:
-        raise typer.BadParameter(f"--robots: {error}") from error
-    if len(set(names)) != len(names):
-        raise typer.BadParameter(f"--robots names one twice: {text}")
-    return names

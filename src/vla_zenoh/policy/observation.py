@@ -134,11 +134,6 @@ def size_variant(spec: CameraSpec) -> str | None:
     return f"{spec.width}x{spec.height}-{spec.resize}"
 
 
-def host_variant(host: str, form: str | None = None) -> str:
-    """Name of what travels to a host with a say in it, in a model's size or as it comes."""
-    return f"{form or 'whole'}-for-{host}"
-
-
 def prepare_image(image: Image, spec: CameraSpec) -> NDArray[np.uint8]:
     """An image in the size and channel order of the spec.
 

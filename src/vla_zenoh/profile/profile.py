@@ -283,10 +283,6 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
                 yield (*place, "nodes"), f"has {kind}, and robot.driver is {profile.robot.driver}"
         if "ros2" in host.nodes and profile.ros2 is None:
             yield (*place, "nodes"), "has ros2, which needs a section ros2"
-        if host.pictures is not None and not profile.workers_of(host):
-            yield (*place, "pictures"), "is for workers, and this host runs none"
-        elif host.pictures is not None and "camera" in host.nodes:
-            yield (*place, "pictures"), "is for cameras elsewhere, and this host has its own"
         named = set(host.cameras or ()) & set(profile.cameras) if "camera" in host.nodes else set()
         for camera in sorted(named - set(profile.served_cameras(host))):
             yield (*place, "cameras"), f"has {camera}, of ROS 2: the node ros2 serves it"

@@ -204,21 +204,6 @@ class TaskProfile(Section):
     speed_percent: float = Field(default=100.0, ge=0, le=100)
 
 
-class HostImagesProfile(Section):
-    """Camera streams for the workers of a host that has no cameras of its own.
-
-    Args:
-        quality: of JPEG, 1 to 100.
-        rate_hz: largest rate of each camera; None: every image.
-        width: wider images are scaled down; None: never. Models that declare a size get that
-            instead, if the camera has ``fit_for_workers``.
-    """
-
-    quality: int = Field(default=80, ge=1, le=100)
-    rate_hz: float | None = Field(default=None, gt=0, le=240)
-    width: int | None = Field(default=None, ge=16, le=8192)
-
-
 class HostProfile(Section):
     """One computer: which nodes run there, and how they reach the router.
 
@@ -230,8 +215,6 @@ class HostProfile(Section):
         link: routers of other hosts that this host's router connects to.
         cameras: served by its camera node; None: all.
         workers: that it runs; None: all.
-        pictures: streams of cameras elsewhere for its workers; None: the JPEG streams of the
-            cameras.
     """
 
     nodes: Annotated[tuple[NodeKind, ...], Field(strict=False, min_length=1), Distinct]
@@ -240,4 +223,3 @@ class HostProfile(Section):
     link: Endpoints | None = None
     cameras: Names | None = None
     workers: Names | None = None
-    pictures: HostImagesProfile | None = None

@@ -147,8 +147,6 @@ class SessionProfile(Section):
         connect: endpoints of the router; nodes use the first that answers, and the next one when it
             is lost.
         listen: endpoints on which the router listens.
-        router: ``own``: a Python process of ours; ``zenohd``: that program, with the same
-            configuration.
         separate_links: images use connections of their own, to the router's next port, so that a
             reader that is stuck in an image does not delay the arm.
         shared_memory: processes of one host exchange large payloads through shared memory.
@@ -160,7 +158,6 @@ class SessionProfile(Section):
 
     connect: Endpoints = ("tcp/127.0.0.1:7447",)
     listen: Endpoints = ("tcp/127.0.0.1:7447",)
-    router: Literal["own", "zenohd"] = "own"
     separate_links: bool = False
     shared_memory: bool = True
     lease_ms: int = Field(default=1000, ge=200, le=60000)

@@ -8,18 +8,16 @@ from __future__ import annotations
 import datetime as dt
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from vla_zenoh.errors import MissingExtraError, SecurityError
 from vla_zenoh.profile.session import SecurityProfile
-from vla_zenoh.security.store import Store
 
 LOOK_PERIOD_S = 3600.0
 TELL_PERIOD_S = 24 * 3600.0
 
 
-@dataclass(frozen=True, slots=True)
-class ExpiryOutlook:
+class ExpiryOutlook(NamedTuple):
     """Result of checking the certificates.
 
     Args:
@@ -40,8 +38,10 @@ def outlook(security: SecurityProfile, now: dt.datetime) -> ExpiryOutlook:
         security: of the profile; its host says which computer this is.
         now: UTC.
     """
-    store = Store(security.folder)
     try:
+        from vla_zenoh.security.lab_certificates import LabCertificates
+
+        store = LabCertificates(security.folder)
         entries = store.entries(now, store.this_host(security.host))
     except MissingExtraError as error:  # using certificates needs no library to read them
         return ExpiryOutlook(unknown=f"the expiry of certificates cannot be checked here: {error}")

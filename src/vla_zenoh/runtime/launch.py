@@ -242,7 +242,7 @@ class Host:
         client = self.client
         if client is None:
             return []
-        # A router may be a program that publishes no status.
+        # Who hears of it has reached the only router, which is not expected.
         return [each for each in self.supervisor.down(client.alive) if each.name in client.expected]
 
     def _router_answers(self) -> bool:
@@ -294,7 +294,7 @@ class Host:
         """Whether a node that lives is one of ours, and not another one of its name."""
         alive = client.alive
         return any(
-            kind == "router"  # which starts where no other one answers, and may be silent: zenohd
+            kind == "router"  # which starts only where no other one answers
             or (
                 name in alive
                 and (status := client.status(name)) is not None

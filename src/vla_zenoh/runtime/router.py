@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
-import shutil
 import socket
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session, session_config
@@ -23,7 +19,6 @@ from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.security.rules import access_control
 
 POLL_S = 0.25
-ZENOHD = "zenohd"
 RUNTIME_VARIABLE, RUNTIME = "ZENOH_RUNTIME", "(rx: (worker_threads: 16))"
 """What arrives is handed on by the thread that received it, which waits where a link is stuck. With
 the usual two of them one bad link would hold up all others, the arm's among them."""
@@ -67,7 +62,7 @@ def run_router(
             impatience.apply()
             links_now = len(list(session.info.links()))
             if profile.session.security is not None:
-                detail["certificates"] = asdict(expiry.outlook)
+                detail["certificates"] = expiry.outlook._asdict()
             node.publish_status("routing", detail={**detail, "links": links_now})
         node.close()
 
@@ -100,37 +95,10 @@ def reject_taken(endpoints: Sequence[str]) -> None:
             ) from error
 
 
-def run_zenohd(
-    profile: Profile, folder: Path, *, host: str | None = None, also: Sequence[Profile] = ()
-) -> NoReturn:
-    """Become the program ``zenohd``, with the configuration that our own router would have.
-
-    Args:
-        profile: as in `run_router`.
-        folder: where the configuration is left for it.
-        host: as in `run_router`.
-        also: further profiles, see `run_router`.
-
-    Raises:
-        NodeError: there is no such program.
-        SecurityError: the router's certificate is not there.
-    """
-    program = shutil.which(ZENOHD)
-    if program is None:
-        raise NodeError(
-            f"there is no {ZENOHD} on PATH: install Zenoh's router, or leave out "
-            "session.router: zenohd"
-        )
-    file = folder / "zenohd.json5"
-    file.write_text(json.dumps(router_config(profile, host=host, also=also), indent=2))
-    os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)
-    os.execv(program, [ZENOHD, "--config", str(file)])
-
-
 def router_config(
     profile: Profile, *, host: str | None = None, also: Sequence[Profile] = ()
 ) -> dict[str, Any]:
-    """Zenoh's configuration of the profile's router.
+    """Zenoh's configuration of the profile's router, of ours or of the program ``zenohd``.
 
     Raises:
         SecurityError: the router's certificate is not there.

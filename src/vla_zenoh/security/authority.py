@@ -12,15 +12,18 @@ import ipaddress
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from vla_zenoh.errors import MissingExtraError, SecurityError
 
-if TYPE_CHECKING:
+try:
     from cryptography import x509
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+except ImportError as error:  # nodes that only use their certificates do without it
+    raise MissingExtraError("cryptography", "secure") from error
 
-EXTRA = "secure"
 AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 365
 WARN_DAYS = 30
 """A certificate that expires within this time should be renewed."""
@@ -44,19 +47,15 @@ class Certificate:
 
     Args:
         common_name: of its subject.
-        issuer: common name of the signer.
         not_before: valid from, UTC.
         not_after: valid until, UTC.
         addresses: host names and IP addresses that it is valid for as a server.
-        authority: whether it may sign others.
     """
 
     common_name: str
-    issuer: str
     not_before: dt.datetime
     not_after: dt.datetime
     addresses: tuple[str, ...]
-    authority: bool
 
     def days_left(self, now: dt.datetime) -> int:
         """Whole days until it expires; negative if it has."""
@@ -87,19 +86,10 @@ def make_authority(name: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> K
         days: validity.
 
     Raises:
-        MissingExtraError: the library ``cryptography`` is not installed.
         SecurityError: invalid name.
     """
-    x509, ec = _library()
     key = ec.generate_private_key(ec.SECP256R1())
-    subject = _name(name)
-    usage = _usage(sign_others=True)
-    builder = (
-        _builder(subject, subject, key.public_key(), now, days)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(usage, critical=True)
-    )
-    return _signed(builder, key, key)
+    return _signed(_builder(name, None, key.public_key(), now, days), key, key)
 
 
 def issue(
@@ -120,62 +110,47 @@ def issue(
         addresses: host names and IP addresses of a server; None: it may only connect.
 
     Raises:
-        MissingExtraError: the library ``cryptography`` is not installed.
         SecurityError: invalid name or address, or an authority that is invalid or expired.
     """
-    x509, ec = _library()
-    from cryptography.x509.oid import ExtendedKeyUsageOID
-
     signer, signer_key = _load(authority)
     end = signer.not_valid_after_utc
     if now > end:
         raise SecurityError(f"the lab's authority expired on {end:%Y-%m-%d}: make a new one")
     key = ec.generate_private_key(ec.SECP256R1())
-    days_left = (end - now) / dt.timedelta(days=1)
+    valid_days = min(days, (end - now) / dt.timedelta(days=1))
+    builder = _builder(common_name, signer.subject, key.public_key(), now, valid_days)
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if addresses is not None:
         purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
-    builder = (
-        _builder(_name(common_name), signer.subject, key.public_key(), now, min(days, days_left))
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(sign_others=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-        .add_extension(
-            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer_key.public_key()),
-            critical=False,
-        )
-    )
-    if addresses is not None:
         names = [_address(address) for address in dict.fromkeys(addresses)]
         builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-    return _signed(builder, key, signer_key)
+    signed_with = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer_key.public_key())
+    builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+    return _signed(builder.add_extension(signed_with, critical=False), key, signer_key)
 
 
 def read(pem: bytes) -> Certificate:
     """Contents of a certificate.
 
     Raises:
-        MissingExtraError: the library ``cryptography`` is not installed.
         SecurityError: not a certificate.
     """
-    x509, _ = _library()
     try:
         found = x509.load_pem_x509_certificate(pem)
-        constraints = found.extensions.get_extension_for_class(x509.BasicConstraints).value
-        try:
-            names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-        except x509.ExtensionNotFound:
-            names = ()
-        return Certificate(
-            _common_name(found.subject),
-            _common_name(found.issuer),
-            found.not_valid_before_utc,
-            found.not_valid_after_utc,
-            tuple(str(name.value) for name in names),
-            bool(constraints.ca),
-        )
-    except (ValueError, x509.ExtensionNotFound) as error:
-        raise SecurityError(f"is not a certificate as we make them: {error}") from error
+        extensions = found.extensions
+    except ValueError as error:
+        raise SecurityError(f"is not a certificate: {error}") from error
+    names = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    try:
+        addresses = extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        addresses = ()
+    return Certificate(
+        str(names[0].value) if names else "",
+        found.not_valid_before_utc,
+        found.not_valid_after_utc,
+        tuple(str(address.value) for address in addresses),
+    )
 
 
 def signed_by(pem: bytes, authority: bytes) -> bool:
@@ -184,9 +159,6 @@ def signed_by(pem: bytes, authority: bytes) -> bool:
     Raises:
         SecurityError: one of them is not a certificate.
     """
-    x509, _ = _library()
-    from cryptography.exceptions import InvalidSignature
-
     try:
         found, signer = map(x509.load_pem_x509_certificate, (pem, authority))
     except ValueError as error:
@@ -208,33 +180,7 @@ def key_fits(pair: KeyPair) -> bool:
     return certificate.public_key() == key.public_key()
 
 
-def _library():
-    try:
-        from cryptography import x509
-        from cryptography.hazmat.primitives.asymmetric import ec
-    except ImportError as error:
-        raise MissingExtraError("cryptography", EXTRA) from error
-    return x509, ec
-
-
-def _name(common_name: str) -> x509.Name:
-    x509, _ = _library()
-    if not 0 < len(common_name) <= MAX_COMMON_NAME:
-        raise SecurityError(
-            f"{common_name[:80]!r} cannot be the name in a certificate: give 1 to "
-            f"{MAX_COMMON_NAME} characters; shorter names of node and host help"
-        )
-    return x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, common_name)])
-
-
-def _common_name(name: x509.Name) -> str:
-    x509, _ = _library()
-    found = name.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
-    return str(found[0].value) if found else ""
-
-
 def _address(address: str) -> x509.GeneralName:
-    x509, _ = _library()
     try:
         return x509.IPAddress(ipaddress.ip_address(address.partition("%")[0]))
     except ValueError:
@@ -245,38 +191,43 @@ def _address(address: str) -> x509.GeneralName:
         raise SecurityError(f"{address!r} is no host name and no IP address") from error
 
 
-def _usage(*, sign_others: bool) -> x509.KeyUsage:
-    x509, _ = _library()
-    return x509.KeyUsage(
-        digital_signature=not sign_others,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        key_cert_sign=sign_others,
-        crl_sign=sign_others,
-        encipher_only=False,
-        decipher_only=False,
-    )
-
-
 def _builder(
-    subject: x509.Name,
-    issuer: x509.Name,
+    common_name: str,
+    issuer: x509.Name | None,
     public_key: ec.EllipticCurvePublicKey,
     now: dt.datetime,
     days: float,
 ) -> x509.CertificateBuilder:
-    x509, _ = _library()
+    """What every certificate has; without an `issuer` it is of an authority, its own issuer."""
+    if not 0 < len(common_name) <= MAX_COMMON_NAME:
+        raise SecurityError(
+            f"{common_name[:80]!r} cannot be the name in a certificate: give 1 to "
+            f"{MAX_COMMON_NAME} characters; shorter names of node and host help"
+        )
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+    signs, end = issuer is None, now + dt.timedelta(days=days)
+    usage = x509.KeyUsage(
+        digital_signature=not signs,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=signs,
+        crl_sign=signs,
+        encipher_only=False,
+        decipher_only=False,
+    )
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
-        .issuer_name(issuer)
+        .issuer_name(issuer or subject)
         .public_key(public_key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(min(now, now + dt.timedelta(days=days)) - BACKDATE)
-        .not_valid_after(now + dt.timedelta(days=days))
+        .not_valid_before(min(now, end) - BACKDATE)
+        .not_valid_after(end)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(public_key), critical=False)
+        .add_extension(x509.BasicConstraints(signs, 0 if signs else None), critical=True)
+        .add_extension(usage, critical=True)
     )
 
 
@@ -285,8 +236,6 @@ def _signed(
     key: ec.EllipticCurvePrivateKey,
     signer: ec.EllipticCurvePrivateKey,
 ) -> KeyPair:
-    from cryptography.hazmat.primitives import hashes, serialization
-
     certificate = builder.sign(signer, hashes.SHA256())
     return KeyPair(
         certificate.public_bytes(serialization.Encoding.PEM),
@@ -299,10 +248,6 @@ def _signed(
 
 
 def _load(pair: KeyPair) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    x509, _ = _library()
-    from cryptography.hazmat.primitives import serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-
     try:
         certificate = x509.load_pem_x509_certificate(pair.certificate)
         key = serialization.load_pem_private_key(pair.key, password=None)

@@ -127,8 +127,6 @@ def _host(host: HostProfile, secure: Callable[[Sequence[str]], list[str]]) -> di
         endpoints: Sequence[str] | None = getattr(host, name)
         if endpoints is not None:
             out[name] = secure(endpoints)
-    if host.pictures is not None:
-        out["pictures"] = host.pictures.model_dump()
     for name in ("cameras", "workers"):
         names = getattr(host, name)
         if names is not None:

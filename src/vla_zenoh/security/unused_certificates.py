@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.bridge import bridges
 from vla_zenoh.security.identity import identities
-from vla_zenoh.security.store import Entry
+
+if TYPE_CHECKING:
+    from vla_zenoh.security.lab_certificates import Entry
 
 
 def unused_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path, str]:

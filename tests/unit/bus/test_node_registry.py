@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from vla_zenoh.bus.node_registry import (
     MAX_OTHERS,
-    MAX_OTHERS_BYTES,
     MAX_STATUS_BYTES,
     NodeRegistry,
 )
@@ -95,7 +94,7 @@ def test_whatever_comes_no_more_is_kept_than_there_is_room_for(acts) -> None:
             getattr(here, act)(name)
     others = [found.pid for name, (found, _, _) in here.snapshot().items() if name not in OURS]
     assert len(others) <= MAX_OTHERS
-    assert sum(others) <= MAX_OTHERS_BYTES
+    assert all(size <= MAX_STATUS_BYTES for size in others)
     if any(
         act == "said" and name == "sim" and size <= MAX_STATUS_BYTES for act, name, size in acts
     ):

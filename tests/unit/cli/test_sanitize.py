@@ -237,7 +237,6 @@ PRINTS = {
     "cli/main.py": "the version",
     "cli/plain.py": "lines made printable there",
     "cli/nodes.py": "the profile's name, for a program that waits for it",
-    "cli/up.py": "a systemd unit as a file",
     "lab/cli/profile.py": "a profile as a file",
     "lab/cli/bridge_config.py": "a bridge's configuration as a file",
     "runtime/environments.py": "the packages of a model that is about to run here",

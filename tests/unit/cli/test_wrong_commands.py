@@ -94,8 +94,6 @@ WRONG: list[tuple[str, int, str]] = [
         "Invalid value for '--delay': must be at least 0 (given:",
     ),
     ("worker scripted --images png", USAGE, "Invalid value for '--images': 'png' is not one of"),
-    ("worker scripted --robots a/b", USAGE, "--robots: robot name 'a/b' cannot be part of a key"),
-    ("worker scripted --robots a,a", USAGE, "--robots names one twice: a,a"),
     (
         "worker scripted --python no-such-python",
         FAILED,

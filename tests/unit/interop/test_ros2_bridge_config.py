@@ -23,8 +23,8 @@ from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.security import authority as ca
 from vla_zenoh.security.bridge import bridge_locks, bridges
 from vla_zenoh.security.identity import Role
+from vla_zenoh.security.lab_certificates import LabCertificates
 from vla_zenoh.security.roles import Act
-from vla_zenoh.security.store import Store
 
 RUNNER = CliRunner()
 HOSTS = """\
@@ -272,7 +272,7 @@ def test_a_renewed_host_has_a_new_certificate_for_its_bridge(tmp_path: Path) -> 
     done = RUNNER.invoke(secure_app, ["add", "robot", "--profile", str(file), "--renew"])
     assert done.exit_code == 0, done.output
     assert pem.read_bytes() != before
-    entries = Store(tmp_path / "certificates").entries(dt.datetime.now(dt.UTC), "robot")
+    entries = LabCertificates(tmp_path / "certificates").entries(dt.datetime.now(dt.UTC), "robot")
     assert "bridge" in {entry.node for entry in entries if not entry.faults}
     (bridge,) = bridges(load_profile(str(file)))
     assert (bridge.role, bridge.common_name) == (Role.BRIDGE, "bridge@robot")

@@ -22,7 +22,7 @@ from vla_zenoh.runtime.certificate_expiry import (
     outlook,
 )
 from vla_zenoh.security.identity import Identity, Role
-from vla_zenoh.security.store import Store
+from vla_zenoh.security.lab_certificates import LabCertificates
 from vla_zenoh.types import NodeStatus
 
 NOW = dt.datetime(2026, 3, 1, 12, tzinfo=dt.UTC)
@@ -33,7 +33,7 @@ PATIENCE_S = 20.0
 @pytest.fixture
 def security(tmp_path: Path) -> SecurityProfile:
     """One certificate for 50 days, one for 40."""
-    store = Store(tmp_path)
+    store = LabCertificates(tmp_path)
     store.make_authority("test lab", NOW)
     store.add([Identity(Role.WORKER, "worker-a", HOST, worker="a")], NOW, days=50)
     store.add([Identity(Role.VIEWER, "viewer", HOST)], NOW, days=40)
@@ -90,7 +90,7 @@ def test_a_certificate_that_is_renewed_is_told_of_no_more(security: SecurityProf
     time.s = days(45)
     assert len(expiry.due()) == 2
     renewed = [Identity(Role.VIEWER, "viewer", HOST)]
-    Store(security.folder).add(renewed, time.now(), renew=True)
+    LabCertificates(security.folder).add(renewed, time.now(), renew=True)
     time.s += LOOK_PERIOD_S
     (left,) = expiry.due()
     assert "worker-a.pem" in left
@@ -99,7 +99,7 @@ def test_a_certificate_that_is_renewed_is_told_of_no_more(security: SecurityProf
 
 
 def test_a_computer_that_cannot_say_which_it_is_says_so_once(security: SecurityProfile) -> None:
-    Store(security.folder).add([Identity(Role.VIEWER, "viewer", "wall")], NOW)
+    LabCertificates(security.folder).add([Identity(Role.VIEWER, "viewer", "wall")], NOW)
     time = Time()
     expiry = CertificateExpiry(security.model_copy(update={"host": None}), time.monotonic, time.now)
     (said,) = expiry.due()
@@ -131,7 +131,7 @@ def secured(folder: str) -> Profile:
 
 
 def test_up_tells_of_certificates_while_its_nodes_run(tmp_path: Path) -> None:
-    store, now = Store(tmp_path), dt.datetime.now(dt.UTC)
+    store, now = LabCertificates(tmp_path), dt.datetime.now(dt.UTC)
     store.make_authority("test lab", now)
     store.add([Identity(Role.WORKER, "worker-scripted", HOST, worker="scripted")], now, days=5)
     store.add([Identity(Role.VIEWER, "viewer", HOST)], now - dt.timedelta(days=9), days=3)

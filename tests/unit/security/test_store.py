@@ -17,8 +17,8 @@ from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.security import authority as ca
 from vla_zenoh.security.identity import Identity, Role, operator_identities
+from vla_zenoh.security.lab_certificates import LabCertificates
 from vla_zenoh.security.secure_profile import moved_hosts, profile_text, with_operator
-from vla_zenoh.security.store import Store
 from vla_zenoh.security.unused_certificates import unused_certificates
 
 NOW = dt.datetime(2026, 3, 1, 12, tzinfo=dt.UTC)
@@ -33,8 +33,8 @@ def authority() -> ca.KeyPair:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    made = Store(tmp_path / "lab")
+def store(tmp_path: Path) -> LabCertificates:
+    made = LabCertificates(tmp_path / "lab")
     made.make_authority("test lab", NOW)
     return made
 
@@ -44,8 +44,9 @@ def test_a_certificate_says_whose_it_is_and_who_signed_it(authority: ca.KeyPair)
     made = ca.issue(authority, "worker-scripted@gpu", NOW)
     found = ca.read(made.certificate)
     assert found.common_name == "worker-scripted@gpu"
-    assert found.issuer == "test lab"
-    assert not found.authority
+    raw = x509.load_pem_x509_certificate(made.certificate)
+    assert raw.issuer.rfc4514_string() == "CN=test lab"
+    assert not raw.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
     assert found.days_left(NOW) == ca.CERTIFICATE_DAYS
     assert ca.signed_by(made.certificate, authority.certificate)
     assert ca.key_fits(made)
@@ -112,7 +113,7 @@ def test_what_is_no_certificate_is_refused() -> None:
 
 
 # -- the folder -------------------------------------------------------------------------------
-def test_private_keys_are_their_owners_alone(store: Store) -> None:
+def test_private_keys_are_their_owners_alone(store: LabCertificates) -> None:
     store.add([ROUTER, WORKER], NOW, addresses=["10.0.0.2"])
     keys = sorted(store.folder.rglob("*.key"))
     assert [path.name for path in keys] == ["ca.key", "worker-scripted.key", "router.key"]
@@ -121,7 +122,7 @@ def test_private_keys_are_their_owners_alone(store: Store) -> None:
         assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
 
 
-def test_nothing_is_overwritten_unless_asked_for(store: Store) -> None:
+def test_nothing_is_overwritten_unless_asked_for(store: LabCertificates) -> None:
     store.add([WORKER], NOW)
     files = store.files("gpu", "worker-scripted")
     before = files.certificate.read_bytes(), files.key.read_bytes()
@@ -137,15 +138,17 @@ def test_nothing_is_overwritten_unless_asked_for(store: Store) -> None:
     assert [entry.faults for entry in store.entries(NOW)] == [(), ()]
 
 
-def test_certificates_are_made_where_the_authority_is(store: Store, tmp_path: Path) -> None:
+def test_certificates_are_made_where_the_authority_is(
+    store: LabCertificates, tmp_path: Path
+) -> None:
     with pytest.raises(SecurityError, match="begin with `vla-zenoh secure init`"):
-        Store(tmp_path / "empty").add([WORKER], NOW)
+        LabCertificates(tmp_path / "empty").add([WORKER], NOW)
     (store.folder / "ca.key").unlink()
     with pytest.raises(SecurityError, match="made on the computer where"):
         store.add([WORKER], NOW)
 
 
-def test_a_key_that_others_can_read_is_not_used(store: Store) -> None:
+def test_a_key_that_others_can_read_is_not_used(store: LabCertificates) -> None:
     store.add([WORKER], NOW)
     key = store.files("gpu", "worker-scripted").key
     key.chmod(0o640)
@@ -154,14 +157,14 @@ def test_a_key_that_others_can_read_is_not_used(store: Store) -> None:
     assert any("chmod 600" in fault for entry in store.entries(NOW) for fault in entry.faults)
 
 
-def test_an_authority_whose_key_others_can_read_signs_nothing(store: Store) -> None:
+def test_an_authority_whose_key_others_can_read_signs_nothing(store: LabCertificates) -> None:
     (store.folder / "ca.key").chmod(0o644)
     with pytest.raises(SecurityError, match=r"ca\.key can be read by others \(mode 644\)"):
         store.add([WORKER], NOW)
     assert not store.has("gpu", "worker-scripted")
 
 
-def test_a_router_that_is_renewed_serves_where_it_served(store: Store) -> None:
+def test_a_router_that_is_renewed_serves_where_it_served(store: LabCertificates) -> None:
     store.add([ROUTER], NOW, addresses=["10.0.0.2"])
     store.add([ROUTER], NOW, addresses=["robot.lab"], renew=True)
     (entry,) = store.entries(NOW, "robot")
@@ -169,7 +172,7 @@ def test_a_router_that_is_renewed_serves_where_it_served(store: Store) -> None:
     assert sorted(entry.certificate.addresses) == ["10.0.0.2", "robot.lab"]
 
 
-def test_a_computer_knows_which_host_it_is_when_it_has_one_folder(store: Store) -> None:
+def test_a_computer_knows_which_host_it_is_when_it_has_one_folder(store: LabCertificates) -> None:
     with pytest.raises(SecurityError, match="has no certificates"):
         store.this_host(None)
     store.add([WORKER], NOW)
@@ -182,7 +185,9 @@ def test_a_computer_knows_which_host_it_is_when_it_has_one_folder(store: Store) 
         store.identity_files("robto", "router")
 
 
-def test_a_computer_with_certificates_of_several_hosts_notes_which_it_is(store: Store) -> None:
+def test_a_computer_with_certificates_of_several_hosts_notes_which_it_is(
+    store: LabCertificates,
+) -> None:
     store.add([WORKER, ROUTER], NOW)
     note = store.remember_host("robot")
     assert store.this_host(None) == "robot"
@@ -195,7 +200,7 @@ def test_a_computer_with_certificates_of_several_hosts_notes_which_it_is(store: 
     assert store.known_host() is None
 
 
-def test_people_are_the_operator_where_there_is_one_else_the_viewer(store: Store) -> None:
+def test_people_are_the_operator_where_there_is_one_else_the_viewer(store: LabCertificates) -> None:
     store.add([Identity(Role.VIEWER, "viewer", "desk")], NOW)
     assert store.identity_files("desk", None).certificate.name == "viewer.pem"
     store.add([Identity(Role.OPERATOR, "operator", "desk")], NOW)
@@ -205,7 +210,7 @@ def test_people_are_the_operator_where_there_is_one_else_the_viewer(store: Store
 
 
 def test_people_who_were_given_less_show_that_and_are_told_what_else_lies_there(
-    store: Store,
+    store: LabCertificates,
 ) -> None:
     store.add(
         [*operator_identities("desk", Role.OPERATOR), *operator_identities("desk", Role.VIEWER)],
@@ -225,7 +230,7 @@ def test_people_who_were_given_less_show_that_and_are_told_what_else_lies_there(
         store.identity_files("desk", None, {"desk": "viewer"})
 
 
-def test_what_is_wrong_with_each_file_is_told(store: Store) -> None:
+def test_what_is_wrong_with_each_file_is_told(store: LabCertificates) -> None:
     store.add([WORKER, ROUTER], NOW)
     good = store.files("gpu", "worker-scripted")
     bad = store.files("robot", "router")

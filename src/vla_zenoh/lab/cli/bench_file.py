@@ -14,7 +14,7 @@ from rich.console import RenderableType
 
 from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.cli.output import console, errors, print_json
-from vla_zenoh.cli.output_path import ForceOption, output_file
+from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 
 if TYPE_CHECKING:
     from vla_zenoh.runtime.launch import Host

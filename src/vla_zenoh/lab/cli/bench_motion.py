@@ -21,9 +21,9 @@ from vla_zenoh.cli.options import (
     options,
 )
 from vla_zenoh.cli.output import console, print_json, progress_bars
-from vla_zenoh.cli.output_path import ForceOption, output_folder
 from vla_zenoh.lab.bench.motion import PROTOCOL, STEPS, Conditions, MotionCase
 from vla_zenoh.lab.cli.bench_file import up_with_last_lines, write_json
+from vla_zenoh.lab.cli.output_path import ForceOption, output_folder
 from vla_zenoh.profile import Profile
 
 

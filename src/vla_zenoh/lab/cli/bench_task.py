@@ -23,13 +23,13 @@ from vla_zenoh.cli.options import (
     options,
 )
 from vla_zenoh.cli.output import console, new_table, print_json, progress_bars
-from vla_zenoh.cli.output_path import ForceOption, output_folder, require_free_folder
 from vla_zenoh.lab.bench.task import BASELINES, SCENE, TaskPlan, TaskScore
 from vla_zenoh.lab.cli.bench_file import (
     LAST_LINES,
     up_with_last_lines,
     write_json,
 )
+from vla_zenoh.lab.cli.output_path import ForceOption, output_folder, require_free_folder
 from vla_zenoh.lab.tasks import FAMILIES, LIMIT_S
 from vla_zenoh.policy.loader import find_model
 from vla_zenoh.profile import Profile, override

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from vla_zenoh.cli.options import JsonOption
-from vla_zenoh.cli.output_path import ForceOption
+from vla_zenoh.lab.cli.output_path import ForceOption
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from rich.progress import Progress
 
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import Screen, errors, progress_bars
-from vla_zenoh.cli.output_path import RUNS, output_folder
 from vla_zenoh.lab.cli.loopback import own_address
+from vla_zenoh.lab.cli.output_path import RUNS, output_folder
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.evaluation.plot_image import write_plot
 from vla_zenoh.lab.recording.film import Film, write_film

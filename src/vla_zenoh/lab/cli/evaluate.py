@@ -22,7 +22,7 @@ from vla_zenoh.cli.output import (
     print_json,
     progress_bars,
 )
-from vla_zenoh.cli.output_path import ForceOption, output_file
+from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.evaluation import tables
 from vla_zenoh.lab.evaluation.evaluate import CSV, EMPTY, combined, evaluate, recordings, to_mapping
 from vla_zenoh.lab.evaluation.result import STAGES, Evaluation

@@ -16,10 +16,10 @@ from rich.table import Table
 from vla_zenoh.bus.client import Client
 from vla_zenoh.cli.options import options
 from vla_zenoh.cli.output import console, errors, fail, new_table
-from vla_zenoh.cli.output_path import ForceOption, output_folder
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
+from vla_zenoh.lab.cli.output_path import ForceOption, output_folder
 from vla_zenoh.lab.inference_views import InferenceDebugSubscriber, InferenceView
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.runtime.process import stop_on_signals

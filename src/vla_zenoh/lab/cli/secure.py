@@ -15,9 +15,9 @@ from rich.text import Text
 from vla_zenoh.cli.addresses import is_own
 from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, ProfileOption
 from vla_zenoh.cli.output import console, errors, fail, new_table, print_json, styled
-from vla_zenoh.cli.output_path import ForceOption, output_file
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
+from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.cli.secure_copying import copy_commands
 from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.profile.session import DEFAULT_FOLDER
@@ -25,13 +25,13 @@ from vla_zenoh.resources import is_path
 from vla_zenoh.security.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
 from vla_zenoh.security.bridge import bridges
 from vla_zenoh.security.identity import PEOPLE, Role, identities, identities_of, operator_identities
+from vla_zenoh.security.lab_certificates import Entry, LabCertificates
 from vla_zenoh.security.secure_profile import (
     moved_hosts,
     profile_text,
     serving_addresses,
     with_operator,
 )
-from vla_zenoh.security.store import Entry, Store
 from vla_zenoh.security.unused_certificates import unused_certificates
 
 secure_app = typer.Typer(
@@ -80,7 +80,7 @@ def init(
     if plain.session.security is not None:
         fail(f"profile {plain.name} is already secured; `vla-zenoh secure add HOST` adds to it")
     file = output or Path(f"{plain.name}_secure.yaml")
-    store, now = Store(folder or DEFAULT_FOLDER), _now()
+    store, now = LabCertificates(folder or DEFAULT_FOLDER), _now()
     addresses = _router_addresses(at or ())
     endpoints = moved_hosts(plain, addresses)
     text = profile_text(plain, _extends(profile, file), store.folder.absolute(), endpoints)
@@ -114,7 +114,7 @@ def init(
 
 
 def _print_next(
-    written: Profile, file: Path, store: Store, made: Sequence[Path], here: str | None
+    written: Profile, file: Path, store: LabCertificates, made: Sequence[Path], here: str | None
 ) -> None:
     """Print the files that `init` made, and what to do with them."""
     out = console()
@@ -165,7 +165,7 @@ def add(
             chosen = [*(one for one in nodes if one.node not in names), *chosen]
     else:
         chosen = [*identities_of(loaded, host), *bridges(loaded, host)]
-    store = Store(security.folder)
+    store = LabCertificates(security.folder)
     made = store.add(
         chosen, _now(), days=days, addresses=serving_addresses(loaded, address or ()), renew=renew
     )
@@ -212,7 +212,7 @@ def here(
 ) -> None:
     """Note which host this computer is, where it has certificates of several."""
     security = load_profile(profile).session.security
-    store = Store(folder or (security.folder if security is not None else DEFAULT_FOLDER))
+    store = LabCertificates(folder or (security.folder if security is not None else DEFAULT_FOLDER))
     if host not in store.hosts():
         known = ", ".join(store.hosts()) or "none"
         fail(f"{store.folder} has no certificates of {host!r}; it has those of: {known}")
@@ -230,7 +230,7 @@ def show(
     """Show every certificate here: owner, validity, faults. Exits with 1 on a fault."""
     loaded = load_profile(profile)
     security = loaded.session.security
-    store = Store(folder or (security.folder if security is not None else DEFAULT_FOLDER))
+    store = LabCertificates(folder or (security.folder if security is not None else DEFAULT_FOLDER))
     now = _now()
     entries = store.entries(now)
     if security is not None and folder is None:

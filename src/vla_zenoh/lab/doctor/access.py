@@ -7,6 +7,7 @@ import re
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from vla_zenoh.errors import MissingExtraError, SecurityError, VlaZenohError
 from vla_zenoh.lab.doctor.finding import HostFinding
@@ -14,8 +15,10 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import is_loopback
 from vla_zenoh.security.bridge import NODE as BRIDGE
 from vla_zenoh.security.identity import Identity
-from vla_zenoh.security.store import Entry, Store
 from vla_zenoh.security.unused_certificates import unused_certificates
+
+if TYPE_CHECKING:
+    from vla_zenoh.security.lab_certificates import Entry
 
 SHOWN_FAULTS = 6
 SERVERS = ("router", BRIDGE)
@@ -59,7 +62,9 @@ def access(
         yield _without(profile)
         return
     try:
-        store = Store(security.folder)
+        from vla_zenoh.security.lab_certificates import LabCertificates
+
+        store = LabCertificates(security.folder)
         host = store.this_host(security.host)
         entries = store.entries(now, host)
     except (MissingExtraError, SecurityError) as error:

@@ -30,7 +30,6 @@ from vla_zenoh.profile.session import SecurityProfile
 from vla_zenoh.security.identity import Identity, Role, identities
 from vla_zenoh.security.roles import TABLE, Act, Right, expressions, rights
 from vla_zenoh.security.rules import EVERY_MESSAGE, access_control
-from vla_zenoh.security.store import Store
 
 Done = set[tuple[str, Act, str]]
 """(common name, act, key) of what went through."""
@@ -119,7 +118,9 @@ def _stage(
 ) -> Iterator[tuple[zenoh.Session, Sessions]]:
     """A router with `rules`, a witness, and a session for every identity."""
     with tempfile.TemporaryDirectory(prefix="vla-zenoh-rehearsal-") as folder, ExitStack() as stack:
-        store, now = Store(folder), dt.datetime.now(dt.UTC)
+        from vla_zenoh.security.lab_certificates import LabCertificates
+
+        store, now = LabCertificates(folder), dt.datetime.now(dt.UTC)
         store.make_authority("rehearsal", now)
         router = Identity(Role.ROUTER, "router", WITNESS.host)
         store.add([router, WITNESS, *lab], now, days=1, addresses=["127.0.0.1"])

@@ -7,7 +7,6 @@ Nothing is connected, and no weights are loaded.
 from __future__ import annotations
 
 import contextlib
-import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -323,9 +322,6 @@ def _router(profile: Profile, name: str, host: str | None) -> Iterator[_Found]:
     """The router of this host, and whether its own nodes find it."""
     part = profile.hosts.get(host or "")
     session = profile.session
-    if session.router == "zenohd" and shutil.which("zenohd") is None:
-        why = "is zenohd, and no such program is on PATH: install Zenoh's router, or write own"
-        yield _Found(("session", "router"), why, "router")
     if part is None or "router" not in part.nodes:
         return
     listen = session.listen if part.listen is None else part.listen

@@ -1,10 +1,10 @@
-"""Additional JPEG streams of one camera: in a model's input size, or reduced for one host."""
+"""Additional JPEG streams of one camera, each in the input size of a model."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import zenoh
 
@@ -12,7 +12,7 @@ from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Kind
 from vla_zenoh.policy import CameraSpec, ModelSpec
-from vla_zenoh.policy.observation import host_variant, prepare_image, size_variant
+from vla_zenoh.policy.observation import prepare_image, size_variant
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Event, Image
 
@@ -92,29 +92,18 @@ class RequestedSizes:
                 del self._specs[worker]
 
 
-@dataclass(frozen=True, slots=True)
-class FittedStream:
+class FittedStream(NamedTuple):
     """One JPEG stream.
 
     Args:
         stream: publishes it.
-        quality: of JPEG, 1 to 100.
         limiter: of its rate.
-        spec: images are prepared for this model input; None: they keep their size.
-        width: without a `spec`, wider images are scaled down to this.
+        spec: images are prepared for this model input.
     """
 
     stream: Publisher
-    quality: int
     limiter: RateLimiter
-    spec: CameraSpec | None = None
-    width: int | None = None
-
-    def encode(self, image: Image) -> bytes:
-        """JPEG file of an image in this stream's size."""
-        if self.spec is None:
-            return encode_jpeg(shrink(image, self.width), self.quality)
-        return encode_jpeg(Image(prepare_image(image, self.spec)), self.quality)
+    spec: CameraSpec
 
 
 def shrink(image: Image, max_width: int | None) -> Image:
@@ -146,21 +135,7 @@ class FittedStreams:
     ) -> None:
         self._camera, self._profile, self._node, self._emit = camera, profile, node, emit
         self._lock = threading.Lock()  # no image is published on a stream that is being removed
-        self._hosts = {
-            host: part.pictures
-            for host, part in node.profile.hosts.items()
-            if part.pictures is not None
-        }
-        self._of_hosts = [
-            FittedStream(
-                self._stream(host_variant(host)),
-                one.quality,
-                RateLimiter(one.rate_hz),
-                width=one.width,
-            )
-            for host, one in self._hosts.items()
-        ]
-        self._of_sizes: dict[str, list[FittedStream]] = {}
+        self._streams: dict[str, FittedStream] = {}
         self._left_out: frozenset[str] = frozenset()
 
     # -- called by the capture thread ---------------------------------------------------------
@@ -168,26 +143,25 @@ class FittedStreams:
     def has_subscribers(self) -> bool:
         """Whether any of the streams has a subscriber."""
         with self._lock:
-            return any(one.stream.has_subscribers for one in self._all())
+            return any(one.stream.has_subscribers for one in self._streams.values())
 
     def due(self, mono_ns: int) -> list[FittedStream]:
         """Streams that have a subscriber and are due for the image of this time."""
         with self._lock:
             return [
                 one
-                for one in self._all()
+                for one in self._streams.values()
                 if one.stream.has_subscribers and one.limiter.due(mono_ns)
             ]
 
     def publish(self, fitted: FittedStream, image: Image, stamp_wall_ns: int) -> None:
         """Publish an image on one of the streams, unless it was removed in the meantime."""
-        jpeg, encoding = fitted.encode(image), zenoh.Encoding.IMAGE_JPEG
+        jpeg = encode_jpeg(Image(prepare_image(image, fitted.spec)), self._profile.jpeg_quality)
         with self._lock:
-            if any(fitted is one for one in self._all()):
-                fitted.stream.publish(jpeg, stamp_wall_ns=stamp_wall_ns, encoding=encoding)
-
-    def _all(self) -> list[FittedStream]:
-        return [*self._of_hosts, *(one for some in self._of_sizes.values() for one in some)]
+            if any(fitted is one for one in self._streams.values()):
+                fitted.stream.publish(
+                    jpeg, stamp_wall_ns=stamp_wall_ns, encoding=zenoh.Encoding.IMAGE_JPEG
+                )
 
     # -- called by the thread that receives specs ---------------------------------------------
     def serve(self, requested: Mapping[str, CameraSpec]) -> None:
@@ -199,37 +173,35 @@ class FittedStreams:
         Args:
             requested: variant name -> spec of the camera, see `RequestedSizes.sizes`.
         """
-        missing = [name for name in requested if name not in self._of_sizes]
+        missing = [name for name in requested if name not in self._streams]
         with self._lock:
             unrequested = {
-                name: any(one.stream.has_subscribers for one in streams)
-                for name, streams in self._of_sizes.items()
+                name: one.stream.has_subscribers
+                for name, one in self._streams.items()
                 if name not in requested
             }
         ended = [name for name, subscribed in unrequested.items() if not subscribed]
-        short = len(self._of_sizes) - len(ended) + len(missing) - MAX_SIZES
+        short = len(self._streams) - len(ended) + len(missing) - MAX_SIZES
         ended += [name for name, subscribed in unrequested.items() if subscribed][: max(short, 0)]
         for name in ended:
             self._remove(name)
-        room = MAX_SIZES - len(self._of_sizes)
+        room = MAX_SIZES - len(self._streams)
         for name in missing[:room]:
             self._add(name, requested[name])
         self._report_left_out(missing[room:])
 
     def _add(self, name: str, spec: CameraSpec) -> None:
-        rgb, ours = spec.model_copy(update={"colour": "rgb"}), self._profile
-        limiter = RateLimiter(ours.jpeg_rate_hz)
-        streams = [FittedStream(self._stream(name), ours.jpeg_quality, limiter, rgb)]
-        for host, one in self._hosts.items():
-            stream = self._stream(host_variant(host, name))
-            streams.append(FittedStream(stream, one.quality, RateLimiter(one.rate_hz), rgb))
+        stream = self._node.declare_publisher(
+            self._node.keys.camera_fitted(self._camera, name), Kind.FRAME
+        )
+        limiter = RateLimiter(self._profile.jpeg_rate_hz)
+        fitted = FittedStream(stream, limiter, spec.model_copy(update={"colour": "rgb"}))
         with self._lock:
-            self._of_sizes[name] = streams
+            self._streams[name] = fitted
 
     def _remove(self, name: str) -> None:
         with self._lock:
-            for one in self._of_sizes.pop(name):
-                self._node.undeclare(one.stream)
+            self._node.undeclare(self._streams.pop(name).stream)
         why = f"images are no longer published as {name}: no live model requests this size"
         self._emit(Event("info", "notice", f"{self._camera}:size_given_back", why))
 
@@ -241,8 +213,3 @@ class FittedStreams:
                 f"{', '.join(left_out)} receive the common stream"
             )
             self._emit(Event("warning", "notice", f"{self._camera}:too_many_sizes", why[:1000]))
-
-    def _stream(self, variant: str) -> Publisher:
-        return self._node.declare_publisher(
-            self._node.keys.camera_fitted(self._camera, variant), Kind.FRAME
-        )

@@ -11,7 +11,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.keys import Kind
 from vla_zenoh.policy import CameraSpec
-from vla_zenoh.policy.observation import host_variant, size_variant
+from vla_zenoh.policy.observation import size_variant
 from vla_zenoh.types import Event
 from vla_zenoh.types.stream import SingleWriterFilter
 
@@ -112,31 +112,26 @@ class CameraSubscriber:
 
 
 def subscribe_to_camera(
-    camera: CameraSpec, node: Node, *, jpeg: bool, host: str | None, changed: threading.Condition
+    camera: CameraSpec, node: Node, *, jpeg: bool, changed: threading.Condition
 ) -> CameraSubscriber:
-    """Subscribe to the stream that suits a model: raw, JPEG, or fitted to model and host.
+    """Subscribe to the stream that suits a model: raw, JPEG, or JPEG in its input size.
 
     Args:
         camera: of the model's spec.
         node: of the worker.
         jpeg: JPEG rather than raw images.
-        host: of the profile, on which this runs; it may have streams of its own.
         changed: notified when an image arrives.
 
     Raises:
         SessionError: the router does not answer at the port for images.
     """
     keys, name = node.keys, camera.camera
-    settings, part = node.profile.cameras.get(name), node.profile.hosts.get(host or "")
-    key, fallback, rates_hz = keys.camera_raw(name), None, [settings.rate_hz if settings else None]
-    if jpeg:
-        key = keys.camera_jpeg(name)
-        size = size_variant(camera) if settings is not None and settings.fit_for_workers else None
-        rates_hz.append(settings.jpeg_rate_hz if settings else None)
-        if host is not None and part is not None and part.pictures is not None:
-            key, rates_hz[1] = keys.camera_fitted(name, host_variant(host)), part.pictures.rate_hz
-            size = None if size is None else host_variant(host, size)
+    settings = node.profile.cameras.get(name)
+    key, fallback = keys.camera_jpeg(name) if jpeg else keys.camera_raw(name), None
+    if jpeg and settings is not None and settings.fit_for_workers:
+        size = size_variant(camera)
         if size is not None:
             key, fallback = keys.camera_fitted(name, size), key
+    rates_hz = (settings.rate_hz, settings.jpeg_rate_hz if jpeg else None) if settings else ()
     patience_s = max([PATIENCE_S, *(PERIODS / rate for rate in rates_hz if rate)])
     return CameraSubscriber(node, name, key, fallback, patience_s=patience_s, changed=changed)

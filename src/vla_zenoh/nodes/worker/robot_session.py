@@ -90,7 +90,7 @@ class RobotSession:
         self._tasks = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
         self._jpeg = images == "jpeg"
         self._cameras = {
-            one.camera: subscribe_to_camera(one, node, jpeg=self._jpeg, host=host, changed=changed)
+            one.camera: subscribe_to_camera(one, node, jpeg=self._jpeg, changed=changed)
             for one in self.spec.observation.cameras
         }
         state_keys = {

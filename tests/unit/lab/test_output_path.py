@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from vla_zenoh.cli.output_path import check_folder, output_file, output_folder
 from vla_zenoh.errors import OutputError
+from vla_zenoh.lab.cli.output_path import check_folder, output_file, output_folder
 
 Captured = pytest.CaptureFixture[str]
 Opened = AbstractContextManager[Path]
