@@ -26,7 +26,6 @@ from vla_zenoh.simulation.appearance import (
     check_variations,
     draw_appearance,
 )
-from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
 from vla_zenoh.simulation.objects import draw_places, footprint_m, objects_of
 from vla_zenoh.simulation.render import Backend, Renderer, why_no_opengl
 from vla_zenoh.simulation.robot_model import RobotModel
@@ -111,7 +110,6 @@ def world(vary: list[str] | None = None, seed: int | None = None) -> World:
         SCENE,
         RobotModel(),
         home_rad=HOME_RAD,
-        gains=ImpedanceGains.stiff(),
         seed=seed,
         vary=vary or (),
     )
