@@ -215,7 +215,7 @@ class HostProfile(Section):
         workers: that it runs; None: all.
     """
 
-    nodes: Annotated[tuple[NodeKind, ...], Field(strict=False, min_length=1), Distinct]
+    nodes: Annotated[tuple[NodeKind, ...], Field(strict=False), Distinct]
     connect: Endpoints | None = None
     listen: Endpoints | None = None
     link: Endpoints | None = None
