@@ -46,7 +46,7 @@ class Backoff:
         self.failures, self._next_s = 0, 0.0
 
 
-MAX_TIMEOUT_S = 60.0
+MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.01, 60.0
 ANSWERED = ("peer_error", "peer_reply")
 """Reasons of a server that is alive, and is retried soon."""
 
@@ -91,10 +91,10 @@ class Adapter(ABC):
         clock_s: Callable[[], float],
         normalisation: str | None = None,
     ) -> None:
-        self.where, self.timeout_s = where, number("timeout_s", timeout_s, least=0.01)
-        if self.timeout_s > MAX_TIMEOUT_S:
+        self.where, self.timeout_s = where, number("timeout_s", timeout_s)
+        if not MIN_TIMEOUT_S <= self.timeout_s <= MAX_TIMEOUT_S:
             raise SpecError(
-                f"timeout_s is {timeout_s!r}, wanted 0.01 to {MAX_TIMEOUT_S:g}: "
+                f"timeout_s is {timeout_s!r}, wanted {MIN_TIMEOUT_S:g} to {MAX_TIMEOUT_S:g}: "
                 "a late answer is useless"
             )
         self._profile = load_profile(profile)
