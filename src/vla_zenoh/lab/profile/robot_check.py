@@ -116,7 +116,7 @@ def simulator(profile: Profile, name: str, host: str | None) -> Iterator[Profile
     if profile.robot.driver != "sim" or not running & ({"sim", "camera"} if simulated else {"sim"}):
         return
     try:
-        from vla_zenoh.simulation.appearance import AppearanceSwitcher, draw_appearance
+        from vla_zenoh.simulation.appearance import AppearanceSwitcher
         from vla_zenoh.simulation.scene import scene_file
         from vla_zenoh.simulation.world import build_world
     except ImportError as error:
@@ -142,7 +142,7 @@ def simulator(profile: Profile, name: str, host: str | None) -> Iterator[Profile
             yield ProfileFault(("sim",), str(error))
         return
     try:
-        AppearanceSwitcher(world.model).apply(draw_appearance(0, profile.sim.vary))
+        AppearanceSwitcher(world.model).apply(0, profile.sim.vary)
     except ResourceError as error:
         yield ProfileFault(("sim", "vary"), str(error))
     known = [world.model.camera(index).name for index in range(world.model.ncam)]
