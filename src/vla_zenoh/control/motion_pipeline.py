@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -411,7 +412,7 @@ class MotionPipeline:
 
         A shifted goal lies between bounded goals.
         """
-        cut = Goal(pose, goal.width_m, slowdown=goal.slowdown)
+        cut = replace(goal, pose=pose, joints_rad=None)
         if len(plans) == 1:
             plans[0].shift_rest(plans[0].index_at(now_ns), cut, self._limits)
             return cut
