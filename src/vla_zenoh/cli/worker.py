@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from typing import Annotated, Literal
 
 import typer
@@ -42,6 +43,8 @@ def worker(
     run_in_own_environment(chosen.model, model_options.python)
     policy = make_policy(chosen.model, chosen.options, profile=node.profile)
     form = _image_form(profile, host) if images == "auto" else images
+    if sys.stdout.isatty():
+        print(f"worker {chosen.name} of robot {profile.robot.name} runs; Ctrl-C ends it")
     run_node(
         profile,
         lambda session, stop: WorkerNode(
