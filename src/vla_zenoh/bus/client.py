@@ -255,10 +255,8 @@ class Client:
         self.release_deadman()
         holder = f"{what}-{secrets.token_hex(4)}"
         self._token = self.session.liveliness().declare_token(self.keys.holding(holder))
-        text, give_up_s = (
-            encode_deadman_activation(holder).decode(),
-            time.monotonic() + HOLD_PATIENCE_S,
-        )
+        text = encode_deadman_activation(holder).decode()
+        give_up_s = time.monotonic() + HOLD_PATIENCE_S
         while True:
             try:
                 return self._activate(text, timeout_s)

@@ -276,12 +276,11 @@ class Node:
                 self.counters[f"refused.{found.reason}"] += found.times - 1
                 self.reject(found.reason, f"{key}: {found.why}", key)
 
-    def on_alive(self, callback: Callable[[str, bool], None]) -> None:
-        """Call back with (node, alive) now and at every change, on Zenoh's thread."""
-        self.on_tokens(self.keys.all_alive, callback)
-
     def on_tokens(self, expression: str, callback: Callable[[str, bool], None]) -> None:
-        """Call back with (last part of the key, alive) for every liveliness token."""
+        """Call back with (last part of the key, alive) for every liveliness token.
+
+        Now and at every change, on Zenoh's thread.
+        """
 
         def change(sample: zenoh.Sample) -> None:
             callback(last_chunk(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
@@ -331,7 +330,7 @@ class Node:
         """
         key = str(arrival.sample.key_expr)
         try:
-            header = header or self.header(arrival)
+            header = header or header_of(arrival.sample)
             if writer_filter is not None:  # first: a flood by another source must cost little
                 writer_filter.check(header, arrival.mono_ns)
             record = records.decode(kind, bytes_of(arrival.sample.payload))
@@ -343,15 +342,6 @@ class Node:
             writer_filter.accept(header, arrival.mono_ns)
         self.traffic.received(key, header, arrival.nth)
         return Stamped(here, record, self.arrival_wall_ns(arrival))
-
-    @staticmethod
-    def header(arrival: ReceivedSample) -> Header:
-        """Header of a sample.
-
-        Raises:
-            CodecError: there is none that can be decoded.
-        """
-        return header_of(arrival.sample)
 
     def decode_text(
         self, decode: Callable[[bytes], Record], arrival: ReceivedSample

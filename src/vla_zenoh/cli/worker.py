@@ -26,10 +26,6 @@ def worker(
     name: Annotated[
         str | None, typer.Option("--name", help="Name in its keys; default: the model's name.")
     ] = None,
-    images: Annotated[
-        Literal["auto", "raw", "jpeg"],
-        typer.Option(help="Images to subscribe to; auto: raw where the cameras are on this host."),
-    ] = "auto",
     delay_ms: Annotated[
         float, typer.Option("--delay", min=0, help="Milliseconds added to every inference.")
     ] = 0.0,
@@ -41,7 +37,6 @@ def worker(
     # Returns only where this environment has what the model's header asks for.
     run_in_own_environment(chosen.model, model_options.python)
     policy = make_policy(chosen.model, chosen.options, profile=node.profile)
-    form = _image_form(profile, host) if images == "auto" else images
     run_node(
         profile,
         lambda session, stop: WorkerNode(
@@ -49,7 +44,7 @@ def worker(
             session,
             policy,
             chosen.name,
-            images=form,
+            images=_image_form(profile, host),
             host=host,
             delay_s=delay_ms / 1e3,
             robots=profile.serves.get(chosen.name, ()),
