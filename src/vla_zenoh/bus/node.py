@@ -11,15 +11,7 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.buffers import (
-    CallbackRing,
-    LatestSample,
-    ReceivedSample,
-    SampleBuffer,
-    ZenohRing,
-    bytes_of,
-    header_of,
-)
+from vla_zenoh.bus.buffers import ReceivedSample, SampleBuffer, bytes_of, header_of
 from vla_zenoh.bus.clock import Clock, own_host_id
 from vla_zenoh.bus.clock_sync import ClockSync, reply_with_stamps
 from vla_zenoh.bus.metrics import EventThrottle, Traffic
@@ -36,7 +28,7 @@ STATUS_PERIOD_S = 0.5
 IMAGE_LINK_TIMEOUT_S = 10.0
 
 Record = TypeVar("Record")
-AnyBuffer = TypeVar("AnyBuffer", LatestSample, CallbackRing, ZenohRing)
+AnyBuffer = TypeVar("AnyBuffer", bound=SampleBuffer)
 
 
 class Publisher:
@@ -245,15 +237,8 @@ class Node:
         Raises:
             SessionError: the router does not answer at the port for images.
         """
-        session = self._session_for(kind)
         self.watch_buffer(buffer)
-        if isinstance(buffer, ZenohRing):
-            subscriber = session.declare_subscriber(key, buffer.channel())
-            buffer.receive_from(subscriber.try_recv)
-        else:
-            handler = zenoh.handlers.Callback(buffer, indirect=False)
-            subscriber = session.declare_subscriber(key, handler)
-        self._subscribers.append((buffer, subscriber))
+        self._subscribers.append((buffer, buffer.subscribe(self._session_for(kind), key)))
         return buffer
 
     def unsubscribe(self, buffer: SampleBuffer) -> None:

@@ -12,11 +12,11 @@ from typing import Annotated, Literal
 import typer
 from rich.text import Text
 
-from vla_zenoh.cli.addresses import is_own
 from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, ProfileOption
 from vla_zenoh.cli.output import console, errors, fail, new_table, print_json, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
+from vla_zenoh.lab.cli.addresses import is_own
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.cli.secure_copying import copy_commands
 from vla_zenoh.profile import Profile, load_profile, profile_file

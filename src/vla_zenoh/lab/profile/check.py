@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vla_zenoh import resources
-from vla_zenoh.cli.options import overridden
+from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.errors import (
     MissingExtraError,
     ProfileError,
@@ -80,7 +80,7 @@ def check_profile(
     """
     try:
         loaded, lines = load_with_lines(name)
-        profile = overridden(loaded, connect, listen)
+        profile = effective_profile(loaded, connect, listen)
     except ProfileError as error:
         return ProfileReport(str(error).splitlines(), [])
     if host is None and len(profile.hosts) == 1:
