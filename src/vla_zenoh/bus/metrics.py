@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -158,10 +158,6 @@ class Traffic:
             found = {str(link.dst) for one in self._sessions for link in one.info.links()}
             self._links = sorted(found)[:MAX_LINKS]
         return self._links
-
-    def detail(self, streams: Iterable[Sender]) -> Mapping[str, Any]:
-        """Traffic for the status: sent, lost, links."""
-        return {"sent": self.sent(streams), "lost": self.lost(), "links": self.links()}
 
 
 PERIOD_S = 0.25

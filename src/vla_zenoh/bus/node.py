@@ -183,11 +183,7 @@ class Node:
         self._status_s, self._last_state = time.monotonic(), state
         self._status.publish(
             NodeStatus(
-                self.name,
-                state,
-                self.host_id.host,
-                os.getpid(),
-                self.started_wall_ns,
+                *(self.name, state, self.host_id.host, os.getpid(), self.started_wall_ns),
                 ages_s or {},
                 rates_hz or {},
                 latency_ms or {},
@@ -206,11 +202,11 @@ class Node:
         return due or state != self._last_state
 
     def _traffic_detail(self) -> dict[str, Any]:
+        short, traffic = self.keys.short, self.traffic
         return {
-            name: {self.keys.short(key): value for key, value in part.items()}
-            if isinstance(part, Mapping)
-            else part
-            for name, part in self.traffic.detail(self._publishers).items()
+            "sent": {short(key): rates for key, rates in traffic.sent(self._publishers).items()},
+            "lost": {short(key): count for key, count in traffic.lost().items()},
+            "links": traffic.links(),
         }
 
     def _clock_detail(self) -> dict[str, dict[str, float]]:
