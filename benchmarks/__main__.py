@@ -11,6 +11,7 @@ from benchmarks.codec.cli import codec
 from benchmarks.load.cli import load
 from benchmarks.openvla import openvla
 from benchmarks.stop import stop
+from benchmarks.thesis.cli import thesis
 from vla_zenoh.cli.output import complain
 from vla_zenoh.errors import VlaZenohError
 
@@ -20,7 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for command in (chain, codec, load, openvla, stop):
+for command in (chain, codec, load, openvla, stop, thesis):
     app.command()(command)
 
 if __name__ == "__main__":

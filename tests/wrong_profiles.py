@@ -189,7 +189,10 @@ WRONG: list[tuple[str, str]] = [
     ("cameras: {front: {source: 'ros2:/a'}}", "is 'ros2:/a', which needs a section ros2"),
     ("cameras: {'a/b': {source: 'sim:x'}}", "cameras.a/b: name 'a/b' cannot be part of a key"),
     ("hosts: {}", "lab.yaml:2: hosts: is empty: name at least one host and its nodes"),
-    ("hosts: {a: {nodes: []}}", "lab.yaml:2: hosts.a.nodes: has 0 entries, wants at least 1"),
+    (
+        "hosts: {a: {nodes: []}}",
+        "lab.yaml:2: hosts.a.nodes: is empty: give the host a node, or remove it",
+    ),
     ("hosts: {a: {}}", "lab.yaml:2: hosts.a.nodes: is missing"),
     (
         "hosts:\n  a:\n    nodes: [router, camer]",

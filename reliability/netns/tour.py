@@ -13,9 +13,8 @@ from chain import READY_PATIENCE_S
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.lab.demo.runner import DemoRunner
+from vla_zenoh.lab.demo.runner import MotionRunner
 from vla_zenoh.lab.demo.segments import tour
-from vla_zenoh.lab.recording.stream_listener import StreamListener
 from vla_zenoh.profile import load_profile
 
 RATE_HZ = 10.0
@@ -25,13 +24,11 @@ def main(name: str) -> None:
     profile = load_profile(name)
     with open_session(profile.session, wait_s=READY_PATIENCE_S) as session:
         client = Client(profile, session).subscribe()
-        listener = StreamListener(session, profile.keys, profile.task.worker, keep=4096)
-        run = DemoRunner(client, listener, threading.Event(), lambda: None, lambda *_: None)
-        try:
-            result = run.run(tour(), RATE_HZ, None)
-        finally:
-            listener.close()
-    print(json.dumps([outcome.to_dict() for outcome in result.outcomes]))
+        run = MotionRunner(client, threading.Event())
+        run.begin(RATE_HZ)
+        outcomes = [run.run_segment(segment, RATE_HZ) for segment in tour()]
+        client.deactivate()
+    print(json.dumps([outcome.to_dict() for outcome in outcomes]))
 
 
 if __name__ == "__main__":

@@ -348,6 +348,8 @@ def worker_node(worker: str) -> str:
 
 CRASHED, STARTING = "crashed", "starting"
 """States in the status that `vla-zenoh up` publishes for a node of its host that does not run."""
+ON_BEHALF = "up-"
+"""How the source of such a status begins."""
 
 
 class NodeTraits(NamedTuple):

@@ -19,6 +19,7 @@ from vla_zenoh.runtime.supervisor import GIVE_UP_AFTER
 
 GIVE_UP_S = 120.0
 REASON = "FileNotFoundError: weights.pt not found"
+DEVICE = "/dev/video97"
 NOISE = ("nanobind", "leaked", ".rs:", "cargo")
 MODEL = """\
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, ObservationSpec
@@ -40,7 +41,7 @@ class Model:
 
 
 class Lab(NamedTuple):
-    """A running `up` whose worker `bad` cannot load its weights."""
+    """A running `up`: worker `bad` cannot load its weights, camera `wrist` is not plugged in."""
 
     profile: Path
     running: Up
@@ -59,7 +60,9 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     folder = tmp_path_factory.mktemp("lab")
     (folder / "bad.py").write_text(MODEL)
     more = "workers: [scripted, bad]\nmodels: {bad: ./bad.py}\n"
+    more += "options: {scripted: {camera: wrist}}\n"
     path = write_profile(folder, more=more)
+    path.write_text(path.read_text().replace("wrist: null", f"wrist: {{source: 'v4l2:{DEVICE}'}}"))
     running = Up(str(path), "--log-dir", str(folder / "log"))
     try:
         with client_of(path) as (client, _):
@@ -68,6 +71,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     finally:
         running.end(signal.SIGTERM)
         running.thread.join(5.0)
+        assert running.process.stdout is not None
+        running.process.stdout.close()
 
 
 def test_a_second_up_says_who_runs_and_starts_nothing(lab: Lab) -> None:
@@ -124,11 +129,25 @@ def test_status_has_a_row_for_a_node_that_is_not_there(lab: Lab) -> None:
     until("it is back", lambda: "camera" in lab.client.alive, READY_PATIENCE_S)
 
 
+def test_a_camera_that_is_not_plugged_in_is_named_in_status_and_by_activate(lab: Lab) -> None:
+    why = f"there is no {DEVICE}; cameras here: "
+    until("the camera node", lambda: "camera" in lab.client.alive, READY_PATIENCE_S)
+    assert lab.status()["nodes"]["camera"]["state"] == "degraded"
+    (row,) = (line for line in lab.run("status", "--once").stdout.splitlines() if why in line)
+    assert row.split()[:2] == ["camera", "degraded"]
+    assert f"camera 'wrist': {why}" in row
+
+    refused = lab.run("activate")
+    assert refused.returncode == 1
+    assert f"camera 'wrist' has sent no image yet: {why}" in refused.stderr
+
+
 def test_sim_stands_in_front_of_what_moves(lab: Lab) -> None:
     assert lab.status()["mode"] == "sim"
     assert "SIM |" in lab.running.text
     shown = lab.run("status", "--once").stdout
-    assert "SIM robot panda" in shown
+    assert "SIM robot panda: a simulated robot moves" in shown
+    assert shown.count("a simulated robot moves") == 1
     assert "SIM inactive" in shown
 
 

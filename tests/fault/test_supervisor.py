@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -271,6 +272,19 @@ def test_a_router_that_runs_already_is_used_and_left_running(tmp_path: Path) -> 
         assert took_s < END_S + BUSY_S
         assert running.children() == {}
         open_session(profile.session).close()
+
+
+def test_with_json_every_line_is_an_object_that_says_when_and_which_node(tmp_path: Path) -> None:
+    path = write_profile(tmp_path, more="hosts: {here: {nodes: [router]}}\n")
+    with up(str(path), "--json", "--log-dir", str(tmp_path)) as running:
+        until("the router", lambda: "ready: router" in running.text, READY_PATIENCE_S)
+        running.end(signal.SIGTERM)
+        running.thread.join(5.0)
+    told = [json.loads(line) for line in running.lines]
+    assert all(set(each) == {"time_s", "node", "from", "text"} for each in told)
+    assert {each["node"] for each in told} == {"up", "router"}
+    assert all(abs(each["time_s"] - time.time()) < READY_PATIENCE_S for each in told)
+    assert told[-1]["text"] == "all nodes have ended"
 
 
 MODEL = """

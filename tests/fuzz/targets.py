@@ -34,7 +34,6 @@ from vla_zenoh.keys import Keys
 from vla_zenoh.lab.cli import inspect as cli_inspect
 from vla_zenoh.lab.cli import keys as cli_keys
 from vla_zenoh.lab.cli import net as cli_net
-from vla_zenoh.lab.evaluation.csv_file import evaluate_csv
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.inference_views import InferenceView
 from vla_zenoh.lab.recording.record_json import record_from_json, record_to_json
@@ -267,10 +266,6 @@ def _recording() -> list[bytes]:
     return [_in_file(".mcap", write, b"")]
 
 
-_CSV = b"""t_client_start,t_publish,t_vla_in,t_vla_out,success,error,x,y,z,qx,qy,qz,gw,prompt
-1,5,2,4,True,,0.1,0.2,0.3,0,0,0,0.08,up
-6,9,7,8,False,late,0.1,0.2,0.4,0,0,0,0.08,up
-"""
 _PROFILE = b"""extends: panda_sim
 cameras:
   front: {source: "sim:front", width: 64, height: 48}
@@ -410,7 +405,6 @@ def _targets() -> Iterator[Target]:
         )
     own = (VlaZenohError,)
     yield Target("recording", partial(_in_file, ".mcap", evaluate_run), own, _recording)
-    yield Target("csv", partial(_in_file, ".csv", evaluate_csv), own, lambda: [_CSV])
     yield Target(
         "profile",
         partial(_in_file, ".yaml", lambda path: load_profile(str(path))),

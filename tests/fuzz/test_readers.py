@@ -20,7 +20,7 @@ PATIENCE_S = 10.0
 """For one input. A reader that follows a bomb would be at it for minutes."""
 MEMORY_LIMIT_BYTES = 3 * 1024**3
 """Of address space, most of it libraries."""
-SLOW = frozenset({"recording", "replay", "profile", "csv"})
+SLOW = frozenset({"recording", "replay", "profile"})
 """They read a file each time."""
 EXAMPLES, SLOW_EXAMPLES = 15, 4
 SUPPRESSED = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much]

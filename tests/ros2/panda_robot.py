@@ -49,7 +49,6 @@ from ros_messages import (
 from ros_node import RosNode
 
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.world import STEP_NS, World
@@ -190,7 +189,6 @@ def build_world(profile: Profile) -> World:
         profile.sim.scene,
         robot_model(profile),
         home_rad=profile.robot.home_rad,
-        gains=ImpedanceGains.stiff(),
         joint_friction_nm=profile.sim.joint_friction_nm,
         seed=profile.sim.seed,
     )

@@ -25,7 +25,7 @@ def make_world(
         SCENE,
         RobotModel(),
         home_rad=HOME_RAD,
-        gains=gains or ImpedanceGains.stiff(),
+        gains=gains,
         joint_friction_nm=friction_nm,
         seed=seed,
     )

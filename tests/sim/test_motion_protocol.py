@@ -48,7 +48,6 @@ def test_rows_come_in_the_order_they_were_asked_for() -> None:
         [NAMES["open gripper"], NAMES["close gripper"]],
         [Conditions(10.0), Conditions(5.0)],
         threading.Event(),
-        lambda _: None,
     )
     assert [(row["prompt"], row["rate_hz"]) for row in rows] == [
         ("open gripper", 10.0),
@@ -79,7 +78,6 @@ def test_a_process_that_is_killed_ends_the_bench_with_a_word() -> None:
         [NAMES["go up"]],
         [Conditions(1.0)],
         threading.Event(),
-        lambda _: None,
         processes=1,
     )
     with pytest.raises(NodeError, match="was killed"):
@@ -88,7 +86,7 @@ def test_a_process_that_is_killed_ends_the_bench_with_a_word() -> None:
 
 
 def test_who_stops_it_does_not_wait_for_the_end_of_a_row() -> None:
-    stop, ended = threading.Event(), []
+    stop = threading.Event()
 
     def stop_soon() -> None:
         begun()
@@ -96,9 +94,7 @@ def test_who_stops_it_does_not_wait_for_the_end_of_a_row() -> None:
 
     stopper = threading.Thread(target=stop_soon)
     stopper.start()
-    rows = run_in_lockstep(
-        load_profile("panda_sim"), [NAMES["go up"]], [Conditions(1.0)], stop, ended.append
-    )
-    assert list(rows) == ended == []
+    rows = run_in_lockstep(load_profile("panda_sim"), [NAMES["go up"]], [Conditions(1.0)], stop)
+    assert list(rows) == []
     assert multiprocessing.active_children() == []
     stopper.join()

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from access_rehearsal import surprises
 from camera_rig import camera_rig, free_endpoint, grey, until
 
 from vla_zenoh.bus.buffers import LatestSample
@@ -220,6 +221,7 @@ def lab() -> Profile:
 
 def test_every_role_does_its_part_and_nothing_else_with_real_sessions(lab: Profile) -> None:
     verdicts = check_access(lab)
+    assert not any(surprises(lab).values())
     assert {one.identity.node for one in verdicts} == {
         "sim",
         "camera",
@@ -251,6 +253,7 @@ def test_a_rule_that_lets_a_viewer_delete_is_named(lab: Profile) -> None:
     for policy in rules["policies"]:
         if policy["subjects"] == ["viewer@wall"]:
             policy["rules"].append("too much")
+    assert surprises(lab, rules)["viewer@wall"] == [("can", Act.DELETE, reset)]
     faults = {one.identity.node: one.faults for one in check_access(lab, rules)}
     assert faults.pop("viewer") == (
         f"viewer@wall can delete {reset} and must not: rule 'too much' allows it",
@@ -269,6 +272,7 @@ def test_everybody_of_every_robot_of_a_router_tries_the_keys_of_all(lab: Profile
         },
     )
     verdicts = check_access(lab, also=[other])
+    assert not any(surprises(lab, also=[other]).values())
     named = {one.identity.common_name: one for one in verdicts}
     assert {"viewer@wall", "operator@wall", "sim@here"} <= set(named)
     assert [fault for one in verdicts for fault in one.faults] == []
@@ -294,6 +298,9 @@ def test_a_missing_rule_and_one_too_much_are_named(lab: Profile) -> None:
             rule["key_exprs"].append(lab.keys.camera_jpeg("front"))
     faults = {one.identity.node: one.faults for one in check_access(lab, rules)}
     key = lab.keys.delta("scripted")
+    found = surprises(lab, rules)
+    assert ("cannot", Act.PUT, key) in found["worker-scripted@here"]
+    assert found["viewer@wall"] == [("can", Act.SUBSCRIBE, lab.keys.camera_jpeg("front"))]
     assert (
         f"worker-scripted@here cannot {Act.PUT.value} {key}: no rule allows egress "
         f"declare_subscriber {key}"

@@ -200,7 +200,7 @@ def process(*words: str, profile: Path, **more: Any) -> Iterator[subprocess.Pope
 
 
 def test_a_replay_onto_a_live_robot_is_refused(run_file: Path, chain: Chain) -> None:
-    with pytest.raises(NodeError, match=r"robot 'panda' is alive \(command, sim\).*--as NAME"):
+    with pytest.raises(NodeError, match=r"robot 'panda' is alive \(command, sim\).*--robot NAME"):
         Replay(chain.profile, chain.session, open_recording(run_file))
 
 

@@ -16,6 +16,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.control.preflight import PeerSnapshot
+from vla_zenoh.keys import ON_BEHALF, STARTING
 from vla_zenoh.nodes.command.peer_monitor import MAX_WORKERS, PeerMonitor
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import Header, NodeStatus
@@ -147,6 +148,19 @@ def test_a_worker_among_many_who_complain_says_when_it_is_well_again(scene: Scen
     assert len(scene.peers.worker_complaints) == MAX_WORKERS
     for node in others:
         node.close()
+
+
+def test_up_that_still_takes_a_living_node_for_a_starting_one_is_not_heard_in_its_place(
+    scene: Scene,
+) -> None:
+    up = NodeStatus("camera", STARTING, "robot", 1, 1)
+    header = records.encode_header(Header(time.time_ns(), 1, f"{ON_BEHALF}camera#1"))
+    key = scene.camera.keys.status("camera")
+    for _ in range(AT_ONCE):
+        scene.camera.session.put(key, records.encode(up), attachment=header)
+    scene.says(scene.camera, 3.0)
+    until("the camera's own word", lambda: scene.look().camera_nodes == {"front": "camera"})
+    assert scene.refused("foreign_status") == 0
 
 
 def test_no_picture_is_younger_than_now(scene: Scene) -> None:

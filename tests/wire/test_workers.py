@@ -253,7 +253,7 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
         keys = {json.loads(line)["key"].rsplit("/", 1)[-1] for line in said.stdout.splitlines()}
         assert keys == {"scripted", "riser"}
         shown = command_line("status", "--once", profile=chain.profile_file).stdout
-        assert "moves the arm" in shown
+        assert "in control" in shown
         assert "shadow mode" in shown
 
 

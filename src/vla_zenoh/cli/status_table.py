@@ -21,7 +21,7 @@ from vla_zenoh.cli.node_rows import (
     node_rows,
 )
 from vla_zenoh.cli.output import console, new_table, styled
-from vla_zenoh.sanitize import one_line
+from vla_zenoh.sanitize import one_line, printable
 from vla_zenoh.types import Event, Header, NodeStatus
 
 if TYPE_CHECKING:
@@ -93,14 +93,12 @@ def render(
         alive: nodes that have a liveliness token.
     """
     mode, sentence, style = MODE_WORDS[mode_of(nodes)]
-    table = new_table(
-        *("node", "state", "age", "rate", "rejected", "message"), title=f"{mode} robot {robot}"
-    )
+    title = Text.assemble((mode, style), printable(f" robot {robot}: {sentence}"))
+    columns = ("node", "state", "age", "rate", "rejected", "message")
+    table = new_table(*columns, title=title, title_style="")
     for row in node_rows(nodes, expected or {}, alive):
         table.add_row(*_cells(row, mode))
     above = [_line(*each) for each in _warnings(nodes, insecure=insecure, left_out=left_out)]
-    if nodes:
-        above.append(Text.assemble((f" {mode} ", style), f" {sentence}"))
     below = [_line(f"limit acting now: {limit}", "yellow") for limit in acting_limits(nodes)]
     for host, missing in hosts_down(nodes, expected or {}, alive).items():
         text = f"host {host} does not run ({', '.join(missing)}): `vla-zenoh up` there starts it"
@@ -193,7 +191,7 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
         return _cell(bad, MAX_WORDS)
     text = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
     if not text and "obeyed" in detail:
-        return f"{mode} moves the arm" if detail["obeyed"] else "shadow mode"
+        return f"{mode}: in control" if detail["obeyed"] else "shadow mode"
     certificates = _fields(detail.get("certificates"))
     days, unknown = certificates.get("days"), certificates.get("unknown")
     if not text and isinstance(days, (int, float)):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import logging.handlers
 import os
 import subprocess
 import sys
 import threading
+import time
 import zlib
 from pathlib import Path
 from typing import Annotated
@@ -20,6 +22,7 @@ from vla_zenoh.cli.options import (
     AlsoOption,
     ConnectOption,
     HostOption,
+    JsonOption,
     ListenOption,
     effective_profile,
 )
@@ -57,6 +60,7 @@ def up(
             "--log-dir", help="Folder of the log file. Default: ~/.local/state/vla-zenoh."
         ),
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Start and supervise all nodes of this host. Ctrl-C brakes the arm, then ends them.
 
@@ -75,6 +79,11 @@ def up(
     lock = threading.Lock()
 
     def show(node: str, line: str, style: str = "") -> None:
+        if as_json:
+            said = {"time_s": time.time(), "node": node, "from": "up" if style else "node"}
+            with lock:
+                print(json.dumps({**said, "text": line}), flush=True)
+            return
         name = styled(f"{node:>16}", COLOURS[zlib.crc32(node.encode()) % len(COLOURS)])
         with lock:
             out.print(name, styled(line, style), sep=" | ", soft_wrap=True)

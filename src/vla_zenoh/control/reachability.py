@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from vla_zenoh.control.barriers import Barriers, Margins
 from vla_zenoh.control.limits import LEAST, SLOWEST, LimitHit, Slowdown, full_speed_s
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.ik import Approach, IkSettings, InverseKinematics, pose_error
+from vla_zenoh.kinematics.ik import TOLERANCE_M, Approach, InverseKinematics, pose_error
 from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, orthonormal
 from vla_zenoh.profile import Limits, Profile
@@ -115,10 +115,12 @@ class ReachabilityFilter:
         self.kinematics = kinematics
         self._limits = limits = limits or Limits()
         self._free_elbow = free_elbow
-        settings = IkSettings(
-            joint_margin_rad=limits.reach.joint_margin_rad, max_iterations=SOLVER_ITERATIONS
+        self._solver = InverseKinematics(
+            kinematics,
+            posture_rad,
+            joint_margin_rad=limits.reach.joint_margin_rad,
+            max_iterations=SOLVER_ITERATIONS,
         )
-        self._solver = InverseKinematics(kinematics, posture_rad, settings)
         self._follow_posture = posture_rad is None
         most = kinematics.velocity_rad_s
         self._velocity_rad_s = most if velocity_rad_s is None else np.minimum(velocity_rad_s, most)
@@ -318,8 +320,7 @@ class ReachabilityFilter:
         return LimitHit("joint_limit", value, bound, where=self.kinematics.arm_joints[joint])
 
     def _out_of_reach(self, found: Approach) -> LimitHit:
-        tolerance = self._solver.settings.position_tolerance_m
-        return LimitHit("reach", found.error_m + found.error_rad, tolerance)
+        return LimitHit("reach", found.error_m + found.error_rad, TOLERANCE_M)
 
     def _late(self, start: _Configuration, end: _Configuration, dt_s: float) -> Slowdown | None:
         """The slowdown of a step whose joints need longer than `dt_s`, None where they do not."""

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -30,31 +29,16 @@ from vla_zenoh.types import FloatArray
 _IDENTITY_6 = np.eye(6)
 HOLDING = 2
 """Iterations that a round costs in which joints are put on their bounds."""
-
-
-@dataclass(frozen=True, slots=True)
-class IkSettings:
-    """How well and how hard to solve.
-
-    Args:
-        position_tolerance_m: a solution is at most this far off.
-        rotation_tolerance_rad: the same for rotation.
-        joint_margin_rad: kept from both ends of every joint's range.
-        posture_gain: part of the way to the posture taken in a first iteration, 0 to 1.
-        max_posture_step_rad: and at most this far: a posture is drifted to, not leapt at.
-        damping_bias: W of an error of zero.
-        max_iterations: after which there is no solution.
-        max_joint_step_rad: of one iteration: a far pose is approached, not leapt at.
-    """
-
-    position_tolerance_m: float = 1e-6
-    rotation_tolerance_rad: float = 1e-6
-    joint_margin_rad: float = 0.05
-    posture_gain: float = 0.1
-    max_posture_step_rad: float = 0.01
-    damping_bias: float = 1e-9
-    max_iterations: int = 40
-    max_joint_step_rad: float = 0.5
+TOLERANCE_M, TOLERANCE_RAD = 1e-6, 1e-6
+"""A solution is at most this far off."""
+POSTURE_GAIN = 0.1
+"""Part of the way to the posture taken in a first iteration."""
+MAX_POSTURE_STEP_RAD = 0.01
+"""At most this far: a posture is drifted to, not leapt at."""
+DAMPING_BIAS = 1e-9
+"""W of an error of zero."""
+MAX_JOINT_STEP_RAD = 0.5
+"""Of one iteration: a far pose is approached, not leapt at."""
 
 
 class Approach(NamedTuple):
@@ -93,7 +77,8 @@ class InverseKinematics:
     Args:
         kinematics: of the arm.
         posture_rad: (n,) where a redundant arm prefers to be; None: the middle of its ranges.
-        settings: see `IkSettings`.
+        joint_margin_rad: kept from both ends of every joint's range.
+        max_iterations: after which there is no solution.
 
     Raises:
         RecordError: the margin leaves a joint no range, or the posture has the wrong size.
@@ -103,17 +88,16 @@ class InverseKinematics:
         self,
         kinematics: Kinematics,
         posture_rad: ArrayLike | None = None,
-        settings: IkSettings | None = None,
+        *,
+        joint_margin_rad: float = 0.05,
+        max_iterations: int = 40,
     ) -> None:
-        self.kinematics = kinematics
-        self.settings = settings or IkSettings()
-        self.lower_rad = kinematics.lower_rad + self.settings.joint_margin_rad
-        self.upper_rad = kinematics.upper_rad - self.settings.joint_margin_rad
+        self.kinematics, self._max_iterations = kinematics, max_iterations
+        self.lower_rad = kinematics.lower_rad + joint_margin_rad
+        self.upper_rad = kinematics.upper_rad - joint_margin_rad
         if np.any(self.lower_rad >= self.upper_rad):
             name = kinematics.arm_joints[int(np.argmin(self.upper_rad - self.lower_rad))]
-            raise RecordError(
-                f"joint_margin_rad {self.settings.joint_margin_rad:g} leaves {name!r} no range"
-            )
+            raise RecordError(f"joint_margin_rad {joint_margin_rad:g} leaves {name!r} no range")
         middle = 0.5 * (self.lower_rad + self.upper_rad)
         self.posture_rad = middle if posture_rad is None else np.array(posture_rad, dtype=float)
         if self.posture_rad.shape != (kinematics.size,):
@@ -140,32 +124,28 @@ class InverseKinematics:
             bounded: keep every joint within its bounds, by the other joints' taking over. Without,
                 the joints go where pose and posture alone put them.
         """
-        settings = self.settings
         lower, upper = self.bounds(start_rad)
         joints = wanted = start_rad
         last, stalls, effort = math.inf, 0, 0
-        for iteration in range(settings.max_iterations + 1):
+        for iteration in range(self._max_iterations + 1):
             here, jacobian = self.kinematics.pose_and_jacobian(joints)
             error = pose_error(pose, here)
             x, y, z, rx, ry, rz = error.tolist()
             error_m, error_rad = math.hypot(x, y, z), math.hypot(rx, ry, rz)
             squared = error_m * error_m + error_rad * error_rad
-            solved = (
-                error_m <= settings.position_tolerance_m
-                and error_rad <= settings.rotation_tolerance_rad
-            )
+            solved = error_m <= TOLERANCE_M and error_rad <= TOLERANCE_RAD
             # At a bound or out of reach the error shrinks by ever less: three rounds are proof.
             stalls = stalls + 1 if squared > 0.8 * last and iteration > 2 else 0
-            if solved or stalls == 3 or iteration == settings.max_iterations:
+            if solved or stalls == 3 or iteration == self._max_iterations:
                 effort += iteration
                 return Approach(joints, error_m, error_rad, solved, wanted, jacobian, effort)
             last = squared
             # After the first iteration the pose has the last word.
             drift = self._drift(joints) if iteration == 0 else None
-            step = self._step(error, jacobian, drift, 0.5 * squared + settings.damping_bias)
+            step = self._step(error, jacobian, drift, 0.5 * squared + DAMPING_BIAS)
             largest = max(map(abs, step.tolist()))
-            if largest > settings.max_joint_step_rad:
-                step *= settings.max_joint_step_rad / largest
+            if largest > MAX_JOINT_STEP_RAD:
+                step *= MAX_JOINT_STEP_RAD / largest
             wanted = joints + step
             if bounded:
                 joints, rounds = self._inside(
@@ -182,10 +162,10 @@ class InverseKinematics:
 
     def _drift(self, joints: FloatArray) -> FloatArray:
         """(n,) the step towards the posture."""
-        drift = self.settings.posture_gain * (self.posture_rad - joints)
+        drift = POSTURE_GAIN * (self.posture_rad - joints)
         farthest = max(map(abs, drift.tolist()))
-        if farthest > self.settings.max_posture_step_rad:
-            drift *= self.settings.max_posture_step_rad / farthest
+        if farthest > MAX_POSTURE_STEP_RAD:
+            drift *= MAX_POSTURE_STEP_RAD / farthest
         return drift
 
     @staticmethod
@@ -226,7 +206,7 @@ class InverseKinematics:
                 return np.clip(wanted, lower, upper), rounds
             onto = np.where(held, np.clip(wanted, lower, upper) - joints, 0.0)
             free = np.where(held, 0.0, jacobian)
-            damping = 0.5 * squared + self.settings.damping_bias + 1e-6
+            damping = 0.5 * squared + DAMPING_BIAS + 1e-6
             aside = None if drift is None else np.where(held, 0.0, drift)
             step = onto + self._step(error - jacobian @ onto, free, aside, damping)
         raise AssertionError("there are no more joints to hold")

@@ -168,14 +168,6 @@ def smallest_singular_value(jacobian: FloatArray) -> float:
     return math.sqrt(max(float(np.linalg.eigvalsh(squared)[0]), 0.0))
 
 
-def manipulability(jacobian: FloatArray) -> float:
-    """``sqrt(det(J J^T))``: volume of the ellipsoid of TCP velocities; 0 when singular.
-
-    Source: Yoshikawa, "Manipulability of robotic mechanisms", Int. J. Robotics Research, 1985.
-    """
-    return math.sqrt(max(float(np.linalg.det(jacobian @ jacobian.T)), 0.0))
-
-
 def _locked(
     model: Any,
     urdf: Path,

@@ -143,19 +143,20 @@ def _coefficients(squared: float) -> tuple[float, float, float, float]:
     )
 
 
-def body_rates(
+def spatial_rates(
     rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Angular velocity and acceleration of ``R = exp3(r(t))`` in the body frame.
+    """Angular velocity and acceleration of ``exp3(r(t)) R0`` in the fixed axes.
 
-    With the right Jacobian ``Jr(r) = I - B [r] + C [r]^2``, ``B = (1 - cos t)/t^2``,
+    With the left Jacobian ``Jl(r) = I + B [r] + C [r]^2``, ``B = (1 - cos t)/t^2``,
     ``C = (t - sin t)/t^3``, ``t = |r|``::
 
-        w     = Jr r'
-        alpha = Jr r'' + Jr' r'
-        Jr'r' = -B' [r]r' + C' [r][r]r' + C [r'][r]r'
+        w     = Jl r'
+        alpha = Jl r'' + Jl' r'
+        Jl'r' = B' [r]r' + C' [r][r]r' + C [r'][r]r'
 
-    Closed form, because finite differences of Jr show as spikes in the jerk.
+    Closed form, because finite differences of Jl show as spikes in the jerk; written out, because
+    it runs in every tick.
 
     Args:
         rotvec: r, rad, (3,).
@@ -163,34 +164,9 @@ def body_rates(
         rate_change: r'', (3,).
 
     Returns:
-        w (rad/s) and alpha (rad/s^2), both (3,), in the axes of R.
+        w (rad/s) and alpha (rad/s^2), both (3,).
 
-    Source: Sola, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 143, differentiated.
-    """
-    b, c, db_over_angle, dc_over_angle = _coefficients(float(rotvec @ rotvec))
-    cross = pin.skew(rotvec)
-    along = float(rotvec @ rate)
-    r_rate = cross @ rate
-    r_r_rate = cross @ r_rate
-    r_change = cross @ rate_change
-    velocity = rate - b * r_rate + c * r_r_rate
-    acceleration = (
-        rate_change
-        - b * r_change
-        + c * (cross @ r_change)
-        - db_over_angle * along * r_rate
-        + dc_over_angle * along * r_r_rate
-        + c * (pin.skew(rate) @ r_rate)
-    )
-    return velocity, acceleration
-
-
-def spatial_rates(
-    rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Angular velocity and acceleration of ``exp3(r(t)) R0`` in the fixed axes: see `body_rates`.
-
-    With ``Jl(r) = Jr(-r) = I + B [r] + C [r]^2``, written out: it runs in every tick of a guard.
+    Source: Sola, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 145, differentiated.
     """
     r, r1, r2 = rotvec.tolist(), rate.tolist(), rate_change.tolist()
     squared = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
@@ -206,6 +182,17 @@ def spatial_rates(
         r2[i] + b * s[i] + b_rate * p[i] + c_rate * q[i] + c * (t[i] + u[i]) for i in range(3)
     ]
     return np.array(velocity), np.array(acceleration)
+
+
+def body_rates(
+    rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Angular velocity and acceleration of ``exp3(r(t))`` in its own axes: see `spatial_rates`.
+
+    The right Jacobian is ``Jr(r) = Jl(-r)``.
+    """
+    velocity, acceleration = spatial_rates(-rotvec, -rate, -rate_change)
+    return -velocity, -acceleration
 
 
 def rates_of(

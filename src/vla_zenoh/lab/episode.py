@@ -1,7 +1,7 @@
 """An episode: a prompt that the arm follows until something ends it.
 
-`EpisodeRunner` does with a running robot what every episode needs. What an episode is judged by is
-up to its subclasses: measured poses (`vla_zenoh.lab.demo.runner`), the objects of the simulator
+`EpisodeRunner` does with a running robot what every episode needs. What judges an episode is up to
+its users: measured poses (`vla_zenoh.lab.demo.runner`), the objects of the simulator
 (`vla_zenoh.lab.bench.task_runner`), a person (`vla_zenoh.lab.trial.runner`).
 """
 
@@ -15,9 +15,17 @@ from typing import Literal
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.errors import NodeError, SessionError
+from vla_zenoh.keys import worker_node
+from vla_zenoh.lab.newest_records import NewestRecords
 from vla_zenoh.types import Task
 
 COMMAND, SIM = "command", "sim"
+READY_PATIENCE_S = 60.0
+LOAD_PATIENCE_S = 600.0
+"""While the worker reports that it loads; it may be building its environment."""
+SETTLE_PATIENCE_S = 5.0
+"""For cameras and worker to have data; then activation names what is missing."""
+UNSETTLED = {"waiting", "degraded"}
 ACTIVATE_PATIENCE_S, ACTIVATE_PERIOD_S = 15.0, 0.2
 RESET_PATIENCE_S, RESET_PERIOD_S = 8.0, 1.0
 POLL_S, WATCH_S = 0.03, 0.1
@@ -38,6 +46,7 @@ class EpisodeView:
         why: its reason for that state.
         done: the policy reports its end, and the arm is at rest.
         chunks: accepted so far.
+        steps: that came into force so far.
         holds: times the command node braked for want of a chunk.
         deactivated: a client deactivated the arm.
         recording: what is wrong with the recording, empty: nothing.
@@ -49,6 +58,7 @@ class EpisodeView:
     why: str = ""
     done: bool = False
     chunks: int = 0
+    steps: int = 0
     holds: int = 0
     deactivated: bool = False
     recording: str = ""
@@ -92,6 +102,34 @@ class EpisodeRunner:
         self.client, self._stop, self._watch = client, stop, watch
         self._task: Task | None = None
         self._holds, self._deactivated = 0, False
+
+    def wait_until_ready(self, worker: str, streams: NewestRecords) -> None:
+        """Wait until the worker has loaded its model and all nodes have data.
+
+        Args:
+            worker: its name.
+            streams: of each of which there has to be a record.
+
+        Raises:
+            NodeError: the nodes do not come up in time; with the state of each.
+            Interrupted: Ctrl-C.
+        """
+        began_s = time.monotonic()
+        while True:
+            status = self.client.status(worker_node(worker))
+            loading = status is None or status.detail.get("complaint") == "loading"
+            missing = streams.missing()
+            waited_s = time.monotonic() - began_s
+            settled = waited_s > SETTLE_PATIENCE_S or self._settled()
+            up = settled and self.client.status(COMMAND) is not None
+            if up and not (missing or loading):
+                return
+            if waited_s > (READY_PATIENCE_S if missing or not loading else LOAD_PATIENCE_S):
+                lacking = f"; not received: {', '.join(missing)}" if missing else ""
+                raise NodeError(
+                    f"the nodes did not come up in {waited_s:.0f} s{lacking}; {self._states()}"
+                )
+            self.pause(0.1)
 
     def reset_simulator(self, seed: int | None = None) -> None:
         """Reset the simulator; it refuses while it still follows the end of a command stream.
@@ -147,8 +185,17 @@ class EpisodeRunner:
         self._task = client.activate_with_deadman(holder) if holder else client.activate()
         return self._task
 
+    def prompt(self, text: str) -> Task:
+        """Publish another prompt while the arm is active; from here on `view` is about it.
+
+        Raises:
+            SessionError: it was rejected.
+        """
+        self._task = self.client.set_prompt(text)
+        return self._task
+
     def view(self) -> EpisodeView:
-        """State of the episode that was activated last."""
+        """State of the episode that was activated or prompted last."""
         for node, _, event in self.client.pop_events():
             if node == COMMAND and event.kind == "transition":
                 if event.what == "active->holding":
@@ -167,6 +214,7 @@ class EpisodeRunner:
             why=str(detail.get("why", "")) if ours else _changed(started, task),
             done=bool(current and detail.get("policy_done") and detail.get("at_rest")),
             chunks=int(detail.get("accepted_chunks", 0)) if current else 0,
+            steps=int(detail.get("accepted_steps", 0)) if current else 0,
             holds=self._holds,
             deactivated=self._deactivated,
         )
@@ -199,6 +247,10 @@ class EpisodeRunner:
                 raise Interrupted
             if left_s <= WATCH_S:
                 return
+
+    def _settled(self) -> bool:
+        states = {found[0].state for found in self.client.snapshot().values()}
+        return states.isdisjoint(UNSETTLED)
 
     def _resets(self) -> int:
         status = self.client.status(SIM)

@@ -100,6 +100,11 @@ class RotationLimits(Section):
     jerk_rad_s3: float = Field(default=60.0, gt=0, le=12500)
 
 
+def _values(section: Section, *pairs: tuple[str, str]) -> list[tuple[str, Any, str, Any]]:
+    """Each pair of fields with their values, as (name, value, name, value)."""
+    return [(a, getattr(section, a), b, getattr(section, b)) for a, b in pairs]
+
+
 class ReachLimits(Section):
     """Limits of goals by the arm's kinematics; see `vla_zenoh.control.reachability`.
 
@@ -131,20 +136,11 @@ class ReachLimits(Section):
         reject(
             [
                 ((stop,), f"is {at:g}, which must not be above {slow} ({before:g})")
-                for slow, before, stop, at in (
-                    (
-                        "singularity_slow",
-                        self.singularity_slow,
-                        "singularity_stop",
-                        self.singularity_stop,
-                    ),
-                    (
-                        "collision_slow_m",
-                        self.collision_slow_m,
-                        "collision_stop_m",
-                        self.collision_stop_m,
-                    ),
-                    ("table_slow_m", self.table_slow_m, "table_stop_m", self.table_stop_m),
+                for slow, before, stop, at in _values(
+                    self,
+                    ("singularity_slow", "singularity_stop"),
+                    ("collision_slow_m", "collision_stop_m"),
+                    ("table_slow_m", "table_stop_m"),
                 )
                 if at > before
             ]
@@ -182,10 +178,11 @@ class ContactLimits(Section):
         reject(
             [
                 ((slow,), f"is {before}, which must be below {stop} ({at})")
-                for slow, before, stop, at in (
-                    ("force_slow_n", self.force_slow_n, "force_stop_n", self.force_stop_n),
-                    ("torque_slow_nm", self.torque_slow_nm, "torque_stop_nm", self.torque_stop_nm),
-                    ("effort_slow_nm", self.effort_slow_nm, "effort_stop_nm", self.effort_stop_nm),
+                for slow, before, stop, at in _values(
+                    self,
+                    ("force_slow_n", "force_stop_n"),
+                    ("torque_slow_nm", "torque_stop_nm"),
+                    ("effort_slow_nm", "effort_stop_nm"),
                 )
                 if before is not None and (at is None or before >= at)
             ]
@@ -240,9 +237,8 @@ class Limits(Section):
         reject(
             [
                 ((step,), f"is {value:g}, longer than the leash {lead} ({limit:g})")
-                for step, value, lead, limit in (
-                    ("step_m", self.step_m, "lead_m", self.lead_m),
-                    ("step_rad", self.step_rad, "lead_rad", self.lead_rad),
+                for step, value, lead, limit in _values(
+                    self, ("step_m", "lead_m"), ("step_rad", "lead_rad")
                 )
                 if value > limit
             ]

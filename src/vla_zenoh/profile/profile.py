@@ -276,6 +276,13 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
     runs: dict[tuple[str, str], list[str]] = defaultdict(list)
     for name, host in profile.hosts.items():
         place = ("hosts", name)
+        if not host.nodes:
+            yield (
+                (*place, "nodes"),
+                "is empty: give the host a node, or remove it. A computer that only drives or "
+                f"watches is no host: `vla-zenoh secure add {name} --role operator` (or viewer) "
+                "gives it a certificate",
+            )
         yield from _unknown((*place, "cameras"), host.cameras or (), "cameras", profile.cameras)
         yield from _unknown((*place, "workers"), host.workers or (), "workers", profile.workers)
         for kind in ("sim", "arm"):

@@ -169,7 +169,6 @@ class SimProfile(Section):
 
     Args:
         scene: folder under sim/.
-        gains: preset of the impedance controller.
         joint_friction_nm: Coulomb friction in every arm joint.
         seed: of the first placement of the objects.
         vary: what else a seed randomizes beside the placement; the scene has to support it.
@@ -177,7 +176,6 @@ class SimProfile(Section):
     """
 
     scene: Word = "table"
-    gains: Literal["stiff", "compliant"] = "stiff"
     joint_friction_nm: float = Field(default=0.0, ge=0, le=10)
     seed: int = Field(default=0, ge=0)
     vary: Annotated[
@@ -185,7 +183,7 @@ class SimProfile(Section):
         Field(strict=False),
         Distinct,
     ] = ()
-    renderer: Literal["auto", "egl", "osmesa", "raycast"] = "auto"
+    renderer: Literal["auto", "egl", "raycast"] = "auto"
 
 
 class TaskProfile(Section):
@@ -217,7 +215,7 @@ class HostProfile(Section):
         workers: that it runs; None: all.
     """
 
-    nodes: Annotated[tuple[NodeKind, ...], Field(strict=False, min_length=1), Distinct]
+    nodes: Annotated[tuple[NodeKind, ...], Field(strict=False), Distinct]
     connect: Endpoints | None = None
     listen: Endpoints | None = None
     link: Endpoints | None = None

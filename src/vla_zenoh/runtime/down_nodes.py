@@ -18,7 +18,7 @@ from vla_zenoh.bus.clock import Clock, own_host_id
 from vla_zenoh.bus.node import Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import VlaZenohError
-from vla_zenoh.keys import CRASHED, STARTING, Kind
+from vla_zenoh.keys import CRASHED, ON_BEHALF, STARTING, Kind
 from vla_zenoh.profile import Profile
 from vla_zenoh.runtime.supervisor import DownNode
 from vla_zenoh.types import Event, NodeStatus
@@ -85,7 +85,7 @@ class _Voice:
         self, profile: Profile, name: str, session: zenoh.Session, own: zenoh.Session | None
     ) -> None:
         keys, clock, used = profile.keys, Clock(), own or session
-        source = f"up-{name}#{secrets.token_hex(4)}"
+        source = f"{ON_BEHALF}{name}#{secrets.token_hex(4)}"
         self._own, self._since_wall_ns, self._crashes = own, time.time_ns(), 0
         self._status = Publisher(used, keys.status(name), Kind.TELEMETRY, source, clock)
         self._event = Publisher(used, keys.event(name), Kind.TELEMETRY, source, clock)

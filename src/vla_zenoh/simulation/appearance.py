@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -30,9 +30,8 @@ _STREAM = 0x100C
 """Second seed of the random generator: appearance and places of objects are independent."""
 
 
-@dataclass(frozen=True, slots=True)
-class Appearance:
-    """Differences from the scene file; None: as in the file.
+class Appearance(NamedTuple):
+    """Differences from the scene file, of which a reset applies those that are varied.
 
     Args:
         ambient: (3,) ambient colour of the head light.
@@ -40,26 +39,31 @@ class Appearance:
         key: (3,) diffuse colour of the scene's light.
         key_turn_rad: rotation vector (3,) of the direction of that light, world frame.
         table: (3,) colour of the table.
-        shift_m: (3,) offset of the front camera, world frame.
-        turn_rad: (3,) rotation vector of the front camera, world frame.
+        shift_m: (3,) offset of the front camera, world frame, at most 3 cm.
+        turn_rad: (3,) rotation vector of the front camera, world frame, at most 5 degrees.
     """
 
-    ambient: FloatArray | None = None
-    head: FloatArray | None = None
-    key: FloatArray | None = None
-    key_turn_rad: FloatArray | None = None
-    table: FloatArray | None = None
-    shift_m: FloatArray | None = None
-    turn_rad: FloatArray | None = None
+    ambient: FloatArray
+    head: FloatArray
+    key: FloatArray
+    key_turn_rad: FloatArray
+    table: FloatArray
+    shift_m: FloatArray
+    turn_rad: FloatArray
 
 
-def draw_appearance(seed: int, vary: Collection[str]) -> Appearance:
-    """The appearance of `seed`; each part is the same whatever else is varied.
+def draw_appearance(seed: int) -> Appearance:
+    """The appearance of a reset with `seed`; offsets and rotations are uniform in a ball."""
+    random = np.random.default_rng((_STREAM, seed))
+    ambient, head, key = (_tinted(random, *bounds) for bounds in (AMBIENT, HEAD, KEY))
+    key_turn_rad = _in_ball(random, MAX_LIGHT_TURN_RAD)
+    table = random.uniform(*TABLE_BRIGHTNESS) * (1.0 - TABLE_SATURATION * random.uniform(size=3))
+    shift_m, turn_rad = _in_ball(random, MAX_SHIFT_M), _in_ball(random, MAX_TURN_RAD)
+    return Appearance(ambient, head, key, key_turn_rad, table, shift_m, turn_rad)
 
-    Args:
-        seed: of the reset.
-        vary: names of `VARIATIONS`; ``camera`` shifts by at most 3 cm and rotates by at most 5
-            degrees, each uniform in a ball.
+
+def check_variations(vary: Collection[str]) -> None:
+    """Make sure that everything in `vary` is one of `VARIATIONS`.
 
     Raises:
         ResourceError: an unknown name.
@@ -67,18 +71,6 @@ def draw_appearance(seed: int, vary: Collection[str]) -> Appearance:
     unknown = sorted(set(vary) - set(VARIATIONS))
     if unknown:
         raise ResourceError(f"nothing called {unknown[0]!r} to vary; {', '.join(VARIATIONS)}")
-    random = np.random.default_rng((_STREAM, seed))
-    ambient, head, key = (_tinted(random, *bounds) for bounds in (AMBIENT, HEAD, KEY))
-    key_turn_rad = _in_ball(random, MAX_LIGHT_TURN_RAD)
-    table = random.uniform(*TABLE_BRIGHTNESS) * (1.0 - TABLE_SATURATION * random.uniform(size=3))
-    shift_m, turn_rad = _in_ball(random, MAX_SHIFT_M), _in_ball(random, MAX_TURN_RAD)
-    return Appearance(
-        **({"ambient": ambient, "head": head, "key": key} if LIGHTS in vary else {}),
-        key_turn_rad=key_turn_rad if LIGHTS in vary else None,
-        table=table if TABLE in vary else None,
-        shift_m=shift_m if CAMERA in vary else None,
-        turn_rad=turn_rad if CAMERA in vary else None,
-    )
 
 
 class AppearanceSwitcher:
@@ -91,39 +83,40 @@ class AppearanceSwitcher:
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
         head = model.vis.headlight
-        self._ambient, self._head = np.array(head.ambient), np.array(head.diffuse)
-        self._diffuse, self._dir = model.light_diffuse.copy(), model.light_dir.copy()
-        self._rgba = model.mat_rgba.copy()
-        self._cam_pos, self._cam_quat = model.cam_pos.copy(), model.cam_quat.copy()
+        self._changed = (
+            *(head.ambient, head.diffuse, model.light_diffuse, model.light_dir),
+            *(model.mat_rgba, model.cam_pos, model.cam_quat),
+        )
+        self._original = tuple(np.array(values) for values in self._changed)
 
-    def apply(self, look: Appearance) -> None:
-        """Apply `look`; the caller recomputes the positions in its data.
+    def apply(self, seed: int | None, vary: Collection[str]) -> None:
+        """Apply what `vary` names of the appearance of `seed`; None: that of the scene file.
+
+        The caller recomputes the positions in its data.
 
         Raises:
-            ResourceError: the scene lacks what this appearance changes.
+            ResourceError: an unknown name in `vary`, or the scene lacks what it varies.
         """
-        model, head = self._model, self._model.vis.headlight
-        head.ambient[:] = self._ambient if look.ambient is None else look.ambient
-        head.diffuse[:] = self._head if look.head is None else look.head
-        model.light_diffuse[:], model.light_dir[:] = self._diffuse, self._dir
-        model.mat_rgba[:] = self._rgba
-        model.cam_pos[:], model.cam_quat[:] = self._cam_pos, self._cam_quat
-        if look.key is not None:
-            model.light_diffuse[self._index("light", KEY_LIGHT)] = look.key
-        if look.key_turn_rad is not None:
+        check_variations(vary)
+        for values, original in zip(self._changed, self._original, strict=True):
+            values[:] = original
+        if seed is None:
+            return
+        model, look = self._model, draw_appearance(seed)
+        if LIGHTS in vary:
             light = self._index("light", KEY_LIGHT)
-            turned = np.empty(3)
-            mujoco.mju_rotVecQuat(turned, self._dir[light], _quat_wxyz(look.key_turn_rad))
-            model.light_dir[light] = turned
-        if look.table is not None:
+            model.vis.headlight.ambient[:] = look.ambient
+            model.vis.headlight.diffuse[:] = look.head
+            model.light_diffuse[light] = look.key
+            direction = model.light_dir[light].copy()
+            mujoco.mju_rotVecQuat(model.light_dir[light], direction, _quat_wxyz(look.key_turn_rad))
+        if TABLE in vary:
             model.mat_rgba[self._index("material", TABLE_MATERIAL), :3] = look.table
-        if look.shift_m is not None:
-            model.cam_pos[self._index("camera", FRONT_CAMERA)] += look.shift_m
-        if look.turn_rad is not None:
+        if CAMERA in vary:
             camera = self._index("camera", FRONT_CAMERA)
-            turned = np.empty(4)
-            mujoco.mju_mulQuat(turned, _quat_wxyz(look.turn_rad), self._cam_quat[camera])
-            model.cam_quat[camera] = turned
+            model.cam_pos[camera] += look.shift_m
+            quat = model.cam_quat[camera].copy()
+            mujoco.mju_mulQuat(model.cam_quat[camera], _quat_wxyz(look.turn_rad), quat)
 
     def _index(self, kind: str, name: str) -> int:
         try:
@@ -143,9 +136,7 @@ def _in_ball(random: np.random.Generator, radius: float) -> FloatArray:
     return direction * radius * random.uniform() ** (1 / 3) / np.linalg.norm(direction)
 
 
-def _quat_wxyz(rotation_vector: FloatArray) -> FloatArray:
-    angle = float(np.linalg.norm(rotation_vector))
-    axis = rotation_vector / angle if angle > 0.0 else np.array([1.0, 0.0, 0.0])
-    quat_wxyz = np.empty(4)
-    mujoco.mju_axisAngle2Quat(quat_wxyz, axis, angle)
-    return quat_wxyz
+def _quat_wxyz(rotvec: FloatArray) -> FloatArray:
+    quat = np.array([1.0, 0.0, 0.0, 0.0])
+    mujoco.mju_quatIntegrate(quat, rotvec, 1.0)
+    return quat

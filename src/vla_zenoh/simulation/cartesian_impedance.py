@@ -80,7 +80,7 @@ class ImpedanceOutput(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ImpedanceGains:
-    """Gains of the law; `stiff` and `compliant` are the presets.
+    """Gains of the law: by default it follows within a millimetre, and presses with at most 55 N.
 
     Args:
         translational_n_m: stiffness.
@@ -107,18 +107,6 @@ class ImpedanceGains:
     posture_nm_rad: float = 20.0
     limit_nm_rad: float = 30.0
     limit_margin_rad: float = 0.1
-
-    @classmethod
-    def stiff(cls) -> ImpedanceGains:
-        """Follows within a millimetre; presses with at most 55 N."""
-        return cls()
-
-    @classmethod
-    def compliant(cls) -> ImpedanceGains:
-        """Yields to a hand; presses with at most 39 N."""
-        return cls(
-            translational_n_m=400.0, rotational_nm_rad=20.0, max_error_m=0.06, max_error_rad=0.5
-        )
 
 
 class CartesianImpedance:

@@ -48,7 +48,8 @@ class JointImpedanceOutput(NamedTuple):
 class JointGains:
     """Gains of the law, per joint from the base outwards.
 
-    A longer arm repeats the last number, a shorter one ignores the surplus.
+    By default it follows within a milliradian; a blocked joint exerts at most 40 Nm. A longer arm
+    repeats the last number, a shorter one ignores the surplus.
 
     Args:
         stiffness_nm_rad: K.
@@ -63,18 +64,6 @@ class JointGains:
     integral_1_s: float = 4.0
     max_integral_nm: tuple[float, ...] = (10.0, 10.0, 10.0, 10.0, 4.0, 4.0, 2.0)
     max_error_rad: float = 0.05
-
-    @classmethod
-    def stiff(cls) -> JointGains:
-        """Follows within a milliradian; a blocked joint exerts at most 40 Nm."""
-        return cls()
-
-    @classmethod
-    def compliant(cls) -> JointGains:
-        """Yields to a hand: a quarter of the stiffness, and at most 33 Nm."""
-        return cls(
-            stiffness_nm_rad=(150.0, 150.0, 150.0, 150.0, 60.0, 40.0, 15.0), max_error_rad=0.15
-        )
 
 
 class JointImpedance:

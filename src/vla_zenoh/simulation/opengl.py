@@ -1,16 +1,14 @@
-"""Renders by OpenGL through EGL or OSMesa, without a window system.
+"""Renders by OpenGL through EGL, without a window system.
 
-``python -m vla_zenoh.simulation.opengl egl`` renders one small test image and exits with 0 when it
+``python -m vla_zenoh.simulation.opengl`` renders one small test image and exits with 0 when it
 is right. `vla_zenoh.simulation.render` runs that in a process of its own, since a broken driver can
 crash it.
 """
 
 from __future__ import annotations
 
-import importlib
 import os
 import sys
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -36,28 +34,28 @@ class OpenGlCanvas:
 
     Args:
         model: the scene.
-        platform: ``egl`` or ``osmesa``.
 
     Raises:
         NodeError: OpenGL does not work this way here.
     """
 
-    def __init__(self, model: mujoco.MjModel, platform: str) -> None:
+    def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
-        # MuJoCo's own Renderer takes its context from MUJOCO_GL as it was at `import mujoco`; the
-        # platform's module does not depend on the order of imports.
         other = os.environ.get("PYOPENGL_PLATFORM")
-        if other not in (None, "", platform):
+        if other not in (None, "", "egl"):
             raise NodeError(
-                f"this process already renders with PYOPENGL_PLATFORM={other}; {platform} needs a "
-                "process of its own"
+                f"this process already renders with PYOPENGL_PLATFORM={other}; EGL needs a process "
+                "of its own"
             )
         try:
-            self._context: Any = importlib.import_module(f"mujoco.{platform}").GLContext(64, 64)
+            # MuJoCo's own Renderer takes its context from MUJOCO_GL as it was at `import mujoco`.
+            from mujoco.egl import GLContext
+
+            self._context = GLContext(64, 64)
             self._context.make_current()
             self._gl = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         except Exception as error:  # drivers raise exceptions of many types here
-            raise NodeError(f"no OpenGL through {platform}: {in_words(error)}") from error
+            raise NodeError(f"no OpenGL through EGL: {in_words(error)}") from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._gl)
         self._scene = mujoco.MjvScene(model, MAX_GEOMS)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
@@ -102,7 +100,7 @@ def main() -> None:
     model = mujoco.MjModel.from_xml_string(PROBE_SCENE)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    canvas = OpenGlCanvas(model, sys.argv[1])
+    canvas = OpenGlCanvas(model)
     image = canvas.draw(data, "eye", PROBE_SIZE, PROBE_SIZE)
     red, green, _ = image[PROBE_SIZE // 2, PROBE_SIZE // 2].tolist()
     canvas.close()

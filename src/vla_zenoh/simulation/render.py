@@ -5,7 +5,7 @@ Rendering belongs in a process of its own: it would disturb the control loop. Th
 
 OpenGL is fast but needs a system library; ray casting needs nothing. With ``MUJOCO_GL`` naming a
 missing library ``import mujoco`` itself fails, and a broken driver can crash the process: so this
-module does not import MuJoCo, and `choose_backend` tries each OpenGL platform in another process.
+module does not import MuJoCo, and `choose_backend` tries OpenGL in another process.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     import mujoco
 
 VARIABLE = "VLA_ZENOH_RENDERER"
-EGL, OSMESA, RAYCAST = "egl", "osmesa", "raycast"
-BACKENDS = (EGL, OSMESA, RAYCAST)
+EGL, RAYCAST = "egl", "raycast"
 AUTO = "auto"
 PROBE_LIMIT_S = 60.0
 
-# Libraries that PyOpenGL and MuJoCo load for each platform, and the Debian packages that have them.
-_LIBRARIES = {EGL: ("EGL", "OpenGL"), OSMESA: ("OSMesa",)}
-_PACKAGES = {EGL: "libegl1 libopengl0 libgl1-mesa-dri", OSMESA: "libosmesa6"}
+_LIBRARIES = ("EGL", "OpenGL")
+"""That PyOpenGL and MuJoCo load."""
+_PACKAGES = "libegl1 libopengl0 libgl1-mesa-dri"
+"""Debian packages that have them; Mesa renders on the CPU where there is no GPU."""
 _GL_VARIABLES = ("MUJOCO_GL", "PYOPENGL_PLATFORM")
 
 
@@ -45,9 +45,9 @@ class Backend:
     """A way to render.
 
     Args:
-        name: ``egl``, ``osmesa`` or ``raycast``.
-        reason: why no faster one works; empty where it is the one asked for.
-        install: Debian packages that would bring the faster one; may be empty.
+        name: ``egl`` or ``raycast``.
+        reason: why OpenGL does not work here; empty where ray casting was asked for.
+        install: Debian packages that OpenGL needs; may be empty.
     """
 
     name: str
@@ -56,48 +56,42 @@ class Backend:
 
 
 def choose_backend(wanted: str | None = None) -> Backend:
-    """The fastest back end that works on this machine, or the one asked for.
+    """OpenGL where it works on this machine, else ray casting; or the one asked for.
 
     Args:
-        wanted: a name of `BACKENDS`, ``auto``, or None for the environment variable
+        wanted: ``egl``, ``raycast`` or ``auto``; None: the environment variable
             ``VLA_ZENOH_RENDERER``, and ``auto`` where that is not set.
 
     Raises:
         NodeError: `wanted` is unknown, or is asked for by name and does not work here.
     """
     name = wanted if wanted is not None else os.environ.get(VARIABLE) or AUTO
-    if name not in (AUTO, *BACKENDS):
-        raise NodeError(f"no renderer called {name!r}; there are: {AUTO}, {', '.join(BACKENDS)}")
+    if name not in (AUTO, EGL, RAYCAST):
+        raise NodeError(f"no renderer called {name!r}; there are: {AUTO}, {EGL}, {RAYCAST}")
     if name == RAYCAST:
         return Backend(RAYCAST)
-    if name != AUTO:
-        failure = why_not(name)
-        if failure:
-            raise NodeError(
-                f"the renderer {name!r} does not work here: {failure}; "
-                f"on Debian: apt-get install {_PACKAGES[name]}"
-            )
-        return Backend(name)
-    failures = []
-    for candidate in (EGL, OSMESA):
-        failure = why_not(candidate)
-        if not failure:
-            return Backend(candidate)
-        failures.append(f"{candidate}: {failure}")
-    return Backend(RAYCAST, "; ".join(failures), _PACKAGES[EGL])
+    failure = why_no_opengl()
+    if not failure:
+        return Backend(EGL)
+    if name == EGL:
+        raise NodeError(
+            f"the renderer {name!r} does not work here: {failure}; "
+            f"on Debian: apt-get install {_PACKAGES}"
+        )
+    return Backend(RAYCAST, f"{EGL}: {failure}", _PACKAGES)
 
 
-def why_not(name: str) -> str:
-    """Why the OpenGL platform `name` does not work here; empty when it does."""
-    missing = [part for part in _LIBRARIES[name] if ctypes.util.find_library(part) is None]
+def why_no_opengl() -> str:
+    """Why OpenGL does not work here without a window system; empty when it does."""
+    missing = [part for part in _LIBRARIES if ctypes.util.find_library(part) is None]
     if missing:
         return f"the library lib{missing[0]} is not installed"
-    # The caller's own choice of a platform must not decide which one the probe tries.
+    # The caller's own choice of a platform must not decide what the probe tries.
     environment = {key: value for key, value in os.environ.items() if key not in _GL_VARIABLES}
     environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)
     try:
         done = subprocess.run(
-            [sys.executable, "-m", "vla_zenoh.simulation.opengl", name],
+            [sys.executable, "-m", "vla_zenoh.simulation.opengl"],
             env=environment,
             capture_output=True,
             text=True,
@@ -177,9 +171,7 @@ class Renderer:
         Raises:
             ResourceError: an unknown name in `vary`, or the scene lacks what it varies.
         """
-        from vla_zenoh.simulation.appearance import Appearance, draw_appearance
-
-        self._appearance.apply(Appearance() if seed is None else draw_appearance(seed, vary))
+        self._appearance.apply(seed, vary)
         self._canvas.refresh()
         self._update()
 
@@ -233,4 +225,4 @@ def _canvas(name: str, model: mujoco.MjModel) -> Canvas:
         return RaycastCanvas(model)
     from vla_zenoh.simulation.opengl import OpenGlCanvas
 
-    return OpenGlCanvas(model, name)
+    return OpenGlCanvas(model)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import Profile
-from vla_zenoh.simulation.appearance import DISTRACTORS, draw_appearance
+from vla_zenoh.simulation.appearance import DISTRACTORS, check_variations
 from vla_zenoh.simulation.cartesian_impedance import (
     ArmDynamics,
     CartesianImpedance,
@@ -48,8 +48,7 @@ class World:
         scene: name of a folder of ``sim/``, or a path.
         robot: the robot in it.
         home_rad: (n,) arm joints after a reset; also the posture that the nullspace prefers.
-        gains: of the Cartesian impedance controller.
-        joint_gains: of the joint impedance controller; None: the stiff ones.
+        gains: of the Cartesian impedance controller; None: the default ones.
         joint_friction_nm: dry friction in every arm joint, which the controller does not model.
         seed: see `reset`.
         vary: what else a seeded reset changes, names of `appearance.VARIATIONS`.
@@ -65,13 +64,12 @@ class World:
         robot: RobotModel,
         *,
         home_rad: ArrayLike,
-        gains: ImpedanceGains,
-        joint_gains: JointGains | None = None,
+        gains: ImpedanceGains | None = None,
         joint_friction_nm: float = 0.0,
         seed: int | None = None,
         vary: Collection[str] = (),
     ) -> None:
-        draw_appearance(0, vary)  # an unknown name fails here, not in the renderer
+        check_variations(vary)  # an unknown name fails here, not in the renderer
         self._vary = frozenset(vary)
         self.seed: int | None = None
         self.robot = robot
@@ -82,7 +80,7 @@ class World:
         self._gripper = SimulatedGripper(self.model, self._data, robot)
         self._objects = SimulatedObjects(self.model, self._data)
         self._controller = CartesianImpedance(
-            gains,
+            gains or ImpedanceGains(),
             lower_rad=self._arm.lower_rad,
             upper_rad=self._arm.upper_rad,
             effort_nm=self._arm.effort_limit_nm,
@@ -90,7 +88,7 @@ class World:
             period_s=STEP_S,
         )
         self._joint_controller = JointImpedance(
-            joint_gains or JointGains.stiff(),
+            JointGains(),
             effort_nm=self._arm.effort_limit_nm,
             period_s=STEP_S,
         )
@@ -324,13 +322,10 @@ def build_world(profile: Profile) -> World:
         arm_joints=profile.robot.arm_joints,
         tcp_link=profile.robot.tcp_frame,
     )
-    stiff = profile.sim.gains == "stiff"
     return World(
         profile.sim.scene,
         robot,
         home_rad=profile.robot.home_rad,
-        gains=ImpedanceGains.stiff() if stiff else ImpedanceGains.compliant(),
-        joint_gains=JointGains.stiff() if stiff else JointGains.compliant(),
         joint_friction_nm=profile.sim.joint_friction_nm,
         seed=profile.sim.seed,
         vary=profile.sim.vary,

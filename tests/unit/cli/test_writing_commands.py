@@ -28,7 +28,7 @@ READ = {
     "bench compare a",
     "bench compare b",
     "lab trial setups",
-    "lab compare recording",
+    "lab compare file",
     "profile bridge-config certificates",  # a name on another computer
 }
 """Files and folders that commands read."""

@@ -18,6 +18,7 @@ START = Pose(np.array([0.43, 0.0, 0.3]), exp3(np.array([3.0, 0.2, -0.4])))
 
 LIMIT_RTOL = 1e-6
 STILL = 1e-6  # m/s and rad/s
+LEAST_SHARE = 1e-3
 AT_TARGET_M, AT_TARGET_RAD = 1e-8, 1e-7
 # Errors of the trapezium rule over one tick of a motion whose jerk is bounded.
 STEP_ATOL_M, STEP_ATOL_RAD = 2e-7, 1e-6
@@ -303,14 +304,31 @@ def test_an_axis_at_its_goal_stays_there_whatever_the_others_do(
             assert (np.abs(away[[1, 2, 3, 4]]) < AT_GOAL[[1, 2, 3, 4]]).all()
 
 
-def brake_range(motion: Smoother) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest positions (3,) m of the shortest stop from here."""
-    stopping = Smoother(motion.motion.pose, DT_S, LIMITS)
-    stopping.brake_from(motion.motion)
+def stop_range(motion: Motion, share: float, axes: np.ndarray) -> np.ndarray:
+    """(2, 3) m: least and greatest positions of these axes' stop with a share of their limits."""
+    (velocity, acceleration, jerk), rotation = LIMITS
+    limits = MotionLimits((velocity, share * acceleration, share * jerk), rotation)
+    stopping = Smoother(motion.pose, DT_S, limits)
+    only = np.concatenate([axes, np.zeros(3)])
+    stopping.brake_from(Motion(motion.pose, only * motion.twist, only * motion.acceleration))
     path = [stopping.motion.pose.position_m]
     while not stopping.at_rest:
         path.append(stopping.tick().pose.position_m)
-    return np.min(path, axis=0), np.max(path, axis=0)
+    return np.array([np.min(path, axis=0), np.max(path, axis=0)])
+
+
+def brake_range(motion: Motion) -> np.ndarray:
+    """(2, 3) m: least and greatest positions of the shortest stop from here.
+
+    That is each axis by itself, or, to stay on a line, all axes in the proportion of the fastest.
+    """
+    least, most = stop_range(motion, 1.0, np.ones(3))
+    speeds = np.abs(motion.twist[:3])
+    for axis, share in enumerate(speeds / max(speeds.max(), STILL)):
+        if LEAST_SHARE < share < 1.0:
+            low, high = stop_range(motion, float(share), np.eye(3)[axis])
+            least, most = np.minimum(least, low), np.maximum(most, high)
+    return np.array([least, most])
 
 
 @settings(max_examples=120)
@@ -321,7 +339,7 @@ def test_a_retargeted_motion_stays_between_its_start_its_target_and_where_it_can
     motion = smoother()
     for ticks, offset in retargets:
         target = START.position_m + REACH_M * offset
-        start, (least, most) = motion.motion.pose.position_m, brake_range(motion)
+        start, (least, most) = motion.motion.pose.position_m, brake_range(motion.motion)
         least = np.minimum(np.minimum(least, start), target) - AT_GOAL[:3]
         most = np.maximum(np.maximum(most, start), target) + AT_GOAL[:3]
         motion.target(Pose(target, START.rotation))

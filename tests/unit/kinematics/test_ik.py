@@ -13,7 +13,7 @@ from panda_arm import HOME_RAD, moved, panda, tool_down_at
 from vla_zenoh.control.joint_follower import FollowSettings, JointFollower, JointMotion
 from vla_zenoh.control.smoothing import MotionLimits, Smoother
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.ik import IkSettings, InverseKinematics, pose_error
+from vla_zenoh.kinematics.ik import InverseKinematics, pose_error
 from vla_zenoh.kinematics.kinematics import smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose, angle_between
 from vla_zenoh.types import FloatArray
@@ -121,7 +121,7 @@ def test_where_a_joint_ends_the_others_take_over() -> None:
 @pytest.mark.parametrize("margin_rad", [1.6, 3.0])
 def test_a_margin_that_leaves_no_range_is_refused(margin_rad: float) -> None:
     with pytest.raises(RecordError, match="leaves 'panda_joint"):
-        InverseKinematics(KINEMATICS, HOME_RAD, IkSettings(joint_margin_rad=margin_rad))
+        InverseKinematics(KINEMATICS, HOME_RAD, joint_margin_rad=margin_rad)
 
 
 def test_a_posture_of_the_wrong_size_is_refused() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from panda_arm import ARM_JOINTS, FINGER_JOINTS, HOME_RAD, TCP_FRAME, URDF, panda
 
 from vla_zenoh.errors import ProfileError, RecordError
-from vla_zenoh.kinematics.kinematics import Kinematics, manipulability, smallest_singular_value
+from vla_zenoh.kinematics.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.kinematics.so3 import log3
 from vla_zenoh.types import FloatArray, JointState
 
@@ -160,7 +160,6 @@ def test_the_smallest_singular_value_is_that_of_the_decomposition(shares: list[f
     jacobian = KINEMATICS.jacobian(joints_at(shares))
     values = np.linalg.svd(jacobian, compute_uv=False)
     assert abs(smallest_singular_value(jacobian) - values[-1]) < 1e-7
-    assert abs(manipulability(jacobian) - np.prod(values)) < 1e-7
 
 
 def test_a_stretched_arm_is_singular_and_home_is_not() -> None:

@@ -14,7 +14,7 @@ from vla_zenoh.lab.bench.motion import (
     make_row,
     path_length,
 )
-from vla_zenoh.lab.cli.bench_motion_tables import motion_table, thesis_table
+from vla_zenoh.lab.cli.bench_motion_tables import motion_table
 from vla_zenoh.lab.demo.segments import SegmentOutcome
 from vla_zenoh.profile import load_profile
 
@@ -129,6 +129,3 @@ def test_the_tables_hold_what_was_measured_and_what_was_not() -> None:
         "ok",
         "the arm is inactive",
     ]
-    beside = thesis_table(rows, virtual=False)
-    assert beside.row_count == 1
-    assert list(beside.columns[3].cells) == ["0.248 m, 0.421 rad"]

@@ -1,4 +1,4 @@
-"""Two workers of a recording are compared as those of a live run."""
+"""Two workers of a recording are compared."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ import pytest
 from chain import command_line
 
 from vla_zenoh.codec import records
+from vla_zenoh.errors import RecordError
 from vla_zenoh.keys import Keys
+from vla_zenoh.lab.evaluation.disagreement import arm_state
+from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.recording.sample import MSGPACK, Sample
 from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.policy import ActionSpec, ModelSpec
@@ -57,7 +60,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 def test_their_difference_is_found(recording: Path) -> None:
-    done = command_line("lab", "compare", "a", "b", "--recording", str(recording), "--json")
+    done = command_line("lab", "compare", "a", "b", str(recording), "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert (found["pairs"], found["only_a"], found["only_b"]) == (PAIRS, 0, 0)
@@ -66,6 +69,20 @@ def test_their_difference_is_found(recording: Path) -> None:
 
 
 def test_a_worker_that_is_not_in_it_is_named_with_those_that_are(recording: Path) -> None:
-    done = command_line("lab", "compare", "a", "ghost", "--recording", str(recording))
+    done = command_line("lab", "compare", "a", "ghost", str(recording))
     assert done.returncode == 1
     assert "has no chunks of 'ghost'; it has: a, b" in done.stderr
+
+
+def test_where_the_arm_was_is_the_nearest_state_and_unknown_without_one(recording: Path) -> None:
+    run = load_run(recording)
+    for index, entry in enumerate(run.poses):
+        entry.record.position_m.setflags(write=True)
+        entry.record.position_m[0] = 0.1 * index
+    for at_ns, nearest_m in ((-PERIOD_NS, 0.0), (PERIOD_NS * 1.4, 0.1), (PERIOD_NS * 1.6, 0.2)):
+        found = arm_state(run, START_NS + round(at_ns))
+        assert found.pose.position_m[0] == pytest.approx(nearest_m)
+    assert arm_state(run, START_NS + 10**12).pose.position_m[0] == pytest.approx(0.9)
+    run.poses.clear()
+    with pytest.raises(RecordError, match="pose of the arm is unknown"):
+        arm_state(run, START_NS)

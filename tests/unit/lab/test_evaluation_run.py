@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import csv
+import json
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from vla_zenoh.cli.main import app
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Keys
+from vla_zenoh.lab.evaluation.evaluate import evaluate
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.evaluation.plot_image import write_plot
 from vla_zenoh.lab.evaluation.report import page
@@ -318,7 +324,7 @@ def test_the_film_is_as_long_as_the_run_and_shows_every_camera(
 def test_the_curves_are_drawn_into_a_picture(judged: Path, tmp_path: Path) -> None:
     assert write_plot(tmp_path / "plot.png", evaluate_run(judged))
     assert cv2.imread(str(tmp_path / "plot.png")).shape[1] > 1000
-    assert not write_plot(tmp_path / "none.png", Evaluation("empty", "mcap"))
+    assert not write_plot(tmp_path / "none.png", Evaluation("empty"))
     assert not (tmp_path / "none.png").exists()
 
 
@@ -329,3 +335,50 @@ def test_a_reset_and_a_gap_break_a_curve() -> None:
     times, values = unbroken(PlotTrace(t_s, position_m, position_m))
     assert np.flatnonzero(np.isnan(times)).tolist() == [2, 5]
     assert np.isnan(values[[2, 5]]).all()
+
+
+# -- the command ----------------------------------------------------------------------------------
+def test_what_cannot_be_evaluated_does_not_stop_the_rest(recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "cut.mcap").write_bytes(b"\x89MCAP0\r\n")
+    (tmp_path / "none.csv").write_text("a,b\n")
+    out, html, table = tmp_path / "out.json", tmp_path / "out.html", tmp_path / "rows.csv"
+    paths = [str(tmp_path / name) for name in ("cut.mcap", "none.csv", "missing.mcap")]
+    outputs = [word for path in (out, html, table) for word in ("-o", str(path))]
+    done = CliRunner().invoke(
+        app, ["eval", *paths, str(recording), *outputs], env={"COLUMNS": "200"}
+    )
+    assert done.exit_code == 0, done.output
+    found = json.loads(out.read_text())
+    assert [run["record_id"] for run in found["runs"]] == ["lab"]
+    assert list(found["faults"]) == paths
+    assert done.stderr.count("not evaluated") == 3
+    assert found["overall"]["e2e_mean_ms"] == found["runs"][0]["e2e_mean_ms"]
+    with table.open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["trans_total_m"]) == found["runs"][0]["trans_total_m"]
+    assert "lab" in html.read_text()
+
+
+def test_nothing_to_evaluate_is_an_error(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["eval", str(tmp_path)])
+    assert done.exit_code == 1
+    assert "holds no recording" in " ".join(done.stderr.split())  # it is wrapped
+
+
+def test_other_files_in_a_folder_are_passed_over(recording: Path) -> None:
+    (recording.parent / "poses.csv").write_text("heard_wall_ns,x_m\n1,2\n")
+    runs, faults = evaluate([recording.parent])
+    assert [run.name for run in runs] == ["lab"]
+    assert faults == {}
+
+
+def test_the_page_needs_no_network_and_no_prompt_breaks_it(recording: Path) -> None:
+    run = evaluate_run(recording)
+    run.marks = [(0.0, "</script><script>alert(1)</script><b>")]
+    run.segments = [replace(run.segments[0], prompt=run.marks[0][1])]
+    text = page([run], {})
+    body = text[text.index("<body>") :]
+    assert "<script>alert" not in body
+    assert "&lt;/script&gt;" in body
+    for source in ('src="http', "src='http", "<link", "@import"):
+        assert source not in text[: text.index("<script>")] + body

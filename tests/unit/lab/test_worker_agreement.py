@@ -9,16 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import Pose, exp3, quat_from_rotation
-from vla_zenoh.lab.compare.agreement import (
+from vla_zenoh.lab.evaluation.disagreement import (
     ArmState,
-    ArmStateHistory,
     Disagreement,
-    compare,
+    disagreement,
 )
 from vla_zenoh.policy import ActionSpec
-from vla_zenoh.types import ActionChunk, GripperState, PoseState
+from vla_zenoh.types import ActionChunk
 
 ATOL_M, ATOL_RAD = 1e-6, 1e-6
 """Steps travel as float32."""
@@ -45,7 +43,7 @@ def apart(
     spec_a: ActionSpec = DELTA,
     spec_b: ActionSpec = DELTA,
 ) -> Disagreement:
-    return compare(
+    return disagreement(
         a if isinstance(a, list) else [a],
         b if isinstance(b, list) else [b],
         spec_a,
@@ -134,17 +132,3 @@ def test_every_chunk_is_counted_once(times_a: list[int], times_b: list[int]) -> 
     assert found.pairs + found.only_a == len(times_a)
     assert found.pairs + found.only_b == len(times_b)
     assert found.apart_s <= 0.06
-
-
-def test_where_the_arm_was_is_the_nearest_state_and_unknown_without_one() -> None:
-    history = ArmStateHistory()
-    with pytest.raises(RecordError, match="pose of the arm is unknown"):
-        history.at(START_NS)
-    for index in range(10):
-        pose = PoseState(np.array([0.1 * index, 0, 0]), np.array([0, 0, 0, 1.0]), np.zeros(6))
-        history.add(START_NS + index * 5 * MS, pose)
-        history.add(START_NS + index * 5 * MS, GripperState(0.08, moving=False, holding=False))
-    assert history.at(START_NS - MS).pose.position_m[0] == 0.0
-    assert history.at(START_NS + 12 * MS).pose.position_m[0] == pytest.approx(0.2)
-    assert history.at(START_NS + 13 * MS).pose.position_m[0] == pytest.approx(0.3)
-    assert history.at(START_NS + 10**9).pose.position_m[0] == pytest.approx(0.9)

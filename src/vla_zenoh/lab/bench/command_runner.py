@@ -12,9 +12,8 @@ from typing import Any
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.bench.cpu_time import cpu_s
-from vla_zenoh.lab.demo.runner import DemoRunner
+from vla_zenoh.lab.demo.runner import MotionRunner
 from vla_zenoh.lab.episode import Interrupted
-from vla_zenoh.lab.recording.stream_listener import StreamListener
 from vla_zenoh.nodes.command.node import SPREAD_S
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.runtime.launch import Host
@@ -49,18 +48,10 @@ def measure_command(
     """
     profile = override(profile, {"timing": {"command_hz": command_hz}})
     with Host(profile, None, log=log, tell=log, own_router=True) as host:
-        assert host.session is not None and host.client is not None
+        assert host.client is not None
         client = host.client
 
-        def watch() -> None:
-            if not host.supervisor.poll():
-                raise NodeError("a node crashes again and again")
-
-        listener = StreamListener(host.session, profile.keys, profile.task.worker)
-        run = DemoRunner(client, listener, stop, watch, lambda *_: None)
-        run.wait_until_ready()
-        run.start("hold", RATE_HZ)
-        listener.close()  # its decoding costs time of this process
+        MotionRunner(client, stop, host.poll).begin(RATE_HZ)
         client.set_prompt(PROMPT)
         if stop.wait(STATUS_S):
             raise Interrupted

@@ -6,13 +6,8 @@ are those of the nodes.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,11 +25,11 @@ from vla_zenoh.lab.bench.motion import (
     make_row,
     path_length,
 )
+from vla_zenoh.lab.bench.processes import in_processes
 from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, judge_segment, make_segment
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import Profile
-from vla_zenoh.runtime.process import die_with_parent
 from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import PoseCommand
 
@@ -42,7 +37,6 @@ CAMERA_S, WIRE_S = 0.015, 0.0005
 """Camera stamp to worker, and every other link, about as measured in real time."""
 WARM_UP_S, SETTLE_S, SLACK_S = 1.2, 1.0, 5.0
 LOOK_S = 0.25
-"""How often the parent checks for Ctrl-C."""
 
 Row = dict[str, Any]
 
@@ -52,7 +46,6 @@ def run_in_lockstep(
     trials: Sequence[MotionCase],
     conditions: Sequence[Conditions],
     stop: threading.Event,
-    done: Callable[[Row], None],
     *,
     processes: int | None = None,
 ) -> Iterator[Row]:
@@ -63,40 +56,13 @@ def run_in_lockstep(
         trials: prompts.
         conditions: of each prompt.
         stop: set by Ctrl-C; unfinished rows are dropped.
-        done: called with every row as it ends, in any order.
         processes: at once; None: one per core.
 
     Raises:
         NodeError: a process was killed.
     """
     jobs = [(profile, trial, each) for each in conditions for trial in trials]
-    context = multiprocessing.get_context("spawn")
-    many = processes or os.cpu_count() or 1
-    with ProcessPoolExecutor(many, mp_context=context, initializer=_begin) as pool:
-        futures = [pool.submit(lockstep_row, *job) for job in jobs]
-        left = set(futures)
-        while left and not stop.is_set():
-            ended, left = wait(left, LOOK_S, FIRST_COMPLETED)
-            for future in ended:
-                done(_result(future))
-        if left:  # in the middle of a row
-            for process in multiprocessing.active_children():
-                process.terminate()
-        yield from (_result(future) for future in futures if future not in left)
-
-
-def _result(future: Future[Row]) -> Row:
-    try:
-        return future.result()
-    except BrokenProcessPool as error:
-        raise NodeError(
-            "a process of the bench was killed; is there enough memory for one on every core?"
-        ) from error
-
-
-def _begin() -> None:
-    die_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    yield from in_processes(lockstep_row, jobs, stop, processes=processes)
 
 
 def lockstep_row(profile: Profile, trial: MotionCase, conditions: Conditions) -> Row:

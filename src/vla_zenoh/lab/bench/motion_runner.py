@@ -6,6 +6,8 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,13 +24,14 @@ from vla_zenoh.lab.bench.motion import (
     make_row,
     path_length,
 )
-from vla_zenoh.lab.demo.runner import DemoRunner
+from vla_zenoh.lab.demo.runner import MotionRunner
 from vla_zenoh.lab.demo.segments import make_segment
-from vla_zenoh.lab.recording.run import first_commands
-from vla_zenoh.lab.recording.stream_listener import StreamListener, Streams
+from vla_zenoh.lab.recording.recorder import Recorder
+from vla_zenoh.lab.recording.run import Run, load_run
 from vla_zenoh.runtime.launch import Host
 
 RESET_SETTLE_S = 0.3
+RECORDED = ("state/*", "command/*", "task", "prompt")
 
 
 def run_in_real_time(
@@ -36,15 +39,17 @@ def run_in_real_time(
     trials: Sequence[MotionCase],
     conditions: Sequence[Conditions],
     stop: threading.Event,
+    folder: Path,
     progress: Callable[[MotionCase, Conditions, int], None],
-) -> Iterator[tuple[dict[str, Any], Streams]]:
-    """One row after the other, with its recorded streams.
+) -> Iterator[tuple[dict[str, Any], Run]]:
+    """One row after the other, with what was recorded of it.
 
     Args:
         host: up, with a simulator.
         trials: prompts.
         conditions: of each prompt; only the rate may differ, as the worker is running.
         stop: set by Ctrl-C.
+        folder: for the recordings.
         progress: called with case, conditions and accepted steps.
 
     Raises:
@@ -52,47 +57,52 @@ def run_in_real_time(
         Interrupted: Ctrl-C.
     """
     assert host.session is not None and host.client is not None
-    profile = host.profile
-    for each in conditions:
-        for trial in trials:
-            listener = StreamListener(host.session, profile.keys, profile.task.worker)
-            run = DemoRunner(
-                host.client,
-                listener,
-                stop,
-                host.poll,
-                lambda _, done, trial=trial, each=each: progress(trial, each, done),
-            )
-            run.wait_until_ready()
+    run = MotionRunner(host.client, stop, host.poll)
+    keys = host.profile.keys
+    jobs = [(trial, each) for each in conditions for trial in trials]
+    for number, (trial, each) in enumerate(jobs):
+        path = folder / f"{number:04d}-{each.horizon}.mcap"
+        recorder = Recorder(
+            host.profile,
+            host.session,
+            path,
+            expressions=[keys.full(key) for key in RECORDED],
+            name=f"recorder{number}",
+        ).start()
+        why, outcome, since_ns, rejected = "", None, 0, Counter[str]()
+        try:
+            _prepare(host, run, trial)
+            host.client.set_rate(each.rate_hz)
+            before, since_ns = _rejections(host), time.time_ns()
+            outcome = run.run_segment(trial.segment, each.rate_hz, partial(progress, trial, each))
+            rejected = _rejections(host) - before
+        except NodeError as error:
+            why = str(error)  # the arm is at rest; the other prompts can still be measured
+        finally:
             host.client.deactivate()
-            run.reset_simulator()
-            run.pause(RESET_SETTLE_S)
-            run.start("hold", PREPARATION_HZ)
-            try:
-                if trial.preparation:
-                    prepared = run.run_segment(
-                        0, make_segment(trial.preparation, 1), PREPARATION_HZ
-                    )
-                    if prepared.faults():
-                        raise NodeError(f"{trial.preparation}: {'; '.join(prepared.faults())}")
-                host.client.set_rate(each.rate_hz)
-                before = _refusals(host)
-                since_ns = time.time_ns()
-                outcome = run.run_segment(0, trial.segment, each.rate_hz)
-            except NodeError as error:
-                # The arm is at rest; the other prompts can still be measured.
-                yield failed_row(trial, each, str(error)), listener.close()
-                continue
-            finally:
-                host.client.deactivate()
-            recording = listener.close()
-            first = first_commands(recording.commands or recording.joint_commands)
-            stream = stream_of(recording, first, since_ns, profile.timing.state_hz)
-            refused = _refusals(host) - before
-            yield make_row(trial, each, profile, outcome, stream, refused), recording
+            recorder.close()
+        recorded = load_run(path)
+        if outcome is None:
+            yield failed_row(trial, each, why), recorded
+        else:
+            stream = stream_of(recorded, since_ns, host.profile.timing.state_hz)
+            yield make_row(trial, each, host.profile, outcome, stream, rejected), recorded
 
 
-def _refusals(host: Host) -> Counter[str]:
+def _prepare(host: Host, run: MotionRunner, trial: MotionCase) -> None:
+    """Bring the arm to the start of a case, active."""
+    assert host.client is not None
+    host.client.deactivate()
+    run.reset_simulator()
+    run.pause(RESET_SETTLE_S)
+    run.begin(PREPARATION_HZ)
+    if trial.preparation:
+        prepared = run.run_segment(make_segment(trial.preparation, 1), PREPARATION_HZ)
+        if prepared.faults():
+            raise NodeError(f"{trial.preparation}: {'; '.join(prepared.faults())}")
+
+
+def _rejections(host: Host) -> Counter[str]:
     """Rejections of every node so far, by ``node.reason``."""
     assert host.client is not None
     return Counter(
@@ -105,30 +115,30 @@ def _refusals(host: Host) -> Counter[str]:
     )
 
 
-def stream_of(
-    recording: Streams, first: Sequence[tuple[Any, int]], since_ns: int, state_hz: float
-) -> MeasuredStream:
-    """The commanded motion since `since_ns`, as arrays."""
-    commands = [entry for entry in recording.commands if entry.header.stamp_wall_ns >= since_ns]
+def stream_of(run: Run, since_ns: int, state_hz: float) -> MeasuredStream:
+    """The commanded motion of a recording since `since_ns`, as arrays."""
+    commands = [entry for entry in run.commands if entry.header.stamp_wall_ns >= since_ns]
     causes = [entry.record.cause for entry in commands]
-    poses = [entry.record for entry in recording.poses if entry.header.stamp_wall_ns >= since_ns]
+    states = [entry for entry in run.poses if entry.header.stamp_wall_ns >= since_ns]
     tracking_m = max(
         (
-            float(np.linalg.norm(pose.position_m - pose.reference_position_m))
-            for pose in poses
-            if pose.reference_position_m is not None
+            float(np.linalg.norm(entry.record.position_m - entry.record.reference_position_m))
+            for entry in states
+            if entry.record.reference_position_m is not None
         ),
         default=0.0,
     )
     mine = [
-        (cause, stamp_ns) for cause, stamp_ns in first if cause.observation_stamp_ns >= since_ns
+        (cause, stamp_ns)
+        for cause, stamp_ns in run.first_commands()
+        if cause.observation_stamp_ns >= since_ns
     ]
     return MeasuredStream(
         np.array([entry.header.stamp_wall_ns - since_ns for entry in commands]) / 1e9,
         np.array([entry.record.twist for entry in commands]).reshape(-1, 6),
         np.array([entry.record.acceleration for entry in commands]).reshape(-1, 6),
         np.array([cause.chunk_seq if cause else -1 for cause in causes]),
-        *path_length([pose_of(pose) for pose in poses[:: round(state_hz / WAY_HZ)]]),
+        *path_length([pose_of(entry.record) for entry in states[:: round(state_hz / WAY_HZ)]]),
         tracking_m,
         [(stamp_ns - cause.observation_stamp_ns) / 1e6 for cause, stamp_ns in mine],
         [(cause.received_ns - cause.observation_stamp_ns) / 1e6 for cause, _ in mine],

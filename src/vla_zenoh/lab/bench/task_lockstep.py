@@ -5,15 +5,11 @@ Pictures are drawn when the policy reads them, from the poses at their capture.
 
 from __future__ import annotations
 
-import multiprocessing
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,18 +17,13 @@ from numpy.typing import NDArray
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError, in_words
-from vla_zenoh.lab.bench.task import (
-    ARM_LOST,
-    TaskOutcome,
-    TaskPlan,
-    TaskRequest,
-)
+from vla_zenoh.lab.bench.processes import in_processes
+from vla_zenoh.lab.bench.task import ARM_LOST, TaskOutcome, TaskPlan, TaskRequest
 from vla_zenoh.lab.bench.task_episode import SceneSnapshot, run_task
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_of
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile
-from vla_zenoh.runtime.process import die_with_parent
 from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
 from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses
@@ -51,7 +42,7 @@ def run_in_lockstep(
     options: Mapping[str, str],
     camera: str | None,
     stop: threading.Event,
-    processes: int,
+    processes: int | None,
     *,
     named: str | None = None,
 ) -> Iterator[tuple[TaskOutcome, dict[str, tuple[float, float]]]]:
@@ -62,32 +53,21 @@ def run_in_lockstep(
         plan: what to run.
         options: of the model.
         camera: for the pictures of an outcome, None: none.
-        stop: set by Ctrl-C; episodes not begun are left out.
-        processes: at once.
+        stop: set by Ctrl-C; episodes that have not ended are left out.
+        processes: at once; None: one per core.
         named: name or path of the profile, for a model with that option.
 
     Raises:
         NodeError: world or model cannot be made or loaded, says why; or a process was killed.
     """
-    with ProcessPoolExecutor(
-        processes,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_begin,
-        initargs=(profile, plan, dict(options), camera, named),
-    ) as pool:
-        futures: list[Future[Any]] = [pool.submit(_one, request) for request in plan.requests()]
-        try:
-            for future in futures:
-                while not future.done():
-                    if stop.wait(POLL_S):
-                        return
-                yield future.result()
-        except BrokenProcessPool as error:
-            raise NodeError(
-                "a process of the bench was killed; is there enough memory for --processes?"
-            ) from error
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    yield from in_processes(
+        _one,
+        [(request,) for request in plan.requests()],
+        stop,
+        processes=processes,
+        prepare=_prepare,
+        prepared=(profile, plan, dict(options), camera, named),
+    )
 
 
 @dataclass(slots=True)
@@ -222,12 +202,11 @@ class _Loaded:
 _stage: _LockstepStage | NodeError | None = None
 
 
-def _begin(
+def _prepare(
     profile: Profile, plan: TaskPlan, options: dict[str, str], camera: str | None, named: str | None
 ) -> None:
     """Build the stage of this process; an exception here would end the pool without a reason."""
     global _stage
-    die_with_parent()
     try:
         world = build_world(profile)
         wanted = profile.sim.renderer
@@ -238,7 +217,7 @@ def _begin(
         policy = _Loaded(make_policy(model, options, profile=named))
     except Exception as error:
         # As text: some exceptions cannot be pickled.
-        _stage = NodeError(_message(error))
+        _stage = NodeError(in_words(error))
     else:
         _stage = _LockstepStage(profile, plan, camera, world, renderer, policy)
 
@@ -262,8 +241,4 @@ def _model_errors(what: str) -> Iterator[None]:
     except VlaZenohError as error:
         raise WorkerError(str(error)) from error
     except Exception as error:
-        raise WorkerError(f"the model {what}: {_message(error)}") from error
-
-
-def _message(error: Exception) -> str:
-    return in_words(error)
+        raise WorkerError(f"the model {what}: {in_words(error)}") from error

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import TaskID
@@ -25,6 +26,9 @@ from vla_zenoh.lab.bench.motion import PROTOCOL, STEPS, Conditions, MotionCase
 from vla_zenoh.lab.cli.bench_file import up_with_last_lines, write_json
 from vla_zenoh.lab.cli.output_path import ForceOption, output_folder
 from vla_zenoh.profile import Profile
+
+if TYPE_CHECKING:
+    from vla_zenoh.lab.recording.run import Run
 
 
 @dataclass(frozen=True)
@@ -93,13 +97,9 @@ class _Run:
         """Run on a virtual clock."""
         from vla_zenoh.lab.bench.motion_lockstep import run_in_lockstep
 
-        self.rows += run_in_lockstep(
-            self._profile,
-            self._cases,
-            self._conditions,
-            self._stop,
-            lambda _: self.bars.update(self._everything, advance=1),
-        )
+        for row in run_in_lockstep(self._profile, self._cases, self._conditions, self._stop):
+            self.rows.append(row)
+            self.bars.update(self._everything, advance=1)
 
     def in_real_time(self) -> None:
         """Run with real nodes."""
@@ -146,29 +146,24 @@ class _Run:
             own_router=True,
             worker_options={profile.task.worker: settings},
         )
-        with up_with_last_lines(host, lines) as running:
-            for row, recording in run_in_real_time(
-                running, self._cases, conditions, self._stop, progress
+        with TemporaryDirectory() as folder, up_with_last_lines(host, lines) as running:
+            for row, run in run_in_real_time(
+                running, self._cases, conditions, self._stop, Path(folder), progress
             ):
                 self.rows.append(row)
                 self.bars.update(self._everything, advance=1)
                 if self._out is not None:
-                    _plot(self._out, profile, row, recording)
+                    _plot(self._out, profile, row, run)
 
 
-def _plot(folder: Path, profile: Profile, row: dict[str, Any], recording: Any) -> None:
-    from vla_zenoh.lab.evaluation.mcap_file import add_motion
+def _plot(folder: Path, profile: Profile, row: dict[str, Any], run: Run) -> None:
+    from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
     from vla_zenoh.lab.evaluation.plot_image import write_plot
-    from vla_zenoh.lab.evaluation.result import Evaluation
 
     name = f"{row['prompt']}_{row['rate_hz']:g}Hz_{row['horizon']}.png".replace(" ", "_")
-    if not recording.poses:
-        return
-    zero_ns = recording.poses[0].header.stamp_wall_ns
-    run = Evaluation(f"{row['prompt']}, {row['rate_hz']:g} Hz, {profile.name}", "mcap")
-    add_motion(run, recording, zero_ns, recording.poses[-1].header.stamp_wall_ns)
-    run.marks = [((stamp_ns - zero_ns) / 1e9, prompt) for stamp_ns, prompt in recording.marks]
-    write_plot(folder / name, run)
+    found = evaluate_loaded(run)
+    found.name = f"{row['prompt']}, {row['rate_hz']:g} Hz, {profile.name}"
+    write_plot(folder / name, found)
 
 
 @options
@@ -190,7 +185,7 @@ def motion(
 
     Exits with 0 only when every row passes.
     """
-    from vla_zenoh.lab.cli.bench_motion_tables import motion_table, thesis_table
+    from vla_zenoh.lab.cli.bench_motion_tables import motion_table
     from vla_zenoh.runtime.process import stop_on_signals
 
     saving = nullcontext() if output is None else output_folder(output, force=force)
@@ -206,11 +201,7 @@ def motion(
     if as_json:
         print_json(run.rows)
     else:
-        screen = console()
-        screen.print(motion_table(run.rows))
-        thesis = thesis_table(run.rows, virtual=lockstep)
-        if thesis.row_count:
-            screen.print(thesis)
+        console().print(motion_table(run.rows))
     if stop.is_set():
         raise typer.Exit(130)
     if not run.rows or not all(row["ok"] for row in run.rows):

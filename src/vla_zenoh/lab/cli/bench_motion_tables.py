@@ -1,9 +1,8 @@
-"""Tables of the motion protocol, also beside the figures published in the thesis."""
+"""Table of the motion protocol."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from rich.table import Table
@@ -18,8 +17,7 @@ def motion_table(rows: Sequence[Row]) -> Table:
     """Asked and reached motion, with peaks, tracking and jerk."""
     chunked = any(row["horizon"] > 1 for row in rows)
     delayed = any(row["delay_ms"] for row in rows)
-    table = _table(
-        "50 steps each, measured at rest",
+    columns = (
         "prompt",
         "Hz",
         *(["chunk"] if chunked else []),
@@ -35,6 +33,7 @@ def motion_table(rows: Sequence[Row]) -> Table:
         *(["at seams"] if chunked or delayed else []),
         "",
     )
+    table = new_table(*columns, left=("prompt", ""), title="50 steps each, measured at rest")
     table.caption = (
         "off: beside the asked direction or axis. track: measured from commanded pose, at most. "
         "v, a: peaks in m/s, m/s2, of rotations in rad. jerk: peak as a share of its limit"
@@ -66,50 +65,6 @@ def motion_table(rows: Sequence[Row]) -> Table:
     return table
 
 
-def thesis_table(rows: Sequence[Row], *, virtual: bool) -> Table:
-    """The thesis's Table 5.2 beside ours: one step a request, path lengths over 50 requests.
-
-    Args:
-        rows: of any conditions; those that the thesis ran too are shown.
-        virtual: latencies are those of lockstep, and left out.
-    """
-    table = _table("beside the thesis", "prompt", "Hz", "asked", "thesis", "ours")
-    for column in ("thesis e2e", "ours", "outbound", "ours"):
-        if not virtual:
-            table.add_column(column, justify="right", no_wrap=True)
-    for row in rows:
-        published = THESIS.get((row["prompt"], row["rate_hz"]))
-        if published is None or "asked_m" not in row or row["horizon"] > 1 or row["delay_ms"]:
-            continue
-        times = (
-            _mean_p95(published.e2e_ms),
-            _mean_p95((row["e2e_ms_mean"], row["e2e_ms_p95"])),
-            _mean_p95(published.outbound_ms),
-            _mean_p95((row["outbound_ms_mean"], row["outbound_ms_p95"])),
-        )
-        table.add_row(
-            row["prompt"],
-            f"{row['rate_hz']:g}",
-            _paths(row["asked_path_m"] or None, row["asked_path_rad"] or None),
-            _paths(published.path_m, published.path_rad),
-            _paths(row["path_m"], row["path_rad"]),
-            *(() if virtual else times),
-        )
-    table.caption = (
-        "way of the TCP over 50 requests in m and rad, the thesis's on a real arm, ours simulated"
-    )
-    if not virtual:
-        table.caption += (
-            "; mean / p95 in ms: e2e from the request (ours: the camera's stamp) to the command, "
-            "outbound to the model (ours: until its answer is with the command node)"
-        )
-    return table
-
-
-def _table(title: str, *columns: str) -> Table:
-    return new_table(*columns, left=("prompt", ""), title=title)
-
-
 def _amounts(row: Row) -> tuple[str, str]:
     if row["asked_m"]:
         return f"{row['asked_m']:.4f} m", f"{row['reached_m']:.4f} m"
@@ -121,46 +76,3 @@ def _amounts(row: Row) -> tuple[str, str]:
 def _peak(row: Row, what: str, power: str) -> str:
     unit = "rad" if row["asked_rad"] else "m"
     return f"{row[f'peak_{what}_{unit}_s{power}']:.3f}"
-
-
-def _paths(way_m: float | None, way_rad: float | None) -> str:
-    parts = ((way_m, "m"), (way_rad, "rad"))
-    return ", ".join(f"{value:.3f} {unit}" for value, unit in parts if value is not None)
-
-
-def _mean_p95(pair: tuple[float | None, float | None] | None) -> str:
-    if pair is None or pair[0] is None or pair[1] is None:
-        return ""
-    return f"{pair[0]:.1f} / {pair[1]:.1f}"
-
-
-@dataclass(frozen=True, slots=True)
-class PublishedRun:
-    """Figures of one run; None where none was published.
-
-    Args:
-        path_m: length of the path of the TCP, in translation.
-        path_rad: likewise in rotation.
-        e2e_ms: request to pose command, mean and p95.
-        outbound_ms: request to its arrival at the model, mean and p95.
-    """
-
-    path_m: float | None = None
-    path_rad: float | None = None
-    e2e_ms: tuple[float, float] | None = None
-    outbound_ms: tuple[float, float] | None = None
-
-
-THESIS: dict[tuple[str, float], PublishedRun] = {
-    ("go up", 1.0): PublishedRun(0.248, 0.421, (7.323, 8.055), (5.963, 6.631)),
-    ("go up", 5.0): PublishedRun(0.121),
-    ("yaw right", 1.0): PublishedRun(None, 1.248),
-    ("yaw right", 5.0): PublishedRun(None, 1.003),
-    ("yaw left", 5.0): PublishedRun(0.096, 1.251, (6.189, 6.948), (5.122, 5.702)),
-    ("pitch down", 1.0): PublishedRun(0.076, 0.238, (7.210, 8.340), (5.939, 6.692)),
-    ("pitch down", 5.0): PublishedRun(None, 0.285),
-    ("roll left", 1.0): PublishedRun(None, 0.043),
-    ("roll left", 5.0): PublishedRun(None, 0.010),
-    ("close gripper", 5.0): PublishedRun(0.001, 0.001, (6.169, 6.828), (5.047, 5.594)),
-}
-"""By motion and rate in Hz."""

@@ -12,7 +12,7 @@ from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.cli.output import console, errors, fail, print_json, progress
 from vla_zenoh.errors import RecordingError, counted, nearest
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file, output_folder
-from vla_zenoh.lab.evaluation.evaluate import MCAP
+from vla_zenoh.lab.evaluation.evaluate import MCAP, recordings
 
 dataset_app = typer.Typer(
     name="dataset", help="Turn recorded runs into training data.", no_args_is_help=True
@@ -126,11 +126,7 @@ def stats(
 
 
 def _files(given: list[Path]) -> list[Path]:
-    out = [
-        path
-        for each in given
-        for path in (sorted(each.rglob(f"*{MCAP}")) if each.is_dir() else [each])
-    ]
+    out = list(recordings(given))
     if not out:
         raise RecordingError(f"no {MCAP} file in {', '.join(map(str, given))}")
     return out

@@ -23,7 +23,7 @@ class DemoOptions:
         float | None,
         typer.Option(
             "--seconds",
-            help="Duration of a fixed motion; time limit of a task.",
+            help="Time for the steps of a fixed motion; time limit of a task.",
             min=0.5,
             max=3600,
         ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,90 +10,94 @@ import typer
 
 from vla_zenoh.cli.output import console, new_table, print_json, styled
 from vla_zenoh.lab.cli.demo_options import DemoOptions
-from vla_zenoh.lab.cli.demo_stage import Stage, open_stage, refusals, run_folder
+from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage, refusals, run_folder
 from vla_zenoh.lab.demo.chunk_file import write_chunks
-from vla_zenoh.lab.demo.runner import DemoResult, DemoRunner
+from vla_zenoh.lab.demo.runner import MotionRunner
 from vla_zenoh.lab.demo.segments import DemoSegment, SegmentOutcome, latencies
+from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.evaluation.result import TASKS
 from vla_zenoh.lab.recording.run import Run
-from vla_zenoh.lab.recording.stream_listener import StreamListener
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile
-
-KEPT = 400
-"""States that the demo keeps."""
+from vla_zenoh.types import NodeStatus
 
 
 def run_demo(segments: list[DemoSegment], profile: str, given: DemoOptions) -> None:
     """Run fixed motions and show how far each came."""
     folder = run_folder(given.output)
+    if given.seconds is not None:
+        steps = max(round(given.seconds * given.rate_hz), 1)
+        segments = [replace(segment, steps=steps) for segment in segments]
     with open_stage(profile, folder, force=given.force) as stage:
-        result = _run(stage, segments, given.rate_hz, given.seconds)
-        run = stage.recorded()
-        summary = _summary(stage.profile, given.rate_hz, result, run)
+        outcomes, statuses = _run(stage, segments, given.rate_hz)
+        run, interrupted = stage.recorded(), len(outcomes) < len(segments)
+        summary = _summary(stage.profile, given.rate_hz, outcomes, statuses, run)
+        summary["ok"] = summary["ok"] and not interrupted
         stage.write(summary)
-        _write_files(stage, run)
+        _write_chunks(stage, run)
+        stage.draw(run)
+        stage.film(run)
     if given.as_json:
         print_json({**summary, "folder": folder})
     else:
-        _show(summary, result, folder)
+        _show(summary, outcomes, folder, interrupted=interrupted)
     if not summary["ok"]:
-        raise typer.Exit(130 if result.interrupted else 1)
+        raise typer.Exit(130 if interrupted else 1)
 
 
 def _run(
-    stage: Stage, segments: list[DemoSegment], rate_hz: float, seconds: float | None
-) -> DemoResult:
-    profile, stop = stage.profile, stage.stop
+    stage: Stage, segments: list[DemoSegment], rate_hz: float
+) -> tuple[list[SegmentOutcome], dict[str, NodeStatus]]:
+    """The segments that ended, and the last status of every node."""
+    outcomes: list[SegmentOutcome] = []
     with stage.nodes(24) as (running, bars):
-        assert running.session is not None and running.client is not None
-        tasks: list[Any] = []
-
-        def progress(index: int, done: int) -> None:
-            while len(tasks) <= index:
-                segment = segments[len(tasks)]
-                tasks.append(bars.add_task(segment.prompt, total=segment.steps))
-            bars.update(tasks[index], completed=done)
-
-        def watch() -> None:
-            if not running.supervisor.poll():
-                stop.set()
-
-        listener = StreamListener(running.session, profile.keys, profile.task.worker, keep=KEPT)
+        assert running.client is not None
+        client = running.client
         try:
-            run = DemoRunner(running.client, listener, stop, watch, progress)
-            result = run.run(segments, rate_hz, seconds)
-            stage.facts[TASKS] = [_fact(outcome) for outcome in result.outcomes]
+            run = MotionRunner(client, stage.stop, running.poll)
+            run.begin(rate_hz)
+            for segment in segments:
+                bar = bars.add_task(segment.prompt, total=segment.steps)
+                outcome = run.run_segment(
+                    segment, rate_hz, lambda done, bar=bar: bars.update(bar, completed=done)
+                )
+                bars.update(bar, completed=segment.steps)
+                outcomes.append(outcome)
+        except Interrupted:
+            pass
         finally:
-            listener.close()
-        for index, task in enumerate(tasks):
-            if index < len(result.outcomes):
-                bars.update(task, completed=segments[index].steps)
-    return result
+            statuses = {name: found[0] for name, found in client.snapshot().items()}
+            client.deactivate()
+            stage.facts[TASKS] = [_fact(outcome) for outcome in outcomes]
+    return outcomes, statuses
 
 
-def _summary(profile: Profile, rate_hz: float, result: DemoResult, run: Run) -> dict[str, Any]:
-    outcomes = [outcome.to_dict() for outcome in result.outcomes]
-    commands = run.commands or run.joint_commands
-    only = outcomes[0] if len(outcomes) == 1 else {}
+def _summary(
+    profile: Profile,
+    rate_hz: float,
+    outcomes: list[SegmentOutcome],
+    statuses: dict[str, NodeStatus],
+    run: Run,
+) -> dict[str, Any]:
+    rows = [outcome.to_dict() for outcome in outcomes]
+    only = rows[0] if len(rows) == 1 else {}
+    worker, command = statuses.get(f"worker-{profile.task.worker}"), statuses.get("command")
     return {
-        "ok": bool(outcomes) and not result.interrupted and all(o["ok"] for o in outcomes),
+        "ok": bool(rows) and all(row["ok"] for row in rows),
         "profile": profile.name,
         "rate_hz": rate_hz,
         **{key: only[key] for key in ("prompt", "steps", "steps_done", "asked", "reached") if only},
-        "drift_mm": max((o["drift_mm"] for o in outcomes), default=None),
-        "rotation_drift_rad": max((o["rotation_drift_rad"] for o in outcomes), default=None),
+        "drift_mm": max((row["drift_mm"] for row in rows), default=None),
+        "rotation_drift_rad": max((row["rotation_drift_rad"] for row in rows), default=None),
         "latency_ms": latencies(run.first_commands()),
         "rates_hz": {
-            "command": _rate(commands),
+            "command": _rate(run.commands or run.joint_commands),
             "state": _rate(run.poses),
-            "chunks": result.statuses[f"worker-{profile.task.worker}"].rates_hz.get("chunks", 0.0)
-            if f"worker-{profile.task.worker}" in result.statuses
-            else 0.0,
+            "chunks": worker.rates_hz.get("chunks", 0.0) if worker else 0.0,
         },
-        "missed_ticks": _counter(result, "command", "command.missed_ticks"),
-        "refusals": refusals(result.statuses),
-        "segments": outcomes,
+        "missed_ticks": command.counters.get("command.missed_ticks", 0) if command else 0,
+        "refusals": refusals(statuses),
+        "segments": rows,
     }
 
 
@@ -113,60 +118,43 @@ def _rate(entries: list[Any]) -> float:
     return round((len(entries) - 1) / span_s, 2) if span_s > 0 else 0.0
 
 
-def _counter(result: DemoResult, node: str, name: str) -> int:
-    status = result.statuses.get(node)
-    return int(status.counters.get(name, 0)) if status else 0
-
-
-def _write_files(stage: Stage, run: Run) -> None:
-    folder, profile = stage.folder, stage.profile
+def _write_chunks(stage: Stage, run: Run) -> None:
+    profile = stage.profile
     worker = profile.task.worker
     spec = make_policy(find_worker(worker, profile.models)[1], profile.options.get(worker)).spec
-    first = run.first_commands()
-    obeyed = {cause.chunk_seq for cause, _ in first if cause.worker == worker}
+    obeyed = {cause.chunk_seq for cause, _ in run.first_commands() if cause.worker == worker}
     chunks = [
         entry.record.steps
         for entry in run.chunks
         if entry.record.worker == worker and entry.header.seq in obeyed
     ]
-    write_chunks(folder / "chunks.npz", spec, chunks)
-    stage.draw(run)
-    stage.film(run)
+    write_chunks(stage.folder / "chunks.npz", spec, chunks)
 
 
-def _show(summary: dict[str, Any], result: DemoResult, folder: Path) -> None:
+def _show(
+    summary: dict[str, Any], outcomes: list[SegmentOutcome], folder: Path, *, interrupted: bool
+) -> None:
     columns = ("prompt", "steps", "asked", "reached", "drift", "rotation drift", "verdict")
     title = "asked and reached, measured at rest"
     table = new_table(*columns, title=title, left=("prompt", "verdict"))
-    for outcome in result.outcomes:
-        asked, reached = _amounts(outcome)
+    for outcome in outcomes:
         faults = outcome.faults()
         table.add_row(
             outcome.segment.prompt,
             f"{outcome.steps_done}/{outcome.segment.steps}",
-            asked,
-            reached,
+            *_amounts(outcome),
             f"{outcome.drift_mm:.2f} mm",
             f"{outcome.drift_rad * 1e3:.2f} mrad",
             styled("; ".join(faults), "red") if faults else styled("ok", "green"),
         )
     screen = console()
     screen.print(table)
-    latency = summary["latency_ms"]
-    if latency.get("p50") is not None:
-        stages = ", ".join(
-            f"{name.replace('_', ' ')} {values['p50']:.1f}"
-            for name, values in latency["stages"].items()
-        )
-        screen.print(
-            f"latency, camera stamp to pose command: p50 {latency['p50']:.1f} ms, "
-            f"p95 {latency['p95']:.1f} ms ({stages})"
-        )
+    screen.print(latency_line(summary["latency_ms"]))
     rates = ", ".join(f"{name} {value:.1f} Hz" for name, value in summary["rates_hz"].items())
     refused = ", ".join(f"{reason} {count}" for reason, count in summary["refusals"].items())
-    screen.print(f"rates: {rates}; refusals: {refused or 'none'}")
+    screen.print(f"rates: {rates}; rejections: {refused or 'none'}")
     screen.print(f"run folder: {folder} (run.mcap, summary.json, chunks.npz, plot.png, video.mp4)")
-    if result.interrupted:
+    if interrupted:
         screen.print("interrupted; the arm braked", style="yellow")
     elif summary["ok"]:
         screen.print("the arm did what was asked", style="bold green")

@@ -158,6 +158,21 @@ def run_folder(given: Path | None) -> Path:
     return given or RUNS / time.strftime("demo-%Y%m%d-%H%M%S")
 
 
+def latency_line(latency: Mapping[str, Any]) -> str:
+    """The latency of a run, see `vla_zenoh.lab.demo.segments.latencies`, in one line."""
+    if latency.get("p50") is None:
+        return "latency: no chunk was carried out"
+    stages = ", ".join(
+        f"{name.replace('_', ' ')} {values['p50']:.1f}"
+        for name, values in latency["stages"].items()
+        if values
+    )
+    return (
+        f"latency, camera stamp to pose command: p50 {latency['p50']:.1f} ms, "
+        f"p95 {latency['p95']:.1f} ms ({stages})"
+    )
+
+
 def refusals(statuses: Mapping[str, NodeStatus]) -> dict[str, int]:
     """Rejections of all nodes, by reason."""
     out: Counter[str] = Counter()

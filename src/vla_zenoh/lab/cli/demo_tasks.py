@@ -15,7 +15,7 @@ from vla_zenoh.lab.bench.task import DemoPlan, TaskOutcome, is_judged
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
 from vla_zenoh.lab.cli.demo_options import DemoOptions
-from vla_zenoh.lab.cli.demo_stage import Stage, open_stage, refusals, run_folder
+from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage, refusals, run_folder
 from vla_zenoh.lab.demo.segments import latencies
 from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.evaluation.result import TASKS
@@ -136,11 +136,5 @@ def _show(ended: list[TaskOutcome], summary: dict[str, Any], folder: Path) -> No
         table.add_row(each.prompt, said)
     screen = console()
     screen.print(table)
-    latency = summary["latency_ms"]
-    if latency.get("p50") is not None:
-        screen.print(
-            f"latency, camera stamp to pose command: p50 {latency['p50']:.1f} ms, "
-            f"p95 {latency['p95']:.1f} ms; inference p50 "
-            f"{latency['stages']['inference'].get('p50', 0.0):.1f} ms"
-        )
+    screen.print(latency_line(summary["latency_ms"]))
     screen.print(f"run folder: {folder} (run.mcap, summary.json, tasks.jpg, plot.png, video.mp4)")

@@ -55,7 +55,7 @@ def doctor(
     as_json: JsonOption = False,
     rules: Annotated[
         Path | None,
-        typer.Option("--rules", help="Test the access rules in this Zenoh configuration instead."),
+        typer.Option("--rules", help="Check the access rules in this Zenoh configuration instead."),
     ] = None,
     also: AlsoOption = None,
 ) -> None:
@@ -80,7 +80,7 @@ def doctor(
             findings += access(
                 loaded,
                 dt.datetime.now(dt.UTC),
-                functools.partial(_rehearse, loaded, rules, also or ()),
+                functools.partial(_check_access, loaded, rules, also or ()),
                 functools.partial(try_identity, loaded),
             )
     if as_json:
@@ -91,7 +91,7 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _rehearse(profile: Profile, rules: Path | None, also: Sequence[str]) -> list[AccessVerdict]:
+def _check_access(profile: Profile, rules: Path | None, also: Sequence[str]) -> list[AccessVerdict]:
     others = [effective_profile(name) for name in also]
     return check_access(profile, None if rules is None else read_access(rules), others)
 

@@ -24,13 +24,13 @@ from vla_zenoh.cli.output import (
 )
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.evaluation import tables
-from vla_zenoh.lab.evaluation.evaluate import CSV, EMPTY, combined, evaluate, recordings, to_mapping
+from vla_zenoh.lab.evaluation.evaluate import EMPTY, combined, evaluate, recordings, to_mapping
 from vla_zenoh.lab.evaluation.result import STAGES, Evaluation
 
 IMAGES = 8
 WIDE = 110
 """Width of a terminal with room for every column, in characters."""
-HTML = ".html"
+HTML, CSV = ".html", ".csv"
 KINDS = (HTML, CSV, ".json")
 """Ends of the names of the files that can be written."""
 
@@ -38,7 +38,7 @@ KINDS = (HTML, CSV, ".json")
 def evaluation(
     paths: Annotated[
         list[Path],
-        typer.Argument(help="Recordings (.mcap), CSV of the thesis, or folders of them."),
+        typer.Argument(help="Recordings (.mcap), or folders of them."),
     ],
     first: Annotated[
         int | None, typer.Option("--first", help="Only this many requests of each run.", min=1)

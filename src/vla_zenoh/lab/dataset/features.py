@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
-from vla_zenoh.lab.recording.run import RecordedSample
+from vla_zenoh.lab.recording.run import nearest
 from vla_zenoh.policy import ActionSpec, Observation
 from vla_zenoh.policy.state_vector import parts_of, state_vector
 from vla_zenoh.types import Task
@@ -66,14 +64,14 @@ def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.floa
     run = episode.run
     streams = {"joint": run.joints, "pose": run.poses, "gripper": run.grippers}
     wanted = {part: streams[part] for part in parts_of(parts)}
-    most_m = _max_width_m(run.file.profile_yaml)
+    most_m = run.max_width_m
     task = Task(0, True, "", episode.worker, 1.0)
     rows = []
     for frame in episode.frames:
         found: dict[str, Any] = {}
         for part, stream in wanted.items():
-            near = _nearest(stream, frame.stamp_ns)
-            if near is None:
+            near = nearest(stream, frame.stamp_ns)
+            if near is None or abs(near.header.stamp_wall_ns - frame.stamp_ns) > NEAR_NS:
                 raise RecordingError(
                     f"{run.path}: no state/{part} within {NEAR_NS / 1e6:g} ms of a frame"
                 )
@@ -81,20 +79,3 @@ def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.floa
         observation = Observation(frame.stamp_ns, 0, task, **found)
         rows.append(state_vector(parts, observation, most_m))
     return np.array(rows, np.float32)
-
-
-def _nearest(stream: list[RecordedSample], at_ns: int) -> RecordedSample | None:
-    index = bisect_left(stream, at_ns, key=lambda entry: entry.header.stamp_wall_ns)
-    around = stream[max(index - 1, 0) : index + 1]
-    near = min(around, key=lambda each: abs(each.header.stamp_wall_ns - at_ns), default=None)
-    if near is None or abs(near.header.stamp_wall_ns - at_ns) > NEAR_NS:
-        return None
-    return near
-
-
-def _max_width_m(profile_yaml: str) -> float:
-    """From the profile in force; 1 without one, so that fractions equal widths."""
-    try:
-        return float(yaml.safe_load(profile_yaml)["robot"]["gripper"]["max_width_m"])
-    except (TypeError, KeyError, ValueError, yaml.YAMLError):
-        return 1.0

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
-
 from vla_zenoh.errors import RecordError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
-from vla_zenoh.lab.recording.run import RecordedSample
+from vla_zenoh.lab.recording.run import newest
 from vla_zenoh.lab.tasks.judge import SETTLED_S, TaskJudge
 from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.lab.trial.verdict import verdict_in
@@ -27,8 +25,8 @@ def succeeded(episode: RecordedEpisode) -> bool | None:
     prompts = {frame.prompt for frame in episode.frames}
     order = parse_prompt(prompts.pop()) if len(prompts) == 1 else None
     run = episode.run
-    before = _newest(run.objects, episode.since_ns)
-    pose = _newest(run.poses, episode.since_ns)
+    before = newest(run.objects, episode.since_ns)
+    pose = newest(run.poses, episode.since_ns)
     if order is None or before is None or pose is None:
         return None
     try:
@@ -40,7 +38,7 @@ def succeeded(episode: RecordedEpisode) -> bool | None:
         at_ns = entry.header.stamp_wall_ns
         if not episode.since_ns <= at_ns < episode.until_ns + AFTER_NS:
             continue
-        width, pose = _newest(run.grippers, at_ns), _newest(run.poses, at_ns)
+        width, pose = newest(run.grippers, at_ns), newest(run.poses, at_ns)
         if width is None or pose is None:
             continue
         time_s = (at_ns - episode.since_ns) / 1e9
@@ -48,8 +46,3 @@ def succeeded(episode: RecordedEpisode) -> bool | None:
         if verdict is not None:
             break
     return (verdict or judge.end()).success
-
-
-def _newest(stream: list[RecordedSample], at_ns: int) -> RecordedSample | None:
-    index = bisect_right(stream, at_ns, key=lambda entry: entry.header.stamp_wall_ns) - 1
-    return stream[index] if index >= 0 else None

@@ -1,154 +1,92 @@
-"""Runs motion segments on a robot: prompt, wait for rest, compare the poses before and after."""
+"""Runs fixed motions on a robot: prompt, wait for rest, compare the poses before and after."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.errors import NodeError
-from vla_zenoh.keys import worker_node
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, rotation_from_quat
 from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, SegmentOutcome, judge_segment
-from vla_zenoh.lab.episode import COMMAND, EpisodeRunner, Interrupted
-from vla_zenoh.lab.recording.stream_listener import StreamListener
-from vla_zenoh.types import NodeStatus
+from vla_zenoh.lab.episode import EpisodeRunner
+from vla_zenoh.lab.newest_records import NewestRecords
+from vla_zenoh.types import GripperState, PoseState
 
-READY_PATIENCE_S = 40.0
-READY_FOR_S = 0.7
-"""A status comes twice a second."""
 SETTLE_S = 0.8
 """From the end of the commanded motion until arm and integral action are at rest."""
-REST_WINDOW_NS = 150_000_000
+REST_WINDOW_S, REST_SAMPLE_S = 0.15, 0.01
+STILL = 1e-3
+"""Speed of a measured TCP at rest, m/s and rad/s."""
 SLACK_S = 15.0
-NOT_AT_REST = "the arm does not come to rest"
 
 
-@dataclass(slots=True)
-class DemoResult:
-    """Result of a demo.
-
-    Args:
-        outcomes: one per segment that ended.
-        statuses: last status of every node.
-        interrupted: by Ctrl-C.
-    """
-
-    outcomes: list[SegmentOutcome] = field(default_factory=list)
-    statuses: dict[str, NodeStatus] = field(default_factory=dict)
-    interrupted: bool = False
-
-
-class DemoRunner(EpisodeRunner):
-    """Runs segments one after the other.
+class MotionRunner(EpisodeRunner):
+    """Runs motion segments one after the other.
 
     Args:
         client: follows the nodes.
-        listener: receives the streams.
         stop: set by Ctrl-C.
         watch: see `EpisodeRunner`.
-        progress: called with (segment index, accepted steps).
     """
 
     def __init__(
-        self,
-        client: Client,
-        listener: StreamListener,
-        stop: threading.Event,
-        watch: Callable[[], None],
-        progress: Callable[[int, int], None],
+        self, client: Client, stop: threading.Event, watch: Callable[[], None] = lambda: None
     ) -> None:
         super().__init__(client, stop, watch)
-        self._listener, self._progress = listener, progress
-        self._ready_since_s = 0.0
-
-    def run(
-        self, segments: Sequence[DemoSegment], rate_hz: float, seconds: float | None
-    ) -> DemoResult:
-        """Activate, run every segment, brake.
-
-        Raises:
-            NodeError: the chain does not come up, or the arm does not stay active to the end.
-        """
-        result = DemoResult()
-        try:
-            self.wait_until_ready()
-            self.start("hold", rate_hz)
-            for index, segment in enumerate(segments):
-                result.outcomes.append(self.run_segment(index, segment, rate_hz, seconds))
-        except Interrupted:
-            result.interrupted = True
-        result.statuses = {name: found[0] for name, found in self.client.snapshot().items()}
-        self.client.deactivate()
-        return result
-
-    def wait_until_ready(self) -> None:
-        """Wait until every node works.
-
-        Raises:
-            NodeError: one does not in time; with the state of each.
-        """
-        self._ready_since_s = 0.0
-        self.wait(self._ready, READY_PATIENCE_S, "the nodes did not come up")
-
-    def _ready(self) -> bool:
-        """All nodes have worked for long enough that the command node knows."""
-        worker = self.client.status(worker_node(self.client.profile.task.worker))
-        streams = self._listener.streams
-        ready = bool(
-            worker is not None
-            and worker.state == "inferring"
-            and self.client.status(COMMAND) is not None
-            and streams.poses
-            and streams.grippers
+        keys = client.keys
+        self._streams = NewestRecords(
+            client.session, {PoseState: keys.state_pose, GripperState: keys.state_gripper}
         )
-        now_s = time.monotonic()
-        self._ready_since_s = self._ready_since_s or now_s if ready else 0.0
-        return ready and now_s - self._ready_since_s > READY_FOR_S
+
+    def begin(self, rate_hz: float) -> None:
+        """Wait for the nodes and activate the arm; it stays where it is.
+
+        Raises:
+            NodeError: the nodes do not come up.
+            SessionError: activation is rejected to the end, with every reason.
+            Interrupted: Ctrl-C.
+        """
+        self.wait_until_ready(self.client.profile.task.worker, self._streams)
+        self.start("hold", rate_hz)
 
     def run_segment(
-        self, index: int, segment: DemoSegment, rate_hz: float, seconds: float | None = None
+        self,
+        segment: DemoSegment,
+        rate_hz: float,
+        progress: Callable[[int], None] = lambda done: None,
     ) -> SegmentOutcome:
         """Publish a prompt, wait for its end and for rest, and judge.
 
         Args:
-            index: of the segment, for `progress`.
             segment: prompt and steps.
             rate_hz: at which chunks are requested.
-            seconds: run the prompt for this long instead of counting steps.
+            progress: called with the accepted steps.
 
         Raises:
-            NodeError: it does not end.
+            NodeError: it does not end, or the arm does not stay active.
             Interrupted: Ctrl-C.
         """
-        before = self._rest_pose()
-        self._listener.streams.mark(segment.prompt)
-        began_s = time.monotonic()
-        if seconds is None:
-            prompt = segment.prompt_with_count
-            episode = self.client.set_prompt(prompt).episode
-            patience_s = segment.steps / rate_hz * 2 + SLACK_S
-            self.wait(
-                lambda: self._finished(episode, segment.steps, index),
-                patience_s,
-                f"{prompt!r} did not end in {patience_s:.0f} s",
-            )
-            steps_done = self._steps_of(episode)
-        else:
-            episode = self.client.set_prompt(segment.prompt_without_end).episode
-            self.pause(seconds)
-            self._steps_of(episode)
-            self.client.set_prompt("hold")
-            self.wait(self._at_rest, SLACK_S, NOT_AT_REST)
-            steps_done = self._listener.steps_carried_out(episode)
-            segment = replace(segment, steps=steps_done)
+        before, began_s = self._rest_pose(), time.monotonic()
+        prompt, patience_s = segment.prompt_with_count, segment.steps / rate_hz * 2 + SLACK_S
+        self.prompt(prompt)
+        steps_done = 0
+
+        def ended() -> bool:
+            nonlocal steps_done
+            view = self.view()
+            if not view.active:
+                raise NodeError(f"the arm is {view.state}: {view.why}")
+            steps_done = view.steps
+            progress(min(steps_done, segment.steps))
+            return view.done and not self._streams.read(GripperState)[1].moving
+
+        self.wait(ended, patience_s, f"{prompt!r} did not end in {patience_s:.0f} s")
+        duration_s = time.monotonic() - began_s
         self.pause(SETTLE_S)
-        duration_s = time.monotonic() - began_s - SETTLE_S
         return judge_segment(
             segment,
             before,
@@ -158,58 +96,23 @@ class DemoRunner(EpisodeRunner):
             duration_s=duration_s,
         )
 
-    def _detail(self) -> dict[str, Any]:
-        status = self.client.status(COMMAND)
-        if status is None:
-            return {}
-        if status.state not in ("active", "holding"):
-            raise NodeError(f"the arm is {status.state}: {status.detail.get('why', '')}")
-        return dict(status.detail)
-
-    def _steps_of(self, episode: int) -> int:
-        detail = self._detail()
-        return int(detail.get("accepted_steps", 0)) if detail.get("episode") == episode else 0
-
-    def _finished(self, episode: int, steps: int, index: int) -> bool:
-        detail = self._detail()
-        if detail.get("episode") != episode:
-            return False
-        self._progress(index, min(self._steps_of(episode), steps))
-        return bool(detail.get("policy_done")) and self._at_rest()
-
     def _at_rest(self) -> bool:
-        """The commanded motion has ended."""
-        streams = self._listener.streams
-        if not streams.grippers or streams.grippers[-1].record.moving:
-            return False
-        if streams.joint_commands:
-            joints = streams.joint_commands[-1].record
-            return self._at_rest_measured() and float(np.abs(joints.velocity_rad_s).max()) < 1e-5
-        if not streams.commands:
-            return False
-        command = streams.commands[-1].record
-        ahead_m = float(np.linalg.norm(command.goal_position_m - command.position_m))
-        return float(np.abs(command.twist).max()) < 1e-5 and ahead_m < 1e-5
-
-    def _at_rest_measured(self) -> bool:
-        pose = self._listener.streams.newest_pose()
-        return pose is not None and float(np.abs(pose.twist).max()) < 1e-3
+        _, pose = self._streams.read(PoseState)
+        return float(np.abs(pose.twist).max()) < STILL
 
     def _rest_pose(self) -> RestPose:
-        """Mean measured pose over `REST_WINDOW_NS` from now."""
-        self.wait(self._at_rest_measured, SLACK_S, NOT_AT_REST)
-        streams = self._listener.streams
-        # Decoding may lag behind on a busy computer: samples received before now do not count.
-        until_ns = time.time_ns() + REST_WINDOW_NS
-        self.wait(
-            lambda: min(streams.poses[-1].received_ns, streams.grippers[-1].received_ns) > until_ns,
-            SLACK_S,
-            "the robot's states are silent",
-        )
-        since_ns = streams.poses[-1].received_ns - REST_WINDOW_NS
-        poses = [entry.record for entry in streams.poses[-200:] if entry.received_ns >= since_ns]
-        position = np.mean([pose.position_m for pose in poses], axis=0)
-        first = rotation_from_quat(poses[0].quat_xyzw)
-        turns = [log3(rotation_from_quat(pose.quat_xyzw) @ first.T) for pose in poses]
-        rotation = exp3(np.mean(turns, axis=0)) @ first
-        return RestPose(Pose(position, rotation), streams.grippers[-1].record.width_m)
+        """Mean measured pose over `REST_WINDOW_S` from now."""
+        self.wait(self._at_rest, SLACK_S, "the arm does not come to rest")
+        since_s = time.monotonic()
+        poses: dict[int, PoseState] = {}
+        while time.monotonic() < since_s + REST_WINDOW_S or self._streams.missing(since_s):
+            if time.monotonic() > since_s + SLACK_S:
+                raise NodeError("the robot's states are silent")
+            self.pause(REST_SAMPLE_S)
+            header, pose = self._streams.read(PoseState)
+            poses[header.seq] = pose
+        positions = [pose.position_m for pose in poses.values()]
+        rotations = [rotation_from_quat(pose.quat_xyzw) for pose in poses.values()]
+        turns = [log3(rotation @ rotations[0].T) for rotation in rotations]
+        mean = Pose(np.mean(positions, axis=0), exp3(np.mean(turns, axis=0)) @ rotations[0])
+        return RestPose(mean, self._streams.read(GripperState)[1].width_m)

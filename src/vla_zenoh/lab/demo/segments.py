@@ -50,16 +50,8 @@ class DemoSegment:
     @property
     def prompt_with_count(self) -> str:
         """The prompt that ends by itself after the steps."""
-        return f"{self.prompt} x{self.steps}{self._within}"
-
-    @property
-    def prompt_without_end(self) -> str:
-        """The prompt that continues until the next one."""
-        return f"{self.prompt}{self._within}"
-
-    @property
-    def _within(self) -> str:
-        return "" if self.within is None else f" within {self.within:g}"
+        within = "" if self.within is None else f" within {self.within:g}"
+        return f"{self.prompt} x{self.steps}{within}"
 
     @property
     def translation_m(self) -> FloatArray:

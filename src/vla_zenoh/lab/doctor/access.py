@@ -27,7 +27,7 @@ SERVERS = ("router", BRIDGE)
 
 @dataclass(frozen=True, slots=True)
 class AccessVerdict:
-    """Result of the access test for one identity.
+    """Result of the access check for one identity.
 
     Args:
         identity: that verdict.
@@ -53,7 +53,7 @@ def access(
     Args:
         profile: the lab.
         now: UTC.
-        check_access: the access test.
+        check_access: see `vla_zenoh.lab.doctor.access_check`.
         try_identity: presents the certificate of a node of this computer to the running router;
             returns what is wrong.
     """
@@ -76,7 +76,7 @@ def access(
     try:
         yield from map(rules, check_access())
     except VlaZenohError as error:
-        yield HostFinding("access", "fail", f"the access test failed: {error}")
+        yield HostFinding("access", "fail", f"the rules could not be checked: {error}")
     for entry in entries:
         if entry.node not in SERVERS and not entry.faults:
             yield _accepted(entry, try_identity)

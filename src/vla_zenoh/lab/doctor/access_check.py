@@ -1,19 +1,14 @@
-"""Access test: tries with real sessions that every role can do what it must, and nothing else.
+"""Access check: every role can do what it must by the router's rules, and nothing else.
 
 Zenoh drops silently what a rule forbids, so that a missing rule looks like a node that hangs. This
-test opens a router on this computer, with the rules of the profile and certificates of its own, and
-lets every identity of the lab try every act on every key.
+check reads the rules as Zenoh applies them; a test of this package tries the same acts with real
+sessions at a real router.
 """
 
 from __future__ import annotations
 
-import datetime as dt
 import json
-import socket
-import tempfile
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -26,23 +21,13 @@ from vla_zenoh.keys import Keys, covers
 from vla_zenoh.lab.doctor.access import AccessVerdict
 from vla_zenoh.lab.doctor.access_rules import allowing, missing, passages
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.session import SecurityProfile
 from vla_zenoh.security.identity import Identity, Role, identities
-from vla_zenoh.security.roles import TABLE, Act, Right, expressions, rights
-from vla_zenoh.security.rules import EVERY_MESSAGE, access_control
+from vla_zenoh.security.roles import TABLE, Act, expressions, rights
+from vla_zenoh.security.rules import access_control
 
-Done = set[tuple[str, Act, str]]
-"""(common name, act, key) of what went through."""
-Sessions = Mapping[str, zenoh.Session]
-"""Common name -> session."""
-Part = tuple[Keys, Identity]
-"""An identity at one robot."""
-
-SETTLE_S = 0.4
-"""From a declaration until all sessions on one computer know of it."""
 REPLY_S = 2.0
-WITNESS = Identity(Role.ROUTER, "witness", "rehearsal")
-"""Peer of every act; it may do everything, as routers may."""
+RobotIdentity = tuple[Keys, Identity]
+"""An identity at one robot."""
 
 
 def check_access(
@@ -50,42 +35,22 @@ def check_access(
     access: Mapping[str, Any] | None = None,
     also: Sequence[Profile] = (),
 ) -> list[AccessVerdict]:
-    """Run the access test; takes some seconds.
+    """Check every act on every key for every identity.
 
     Args:
         profile: the lab.
-        access: section ``access_control`` to test; None: the one made of the profiles.
-        also: other robots of the router; every identity of each tries the keys of all.
-
-    Raises:
-        MissingExtraError: the library ``cryptography`` is not installed.
-        SecurityError: certificates cannot be made.
-        SessionError: no session can be opened, or a certificate is not accepted.
+        access: section ``access_control`` to check; None: the one made of the profiles.
+        also: other robots of the router; every identity of each is checked on the keys of all.
     """
     profiles = (profile, *also)
-    parts = _parts(profiles)
-    lab = [played[0][1] for played in parts.values()]
     rules = dict(access_control(profiles) if access is None else access)
     keys_of = probes(profiles)
-    robots = [each.keys for each in profiles]
-    with _stage(profile, lab, _with_witness(rules)) as (witness, sessions):
-        done: Done = set().union(
-            # First: a session that has had a publisher on a key without a subscriber sends nothing
-            # there, whatever the router would let through.
-            _deletions(witness, sessions, keys_of[Act.DELETE]),
-            _puts(witness, sessions, keys_of[Act.PUT]),
-            _subscriptions(witness, sessions, keys_of[Act.SUBSCRIBE]),
-            _queries(witness, sessions, keys_of[Act.ASK]),
-            _replies(witness, sessions, keys_of[Act.ANSWER]),
-            _tokens(witness, sessions, keys_of[Act.ANNOUNCE], robots),
-            _watched_tokens(witness, sessions, robots),
-        )
-    return [_judge(played, keys_of, rules, done) for played in parts.values()]
+    return [_verdict(played, keys_of, rules) for played in identities_of_all(profiles).values()]
 
 
-def _parts(profiles: Sequence[Profile]) -> dict[str, list[Part]]:
+def identities_of_all(profiles: Sequence[Profile]) -> dict[str, list[RobotIdentity]]:
     """Common name -> its identity at every robot where it has one; without routers."""
-    out: dict[str, list[Part]] = {}
+    out: dict[str, list[RobotIdentity]] = {}
     for profile in profiles:
         for one in identities(profile):
             if one.role is not Role.ROUTER:
@@ -96,7 +61,7 @@ def _parts(profiles: Sequence[Profile]) -> dict[str, list[Part]]:
 def probes(profiles: Sequence[Profile]) -> dict[Act, list[str]]:
     """Act -> every key of the lab on which some identity may do it or its counterpart.
 
-    Every key of PUT is also tried with DELETE; tokens are watched all at once.
+    Every key of PUT is also checked with DELETE; tokens are watched all at once.
     """
     made: dict[str, set[Act]] = {}
     for profile in profiles:
@@ -107,275 +72,48 @@ def probes(profiles: Sequence[Profile]) -> dict[Act, list[str]]:
                 for key in expressions(profile.keys, row.member, identity, act):
                     made.setdefault(key.replace("*", camera), set()).update(acts)
     keys_of = {act: sorted(key for key, acts in made.items() if act in acts) for act in Act}
-    watched = [one for profile in profiles for one in _token_selectors(profile.keys)]
+    watched = [one for profile in profiles for one in token_selectors(profile.keys)]
     return {**keys_of, Act.DELETE: keys_of[Act.PUT], Act.WATCH: watched}
 
 
-# -- router and sessions --------------------------------------------------------------------------
-@contextmanager
-def _stage(
-    profile: Profile, lab: Sequence[Identity], rules: Mapping[str, Any]
-) -> Iterator[tuple[zenoh.Session, Sessions]]:
-    """A router with `rules`, a witness, and a session for every identity."""
-    with tempfile.TemporaryDirectory(prefix="vla-zenoh-rehearsal-") as folder, ExitStack() as stack:
-        from vla_zenoh.security.lab_certificates import LabCertificates
-
-        store, now = LabCertificates(folder), dt.datetime.now(dt.UTC)
-        store.make_authority("rehearsal", now)
-        router = Identity(Role.ROUTER, "router", WITNESS.host)
-        store.add([router, WITNESS, *lab], now, days=1, addresses=["127.0.0.1"])
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            endpoint = f"tls/127.0.0.1:{probe.getsockname()[1]}"
-        session = profile.session.model_copy(
-            update={
-                "connect": (endpoint,),
-                "listen": (endpoint,),
-                "separate_links": False,
-                "insecure": False,
-            }
-        )
-
-        def enter(one: Identity, **more: Any) -> zenoh.Session:
-            security = SecurityProfile(folder=folder, host=one.host)
-            own = session.model_copy(update={"security": security})
-            return stack.enter_context(open_session(own, identity=one.node, **more))
-
-        enter(router, mode="router", access=rules)
-        witness = enter(WITNESS)
-        yield witness, {one.common_name: enter(one) for one in lab}
-
-
-def _with_witness(rules: Mapping[str, Any]) -> dict[str, Any]:
-    everything = {
-        "id": "witness",
-        "messages": list(EVERY_MESSAGE),
-        "flows": ["ingress", "egress"],
-        "permission": "allow",
-        "key_exprs": ["**"],
-    }
-    subject = {"id": "witness", "cert_common_names": [WITNESS.common_name]}
-    policy = {"rules": ["witness"], "subjects": ["witness"]}
-    return {
-        **access_control([]),
-        **rules,
-        "rules": [*(rules.get("rules") or ()), everything],
-        "subjects": [*(rules.get("subjects") or ()), subject],
-        "policies": [*(rules.get("policies") or ()), policy],
-    }
-
-
-# -- acts: each returns what went through between a session and the witness -----------------------
-def _subscribe(
-    session: zenoh.Session, keys: Sequence[str], callback: Callable[[zenoh.Sample], None]
-) -> list[Any]:
-    handler = zenoh.handlers.Callback(callback, indirect=False)
-    return [session.declare_subscriber(key, handler) for key in keys]
-
-
-def _undeclare(declared: Sequence[Any]) -> None:
-    for one in declared:
-        one.undeclare()
-
-
-def _puts(witness: zenoh.Session, sessions: Sessions, keys: Sequence[str]) -> Done:
-    """Publications that the witness receives."""
-    received: Done = set()
-    subscribers = _subscribe(
-        witness,
-        keys,
-        lambda sample: received.add((sample.payload.to_string(), Act.PUT, str(sample.key_expr))),
-    )
-    # Publishers, as in the nodes: one that learns of no subscriber sends nothing.
-    publishers = [
-        (name, session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK))
-        for name, session in sessions.items()
-        for key in keys
-    ]
-    time.sleep(SETTLE_S)
-    for name, publisher in publishers:
-        publisher.put(name)
-    time.sleep(SETTLE_S)
-    matching = {
-        (name, Act.PUT, str(publisher.key_expr))
-        for name, publisher in publishers
-        if publisher.matching_status.matching  # pyright: ignore  # stub says bool
-    }
-    _undeclare([*subscribers, *(publisher for _, publisher in publishers)])
-    return received & matching
-
-
-def _deletions(witness: zenoh.Session, sessions: Sessions, keys: Sequence[str]) -> Done:
-    """Deletions that the witness receives."""
-    received: Done = set()
-
-    def on_sample(sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.DELETE and sample.attachment is not None:
-            received.add((sample.attachment.to_string(), Act.DELETE, str(sample.key_expr)))
-
-    subscribers = _subscribe(witness, keys, on_sample)
-    time.sleep(SETTLE_S)
-    for name, session in sessions.items():
-        for key in keys:
-            session.delete(key, attachment=name, congestion_control=zenoh.CongestionControl.BLOCK)
-    time.sleep(SETTLE_S)
-    _undeclare(subscribers)
-    return set(received)
-
-
-def _subscriptions(witness: zenoh.Session, sessions: Sessions, keys: Sequence[str]) -> Done:
-    """Keys on which each session receives the witness."""
-    received: Done = set()
-
-    def callback(name: str) -> Callable[[zenoh.Sample], None]:
-        return lambda sample: received.add((name, Act.SUBSCRIBE, str(sample.key_expr)))
-
-    subscribers = [
-        one
-        for name, session in sessions.items()
-        for one in _subscribe(session, keys, callback(name))
-    ]
-    time.sleep(SETTLE_S)
-    for key in keys:
-        witness.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
-    time.sleep(SETTLE_S)
-    _undeclare(subscribers)
-    return set(received)
-
-
-def _serve(session: zenoh.Session, keys: Sequence[str], name: str) -> list[Any]:
-    def reply(key: str) -> Callable[[zenoh.Query], None]:
-        def handle(query: zenoh.Query) -> None:
-            with query:
-                query.reply(key, name)
-
-        return handle
-
-    return [
-        session.declare_queryable(
-            key, zenoh.handlers.Callback(reply(key), indirect=False), complete=True
-        )
-        for key in keys
-    ]
-
-
-def _queries(witness: zenoh.Session, sessions: Sessions, keys: Sequence[str]) -> Done:
-    """Queries that the witness replies to."""
-    queryables = _serve(witness, keys, "witness")
-    time.sleep(SETTLE_S)
-    done = {
-        (name, Act.ASK, key)
-        for name, session in sessions.items()
-        for key in keys
-        if any(reply.ok is not None for reply in session.get(key, timeout=REPLY_S))
-    }
-    _undeclare(queryables)
-    return done
-
-
-def _replies(witness: zenoh.Session, sessions: Sessions, keys: Sequence[str]) -> Done:
-    """Replies to queries of the witness."""
-    queryables = [one for name, session in sessions.items() for one in _serve(session, keys, name)]
-    time.sleep(SETTLE_S)
-    done: Done = set()
-    for key in keys:
-        replies = witness.get(
-            key,
-            timeout=REPLY_S,
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-        )
-        names = [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
-        done |= {(name, Act.ANSWER, key) for name in names}
-    _undeclare(queryables)
-    return done
-
-
-def _tokens(
-    witness: zenoh.Session, sessions: Sessions, keys: Sequence[str], robots: Sequence[Keys]
-) -> Done:
-    """Liveliness tokens that the witness sees."""
-    done: Done = set()
-    for name, session in sessions.items():
-        tokens = [session.liveliness().declare_token(key) for key in keys]
-        time.sleep(SETTLE_S)
-        done |= {(name, Act.ANNOUNCE, key) for of in robots for key in _live_tokens(witness, of)}
-        _undeclare(tokens)
-        time.sleep(SETTLE_S)
-    return done
-
-
-def _watched_tokens(witness: zenoh.Session, sessions: Sessions, robots: Sequence[Keys]) -> Done:
-    """Liveliness tokens of the witness that each session sees."""
-    own = {
-        selector: selector.replace("*", WITNESS.node)
-        for of in robots
-        for selector in _token_selectors(of)
-    }
-    tokens = [witness.liveliness().declare_token(key) for key in own.values()]
-    time.sleep(SETTLE_S)
-    done = {
-        (name, Act.WATCH, selector)
-        for name, session in sessions.items()
-        for selector, key in own.items()
-        if key in _tokens_of(session, selector)
-    }
-    _undeclare(tokens)
-    return done
-
-
-def _token_selectors(keys: Keys) -> tuple[str, ...]:
+def token_selectors(keys: Keys) -> tuple[str, ...]:
+    """Selectors of all liveliness tokens of a robot."""
     return keys.all_alive, keys.all_holding
 
 
-def _live_tokens(session: zenoh.Session, keys: Keys) -> set[str]:
-    return {key for selector in _token_selectors(keys) for key in _tokens_of(session, selector)}
+def obligations(
+    played: Sequence[RobotIdentity], keys_of: Mapping[Act, Sequence[str]]
+) -> dict[tuple[Act, str], bool]:
+    """(act, key) -> whether an identity must be able to do it; if not, it must not."""
+    granted = [right for keys, one in played for right in rights(keys, one)]
+    read_all = [keys.all_keys for keys, one in played if Role.OPERATOR in one.roles]
+    return {
+        (act, key): (act is Act.SUBSCRIBE and any(covers(each, key) for each in read_all))
+        or any(right.act is act and covers(right.key, key) for right in granted)
+        for act, keys in keys_of.items()
+        for key in keys
+    }
 
 
-def _tokens_of(session: zenoh.Session, selector: str) -> set[str]:
-    replies = session.liveliness().get(selector, timeout=REPLY_S)
-    return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
-
-
-# -- verdict --------------------------------------------------------------------------------------
-def _judge(
-    played: Sequence[Part],
-    keys_of: Mapping[Act, Sequence[str]],
-    rules: Mapping[str, Any],
-    done: Done,
+def _verdict(
+    played: Sequence[RobotIdentity], keys_of: Mapping[Act, Sequence[str]], rules: Mapping[str, Any]
 ) -> AccessVerdict:
     one = played[0][1]
-    granted = [right for keys, part in played for right in rights(keys, part)]
     faults: list[str] = []
-    count = {True: 0, False: 0}
-    for act in Act:
-        for key in keys_of[act]:
-            must = _must(played, granted, act, key)
-            count[must] += 1
-            if ((one.common_name, act, key) in done) != must:
-                faults.append(_fault(rules, one, act, key, must=must))
-    return AccessVerdict(one, count[True], count[False], tuple(faults))
+    wanted = obligations(played, keys_of)
+    for (act, key), must in wanted.items():
+        lacking = missing(rules, one, act, key)
+        if must and lacking:
+            why = f"no rule allows {', '.join(map(str, lacking))}"
+            faults.append(f"{one.common_name} cannot {act.value} {key}: {why}")
+        elif not (must or lacking):
+            names = ", ".join(allowing(rules, one.common_name, passages(act, key)[0]))
+            why = f"rule {names!r} allows it" if names else "nothing denies it"
+            faults.append(f"{one.common_name} can {act.value} {key} and must not: {why}")
+    count = sum(wanted.values())
+    return AccessVerdict(one, count, len(wanted) - count, tuple(faults))
 
 
-def _must(played: Sequence[Part], granted: Sequence[Right], act: Act, key: str) -> bool:
-    if act is Act.SUBSCRIBE and any(
-        Role.OPERATOR in one.roles and covers(keys.all_keys, key) for keys, one in played
-    ):
-        return True
-    return any(right.act is act and covers(right.key, key) for right in granted)
-
-
-def _fault(rules: Mapping[str, Any], one: Identity, act: Act, key: str, *, must: bool) -> str:
-    what = f"{one.common_name} {'cannot' if must else 'can'} {act.value} {key}"
-    if must:
-        lacking = ", ".join(map(str, missing(rules, one, act, key)))
-        why = f"no rule allows {lacking}" if lacking else "Zenoh drops it although rules allow it"
-        return f"{what}: {why}"
-    names = ", ".join(allowing(rules, one.common_name, passages(act, key)[0]))
-    return f"{what} and must not: {f'rule {names!r} allows it' if names else 'nothing denies it'}"
-
-
-# -- the running router ---------------------------------------------------------------------------
 def try_identity(profile: Profile, node: str | None) -> str:
     """Why the running router does not serve this computer's certificate for `node`; empty: it does.
 
@@ -388,8 +126,10 @@ def try_identity(profile: Profile, node: str | None) -> str:
         SecurityError: no such certificate.
     """
     with open_session(profile.session, identity=node) as session:
-        if _live_tokens(session, profile.keys):
-            return ""
+        for selector in token_selectors(profile.keys):
+            replies = session.liveliness().get(selector, timeout=REPLY_S)
+            if any(reply.ok is not None for reply in replies):
+                return ""
     return (
         "the router accepts the certificate but grants it no access: its rules lack this name. "
         "Restart the router with this profile, or check that any node is up"

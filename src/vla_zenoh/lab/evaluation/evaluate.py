@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.evaluation.csv_file import evaluate_csv, has_our_columns
 from vla_zenoh.lab.evaluation.result import STAGES, Evaluation
 
-MCAP, CSV = ".mcap", ".csv"
-EMPTY = "{} holds neither recordings (.mcap) nor the thesis's CSV"
+MCAP = ".mcap"
+EMPTY = "{} holds no recording (.mcap)"
 COMBINED = "ALL"
 """``record_id`` of all runs together."""
-_IDENTITY, _SERIES = {"name", "kind", "path"}, {"request_t_s", "width_m", "width_t_s"}
+_IDENTITY, _SERIES = {"name", "path"}, {"request_t_s", "width_m", "width_t_s"}
 _OF_ONE_RUN = (
     _IDENTITY
     | _SERIES
@@ -32,7 +31,7 @@ _OF_ONE_RUN = (
 def recordings(paths: Iterable[Path]) -> Iterator[Path]:
     """The given files, and the recordings below given folders in the order of their names."""
     for path in paths:
-        yield from _recordings_in(path) if path.is_dir() else [path]
+        yield from sorted(path.rglob(f"*{MCAP}")) if path.is_dir() else [path]
 
 
 def evaluate(
@@ -53,6 +52,8 @@ def evaluate(
     Returns:
         Evaluations, and the reason for each file that has none.
     """
+    from vla_zenoh.lab.evaluation.mcap_file import evaluate_run  # needs the libraries of MCAP
+
     runs: list[Evaluation] = []
     faults: dict[str, str] = {}
     for path in paths:
@@ -61,35 +62,16 @@ def evaluate(
             faults[str(path)] = EMPTY.format(path)
         for file in found:
             try:
-                runs.append(_evaluate(file, first, pictures))
+                runs.append(evaluate_run(file, first, pictures=pictures))
             except RecordingError as error:
                 faults[str(file)] = str(error)
             evaluated(file)
     return runs, faults
 
 
-def _recordings_in(folder: Path) -> list[Path]:
-    """Recordings below a folder; other CSV files are left out."""
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in (MCAP, CSV))
-    return [path for path in files if path.suffix.lower() == MCAP or _is_table(path)]
-
-
-def _is_table(path: Path) -> bool:
-    return path.stat().st_size == 0 or has_our_columns(path)
-
-
-def _evaluate(path: Path, first: int | None, pictures: int) -> Evaluation:
-    if path.suffix.lower() == CSV:
-        return evaluate_csv(path, first)
-    # CSV alone needs no MCAP library.
-    from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
-
-    return evaluate_run(path, first, pictures=pictures)
-
-
 def combined(runs: Sequence[Evaluation]) -> Evaluation:
     """All runs as one: values of all requests together, lengths and counts added up."""
-    out = Evaluation(COMBINED, "/".join(sorted({run.kind for run in runs})))
+    out = Evaluation(COMBINED)
     for each in fields(Evaluation):
         if each.name not in _OF_ONE_RUN and each.name != "stages_ms":
             setattr(out, each.name, _joined([getattr(run, each.name) for run in runs]))

@@ -26,7 +26,6 @@ from vla_zenoh.lab.evaluation.result import Evaluation, PlotTrace
 from vla_zenoh.lab.evaluation.segments import segment
 from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.run import RecordedSample, Run, load_run
-from vla_zenoh.lab.recording.stream_listener import Streams
 from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray, NodeStatus
 
 FILM, MAX_FILM_S = Film(height_px=270, rate_hz=10, quality=30), 180.0
@@ -68,7 +67,7 @@ def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) ->
     """`evaluate_run` of a run in memory."""
     zero_ns = run.began_ns
     name = run.path.parent.name if run.path.stem == "run" else run.path.stem
-    out = Evaluation(name, "mcap", run.path, problems=list(run.problems))
+    out = Evaluation(name, run.path, problems=list(run.problems))
     if run.file.ended is None and not run.file.damage:
         out.problems.append("its recorder was ended before it could finish the file")
     if run.file.dropped:
@@ -85,7 +84,7 @@ def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) ->
         wanted = {(entry.record.worker, entry.header.seq) for entry in obeyed}
         causes = [each for each in causes if (each[0].worker, each[0].chunk_seq) in wanted]
     _requests(out, obeyed, causes, zero_ns)
-    measured = add_motion(out, run, zero_ns, until_ns)
+    measured = _add_motion(out, run, zero_ns, until_ns)
     _seams(out, until(run.commands, until_ns))
     _joint_jerk(out, until(run.joint_commands, until_ns))
     active = _active(run, until_ns, zero_ns)
@@ -113,7 +112,7 @@ def _film(run: Run) -> bytes:
             return b""
 
 
-def add_motion(out: Evaluation, run: Run | Streams, zero_ns: int, until_ns: int) -> MeasuredMotion:
+def _add_motion(out: Evaluation, run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
     """Add what the arm and the gripper did; returns the measured motion."""
     measured, commanded = _measured(run, zero_ns, until_ns), _commanded(run, zero_ns, until_ns)
     _motion(out, measured, commanded)
@@ -138,7 +137,6 @@ def _requests(
         out.seconds = (last.stamp_wall_ns - first.stamp_wall_ns) / 1e9
     rows = [cause.latency_ms(stamp_ns) for cause, stamp_ns in causes]
     out.stages_ms = {name: np.array([row[name] for row in rows]) for name in LATENCY_STAGES}
-    # Names of the thesis, which its CSV has as well.
     out.stages_ms["outbound"] = out.stages_ms.pop("capture_to_worker")
     out.stages_ms["inbound"] = out.stages_ms["worker_to_command"] + out.stages_ms["command_to_pose"]
     out.request_t_s = np.array([(stamp - zero_ns) / 1e9 for _, stamp in causes])
@@ -157,7 +155,7 @@ def _stream(entries: Iterable[Any], zero_ns: int) -> MeasuredMotion:
     return MeasuredMotion(t_s[order], position[order], quat[order], twist[order])
 
 
-def _measured(run: Run | Streams, zero_ns: int, until_ns: int) -> MeasuredMotion:
+def _measured(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
     return _stream(
         (
             (e.header.stamp_wall_ns, e.record.position_m, e.record.quat_xyzw, e.record.twist)
@@ -167,7 +165,7 @@ def _measured(run: Run | Streams, zero_ns: int, until_ns: int) -> MeasuredMotion
     )
 
 
-def _commanded(run: Run | Streams, zero_ns: int, until_ns: int) -> MeasuredMotion:
+def _commanded(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
     """Pose commands; for joint commands the reference pose of the controller."""
     if run.commands:
         return _stream(

@@ -92,7 +92,7 @@ def timeline(run: Evaluation) -> str:
 
 def _title(panel: Panel) -> str:
     words = [f"{panel.title}, {panel.unit}"]
-    seen: dict[str, str] = {curve.name: curve.colour for curve in panel.curves if not curve.halo}
+    seen: dict[str, str] = {curve.name: curve.colour for curve in panel.curves}
     words += [f'<span style="color:{colour}"><b>{name}</b></span>' for name, colour in seen.items()]
     return "  ".join([*words, panel.note])
 

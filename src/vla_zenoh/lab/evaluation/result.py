@@ -120,9 +120,8 @@ class Evaluation:
 
     Args:
         name: ``record_id``.
-        kind: ``mcap`` or ``csv``.
         path: of the file; None for all runs.
-        requests: rows of a CSV file; chunks of the obeyed worker.
+        requests: chunks of the worker in control.
         succeeded: number of those that succeeded; None where unknown.
         seconds: from the first request to the last.
         prompts: in their order.
@@ -157,7 +156,6 @@ class Evaluation:
     """
 
     name: str
-    kind: str
     path: Path | None = None
     requests: int = 0
     succeeded: int | None = None
@@ -217,7 +215,6 @@ class Evaluation:
             "success_rate": self.success_rate,
             "trans_total_m": self.path_m,
             "rot_total_rad": self.path_rad,
-            "kind": self.kind,
             "seconds": self.seconds,
             "command_path_m": self.command_path_m,
             "command_path_rad": self.command_path_rad,

@@ -17,6 +17,7 @@ COLOURS = ("#d64541", "#2e9e5b", "#2f7fd0")
 MEASURED, COMMANDED = "#2f7fd0", "#f0932b"
 STAGES = (("outbound", "#5aa9e6"), ("inference", "#e056a0"), ("inbound", "#f2b134"))
 BROAD = "(broad: commanded)"
+"""For the first panel; titles have to fit on a phone."""
 JUMP_M, GAP_S = 0.05, 0.25
 """From one sample to the next: the simulator was reset, or the stream was interrupted."""
 
@@ -80,7 +81,7 @@ def _axes(run: Evaluation, title: str, unit: str, name: str) -> Panel | None:
             for axis, (letter, colour) in enumerate(zip("xyz", COLOURS, strict=True))
         ]
     both = run.commanded is not None and run.measured is not None
-    return Panel(title, unit, curves, note=BROAD if both else "")
+    return Panel(title, unit, curves, note=BROAD if both and name == "position_m" else "")
 
 
 def _speed(run: Evaluation) -> Panel | None:
@@ -92,7 +93,7 @@ def _speed(run: Evaluation) -> Panel | None:
             t_s, values = thinned(*unbroken(trace, "speed_m_s"))
             halo = both and name == "commanded"
             curves.append(Curve(name, colour, t_s, values * 1e3, halo))
-    return Panel("speed of the TCP", "mm/s", curves, note=BROAD if both else "")
+    return Panel("speed of the TCP", "mm/s", curves)
 
 
 def _gripper(run: Evaluation) -> Panel | None:

@@ -57,14 +57,6 @@ def rotvecs(quat_xyzw: FloatArray) -> FloatArray:
     return turned[:, :3] * np.where(norm > 1e-12, angle / np.maximum(norm, 1e-300), 2.0)
 
 
-def with_w(vector_xyz: FloatArray) -> FloatArray:
-    """Unit quaternions (n, 4) from x, y, z; w is positive."""
-    w = np.sqrt(np.clip(1.0 - np.sum(vector_xyz**2, axis=1, keepdims=True), 0.0, None))
-    full = np.hstack([vector_xyz, w])
-    norm = np.linalg.norm(full, axis=1, keepdims=True)
-    return full / np.where(norm > 0, norm, np.nan)
-
-
 def idle_s(t_s: FloatArray, speed_m_s: FloatArray, turn_rad_s: FloatArray) -> float:
     """Time in which the arm stands still, of (n,) times and the (n - 1,) speeds between them."""
     still = (speed_m_s < STILL_M_S) & (turn_rad_s < STILL_RAD_S)

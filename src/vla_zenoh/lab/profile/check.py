@@ -184,7 +184,7 @@ def _simulator(profile: Profile, name: str, host: str | None) -> Iterator[_Found
     if profile.robot.driver != "sim" or not running & ({"sim", "camera"} if simulated else {"sim"}):
         return
     try:
-        from vla_zenoh.simulation.appearance import AppearanceSwitcher, draw_appearance
+        from vla_zenoh.simulation.appearance import AppearanceSwitcher
         from vla_zenoh.simulation.scene import scene_file
         from vla_zenoh.simulation.world import build_world
     except ImportError as error:
@@ -208,7 +208,7 @@ def _simulator(profile: Profile, name: str, host: str | None) -> Iterator[_Found
             yield _Found(("sim",), str(error))
         return
     try:
-        AppearanceSwitcher(world.model).apply(draw_appearance(0, profile.sim.vary))
+        AppearanceSwitcher(world.model).apply(0, profile.sim.vary)
     except ResourceError as error:
         yield _Found(("sim", "vary"), str(error))
     known = [world.model.camera(index).name for index in range(world.model.ncam)]

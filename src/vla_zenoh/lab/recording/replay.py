@@ -145,7 +145,7 @@ class Replay:
         if live and self._groups != {CAMERAS}:
             raise NodeError(
                 f"robot {self._there.robot!r} is alive ({', '.join(live)}): a replay would command "
-                "it, or mislead it with old states. Replay as another robot with --as NAME, or "
+                "it, or mislead it with old states. Replay as another robot with --robot NAME, or "
                 "only the cameras with --only cameras"
             )
 

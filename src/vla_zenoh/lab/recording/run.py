@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import yaml
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Keys, last_chunk
@@ -109,6 +112,14 @@ class Run:
         """From the first sample to the last."""
         return (self.ended_ns - self.began_ns) / 1e9
 
+    @property
+    def max_width_m(self) -> float:
+        """Of the gripper, from the profile in force; 1 without one, so that shares equal widths."""
+        try:
+            return float(yaml.safe_load(self.file.profile_yaml)["robot"]["gripper"]["max_width_m"])
+        except (TypeError, KeyError, ValueError, yaml.YAMLError):
+            return 1.0
+
     def prompts(self) -> list[tuple[int, str]]:
         """(wall ns, prompt) of each published prompt."""
         return [(put.received_ns, put.text) for put in self.settings if put.name == "prompt"]
@@ -131,6 +142,19 @@ def first_commands(commands: Sequence[RecordedSample]) -> list[tuple[Cause, int]
             newest = (cause.worker, cause.chunk_seq)
             out.append((cause, entry.header.stamp_wall_ns))
     return out
+
+
+def newest(stream: Sequence[RecordedSample], at_ns: int) -> RecordedSample | None:
+    """The last sample stamped until a time; None: there is none."""
+    index = bisect_right(stream, at_ns, key=lambda entry: entry.header.stamp_wall_ns) - 1
+    return stream[index] if index >= 0 else None
+
+
+def nearest(stream: Sequence[RecordedSample], at_ns: int) -> RecordedSample | None:
+    """The sample stamped nearest to a time; None: the stream is empty."""
+    index = bisect_left(stream, at_ns, key=lambda entry: entry.header.stamp_wall_ns)
+    around = stream[max(index - 1, 0) : index + 1]
+    return min(around, key=lambda each: abs(each.header.stamp_wall_ns - at_ns), default=None)
 
 
 def load_run(path: Path) -> Run:

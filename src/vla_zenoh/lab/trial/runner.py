@@ -13,14 +13,12 @@ from dataclasses import asdict, replace
 from typing import Protocol
 
 import numpy as np
-import zenoh
 
-from vla_zenoh.bus.buffers import LatestSample, bytes_of
 from vla_zenoh.bus.client import Client
-from vla_zenoh.codec import records
-from vla_zenoh.errors import CodecError, NodeError, SessionError
+from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.episode import EpisodeRunner, EpisodeView, Interrupted
+from vla_zenoh.lab.newest_records import NewestRecords
 from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, Phase
 from vla_zenoh.lab.trial.folder import TrialFolder
@@ -101,10 +99,7 @@ class TrialRunner:
         self._number = 0
         self._last_end: End | None = None
         self._over = threading.Event()
-        self._pose = LatestSample()
-        self._subscriber = client.session.declare_subscriber(
-            client.keys.state_pose, zenoh.handlers.Callback(self._pose, indirect=False)
-        )
+        self._states = NewestRecords(client.session, {PoseState: client.keys.state_pose})
 
     def run(self) -> list[EpisodeVerdict]:
         """Run what is due; the verdicts of the whole trial.
@@ -124,7 +119,7 @@ class TrialRunner:
             while (due := self._plan.next_due(self._done)) is not None:
                 self._episode(due)
         finally:
-            self._subscriber.undeclare()
+            self._states.close()
         return self._done
 
     # -- one episode --------------------------------------------------------------------------
@@ -283,12 +278,10 @@ class TrialRunner:
 
     # -- start pose ---------------------------------------------------------------------------
     def _tcp_m(self) -> tuple[float, float, float] | None:
-        arrival = self._pose.pop()
-        if arrival is not None:
-            with suppress(CodecError):
-                pose = records.decode(PoseState, bytes_of(arrival.sample.payload))
-                x_m, y_m, z_m = (round(float(value), 4) for value in pose.position_m)
-                return x_m, y_m, z_m
+        with suppress(NodeError):
+            _, pose = self._states.read(PoseState)
+            x_m, y_m, z_m = (round(float(value), 4) for value in pose.position_m)
+            return x_m, y_m, z_m
         return None
 
     def _compare_start_pose(self) -> None:

@@ -13,7 +13,7 @@ from vla_zenoh.bus.clock import HostId
 from vla_zenoh.bus.node import Node
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.errors import CodecError
-from vla_zenoh.keys import CRASHED, worker_node
+from vla_zenoh.keys import CRASHED, ON_BEHALF, worker_node
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.security.identity import expected_nodes
 from vla_zenoh.types import Header, NodeStatus
@@ -137,8 +137,9 @@ class PeerMonitor:
         source = header.source
         with self._lock:
             ours = name in self._alive and self._status_sources.get(name, source) == source
-            down = name in self._expected and name not in self._alive
-        if down:
+            alive = name in self._alive
+        # `up` may see a node start later than we do.
+        if source.startswith(ON_BEHALF) if alive else name in self._expected:
             self._receive_on_behalf(name, arrival, header)
             return
         stamped = self._node.decode(NodeStatus, arrival, header=header) if ours else None

@@ -17,8 +17,9 @@ import numpy as np
 from vla_zenoh.control.actions import step_pose, step_width
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import Pose, interpolate, log3, pose_of
+from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec
-from vla_zenoh.types import ActionChunk, FloatArray, GripperState, PoseState
+from vla_zenoh.types import ActionChunk, FloatArray
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 DEFAULT_TOLERANCE_S = 0.06
@@ -36,39 +37,18 @@ class ArmState(NamedTuple):
     width_m: float
 
 
-class ArmStateHistory:
-    """Measured states of the arm by their stamps, added in order."""
+def arm_state(run: Run, stamp_ns: int) -> ArmState:
+    """The measured pose and width of a recording nearest to `stamp_ns`.
 
-    def __init__(self) -> None:
-        self._poses: tuple[list[int], list[PoseState]] = ([], [])
-        self._grippers: tuple[list[int], list[GripperState]] = ([], [])
-
-    def add(self, stamp_ns: int, state: PoseState | GripperState) -> None:
-        """Add a state; one older than the last is left out."""
-        stamps, states = self._poses if isinstance(state, PoseState) else self._grippers
-        if not stamps or stamp_ns >= stamps[-1]:
-            stamps.append(stamp_ns)
-            states.append(state)  # pyright: ignore[reportArgumentType]
-
-    def at(self, stamp_ns: int) -> ArmState:
-        """The measured pose and width nearest to `stamp_ns`.
-
-        Raises:
-            RecordError: no pose or no gripper state was added.
-        """
-        if not self._poses[0] or not self._grippers[0]:
-            raise RecordError(
-                "the pose of the arm is unknown: no state/pose or no state/gripper was received"
-            )
-        pose = self._poses[1][_nearest(self._poses[0], stamp_ns)]
-        gripper = self._grippers[1][_nearest(self._grippers[0], stamp_ns)]
-        return ArmState(pose_of(pose), gripper.width_m)
-
-
-def _nearest(stamps: Sequence[int], stamp_ns: int) -> int:
-    right = min(bisect_left(stamps, stamp_ns), len(stamps) - 1)
-    left = max(right - 1, 0)
-    return min(left, right, key=lambda index: abs(stamps[index] - stamp_ns))
+    Raises:
+        RecordError: no pose or no gripper state was recorded.
+    """
+    pose, gripper = nearest(run.poses, stamp_ns), nearest(run.grippers, stamp_ns)
+    if pose is None or gripper is None:
+        raise RecordError(
+            "the pose of the arm is unknown: no state/pose or no state/gripper was recorded"
+        )
+    return ArmState(pose_of(pose.record), gripper.record.width_m)
 
 
 class RequestedPath(NamedTuple):
@@ -151,7 +131,7 @@ def requested_path(
     return RequestedPath(spec.dt_s, poses, None if spec.gripper == "none" else widths_m)
 
 
-def compare(
+def disagreement(
     a: Sequence[ActionChunk],
     b: Sequence[ActionChunk],
     spec_a: ActionSpec,

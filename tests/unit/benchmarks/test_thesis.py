@@ -22,10 +22,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.main import app
+from benchmarks.__main__ import app
+from benchmarks.thesis.csv_file import COLUMNS, evaluate_csv
+from benchmarks.thesis.published import thesis_table
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.evaluation.csv_file import COLUMNS, evaluate_csv
-from vla_zenoh.lab.evaluation.evaluate import combined, evaluate
+from vla_zenoh.lab.evaluation.evaluate import combined
 from vla_zenoh.lab.evaluation.result import Evaluation
 
 TOLERANCE = 1e-12  # of lengths that are sums of a few floats
@@ -80,12 +81,11 @@ def evaluated(tmp_path: Path, table: Sequence[Row], first: int | None = None) ->
 # -- figures --------------------------------------------------------------------------------------
 @pytest.mark.skipif(not THESIS, reason="VLA_ZENOH_THESIS names no folder with its recordings")
 def test_the_published_figures_come_out_to_the_last_digit() -> None:
-    runs, faults = evaluate([Path(THESIS) / "recordings"], 50)
-    ours = {run.name: run.row() for run in runs}
+    files = sorted((Path(THESIS) / "recordings").rglob("*.csv"))
+    ours = {run.name: run.row() for run in (evaluate_csv(file, 50) for file in files)}
     with (Path(THESIS) / "summary_per_file.csv").open(newline="") as file:
         published = list(csv.DictReader(file))
     assert published
-    assert not faults
     for row in published:
         name = row.pop("record_id")
         found = {key: ours[name][key] for key in row}
@@ -289,59 +289,33 @@ def test_whatever_a_file_holds_it_is_evaluated_or_refused(
 
 
 # -- the command ----------------------------------------------------------------------------------
-def test_what_cannot_be_evaluated_does_not_stop_the_rest(tmp_path: Path) -> None:
-    good = write(tmp_path / "good.csv", rows(10))
-    (tmp_path / "cut.mcap").write_bytes(b"\x89MCAP0\r\n")
-    (tmp_path / "none.csv").write_text("a,b\n")
-    out, html, table = tmp_path / "out.json", tmp_path / "out.html", tmp_path / "rows.csv"
-    paths = [str(tmp_path / name) for name in ("cut.mcap", "none.csv", "missing.mcap")]
+def test_the_command_shows_recordings_and_our_motions_beside_the_published_ones(
+    tmp_path: Path,
+) -> None:
+    recording = write(tmp_path / "good.csv", rows(10))
+    ours = {
+        "prompt": "go up",
+        "rate_hz": 1.0,
+        "horizon": 1,
+        "delay_ms": 0.0,
+        "asked_m": 0.5,
+        "asked_path_m": 0.5,
+        "asked_path_rad": 0.0,
+        "path_m": 0.5,
+        "path_rad": 0.0,
+        "e2e_ms_mean": 20.0,
+        "e2e_ms_p95": 30.0,
+        "outbound_ms_mean": 10.0,
+        "outbound_ms_p95": 11.0,
+    }
+    failed = {"prompt": "go down", "rate_hz": 1.0, "horizon": 1, "delay_ms": 0.0}
+    (tmp_path / "result.json").write_text(json.dumps([ours, failed]))
     done = CliRunner().invoke(
-        app,
-        [
-            "eval",
-            *paths,
-            str(good),
-            *("-o", str(out)),
-            *("-o", str(html)),
-            *("-o", str(table)),
-        ],
-        env={"COLUMNS": "200"},
+        app, ["thesis", str(recording), str(tmp_path / "result.json")], env={"COLUMNS": "200"}
     )
     assert done.exit_code == 0, done.output
-    found = json.loads(out.read_text())
-    assert [run["record_id"] for run in found["runs"]] == ["good"]
-    assert list(found["faults"]) == paths
-    assert done.stderr.count("not evaluated") == 3
-    assert found["overall"]["e2e_mean_ms"] == found["runs"][0]["e2e_mean_ms"]
-    with table.open(newline="") as file:
-        (row,) = csv.DictReader(file)
-    assert float(row["trans_total_m"]) == found["runs"][0]["trans_total_m"]
-    assert "good" in html.read_text()
-
-
-def test_nothing_to_evaluate_is_an_error(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["eval", str(tmp_path)])
-    assert done.exit_code == 1
-    assert "holds neither recordings" in " ".join(done.stderr.split())  # it is wrapped
-
-
-def test_tables_of_something_else_in_a_folder_are_passed_over(tmp_path: Path) -> None:
-    write(tmp_path / "record01.csv", rows(3))
-    (tmp_path / "poses.csv").write_text("heard_wall_ns,x_m\n1,2\n")
-    runs, faults = evaluate([tmp_path])
-    assert [run.name for run in runs] == ["record01"]
-    assert faults == {}
-
-
-def test_the_page_needs_no_network_and_no_prompt_breaks_it(tmp_path: Path) -> None:
-    evil = "</script><script>alert(1)</script><b>"
-    write(tmp_path / "a.csv", rows(10, prompt=evil))
-    html = tmp_path / "out.html"
-    done = CliRunner().invoke(app, ["eval", str(tmp_path / "a.csv"), "--output", str(html)])
-    assert done.exit_code == 0, done.output
-    page = html.read_text()
-    body = page[page.index("<body>") :]
-    assert "<script>alert" not in body
-    assert "&lt;/script&gt;" in body
-    for source in ('src="http', "src='http", "<link", "@import"):
-        assert source not in page[: page.index("<script>")] + body
+    assert "good" in done.output
+    beside = thesis_table([ours, failed])
+    assert beside.row_count == 1
+    assert list(beside.columns[3].cells) == ["0.248 m, 0.421 rad"]
+    assert list(beside.columns[6].cells) == ["20.0 / 30.0"]

@@ -38,15 +38,6 @@ MAX_DIGITS = 19
 _TRUE, _FALSE = TRUE_WORDS | {"1.0"}, FALSE_WORDS | {"0.0"}
 
 
-def has_our_columns(path: Path) -> bool:
-    """Whether the first line names a column that only such files have."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            return not set(TIMES).isdisjoint(next(csv.reader(file), []))
-    except (OSError, csv.Error):
-        return False
-
-
 def evaluate_csv(path: Path, first: int | None = None) -> Evaluation:
     """Evaluate a file; `Evaluation.problems` lists what is missing in it.
 
@@ -64,7 +55,7 @@ def evaluate_csv(path: Path, first: int | None = None) -> Evaluation:
             f"{path} has none of the columns {', '.join(COLUMNS)}; it begins with "
             f"{shown(', '.join(header))}"
         )
-    run = Evaluation(path.stem, "csv", path)
+    run = Evaluation(path.stem, path)
     if missing:
         run.problems.append(f"columns missing: {', '.join(missing)}; their figures are left out")
     if not rows:
@@ -176,9 +167,7 @@ def _motion(run: Evaluation, table: _Table) -> None:
     count = len(table.rows)
     nothing = np.full((count, 4), np.nan)
     position = table.columns(POSITION) if table.has(*POSITION) else nothing[:, :3]
-    turns = (
-        trajectory.with_w(table.columns(ORIENTATION)) if table.has(*ORIENTATION) else nothing.copy()
-    )
+    turns = _with_w(table.columns(ORIENTATION)) if table.has(*ORIENTATION) else nothing.copy()
     run.path_m, run.path_rad = trajectory.path_m(position), trajectory.turned_rad(turns)
     run.width_m = table.column("gw") if table.has("gw") else np.zeros(0)
     run.width_t_s = run.request_t_s if len(run.width_m) else np.zeros(0)
@@ -216,3 +205,11 @@ def _idle(run: Evaluation, t_s: FloatArray, position: FloatArray, turns: FloatAr
 def _span(t_s: Any) -> float:
     known = t_s[np.isfinite(t_s)]
     return float(known[-1] - known[0]) if len(known) else 0.0
+
+
+def _with_w(vector_xyz: FloatArray) -> FloatArray:
+    """Unit quaternions (n, 4) from x, y, z; w is positive."""
+    w = np.sqrt(np.clip(1.0 - np.sum(vector_xyz**2, axis=1, keepdims=True), 0.0, None))
+    full = np.hstack([vector_xyz, w])
+    norm = np.linalg.norm(full, axis=1, keepdims=True)
+    return full / np.where(norm > 0, norm, np.nan)

@@ -1,0 +1,1 @@
+"""What the bachelor thesis measured that this package grew from."""

@@ -1,1 +1,0 @@
-"""Comparison of the actions of two workers."""
