@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import zenoh
 
-from vla_zenoh.bus.buffers import check_size
+from vla_zenoh.bus.buffers import bytes_of, check_size
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.errors import CodecError, RecordingError
 from vla_zenoh.lab.recording.sample import Sample, received_sample
@@ -69,8 +69,9 @@ class SampleQueue:
                 else:
                     self.rejected[error.reason] += 1
             return
-        attachment = None if sample.attachment is None else sample.attachment.to_bytes()
-        self.add(key, sample.payload.to_bytes(), str(sample.encoding), attachment)
+        header = bytes_of(sample.attachment, self._max_bytes)
+        attachment = None if sample.attachment is None else header
+        self.add(key, bytes_of(sample.payload, self._max_bytes), str(sample.encoding), attachment)
 
     def add(self, key: str, payload: bytes, encoding: str, attachment: bytes | None) -> None:
         """Add a sample; it is dropped and counted when the queue is full."""
