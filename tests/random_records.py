@@ -246,7 +246,7 @@ RECORDS: dict[type, st.SearchStrategy[Any]] = {
         counts,
         counts,
         texts,
-        st.tuples(st.integers(0, 6), st.integers(0, 10)).map(
+        st.tuples(st.integers(1, 6), st.integers(1, 10)).map(
             lambda shape: np.linspace(-1, 1, shape[0] * shape[1]).reshape(shape).astype(np.float32)
         ),
         st.floats(0, 1e6),

@@ -178,6 +178,14 @@ def describe_fault(fault: Any) -> str:
     return f"wants {wanted.removeprefix('be ')}"
 
 
+def describe_faults(error: Any, top: str, most: int = 20) -> str:
+    """The faults of a ``ValidationError`` in one line: each with its field, or `top`."""
+    return "; ".join(
+        f"{'.'.join(map(str, fault['loc'])) or top}: {describe_fault(fault)}"[:300]
+        for fault in error.errors(include_url=False)[:most]
+    )
+
+
 def nearest(word: str, known: Iterable[str], otherwise: str = ".") -> str:
     """``; did you mean 'x'?`` if one of `known` is like `word`, else `otherwise`."""
     close = difflib.get_close_matches(word, list(known), 1)

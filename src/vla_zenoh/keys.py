@@ -18,7 +18,6 @@ from vla_zenoh.errors import ProfileError
 SCHEMA = 1
 """Version of the wire. Raise it when a record of the last version cannot be decoded any more, or an
 old node would reject a new one: decoders reject unknown fields, so a new field raises it too."""
-"""Version of headers and payloads; a receiver rejects any other."""
 
 DEFAULT_ROOT = "vla"
 

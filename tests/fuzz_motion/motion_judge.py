@@ -286,13 +286,22 @@ class Judge:
         self._tell("still moves after a stop", sizes, 0.0, "m/s or rad/s")
 
     def _slower(self, over: Array, applies: Any, needed_s: Array) -> None:
-        """Nothing is `over` what a speed allows, as soon as a stop would have been done."""
+        """Nothing is `over` what a speed allows, as soon as a stop would have been done.
+
+        A retreat has a speed of its own, and so has the brake at its end.
+        """
+        retreats = np.array([t.retreats for t in self._told])
+        ended = np.flatnonzero(retreats)
+        for at in ended[np.append(np.diff(ended) > 1, True)[: len(ended)]]:
+            retreats |= (np.arange(len(over)) > at) & (
+                self._time_s <= self._time_s[at] + needed_s[at] + SLOWER_S
+            )
         percent = np.array([t.percent for t in self._told])
         set_at = np.append(0, np.flatnonzero(np.diff(percent) != 0) + 1)
         sizes = np.zeros(len(over))
         for at, end in zip(set_at, [*set_at[1:], len(over)], strict=True):
             due_s = self._time_s[at] + needed_s[max(at - 1, 0)] + SLOWER_S
-            late = (self._time_s[at:end] > due_s) & applies[at:end]
+            late = (self._time_s[at:end] > due_s) & (applies & ~retreats)[at:end]
             sizes[at:end] = np.where(late, over[at:end], 0.0)
         self._tell("faster than the speed that was set", sizes, 1e-5, "over")
 

@@ -80,20 +80,12 @@ def decode_rate(payload: bytes) -> float:
     Raises:
         CodecError: not a plain number, or outside.
     """
-    word = decode_text(payload)
+    word, wanted = decode_text(payload), f"{MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} chunks per second"
     if not _NUMBER.fullmatch(word):
-        raise CodecError(
-            "invalid",
-            f"rate {word[:40]!r} is not a number: give {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} chunks "
-            "per second",
-        )
+        raise CodecError("invalid", f"rate {word[:40]!r} is not a number: give {wanted}")
     rate_hz = float(word)
     if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
-        raise CodecError(
-            "invalid",
-            f"rate {word[:40]!r} Hz is out of range: give {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} "
-            "chunks per second",
-        )
+        raise CodecError("invalid", f"rate {word[:40]!r} Hz is out of range: give {wanted}")
     return rate_hz
 
 

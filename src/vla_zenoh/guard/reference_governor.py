@@ -195,7 +195,7 @@ class ReferenceGovernor(Generic[Reference]):
         elif not steady or self._cramped is not None:
             on, share = self._went_on(target)
             goes_on = self._cramped is None and self._could(space.apart(target, on), share)
-            self._advance(target, share)
+            self._advance(target if goes_on else on, share)
         elif self._way is not None:
             change = space.speed(target).change
             changed = np.array([change, (change - space.speed(self.target).change) / self._dt_s])

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from vla_zenoh.errors import MissingExtraError, SpecError, describe_fault
+from vla_zenoh.errors import MissingExtraError, SpecError, describe_faults
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.policy import ActionSpec, Frame, GripperSemantics, Rotation
 from vla_zenoh.policy.model_options import number, one_of, whole_number
@@ -283,8 +283,5 @@ def as_spec_error() -> Iterator[None]:
     try:
         yield
     except ValidationError as error:
-        faults = "; ".join(
-            f"{'.'.join(map(str, fault['loc'])) or 'options'}: {describe_fault(fault)}"
-            for fault in error.errors(include_url=False)
-        )
-        raise SpecError(f"the options give no valid spec: {faults}") from error
+        why = describe_faults(error, "options")
+        raise SpecError(f"the options give no valid spec: {why}") from error

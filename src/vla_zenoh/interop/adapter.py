@@ -13,9 +13,10 @@ from typing import Any, ClassVar
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop.action_semantics import Forward, make_forward
-from vla_zenoh.interop.field_mapping import read_field_mapping, read_timeout
+from vla_zenoh.interop.field_mapping import read_field_mapping
 from vla_zenoh.interop.presets import Presets
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
+from vla_zenoh.policy.model_options import number
 from vla_zenoh.profile import load_profile
 
 FIRST_S = 0.25
@@ -45,6 +46,7 @@ class Backoff:
         self.failures, self._next_s = 0, 0.0
 
 
+MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.01, 60.0
 ANSWERED = ("peer_error", "peer_reply")
 """Reasons of a server that is alive, and is retried soon."""
 
@@ -57,7 +59,7 @@ class Adapter(ABC):
         where: the server, for messages.
         presets: name -> options.
         preset: name of the preset.
-        layout: options that override it, see `vla_zenoh.interop.field_mapping`.
+        mapping: options that override it, see `vla_zenoh.interop.field_mapping`.
         timeout_s: for connecting, and for each answer.
         profile: of the robot: its gripper and, if answers are joints, its arm.
         clock_s: seconds that only go forwards.
@@ -89,7 +91,12 @@ class Adapter(ABC):
         clock_s: Callable[[], float],
         normalisation: str | None = None,
     ) -> None:
-        self.where, self.timeout_s = where, read_timeout(timeout_s)
+        self.where, self.timeout_s = where, number("timeout_s", timeout_s)
+        if not MIN_TIMEOUT_S <= self.timeout_s <= MAX_TIMEOUT_S:
+            raise SpecError(
+                f"timeout_s is {timeout_s!r}, wanted {MIN_TIMEOUT_S:g} to {MAX_TIMEOUT_S:g}: "
+                "a late answer is useless"
+            )
         self._profile = load_profile(profile)
         self.mapping = read_field_mapping(
             name,

@@ -41,7 +41,6 @@ from vla_zenoh.policy import (
     Resize,
     StatePart,
 )
-from vla_zenoh.policy.model_options import number
 from vla_zenoh.policy.state_vector import parts_of, read_parts, state_vector
 from vla_zenoh.types import shown
 
@@ -274,18 +273,6 @@ def _observation(
         state=tuple(part for part in order if part in parts),
         prompt=any(source.prompt for source in fields.values()),
     )
-
-
-def read_timeout(text: str) -> float:
-    """Value of the option ``timeout_s``.
-
-    Raises:
-        SpecError: not between 0.01 and 60 s.
-    """
-    value = number("timeout_s", text)
-    if not 0.01 <= value <= 60:
-        raise SpecError(f"timeout_s is {text!r}, wanted 0.01 to 60: a late answer is useless")
-    return value
 
 
 def _keys(text: str) -> tuple[str, ...]:

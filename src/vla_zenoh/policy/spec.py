@@ -27,7 +27,7 @@ from pydantic import (
     model_validator,
 )
 
-from vla_zenoh.errors import SpecError, describe_fault
+from vla_zenoh.errors import SpecError, describe_faults
 from vla_zenoh.types import GripperState, JointState, PoseState, Task
 
 StatePart = Literal["joint", "pose", "gripper"]
@@ -41,7 +41,6 @@ ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
 
 
 MAX_CAMERAS = 16
-MAX_FAULTS = 20
 
 Text = Annotated[str, Field(min_length=1, max_length=128)]
 
@@ -193,11 +192,8 @@ class ModelSpec(_Spec):
         try:
             return ModelSpec.model_validate(data)
         except ValidationError as error:
-            faults = "; ".join(
-                f"{'.'.join(map(str, fault['loc'])) or 'spec'}: {describe_fault(fault)}"[:300]
-                for fault in error.errors(include_url=False)[:MAX_FAULTS]
-            )
-            raise SpecError(f"not a valid model spec: {faults}") from error
+            why = describe_faults(error, "spec")
+            raise SpecError(f"not a valid model spec: {why}") from error
 
 
 @lru_cache(maxsize=256)

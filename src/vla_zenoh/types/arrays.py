@@ -54,6 +54,21 @@ def vector(name: str, value: ArrayLike, size: int | None) -> FloatArray:
     return array
 
 
+def float32_table(name: str, value: ArrayLike, most: int) -> NDArray[np.float32]:
+    """Copy `value` into a finite, read-only float32 array (H, D) of at most `most` numbers."""
+    array = numbers(name, value)
+    if array.ndim != 2 or 0 in array.shape:
+        raise RecordError(f"{name} has shape {array.shape}, wanted (H, D)")
+    if array.size > most:
+        raise RecordError(f"{name} has {array.size} numbers, at most {most}")
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, seen below
+        table = np.array(array, dtype=np.float32, order="C")
+    if not np.isfinite(table).all():
+        raise RecordError(f"{name} holds NaN or infinity")
+    table.setflags(write=False)
+    return table
+
+
 def unit_quaternion(name: str, value: ArrayLike) -> FloatArray:
     """Like `vector` for four numbers x, y, z, w; normalised, refused when far from unit."""
     array = vector(name, value, 4)

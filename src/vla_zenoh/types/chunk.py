@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import RecordError
-from vla_zenoh.types.arrays import numbers
+from vla_zenoh.types.arrays import float32_table
 from vla_zenoh.types.checks import (
     MAX_CHUNK_NUMBERS,
     MAX_ENTRIES,
@@ -71,17 +70,7 @@ class ActionChunk:
         ):
             set_field(self, name, integer(name, getattr(self, name)))
         set_field(self, "done", boolean("done", self.done))
-        steps = numbers("steps", self.steps)
-        if steps.ndim != 2 or 0 in steps.shape:
-            raise RecordError(f"steps has shape {steps.shape}, wanted (H, D)")
-        if steps.size > MAX_CHUNK_NUMBERS:
-            raise RecordError(f"steps has {steps.size} numbers, at most {MAX_CHUNK_NUMBERS}")
-        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, seen below
-            steps = np.array(steps, dtype=np.float32, order="C")
-        if not np.isfinite(steps).all():
-            raise RecordError("steps holds NaN or infinity")
-        steps.setflags(write=False)
-        set_field(self, "steps", steps)
+        set_field(self, "steps", float32_table("steps", self.steps, MAX_CHUNK_NUMBERS))
 
 
 MAX_RAW_NUMBERS = 4096
@@ -121,12 +110,7 @@ class InferenceDebug:
         for name in ("chunk_seq", "episode", "observation_stamp_ns"):
             set_field(self, name, integer(name, getattr(self, name)))
         set_field(self, "inference_ms", number("inference_ms", self.inference_ms, 0.0))
-        steps = np.array(self.steps)
-        if steps.dtype.kind not in "iuf" or steps.ndim != 2:
-            raise RecordError(f"steps are {steps.dtype} of shape {steps.shape}, wanted (H, D)")
-        steps = np.ascontiguousarray(steps, np.float32)
-        steps.setflags(write=False)
-        set_field(self, "steps", steps)
+        set_field(self, "steps", float32_table("steps", self.steps, MAX_CHUNK_NUMBERS))
         set_field(self, "raw", details("raw", entries("raw", self.raw)))
 
 

@@ -30,10 +30,10 @@ def standing(*value: float) -> JointReference:
     return JointReference.at_rest(np.array(value))
 
 
-def governor(axes: int = 1) -> ReferenceGovernor[JointReference]:
+def governor(axes: int = 1, dt_s: float = DT_S) -> ReferenceGovernor[JointReference]:
     velocity, acceleration, jerk = (np.full(axes, BRAKE_MARGIN * limit) for limit in OWN)
     limits = GovernorLimits(velocity, acceleration, jerk, np.ones(axes), np.ones(axes))
-    return ReferenceGovernor(JointSpace(), standing(*[0.0] * axes), DT_S, limits)
+    return ReferenceGovernor(JointSpace(), standing(*[0.0] * axes), dt_s, limits)
 
 
 def led(side: ReferenceGovernor[JointReference], told: JointReference, ticks: int) -> FloatArray:
@@ -64,6 +64,31 @@ def test_twenty_millimetres_are_gone_soon_and_a_tenth_of_one_sooner() -> None:
     for step, after_s in ((0.02, SOON_S), (1e-4, SOON_S / 3)):
         path = led(governor(), standing(step), round(SOON_S / DT_S))
         np.testing.assert_array_equal(path[round(after_s / DT_S) :], step)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_at_a_hundred_hertz_a_path_that_jumps_takes_no_more_than_acceleration_and_jerk(
+    seed: int,
+) -> None:
+    rng, dt_s = np.random.default_rng(seed), 0.01
+    side, (velocity, acceleration, jerk) = governor(dt_s=dt_s), OWN
+    told, told_jerk, left = np.zeros(3), 0.0, 0
+    path = np.zeros(403)
+    for tick in range(400):
+        jumps = left <= 0
+        if jumps:
+            left, told_jerk = int(rng.integers(3, 60)), rng.choice([-1, 0, 1]) * jerk
+            told = rng.uniform(-1, 1, 3) * [0.02, 0.5 * velocity, acceleration] + [told[0], 0, 0]
+        grows = abs(told[2] + told_jerk * dt_s) <= acceleration
+        powers = dt_s ** np.array([3, 2, 1]) / [6, 2, 1]
+        told = told + [told[1] * dt_s + told[2] * dt_s**2 / 2, told[2] * dt_s, 0]
+        told = told + told_jerk * grows * powers
+        left = 0 if abs(told[1]) > 0.8 * velocity else left - 1
+        side.follow(JointReference(*told[:, None]), steady=not jumps)
+        path[tick + 3] = side.motion.position_rad[0]
+    for order, limit in ((2, acceleration), (3, jerk)):
+        differences = np.diff(path, order) / dt_s**order
+        assert np.abs(differences).max() <= BRAKE_MARGIN * limit * (1 + 1e-3)
 
 
 @given(at=st.floats(0.2, 0.8), step=st.sampled_from([-0.1, 0.1]), ticks=st.integers(40, 90))
