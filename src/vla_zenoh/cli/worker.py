@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from typing import Annotated, Literal
 
 import typer
@@ -37,6 +38,8 @@ def worker(
     # Returns only where this environment has what the model's header asks for.
     run_in_own_environment(chosen.model, model_options.python)
     policy = make_policy(chosen.model, chosen.options, profile=node.profile)
+    if sys.stdout.isatty():
+        print(f"worker {chosen.name} of robot {profile.robot.name} runs; Ctrl-C ends it")
     run_node(
         profile,
         lambda session, stop: WorkerNode(
