@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from vla_zenoh.cli.options import HostOption, ModelOptions, NodeOptions, effective_profile, options
+from vla_zenoh.cli.plain import say
 from vla_zenoh.keys import worker_node
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy.loader import make_policy
@@ -39,7 +40,7 @@ def worker(
     run_in_own_environment(chosen.model, model_options.python)
     policy = make_policy(chosen.model, chosen.options, profile=node.profile)
     if sys.stdout.isatty():
-        print(f"worker {chosen.name} of robot {profile.robot.name} runs; Ctrl-C ends it")
+        say(f"worker {chosen.name} of robot {profile.robot.name} runs; Ctrl-C ends it")
     run_node(
         profile,
         lambda session, stop: WorkerNode(
