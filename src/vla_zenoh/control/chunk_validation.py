@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.actions import rotation_of, step_pose, step_width
+from vla_zenoh.control.actions import as_deltas, rotation_of, step_pose, step_width
 from vla_zenoh.control.limits import bound_step, workspace_corners
 from vla_zenoh.control.plan_timeline import Goal
 from vla_zenoh.errors import RecordError, SpecError
@@ -171,9 +171,11 @@ def validate_steps(
                 rotation_of(action, rotations[index])
     except RecordError as error:
         return Rejection("meaning", str(error))
-    lengths_m = steps[:, :3] * action.position_scale_m
     if action.kind == "absolute":
-        return _validate_targets(lengths_m, limits)
+        return _validate_targets(steps[:, :3] * action.position_scale_m, limits)
+    action, steps = as_deltas(action, steps)
+    rotations = steps[:, 3 : 3 + ROTATION_SIZE[action.rotation]]
+    lengths_m = steps[:, :3] * action.position_scale_m
     if action.rotation == "quaternion":
         most_rad = 2.0 * np.arccos(np.clip(np.abs(rotations[:, 3]) - ROUNDING, 0.0, 1.0))
     else:  # three angles, or one: together at most as large as this

@@ -2,11 +2,15 @@
 
 A chunk whose observation was taken at ``t_o`` asks for waypoints ``W_1 .. W_H``::
 
-    W_0 = G(t_o)                   what was asked for until the observation was taken
-    W_k = W_(k-1) o step_k         k = 1 .. H
+    W_0 = G(t_o)                   what was asked for until the observation was taken,
+                                   or the measured pose, see `ActionSpec.anchor`
+    W_k = W_(k-1) o step_k         k = 1 .. H; or W_0 o step_k, see `ActionSpec.relative_to`
     in force at t: W_k, k = floor((t - t_o) / dt) + 1, at least 1 and at most H
 
     G(t) = W_s, s = (t - t_o) / dt, at least 1 and at most H, between two waypoints interpolated
+
+Where a controller covers only a part of each step, its response is what is interpolated, and its
+rate is part of W and G. Between chunks it stands still, as a simulator does during inference.
 
 ``G`` is the same function of every earlier plan. A plan is in force from the moment its chunk was
 *published*: an observation taken later shows its effect, so the next delta stands on top of it; one
@@ -32,6 +36,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from vla_zenoh.control.controller_response import Response, between
 from vla_zenoh.control.limits import Slowdown, into_workspace
 from vla_zenoh.kinematics.so3 import Pose, interpolate, orthonormal
 from vla_zenoh.profile import Limits
@@ -91,12 +96,14 @@ class Goal:
         width_m: of the gripper.
         joints_rad: (n,) a joint solution of the pose; None: not computed.
         slowdown: why the arm moves there slower than at full speed.
+        response: state there of a controller that covers only a part of each step; None: without.
     """
 
     pose: Pose
     width_m: float
     joints_rad: FloatArray | None = None
     slowdown: Slowdown | None = None
+    response: Response | None = None
 
 
 @dataclass(slots=True)
@@ -160,10 +167,12 @@ class Plan:
         if done >= self.bounded or part_ns == 0:
             return self.goals[min(done, self.bounded) - 1]
         last, coming, share = self.goals[done - 1], self.goals[done], part_ns / self.dt_ns
-        return Goal(
-            interpolate(last.pose, coming.pose, share),
-            last.width_m + share * (coming.width_m - last.width_m),
-        )
+        width_m = last.width_m + share * (coming.width_m - last.width_m)
+        if coming.response is None:
+            return Goal(interpolate(last.pose, coming.pose, share), width_m)
+        dt_s = self.dt_ns / 1e9
+        pose, state = between(last.pose, coming.pose, coming.response, dt_s, share)
+        return Goal(pose, width_m, response=state)
 
     def steps_until(self, t_ns: int) -> float:
         """Steps of the episode asked for until `t_ns`, including parts of one."""
@@ -195,7 +204,8 @@ class Plan:
             goal = self.goals[later]
             inside, _ = into_workspace(limits, goal.pose.position_m + way_m, goal.pose.position_m)
             turned = orthonormal(goal.pose.rotation @ turn)
-            self.goals[later] = Goal(Pose(inside, turned), goal.width_m)
+            moved = Pose(inside, turned)
+            self.goals[later] = Goal(moved, goal.width_m, response=goal.response)
 
     def shift_rest(self, index: int, goal: Goal, limits: Limits) -> None:
         """Replace goal `index`, and shift the later ones with it."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from vla_zenoh.cli.options import overridden
+from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.errors import (
     ProfileError,
     VlaZenohError,
@@ -66,7 +66,7 @@ def check_profile(
     """
     try:
         loaded, lines = load_with_lines(name)
-        profile = overridden(loaded, connect, listen)
+        profile = effective_profile(loaded, connect, listen)
     except ProfileError as error:
         return ProfileReport(str(error).splitlines(), [])
     if host is None and len(profile.hosts) == 1:
