@@ -328,7 +328,8 @@ class Smoother:
         One, if the motion is already along `way`. Otherwise those of translation and rotation: the
         line and two directions beside it if the motion there is small, or the axes.
         """
-        whole = _line(way, *self._state[1:], self._pace)
+        _, velocity, acceleration = self._state
+        whole = _line(way, velocity, acceleration, self._pace)
         if whole is not None:
             return whole[:, None], [1.0]
         columns: list[FloatArray] = []
@@ -345,7 +346,7 @@ class Smoother:
     ) -> tuple[FloatArray, list[float]]:
         """The same for three axes: (3, k), with `way` (3,) and `limits` (3, 3)."""
         motion = np.array([self._state.velocity[axes], self._state.acceleration[axes]])
-        line = _line(way, *motion, self._pace)
+        line = _line(way, motion[0], motion[1], self._pace)
         if line is not None:
             return (line[:, None], [1.0]) if line.any() else (np.zeros((3, 0)), [])
         length = norm3(way)
