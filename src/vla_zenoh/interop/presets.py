@@ -3,7 +3,7 @@
 Not converted: the origin of the model's world (LIBERO's is not the robot's base), the rotation of
 its tool frame against ours, and the framing of its images.
 
-LIBERO's controller covers a part of each step only, and here the arm moves as far as there:
+LIBERO's controller covers a part of each step only, and here the arm moves about as far:
 `ActionSpec.controller`. BridgeData's arm adds each step to its last target.
 
 Sources: openpi's examples for DROID and LIBERO, DROID's own joint velocity control (one unit is 0.2
