@@ -78,7 +78,7 @@ def test_ci_runs_what_people_run() -> None:
 
 
 def test_what_is_imported_from_the_package_is_there() -> None:
-    """By programs that no other test starts, too, and by models with an environment of their own."""
+    """Of programs that no other test starts, and of models in environments of their own, too."""
     wrong = []
     for folder in ("benchmarks", "examples", "models", "reliability", "scripts", "sim", "tests"):
         for path in (ROOT / folder).rglob("*.py"):
