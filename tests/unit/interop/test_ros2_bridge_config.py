@@ -13,7 +13,6 @@ import zenoh
 from typer.testing import CliRunner
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.interop.ros2.graph import camera_topics
 from vla_zenoh.interop.ros2.keys import Ros2Dds
 from vla_zenoh.lab.certificates.bridge import bridge_locks, bridges
 from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
@@ -134,7 +133,7 @@ def test_cameras_alone_let_through_no_command(tmp_path: Path) -> None:
     found = allowed(profile)
     assert found.pop("publishers") == ["/camera/realsense2_camera/color/image_raw"]
     assert not any(found.values())
-    assert list(camera_topics(profile)) == ["front"]
+    assert list(profile.ros2_cameras()) == ["front"]
 
 
 def test_a_name_is_meant_as_a_whole_and_to_the_letter(tmp_path: Path) -> None:
