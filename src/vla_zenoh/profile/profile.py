@@ -133,7 +133,7 @@ class Profile(Section):
         return tuple(
             name
             for name in self.cameras_of(host)
-            if name not in self.cameras or not self.cameras[name].source.startswith("ros2:")
+            if name not in self.cameras or not self.cameras[name].from_ros2
         )
 
     def ros2_cameras(self) -> dict[str, Ros2Camera]:
@@ -142,7 +142,7 @@ class Profile(Section):
         return {
             name: named.get(name) or Ros2Camera(topic=camera.source.removeprefix("ros2:"))
             for name, camera in self.cameras.items()
-            if camera.source.startswith("ros2:")
+            if camera.from_ros2
         }
 
     def workers_of(self, host: HostProfile) -> tuple[str, ...]:
@@ -165,9 +165,7 @@ class Profile(Section):
         for host, part in self.hosts.items():
             for camera in self.cameras_of(part):
                 servers[camera] = self.node_name(host, "camera")
-        from_ros2 = (
-            name for name, camera in self.cameras.items() if camera.source.startswith("ros2:")
-        )
+        from_ros2 = (name for name, camera in self.cameras.items() if camera.from_ros2)
         return servers | dict.fromkeys(from_ros2, "ros2")
 
 
@@ -191,9 +189,9 @@ def _robot(profile: Profile) -> Iterator[Fault]:
 def _cameras(profile: Profile) -> Iterator[Fault]:
     for name, camera in profile.cameras.items():
         place = ("cameras", name, "source")
-        if camera.source.startswith("ros2:") and profile.ros2 is None:
+        if camera.from_ros2 and profile.ros2 is None:
             yield place, f"is {camera.source!r}, which needs a section ros2"
-        if camera.source.startswith("ros2:") and camera.fit_for_workers:
+        if camera.from_ros2 and camera.fit_for_workers:
             yield ("cameras", name, "fit_for_workers"), "cannot be done for a camera of ROS 2"
         if camera.source.startswith("sim:") and profile.robot.driver != "sim":
             yield (
@@ -326,10 +324,7 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
         if len(hosts) > 1:
             why = NODE_KINDS[name].only_one if what == "nodes" else "each key has one writer"
             hint = "" if what == "nodes" else f". List on each host which {what} it runs"
-            yield (
-                ("hosts", hosts[-1], what),
-                f"{name} runs on {' and '.join(hosts)}: {why}{hint}",
-            )
+            yield (("hosts", hosts[-1], what), f"{name} runs on {' and '.join(hosts)}: {why}{hint}")
 
 
 def _endpoints(profile: Profile, name: str, host: HostProfile) -> Iterator[Fault]:

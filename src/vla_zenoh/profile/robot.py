@@ -179,6 +179,8 @@ class ArmProfile(Section):
 Stiffness = Annotated[float, Field(gt=0, le=3000)]
 Threshold = Annotated[float, Field(gt=0, le=100)]
 _SEVEN = Field(strict=False, min_length=7, max_length=7)
+Stiffnesses = Annotated[tuple[Stiffness, ...], _SEVEN]
+Thresholds = Annotated[tuple[Threshold, ...], _SEVEN]
 
 
 class FrankaLoad(Section):
@@ -223,26 +225,10 @@ class FrankaProfile(Section):
     realtime: Literal["enforce", "ignore"] = "enforce"
     stiffness_n_m: Stiffness = 2000.0
     stiffness_nm_rad: float = Field(default=150.0, gt=0, le=300)
-    joint_stiffness_nm_rad: Annotated[tuple[Stiffness, ...], _SEVEN] = (
-        600.0,
-        600.0,
-        600.0,
-        600.0,
-        250.0,
-        150.0,
-        50.0,
-    )
+    joint_stiffness_nm_rad: Stiffnesses = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)
     posture_stiffness_nm_rad: float = Field(default=10.0, ge=0, le=100)
     collision_force_n: Threshold = 60.0
     collision_torque_nm: Threshold = 30.0
-    collision_joint_nm: Annotated[tuple[Threshold, ...], _SEVEN] = (
-        40.0,
-        40.0,
-        36.0,
-        36.0,
-        32.0,
-        28.0,
-        24.0,
-    )
+    collision_joint_nm: Thresholds = (40.0, 40.0, 36.0, 36.0, 32.0, 28.0, 24.0)
     load: FrankaLoad = FrankaLoad()
     hand: bool = True

@@ -6,15 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from vla_zenoh.profile.section import (
-    Distinct,
-    Name,
-    Names,
-    Section,
-    Text,
-    Word,
-    reject,
-)
+from vla_zenoh.profile.section import Distinct, Name, Names, Section, Text, Word, reject
 from vla_zenoh.profile.session import Endpoints
 
 NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker"]
@@ -162,6 +154,11 @@ class CameraProfile(Section):
     fit_for_workers: bool = False
     loop: bool = True
     check: CameraCheck = CameraCheck()
+
+    @property
+    def from_ros2(self) -> bool:
+        """The node ros2 publishes it, and no camera node."""
+        return self.source.startswith("ros2:")
 
 
 class SimProfile(Section):

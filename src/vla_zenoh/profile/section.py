@@ -79,9 +79,7 @@ Range = Annotated[tuple[float, float], Field(strict=False), AfterValidator(_orde
 Distinct = AfterValidator(_differ)
 
 
-NOT_MADE = {
-    "depth": "cameras give colour images only; depth is not read.",
-}
+NOT_MADE = {"depth": "cameras give colour images only; depth is not read."}
 """Key that looks like a slip of another one but is a wish -> what there is."""
 _NO_VALUE_SHOWN = {"missing", "extra_forbidden", "too_long", "too_short", "value_error"}
 
