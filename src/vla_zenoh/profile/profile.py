@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError
@@ -32,7 +32,6 @@ from vla_zenoh.profile.section import (
     Section,
     Text,
     Word,
-    reject,
     unknown_name,
 )
 from vla_zenoh.profile.session import (
@@ -105,21 +104,16 @@ class Profile(Section):
         """The keys of this profile's robot."""
         return Keys(self.robot.name, self.root)
 
-    @model_validator(mode="after")
-    def _sections_are_consistent(self) -> Profile:
-        reject(
-            [
-                *_robot(self),
-                *_cameras(self),
-                *_ros2(self),
-                *_task(self),
-                *_serves(self),
-                *_unknown(("models",), self.models, "workers", self.workers),
-                *_unknown(("options",), self.options, "workers", self.workers),
-                *_hosts(self),
-            ]
-        )
-        return self
+    def contradictions(self) -> Iterator[Fault]:
+        """Sections that do not go together."""
+        yield from _robot(self)
+        yield from _cameras(self)
+        yield from _ros2(self)
+        yield from _task(self)
+        yield from _serves(self)
+        yield from _unknown(("models",), self.models, "workers", self.workers)
+        yield from _unknown(("options",), self.options, "workers", self.workers)
+        yield from _hosts(self)
 
     # -- which node runs where ----------------------------------------------------------------
     def cameras_of(self, host: HostProfile) -> tuple[str, ...]:
