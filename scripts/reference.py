@@ -25,7 +25,7 @@ from typer.main import get_command
 import vla_zenoh
 from vla_zenoh.cli.help import examples
 from vla_zenoh.cli.main import app
-from vla_zenoh.keys import Keys
+from vla_zenoh.keys import KEY_PATHS
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.roles import TABLE
 
@@ -167,25 +167,12 @@ def keys_page() -> str:
         "without certificates they are not checked."
     )
     rows = ["| key | payload | published by | read by |", "|---|---|---|---|"]
-    table = {row.member: row for row in TABLE}
-    for name, member in inspect.getmembers_static(Keys):
-        if name not in table:
-            continue
-        if isinstance(member, property):
-            text, doc = getattr(Keys("ROBOT", "ROOT"), name), member.__doc__
-        elif inspect.isfunction(member):
-            parameters = list(inspect.signature(member).parameters)[1:]
-            marks = [f"X{number}X" for number in range(len(parameters))]
-            text, doc = getattr(Keys("ROBOT", "ROOT"), name)(*marks), member.__doc__
-            for mark, parameter in zip(marks, parameters, strict=True):
-                text = text.replace(mark, f"<{parameter}>")
-        else:
-            continue
-        text = text.removeprefix("ROOT/ROBOT/")
-        row = table[name]
+    for row in sorted(TABLE, key=lambda row: row.member):
+        path = KEY_PATHS[row.member]
+        text = path.path.replace("{", "<").replace("}", ">")
         writers = sorted(r.value for r in (row.put | row.announce | row.answer))
         readers = sorted(r.value for r in (row.subscribe | row.ask | row.watch))
-        about = " ".join((doc or "").split()).replace("|", "\\|")
+        about = path.payload.replace("|", "\\|")
         rows.append(f"| `{text}` | {about} | {', '.join(writers)} | {', '.join(readers)} |")
     return "\n\n".join([*out, "\n".join(rows)]) + "\n"
 

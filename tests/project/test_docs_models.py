@@ -25,14 +25,9 @@ from vla_zenoh.cli.main import app
 from vla_zenoh.errors import PeerError
 from vla_zenoh.interop.action_semantics import ACTION_OPTIONS, read_action_semantics
 from vla_zenoh.interop.field_mapping import DEFAULTS, read_map
+from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.lockstep import Lockstep
-from vla_zenoh.policy import (
-    ActionSpec,
-    CameraSpec,
-    Observation,
-    ObservationSpec,
-    example_observation,
-)
+from vla_zenoh.policy import ActionSpec, CameraSpec, Observation, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.policy.state_vector import COORDINATES, PARTS, read_parts
 from vla_zenoh.profile import load_profile

@@ -23,8 +23,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from vla_zenoh.errors import PeerError, SpecError
+from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.serve.served_policy import make_served_policy
-from vla_zenoh.policy import ModelSpec, example_observation
+from vla_zenoh.policy import ModelSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 

@@ -14,7 +14,7 @@ from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import NODE_KINDS, Keys
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import ArmProfile, FrankaProfile, Options, RobotProfile
-from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Gripper, Ros2Profile
+from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Camera, Ros2Gripper, Ros2Profile
 from vla_zenoh.profile.schema import (
     SIMULATED,
     CameraProfile,
@@ -135,6 +135,15 @@ class Profile(Section):
             for name in self.cameras_of(host)
             if name not in self.cameras or not self.cameras[name].source.startswith("ros2:")
         )
+
+    def ros2_cameras(self) -> dict[str, Ros2Camera]:
+        """Camera -> its topic, of all that come from ROS 2."""
+        named = self.ros2.cameras if self.ros2 is not None else {}
+        return {
+            name: named.get(name) or Ros2Camera(topic=camera.source.removeprefix("ros2:"))
+            for name, camera in self.cameras.items()
+            if camera.source.startswith("ros2:")
+        }
 
     def workers_of(self, host: HostProfile) -> tuple[str, ...]:
         """Names of the workers that run on `host`."""
