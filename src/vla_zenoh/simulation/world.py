@@ -18,11 +18,7 @@ from vla_zenoh.simulation.cartesian_impedance import (
     ImpedanceGains,
     ImpedanceOutput,
 )
-from vla_zenoh.simulation.joint_impedance import (
-    JointGains,
-    JointImpedance,
-    JointImpedanceOutput,
-)
+from vla_zenoh.simulation.joint_impedance import JointGains, JointImpedance, JointImpedanceOutput
 from vla_zenoh.simulation.objects import SimulatedObjects
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import STEP_S, build_model, read_pose_vector, write_pose_vector
@@ -88,9 +84,7 @@ class World:
             period_s=STEP_S,
         )
         self._joint_controller = JointImpedance(
-            JointGains(),
-            effort_nm=self._arm.effort_limit_nm,
-            period_s=STEP_S,
+            JointGains(), effort_nm=self._arm.effort_limit_nm, period_s=STEP_S
         )
         self._active_law: CartesianImpedance | JointImpedance | None = None
         self._held_rad: FloatArray | None = None
