@@ -353,8 +353,9 @@ def counters_page() -> str:
     rows += [f"| `{name}` | {text} |" for name, text in sorted(COUNTERS.items())]
     out.append("\n".join(rows))
     out.append(
-        "## Rejected messages\n\n`refused.<reason>` counts messages that were rejected. On the "
-        "command node chunks are counted as `refused.<reason>` too; on a robot node `pose_`, "
+        "## Rejected messages\n\n`refused.<reason>` counts messages that were rejected. Of chunks "
+        "`superseded`, `before_activation`, `unknown_worker` and `overtaken` belong to normal "
+        "operation: the command node counts them as `skipped.<reason>`. On a robot node `pose_`, "
         "`joint_` or `gripper_` stands before the reason of a command."
     )
     rows = ["| reason | why |", "|---|---|"]

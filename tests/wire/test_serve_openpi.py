@@ -167,6 +167,21 @@ def test_our_own_adapter_drives_our_own_server() -> None:
             other.infer(seen)
 
 
+def test_a_new_episode_of_our_adapter_is_one_of_our_server() -> None:
+    """A fixed number of steps, done in shadow mode, is done again after an activation."""
+    with serving("--worker", "scripted") as port:
+        settings = {"url": f"ws://127.0.0.1:{port}", "preset": "own", "gripper": "delta_m"}
+        policy: Any = make_policy(find_model("openpi"), settings)
+        seen = example_observation(policy.spec, prompt="HARD: go up x1")
+        try:
+            up_m = [policy.infer(seen).steps[0][2] for _ in range(2)]
+            policy.reset()
+            up_m += [policy.infer(seen).steps[0][2] for _ in range(2)]
+        finally:
+            policy.close()
+    np.testing.assert_allclose(up_m, [STEP_M, 0, STEP_M, 0], atol=ATOL_M)
+
+
 @pytest.mark.slow
 def test_openpis_own_client_is_served(tmp_path: Path) -> None:
     python = python_with(*OPENPI_CLIENT)

@@ -114,6 +114,8 @@ def network_card(franka: FrankaProfile, folder: Path = NETWORK) -> HostFinding:
     try:
         speed = int((folder / card / "speed").read_text())
     except (OSError, ValueError):
+        speed = -1
+    if speed <= 0:  # Linux writes -1 where it is not known
         return HostFinding(name, "warn", f"{card}, of unknown speed", "it should be 1 Gbit/s")
     if speed < 1000:
         return HostFinding(name, "warn", f"{card}, {speed} Mbit/s", "use 1 Gbit/s, without a hub")
