@@ -185,8 +185,8 @@ VARIABLES = {
     "VLA_ZENOH_LISTEN": "where the router of `up` and `node router` listens, as `--listen`",
     "VLA_ZENOH_HOST": "which host of the profile this computer is, as `--host`; see "
     "[Security](../how-to/security.md)",
-    "VLA_ZENOH_PATH": "folders with `profiles/`, `models/` and `sim/` of your own, separated by `:`; "
-    "their contents are found by name: `vla-zenoh up ur5`",
+    "VLA_ZENOH_PATH": "folders with `profiles/`, `models/` and `sim/` of your own, separated "
+    "by `:`; their contents are found by name: `vla-zenoh up ur5`",
     "VLA_ZENOH_RENDERER": "`egl` or `raycast`, where `sim.renderer` is `auto`",
     "VLA_ZENOH_API_KEY": "of `lab serve-openpi`, as `--api-key`",
 }

@@ -36,6 +36,13 @@ def command_lines(page: Path) -> Iterator[tuple[str, list[str]]]:
                 yield line, found[names[0] + 1 :]
 
 
+def commands_in_sentences(page: Path) -> Iterator[tuple[str, list[str]]]:
+    """Those in backticks, which need not be whole."""
+    text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
+    for line in re.findall(r"`(vla-zenoh [a-z][^`]*)`", text):
+        yield line, re.sub(r"[\[\]]", "", line).split("&&")[0].split()[1:]
+
+
 def test_the_commands_are_found() -> None:
     assert sum(1 for page in PAGES for _ in command_lines(page)) > FEWEST
 
@@ -43,15 +50,17 @@ def test_the_commands_are_found() -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_the_commands_of_a_page_can_be_typed(page: Path) -> None:
     """Parsed as the command line does, up to where the command would run."""
-    for line, words in command_lines(page):
+    whole = [(True, *each) for each in command_lines(page)]
+    parts = [(False, *each) for each in commands_in_sentences(page)]
+    for is_whole, line, words in whole + parts:
         command: Any = get_command(app)
         context = command.make_context("vla-zenoh", [], resilient_parsing=True)
         rest = words
-        while hasattr(command, "get_command"):
+        while hasattr(command, "get_command") and rest:
             found = command.get_command(context, rest[0])
             assert found is not None, line
             command, rest = found, rest[1:]
-        if PLACEHOLDER.search(line):
+        if not is_whole or PLACEHOLDER.search(line):
             known = {name for parameter in command.params for name in parameter.opts}
             given = {word.partition("=")[0] for word in rest if re.match(r"--?[a-z]", word)}
             assert given <= known, (line, given - known)
