@@ -123,11 +123,12 @@ class World:
         """
         mujoco.mj_step1(self.model, self._data)
         if isinstance(reference, JointReference):
-            state, self._held_rad = self._switch_to(self._joint_controller), reference.position_rad
-            self._apply(self._joint_controller.torque(reference, state), reference)
+            self._held_rad, law = reference.position_rad, self._joint_controller
+            output = law.torque(reference, self._switch_to(law))
         else:
-            state, self._held_rad = self._switch_to(self._controller), None
-            self._apply(self._controller.torque(reference, state), reference)
+            self._held_rad, law = None, self._controller
+            output = law.torque(reference, self._switch_to(law))
+        self._apply(output, reference)
 
     def hold_reference(self) -> PoseReference:
         """Reference at the measured TCP, at rest."""
