@@ -85,7 +85,7 @@ def kept_rows(options: ResultOptions) -> Iterator[Rows]:
             yield rows
         except Interrupted:
             raise typer.Exit(130) from None
-        except Exception:
+        except Exception:  # whatever it is, it goes on after the log lines
             errors().print("\n".join(rows.lines[-LAST_LINES:]), style="dim")
             raise
         finally:
@@ -108,7 +108,7 @@ def up_with_last_lines(host: Host, lines: Collection[str]) -> Iterator[Host]:
         with host as running:
             try:
                 yield running
-            except Exception:
+            except Exception:  # whatever it is, it goes on
                 failed_at += lines  # before the nodes end
                 raise
     except Interrupted:
