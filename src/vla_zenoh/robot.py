@@ -61,6 +61,8 @@ class Reading:
             hand, a recovery runs). The arm is not activated in it; empty: it is ready.
         measured_ns: time of the measurement by `time.monotonic_ns`; None: now. Set it where a
             library caches the newest state: otherwise a dead link looks like an arm at rest.
+        idle: no controller holds the last set-point any more (it runs in motion only). The next
+            command stream then begins where the arm is measured.
     """
 
     position_rad: ArrayLike
@@ -73,6 +75,7 @@ class Reading:
     fault: str = ""
     mode: str = ""
     measured_ns: int | None = None
+    idle: bool = False
 
 
 @runtime_checkable
@@ -98,7 +101,11 @@ class Robot(Protocol):
         ...
 
     def move(self, command: Command) -> None:
-        """Set the set-point. Between calls the robot has to hold the last one."""
+        """Set the set-point. Between calls the robot has to hold the last one.
+
+        A robot that keeps the velocity too must drop it when no call came for
+        ``timing.command_timeout_s``: this loop may be what hangs.
+        """
         ...
 
 

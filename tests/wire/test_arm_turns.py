@@ -41,6 +41,7 @@ JOINT = 2
 MOVING = 100
 """Turns after which the arm is in full motion."""
 BRAKED_RAD = 1e-5
+SAG_RAD = 0.004
 HEARD = 15
 """Of a fault, however brief it is, so many states tell."""
 JERKED_RAD = 2.5e-4
@@ -55,7 +56,7 @@ from vla_zenoh.robot import Reading
 class Arm:
     def __init__(self):
         self.position_rad, self.said, self.moves, self.failing, self.tried = None, {}, [], 0, 0
-        self.widths_m = []
+        self.widths_m, self.velocity_rad_s = [], None
 
     def read(self):
         if "raise" in self.said:
@@ -68,7 +69,7 @@ class Arm:
             self.failing -= 1
             raise OSError("the cable is out")
         self.moves.append(command.position_rad)
-        self.position_rad = command.position_rad
+        self.position_rad, self.velocity_rad_s = command.position_rad, command.velocity_rad_s
 
     def grip(self, width_m, speed_m_s, force_n):
         self.widths_m.append(width_m)
@@ -99,6 +100,8 @@ class Turns:
     script: dict[int, Callable[[], None]] = field(default_factory=dict)
     last: int = 2 * MOVING
     period_s: float = TICK_S
+    stall_s: float = 0.0
+    """How late the next turn is."""
     state: str = "active"
     stop: threading.Event = field(default_factory=threading.Event)
 
@@ -108,12 +111,13 @@ class Turns:
 
     def wait(self) -> Tick:
         self.mono_ns += round(self.period_s * 1e9)
+        self.stall_s = 0.0
         self.script.get(self.turn, lambda: None)()
         self.turn += 1
         if self.turn > self.last:
             self.stop.set()
         self.lead()
-        return Tick(1, self.mono_ns, 0.0, 0.0)
+        return Tick(1, self.mono_ns, self.stall_s, 0.0)
 
     def lead(self) -> None:
         """A joint is led at a speed that it reached from rest."""
@@ -272,6 +276,28 @@ def test_over_an_ill_link_what_move_is_given_keeps_the_limits(turns: Turns, seed
     assert len(path) > 5 * MOVING
 
 
+@pytest.mark.parametrize(("stall_s", "given"), [(0.2, 1), (10.0, 0)])
+def test_after_a_brief_stall_the_arm_is_given_its_last_set_point_at_rest_and_no_velocity(
+    turns: Turns, stall_s: float, given: int
+) -> None:
+    """After a long one it is given nothing: it may have been moved by other means meanwhile."""
+
+    def stall() -> None:
+        assert turns.arm.velocity_rad_s[JOINT] > 0.9 * SPEED_RAD_S
+        turns.mono_ns += round(stall_s * 1e9)
+        turns.stall_s = stall_s
+
+    turns.script[MOVING] = stall
+    turns.last = MOVING + 50
+    turns.run()
+    assert turns.node.arm is not None
+    assert turns.node.arm.follower.stalls == 1
+    assert len(turns.arm.moves) == MOVING + given
+    if given:
+        np.testing.assert_array_equal(turns.arm.moves[-1], turns.arm.moves[-2])
+        np.testing.assert_array_equal(turns.arm.velocity_rad_s, 0.0)
+
+
 # -- what is raised ---------------------------------------------------------------------------
 def test_one_move_that_fails_brakes_the_arm_by_those_that_follow(turns: Turns) -> None:
     turns.script[MOVING] = lambda: setattr(turns.arm, "failing", 1)
@@ -372,6 +398,47 @@ def test_a_fault_is_told_in_words_that_everybody_can_read(turns: Turns) -> None:
     turns.run()
     assert turns.node.state == "fault"
     assert "\x1b" not in turns.faults[-1][0]
+
+
+# -- an arm that holds its set-point in motion alone ----------------------------------------------
+def test_a_stream_begins_where_the_arm_is_measured_once_nothing_holds_the_last_set_point(
+    turns: Turns,
+) -> None:
+    idle, begins = 4 * MOVING, 5 * MOVING
+    held: list[Any] = []
+    given_before: list[int] = []
+
+    def stop_short() -> None:
+        sag_rad = np.zeros(7)
+        sag_rad[JOINT] = SAG_RAD  # something is in its way
+        turns.arm.said["position_rad"] = turns.arm.moves[-1] - sag_rad
+
+    def begin() -> None:
+        names, still = turns.node.node.profile.robot.arm_joints, np.zeros(7)
+        command = JointCommand(names, turns.arm.said["position_rad"], still, still, "active")
+        header = Header(turns.node.node.clock.wall_at(turns.mono_ns), turns.turn, "command#1")
+        turns.session.put(
+            turns.node.node.keys.command_joint,
+            records.encode(command),
+            attachment=records.encode_header(header),
+        )
+
+    turns.script = {
+        MOVING: lambda: setattr(turns, "lead", lambda: None),
+        idle - 50: stop_short,
+        idle - 1: lambda: held.append(turns.heard[JointState][-1].reference_rad),
+        idle: turns.say(idle=True),
+        idle + 10: lambda: held.append(turns.heard[JointState][-1].reference_rad),
+        begins - 1: lambda: given_before.append(len(turns.arm.moves)),
+        begins: lambda: setattr(turns, "lead", begin),
+    }
+    turns.last = begins + 20
+    turns.run()
+    np.testing.assert_allclose(held[0], turns.arm.moves[given_before[0] - 1])
+    assert held[1] is None
+    given = np.array(turns.arm.moves[given_before[0] :])
+    assert len(given) >= 20
+    np.testing.assert_allclose(given - turns.arm.said["position_rad"], 0.0, atol=BRAKED_RAD)
 
 
 # -- the gripper ------------------------------------------------------------------------------

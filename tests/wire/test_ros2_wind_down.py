@@ -131,7 +131,8 @@ def test_an_arm_that_stood_while_the_loop_did_is_not_moved_again_by_its_brake(
     loop.script[MOVING + 1] = lambda: setattr(loop, "stall_s", STALL_S)
     assert ends_broken(loop).endswith(": braked, and ends")
     assert loop.turns.arm.follower.stalls == 1
-    assert len(loop.turns.goals) == MOVING + 1, "none after that in which it broke"
+    assert len(loop.turns.goals) == MOVING + 2, "after that in which it broke, once more at rest"
+    assert loop.turns.steps_m[-1] == 0.0
 
 
 @pytest.mark.parametrize("turns", [GENTLE], indirect=True)

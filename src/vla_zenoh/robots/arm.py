@@ -166,8 +166,8 @@ class Arm:
     def _why(self, state: str) -> str:
         if state == "stalled":
             return (
-                f"the loop stood still for {self.follower.stall_s:.3f} s while it moved the arm, "
-                f"which stands at its last set-point{self._driver.stalled_hint}"
+                f"the loop stood still for {self.follower.stall_s:.3f} s while it moved the arm; "
+                f"the motion does not go on{self._driver.stalled_hint}"
             )
         timeout_s = self._node.profile.timing.command_timeout_s
         return {

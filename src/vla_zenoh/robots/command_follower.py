@@ -1,7 +1,7 @@
 """Follows a command stream: subscribes to it, guards it, and leads the driver along it.
 
 When the stream falls silent in motion, the guard brakes the arm. Then a real robot is sent nothing
-more: its controller holds the last set-point.
+more: its controller holds the last set-point, until the driver says that it is idle.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ class FollowingRobot(Protocol):
     period_s: float
     simulated: bool
     lockstep: bool
+    idle: bool
 
     @property
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]: ...
@@ -65,6 +66,8 @@ class CommandFollower:
         self._hold = HeldReference()
         self._timeout_s = node.profile.timing.command_timeout_s
         self._stalled_until_ns = 0
+        self._resting = False
+        """The robot is to be sent its last set-point at rest: it may have kept a velocity."""
         self.stall_s, self.stalls = 0.0, 0
         self.accepting = True
         if (state := driver.state_now()) is not None:
@@ -90,17 +93,19 @@ class CommandFollower:
 
         Args:
             mono_ns: on the monotonic clock.
-            stall_s: how late the tick is. The robot stopped at its last set-point: after a long
-                stall motion resumes from there, at rest.
+            stall_s: how late the tick is. After a long stall the robot is held at its last
+                set-point, and motion resumes from there, at rest.
         """
         if stall_s <= self._timeout_s:
             if mono_ns >= self._stalled_until_ns:
                 self._stalled_until_ns = 0
             return
-        if stall_s * 1e9 > SETTLE_NS:
+        brief = stall_s * 1e9 <= SETTLE_NS
+        if not brief:
             self._hold.invalidate()  # the arm may have been moved by other means meanwhile
         if self._guard is not None and self.moving:
             self._guard.hold()
+            self._resting = brief
             self._stalled_until_ns, self.stall_s = mono_ns + STALLED_NS, stall_s
             self.stalls += 1
         for mode, buffer in self._streams:
@@ -117,6 +122,9 @@ class CommandFollower:
             silent: the robot's state is not known.
         """
         guard = self._guard
+        if self._driver.idle and not self.moving:
+            self._hold.invalidate()
+            self._resting = False
         reason = away or ("stalled" if self.stalled else "")
         for mode, buffer in self._streams:
             for arrival in buffer.drain():
@@ -163,7 +171,8 @@ class CommandFollower:
         if self._driver.simulated:
             self._driver.move(guard.tick(mono_ns), now_ns)
             return
-        was_moving = guard.moving
+        was_moving = guard.moving or self._resting
+        self._resting = False
         if away and was_moving:
             guard.anchor()  # the next stream must not begin where the arm never went
             was_moving = guard.moving

@@ -133,7 +133,7 @@ class RobotDriver(ABC):
         has_arm: False: the node serves other devices of the robot and moves nothing.
         simulated: `read` steps a simulation by one period, towards the reference of the last
             `move`, which is called at every tick. A real robot is read first, and moved only while
-            a stream is followed or braked: it holds its last set-point by itself.
+            a stream is followed or braked: unless it is `idle` it holds its last set-point.
         lockstep: time is simulated as well; `serve_lockstep` replaces the loop.
         switch_interval_s: how long another thread may hold the interpreter.
         loop: name of the loop's rate in the status.
@@ -142,6 +142,7 @@ class RobotDriver(ABC):
         gripper_mode: mode of the gripper state while the arm is ready.
         no_gripper: why gripper commands are rejected; empty: the robot has a gripper.
         away: reason to reject commands, one word, while the robot cannot be moved.
+        idle: no controller of the robot holds the last set-point any more.
         recovers: `recover` does something.
         silent_why, stalled_hint: sentences for the events of these states.
         report: gets counters, events and rejections; the node, once there is one.
@@ -156,6 +157,7 @@ class RobotDriver(ABC):
     gripper_mode = "ready"
     no_gripper = ""
     away = ""
+    idle = False
     recovers = False
     silent_why = stalled_hint = ""
 

@@ -91,6 +91,7 @@ class PythonDriver(RobotDriver):
             self.fault = self._fault.words
             if self.fault:
                 self.report.emit(Event("error", "fault", "robot_fault", self.fault))
+        self.idle = reading.idle
         self._set_mode(one_line(reading.mode, MAX_WORDS) or "ready")
         self.away = "fault" if self.fault else "not_ready" if self.gripper_mode != "ready" else ""
         try:

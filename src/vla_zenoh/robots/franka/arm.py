@@ -1,8 +1,9 @@
 """A Franka arm: follows set-points as a spring, by franky's 1 kHz torque loop on libfranka.
 
 The 1 kHz loop is C++ and reads the newest set-point, with velocity and acceleration, in each
-cycle; Python is never in it. It runs while set-points arrive; at rest the robot's own controller
-holds the arm.
+cycle; Python is never in it. When Python falls silent in motion the velocity is dropped, so the arm
+comes to rest at the last set-point. The loop runs while set-points arrive; at rest the robot's own
+controller holds the arm where it stands.
 """
 
 from __future__ import annotations
@@ -55,6 +56,9 @@ class FrankaArm:
         self._measured_ns = self._moved_ns = 0
         self._state: Any = None
         self._recovery: threading.Thread | None = None
+        self._timeout_s = profile.timing.command_timeout_s
+        self._referring, self._closed = threading.Lock(), threading.Event()
+        self._velocity_kept = False
 
     # -- connection ---------------------------------------------------------------------------
     def connect(self) -> None:
@@ -80,9 +84,11 @@ class FrankaArm:
                 "Desk? Is no other program connected?"
             ) from error
         self._update(self._robot.state)
+        threading.Thread(target=self._drop_velocity, name="set-point", daemon=True).start()
 
     def close(self) -> None:
         """End the loop and disconnect."""
+        self._closed.set()
         if self._hand is not None:
             self._hand.close()
         if self._robot is not None and self._robot.is_in_control:
@@ -140,6 +146,7 @@ class FrankaArm:
             fault=self._fault(mode),
             mode="" if mode in READY | STOPPED else mode,
             measured_ns=self._measured_ns,
+            idle=self._motion is None,
         )
 
     def _update(self, state: Any) -> None:
@@ -194,11 +201,39 @@ class FrankaArm:
         if starts:
             self._motion, elapsed_s = self._new_motion(), 0.0
             self._trim = np.zeros(7 if isinstance(command, JointCommand) else 6)
-        self._motion.set_reference(self._reference(command, elapsed_s / TRIM_S))
+        reference = self._reference(command, elapsed_s / TRIM_S)
+        with self._referring:
+            self._motion.set_reference(reference)
+            self._velocity_kept = True
         if starts:
             with realtime_children():
                 self._robot.move(self._motion, asynchronous=True)
             self._was_in_control = True
+
+    def _drop_velocity(self) -> None:
+        """Tell the loop to rest at its set-point when the next one is overdue: a thread.
+
+        The loop keeps a set-point with its velocity, and the spring would lead the arm beyond it.
+        """
+        franky = self._franky
+        while not self._closed.wait(self._timeout_s / 4):
+            if not (self._velocity_kept and self._overdue):
+                continue
+            with self._referring:
+                motion = self._motion
+                if motion is None or not self._overdue:
+                    continue
+                reference = motion.get_reference()
+                motion.set_reference(
+                    franky.JointReference(reference.q)
+                    if isinstance(reference, franky.JointReference)
+                    else franky.CartesianReference(reference.target)
+                )
+                self._velocity_kept = False
+
+    @property
+    def _overdue(self) -> bool:
+        return time.monotonic_ns() - self._moved_ns > self._timeout_s * 1e9
 
     def _new_motion(self) -> Any:
         franky, settings = self._franky, self._settings
