@@ -69,6 +69,10 @@ class JointMonitor:
         """The slowdown of the arm, None for full speed."""
         return slowest(self._bound_slowdown, self._elbow_slowdown)
 
+    def late(self, now_ns: int) -> bool:
+        """A check has been due for as long as it takes to become due again."""
+        return now_ns >= self._next_ns + PERIOD_NS // 2
+
     def update(
         self, measured_rad: FloatArray, commanded_rad: FloatArray | None, now_ns: int
     ) -> LimitHit | None:

@@ -311,9 +311,25 @@ class MotionPipeline:
             joint = self._joints.command(state.value, self._cause)
         else:
             pose = self._pose_command(self._smoother.motion, state)
-        if state is State.ACTIVE:
+        if state is State.ACTIVE and self._override > 0.0:
             width = self.gripper.step(now_ns, gripper)
         return MotionCommands(pose, joint, width)
+
+    def forget_plan(self, oldest_ns: int, now_ns: int) -> bool:
+        """Stand where the arm is, if the plan's observation was taken before `oldest_ns`."""
+        timeline, smoother = self.timeline, self._smoother
+        if timeline is None or smoother is None:
+            return False
+        cause = timeline.plan.cause
+        if cause is None or cause.observation_stamp_ns >= oldest_ns:
+            return False
+        self._hold(timeline, self._resting_pose(smoother, smoother.motion.pose), now_ns)
+        return True
+
+    def _hold(self, timeline: GoalTimeline, pose: Pose, now_ns: int) -> None:
+        timeline.hold(Goal(pose, timeline.at(now_ns).width_m), now_ns)
+        if self._timing is not None:
+            self._timing.restart()
 
     def _set_override(self, override: float, timeline: GoalTimeline, now_ns: int) -> None:
         """Let plan time pass at the speed override, and replan the motion to the goal."""
@@ -452,9 +468,7 @@ class MotionPipeline:
             self._joints.brake(smoother)
         self.goal = None
         if timeline.plan.cause is not None and smoother.at_rest:
-            timeline.hold(Goal(smoother.motion.pose, timeline.at(now_ns).width_m), now_ns)
-            if self._timing is not None:
-                self._timing.restart()
+            self._hold(timeline, smoother.motion.pose, now_ns)
 
     def _must_stream(self, state: State, now_ns: int) -> bool:
         if state in OBEYING or self.retreat.busy or not self.at_rest:

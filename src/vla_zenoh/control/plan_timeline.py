@@ -34,7 +34,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from vla_zenoh.control.controller_response import Response, between
 from vla_zenoh.control.limits import Slowdown, into_workspace
@@ -44,18 +44,21 @@ from vla_zenoh.types import Cause, FloatArray
 
 HISTORY_NS = 15_000_000_000
 """Observations are rejected long before they are this old."""
-OVERRIDES_NS = 600_000_000_000
-"""How long changes of the override are remembered; a slow plan lasts long."""
 FOREVER_NS = 1 << 62
 WHOLE_STEP = 1e-6
 """Parts of steps that add up to one within this are a whole step."""
 
 
 class PlanClock:
-    """Plan time as a function of wall time (both ns): its rate is the speed override."""
+    """Plan time as a function of wall time (both ns): its rate is the speed override.
 
-    def __init__(self) -> None:
-        self._marks: list[tuple[int, int, float]] = [(0, 0, 1.0)]
+    Args:
+        override: from the beginning on.
+        now_ns: of the beginning, at which plan time is wall time.
+    """
+
+    def __init__(self, override: float = 1.0, now_ns: int = 0) -> None:
+        self._marks: list[tuple[int, int, float]] = [(now_ns, now_ns, override)]
 
     @property
     def override(self) -> float:
@@ -65,7 +68,7 @@ class PlanClock:
     def set(self, override: float, now_ns: int) -> None:
         """Set the rate of plan time from `now_ns` on."""
         self._marks.append((now_ns, self.at(now_ns), override))
-        while len(self._marks) > 1 and self._marks[1][0] < now_ns - OVERRIDES_NS:
+        while len(self._marks) > 1 and self._marks[1][0] < now_ns - HISTORY_NS:
             del self._marks[0]
 
     def at(self, wall_ns: int) -> int:
@@ -142,14 +145,20 @@ class Plan:
     computed: int = -1
     clock: PlanClock = WALL_CLOCK
     soonest: bool = False
+    _start_ns: int = field(init=False)  # in plan time
 
     def __post_init__(self) -> None:
+        self.run_on(self.clock)
         if self.bounded < 0:
             self.bounded = self.computed = len(self.goals)
 
+    def run_on(self, clock: PlanClock) -> None:
+        """Run on this clock, which remembers the time of the observation now, and not for long."""
+        self.clock, self._start_ns = clock, clock.at(self.start_ns)
+
     def elapsed_ns(self, t_ns: int) -> int:
         """Plan time from the observation to `t_ns`."""
-        return self.clock.at(t_ns) - self.clock.at(self.start_ns)
+        return self.clock.at(t_ns) - self._start_ns
 
     def due_index(self, t_ns: int) -> int:
         """Index of the step that is due at `t_ns`."""
@@ -186,8 +195,11 @@ class Plan:
     @property
     def end_ns(self) -> int:
         """End of the last step, at the present override."""
-        end_ns = self.clock.at(self.start_ns) + len(self.goals) * self.dt_ns
-        return self.clock.wall_at(end_ns)
+        return self.clock.wall_at(self._start_ns + len(self.goals) * self.dt_ns)
+
+    def left_ns(self, t_ns: int) -> int:
+        """Plan time from `t_ns` to the end of the last step."""
+        return max(len(self.goals) * self.dt_ns - self.elapsed_ns(t_ns), 0)
 
     def shift(self, index: int, way_m: FloatArray, turn: FloatArray, limits: Limits) -> None:
         """Shift the goals from `index` on, within the workspace box.
@@ -234,6 +246,7 @@ class GoalTimeline:
 
     def restart(self, goal: Goal, now_ns: int) -> None:
         """Drop all plans and stand at `goal`."""
+        self.clock = PlanClock(self.clock.override, now_ns)
         self._plans.clear()
         self.hold(goal, now_ns)
 
@@ -241,7 +254,8 @@ class GoalTimeline:
         """Put `plan` in force, not before the newest plan and not after now."""
         earliest = self._plans[-1].effective_ns if self._plans else plan.effective_ns
         plan.effective_ns = max(earliest, min(plan.effective_ns, now_ns))
-        plan.arrival_ns, plan.clock = now_ns, self.clock
+        plan.arrival_ns = now_ns
+        plan.run_on(self.clock)
         self._plans.append(plan)
         while len(self._plans) > 1 and self._plans[1].effective_ns < now_ns - HISTORY_NS:
             del self._plans[0]

@@ -21,10 +21,26 @@ class PoseHistory:
         self._stamps: deque[int] = deque(maxlen=MOST)
         self._poses: deque[PoseState] = deque(maxlen=MOST)
 
-    def add(self, measured: Stamped[PoseState]) -> None:
-        """Keep a pose, unless it was measured before the last one."""
+    def restart(self, measured: Stamped[PoseState]) -> None:
+        """Drop all poses but this one."""
+        self._stamps.clear()
+        self._poses.clear()
+        self._stamps.append(measured.header.stamp_wall_ns)
+        self._poses.append(measured.record)
+
+    def add(self, measured: Stamped[PoseState], tolerance_ns: int) -> None:
+        """Keep a pose; where time goes back, a clock was set: only this one.
+
+        Args:
+            measured: with the time of its measurement.
+            tolerance_ns: it may be stamped later than it was received by this at most.
+        """
         stamp_ns = measured.header.stamp_wall_ns
+        if stamp_ns > measured.received_ns + tolerance_ns:
+            return
         if self._stamps and stamp_ns <= self._stamps[-1]:
+            if stamp_ns < self._stamps[-1]:
+                self.restart(measured)
             return
         self._stamps.append(stamp_ns)
         self._poses.append(measured.record)
