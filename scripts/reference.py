@@ -178,6 +178,20 @@ def keys_page() -> str:
 
 
 # -- commands -----------------------------------------------------------------------------------
+VARIABLES = {
+    "VLA_ZENOH_PROFILE": "the profile of every command that names none, as `--profile`; not of "
+    "`demo` and `bench`, which simulate a robot of their own",
+    "VLA_ZENOH_CONNECT": "where the router is, as `--connect`: `tcp/10.0.0.2:7447`",
+    "VLA_ZENOH_LISTEN": "where the router of `up` and `node router` listens, as `--listen`",
+    "VLA_ZENOH_HOST": "which host of the profile this computer is, as `--host`; see "
+    "[Security](../how-to/security.md)",
+    "VLA_ZENOH_PATH": "folders with `profiles/`, `models/` and `sim/` of your own, separated "
+    "by `:`; their contents are found by name: `vla-zenoh up ur5`",
+    "VLA_ZENOH_RENDERER": "`egl` or `raycast`, where `sim.renderer` is `auto`",
+    "VLA_ZENOH_API_KEY": "of `lab serve-openpi`, as `--api-key`",
+}
+
+
 def commands_of(command: Any, path: str) -> Iterator[tuple[str, Any]]:
     """A command and those under it."""
     if hasattr(command, "commands"):
@@ -216,6 +230,9 @@ def cli_page() -> str:
         wanted = path.split()
         found = [text for words, text in examples() if words[: len(wanted)] == wanted]
         out.append("```sh\n" + "\n".join(found) + "\n```")
+    rows = ["| variable | sets |", "|---|---|"]
+    rows += [f"| `{name}` | {text} |" for name, text in VARIABLES.items()]
+    out += ["## Environment variables", "\n".join(rows)]
     return "\n\n".join(out) + "\n"
 
 

@@ -112,7 +112,7 @@ class Keys:
     )
     camera_fitted = _KeyOf(
         "camera/{camera}/fitted/{form}",
-        "A JPEG as a model wants it, made where the camera is; see `size_variant`.",
+        "A JPEG in the form a model's spec asks for (``224x224-pad``), made where the camera is.",
     )
     state_joint = _Key("state/joint", "`JointState`.")
     state_pose = _Key(
