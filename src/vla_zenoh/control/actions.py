@@ -53,6 +53,12 @@ def step_pose(spec: ActionSpec, step: FloatArray, before: Pose) -> Pose:
     return Pose(before.position_m + translation, orthonormal(rotation @ before.rotation))
 
 
+def step_joints(spec: ActionSpec, step: FloatArray, before_rad: FloatArray) -> FloatArray:
+    """The joints (n,) that a step (D,) asks for, from the goal `before_rad` (n,)."""
+    numbers = np.asarray(step[: spec.arm_size], dtype=np.float64)
+    return numbers if spec.kind == "absolute" else before_rad + numbers
+
+
 def step_width(
     spec: ActionSpec, step: FloatArray, before_m: float, max_width_m: float
 ) -> float | None:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.actions import step_pose, step_width
+from vla_zenoh.control.actions import step_joints, step_pose, step_width
 from vla_zenoh.control.chunk_validation import (
     ROUNDING,
     Lease,
@@ -31,6 +31,7 @@ from vla_zenoh.control.chunk_validation import (
     validate_chunk,
     validate_steps,
 )
+from vla_zenoh.control.joint_space import BoundedJoints, JointBounds
 from vla_zenoh.control.limits import (
     APPROACH,
     LEAST,
@@ -131,7 +132,7 @@ class _StepBounding:
     hits: list[LimitHit] = field(default_factory=list)
     cut: float = 0.0
     slowdown: Slowdown | None = None
-    search: Generator[None, None, BoundedStep] | None = None
+    search: Generator[None, None, BoundedStep | BoundedJoints] | None = None
 
 
 class ChunkOutcome(NamedTuple):
@@ -165,6 +166,9 @@ class ChunkPlanner:
         self._max_age_s = profile.timing.max_observation_age_s
         self._max_width_m = profile.robot.gripper.max_width_m
         self._reach = reach
+        self.joint_bounds: JointBounds | None = None
+        if reach is not None:
+            self.joint_bounds = JointBounds(profile, reach.kinematics, reach.barriers)
         self._pace = profile.composition.pace
         self._queue: deque[Stamped[ActionChunk]] = deque()
         self._pending: tuple[Stamped[ActionChunk], ChunkPlan] | None = None
@@ -266,6 +270,8 @@ class ChunkPlanner:
         previous = timeline.in_force(observed_ns)
         base = previous.goal_at(observed_ns)
         steps = np.asarray(record.steps[:count], np.float64)
+        if action.space == "joint":
+            steps = self._in_chain_order(action, steps)
         rejection = validate_steps(action, steps, base, self._limits, self._max_width_m)
         if rejection is not None:
             return rejection
@@ -285,7 +291,7 @@ class ChunkPlanner:
             soonest=(action.pace if self._pace == "spec" else self._pace) == "soonest",
             action=action,
             steps=steps,
-            base=Goal(base.pose, base.width_m, _joints(base, near), near.slowdown),
+            base=Goal(base.pose, base.width_m, _joints(base, near), near.slowdown, base.arm),
         )
         if count < len(record.steps):
             plan.add_hits(
@@ -350,7 +356,7 @@ class ChunkPlanner:
             or step.shifted is not plan.shifted_goal
         ):
             step = plan.current = self._begin_step(plan)
-        found: BoundedStep | None = None
+        found: BoundedStep | BoundedJoints | None = None
         while step.search is not None and found is None:
             if self._left <= 0 or self._reach is None:
                 return None
@@ -373,13 +379,16 @@ class ChunkPlanner:
             slower = step.slowdown
         most_s = self._limits.lead_m / self._limits.translation.velocity_m_s
         slower = keep_slowdown(step.start.slowdown, slower, plan.dt_ns / 1e9, most_s)
-        plan.goals[index] = Goal(pose, step.width_m, joints_rad, slower)
+        arm = self._reach.kinematics if self._reach and plan.action.space == "joint" else None
+        plan.goals[index] = Goal(pose, step.width_m, joints_rad, slower, arm)
         plan.bounded, plan.current = index + 1, None
         plan.add_hits(hits)
         return hits
 
     def _begin_step(self, plan: ChunkPlan) -> _StepBounding:
         """The next step of `plan` within the limits of a step."""
+        if plan.action.space == "joint":
+            return self._begin_joint_step(plan)
         start, shifted = plan.step_start, plan.shifted_goal
         if shifted is not None:
             step = _StepBounding(
@@ -390,7 +399,9 @@ class ChunkPlanner:
             asked = step_pose(plan.action, numbers, start.pose)
             slower: Slowdown | None = None
             if plan.action.kind == "absolute":
-                asked, slower = self._approach(plan, start.pose, asked)
+                full_s = full_speed_s(self._limits, start.pose, asked)
+                part, slower = self._approach(plan, *pose_distance(start.pose, asked), full_s)
+                asked = interpolate(start.pose, asked, part) if slower else asked
             width_m = step_width(plan.action, numbers, start.width_m, self._max_width_m)
             pose, acted = bound_step(self._limits, start.pose, asked)
             cut = sum(pose_distance(pose, asked)) if acted else 0.0
@@ -404,13 +415,62 @@ class ChunkPlanner:
             next(step.search)  # up to its first evaluation
         return step
 
-    def _approach(self, plan: ChunkPlan, start: Pose, target: Pose) -> tuple[Pose, Slowdown | None]:
-        """The end of a step to an absolute target, and its slowdown: a far target is approached."""
+    def _in_chain_order(self, action: ActionSpec, steps: FloatArray) -> FloatArray:
+        """Steps (n, D) of joints with their columns in the order of the kinematics."""
+        assert self._reach is not None
+        columns = [action.joints.index(name) for name in self._reach.kinematics.arm_joints]
+        return np.concatenate([steps[:, columns], steps[:, action.arm_size :]], axis=1)
+
+    def _begin_joint_step(self, plan: ChunkPlan) -> _StepBounding:
+        """The same of a step in joint space."""
+        bounds, start, shifted = self.joint_bounds, plan.step_start, plan.shifted_goal
+        assert bounds is not None
+        assert self._reach is not None
+        start_rad = self._reach.joints_rad if start.joints_rad is None else start.joints_rad
+        slower: Slowdown | None = None
+        acted: list[LimitHit] = []
+        if shifted is not None and shifted.joints_rad is not None:
+            asked_rad, width_m, slower = shifted.joints_rad, shifted.width_m, shifted.slowdown
+        else:
+            numbers = plan.steps[plan.bounded]
+            asked_rad = step_joints(plan.action, numbers, start_rad)
+            way_rad = asked_rad - start_rad
+            far_m = pose_distance(start.pose, bounds.kinematics.forward(asked_rad))[0]
+            far_rad = float(np.abs(way_rad).max())
+            if plan.action.kind == "absolute":
+                full_s = bounds.full_speed_s(start_rad, asked_rad)
+                part, slower = self._approach(plan, far_m, far_rad, full_s)
+            else:
+                parts = {"step_m": (far_m, self._limits.step_m)}
+                parts["step_rad"] = far_rad, self._limits.step_rad
+                acted = [
+                    LimitHit(name, far, most)
+                    for name, (far, most) in parts.items()
+                    if far > most * (1 + ROUNDING)
+                ]
+                part = min((hit.limit / hit.value for hit in acted), default=1.0)
+            if part < 1.0:
+                asked_rad = start_rad + part * way_rad
+            width_m = step_width(plan.action, numbers, start.width_m, self._max_width_m)
+            width_m = start.width_m if width_m is None else width_m
+        asked = bounds.kinematics.forward(asked_rad)
+        step = _StepBounding(start, shifted, asked, width_m, acted, slowdown=slower)
+        self._reach.cost = 1
+        step.search = bounds.bound_in_pieces(start_rad, asked_rad)
+        next(step.search)
+        return step
+
+    def _approach(
+        self, plan: ChunkPlan, far_m: float, far_rad: float, full_s: float
+    ) -> tuple[float, Slowdown | None]:
+        """The part of a step to an absolute target that is taken, and its slowdown.
+
+        A target further away than a step is approached.
+        """
         limits = self._limits
-        far_m, far_rad = pose_distance(start, target)
         steps = max(far_m / limits.step_m, far_rad / limits.step_rad)
         if steps <= 1 + ROUNDING:
-            return target, None
+            return 1.0, None
         in_m = far_m / limits.step_m >= far_rad / limits.step_rad
         far, step, unit = (far_m, limits.step_m, "m") if in_m else (far_rad, limits.step_rad, "rad")
         plan.approaches = True
@@ -418,11 +478,10 @@ class ChunkPlanner:
             plan.announced = True
             plan.add_hits([LimitHit(APPROACH, far, step, where=unit)])
         needed_s = max(far_m / limits.approach_m_s, far_rad / limits.approach_rad_s)
-        full_s = full_speed_s(limits, start, target)
         share = min(max(full_s / needed_s, LEAST), 1.0)
         has_ns = plan.dt_ns if plan.bounded or plan.first_step_ns < 0 else plan.first_step_ns
         part = min(has_ns / 1e9 / needed_s, 1 / steps)
-        return interpolate(start, target, part), Slowdown(APPROACH, share, far, step, "", BEHIND_S)
+        return part, Slowdown(APPROACH, share, far, step, "", BEHIND_S)
 
 
 OVERTAKEN = Rejection("overtaken", "a newer chunk came before it was planned", quiet=True)

@@ -157,6 +157,10 @@ class ReachabilityFilter:
         found = self._solver.approach(pose, joints_rad, bounded=False)
         return found.joints_rad if found.solved else None
 
+    def nearest(self, pose: Pose, joints_rad: FloatArray) -> FloatArray:
+        """Joints (n,) whose TCP comes nearest to `pose`, from `joints_rad` (n,)."""
+        return self._solver.approach(pose, joints_rad, bounded=False).joints_rad
+
     @property
     def joints_rad(self) -> FloatArray:
         """(n,) of the model: those of the last bounded pose."""

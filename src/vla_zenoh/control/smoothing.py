@@ -111,6 +111,17 @@ class Smoother(AxisSmoother):
             return self.motion.pose
         return Pose(end[:3], orthonormal(self._anchor @ exp3(end[3:])))
 
+    def way_to(self, pose: Pose) -> FloatArray:
+        """(6,) from the smoothed pose to another, m and rad in its own axes."""
+        position_m, rotation = self.motion.pose
+        return np.concatenate([pose.position_m - position_m, log3(rotation.T @ pose.rotation)])
+
+    def axis_rates(self) -> tuple[FloatArray, FloatArray]:
+        """(6,) velocity and acceleration; those of rotation in axes that turn with the arm."""
+        (_, rotation), *rates = self.motion
+        velocity, change = (np.append(part[:3], rotation.T @ part[3:]) for part in rates)
+        return velocity, change
+
     def brake_from(self, motion: Motion) -> None:
         """Brake from the state of another motion."""
         self.reset(motion.pose)

@@ -35,12 +35,13 @@ Resize = Literal["none", "stretch", "pad", "crop"]
 Frame = Literal["base", "tcp"]
 Rotation = Literal["rpy", "rotvec", "quaternion"]
 MotionKind = Literal["delta", "absolute"]
+ActionSpace = Literal["tcp", "joint"]
 GripperSemantics = Literal["none", "delta_m", "absolute_m", "open_fraction", "binary"]
 
 ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
 
 
-MAX_CAMERAS = 16
+MAX_CAMERAS = MAX_JOINTS = 16
 
 Text = Annotated[str, Field(min_length=1, max_length=128)]
 
@@ -60,9 +61,8 @@ class _Spec(BaseModel):
 def _no_joints(kind: Any) -> Any:
     if isinstance(kind, str) and "joint" in kind:
         raise ValueError(
-            f"{kind!r} is not an action of a model file: wants 'delta' or 'absolute' poses of the "
-            "TCP. Turn joint positions into poses with "
-            "vla_zenoh.interop.action_semantics.make_forward, and declare them as 'absolute'"
+            f"{kind!r} is no kind of action; joints are declared as space='joint' with "
+            "joints=(names in the order of the columns) and kind='absolute' or 'delta'"
         )
     return kind
 
@@ -122,10 +122,15 @@ class ObservationSpec(_Spec):
 class ActionSpec(_Spec):
     """What the numbers of a chunk mean: ``[x y z | rotation | gripper]`` in each of H steps.
 
+    In joint space ``[joint 1 .. joint n | gripper]``, in rad (m for a joint that slides): the arm
+    follows the joints themselves, and `frame`, `rotation` and `position_scale_m` mean nothing.
+
     Args:
         horizon: H, steps in a chunk (at most; a shorter chunk is allowed).
         dt_s: duration of one step.
         kind: ``delta`` adds to the goal, ``absolute`` is the goal.
+        space: ``tcp`` poses of the TCP; ``joint`` positions of the arm's joints.
+        joints: names of the joints, in the order of the columns.
         frame: axes of a delta: the robot's ``base`` or the ``tcp`` at that moment. An absolute pose
             is always in the base frame.
         rotation: ``rpy`` extrinsic x, y, z in rad; ``rotvec`` axis times angle in rad;
@@ -153,14 +158,35 @@ class ActionSpec(_Spec):
     gripper_threshold: Annotated[float, AfterValidator(lambda value: value + 0.0)] = 0.5
     normalisation: Text | None = None
     pace: Literal["steady", "soonest"] = "steady"
+    space: ActionSpace = "tcp"
+    joints: Annotated[tuple[Text, ...], AfterValidator(_differ)] = Field(
+        default=(), max_length=MAX_JOINTS, strict=False
+    )
+
+    @property
+    def arm_size(self) -> int:
+        """Numbers of the arm in one step; that of the gripper follows."""
+        return len(self.joints) if self.joints else 3 + ROTATION_SIZE[self.rotation]
 
     @property
     def dimension(self) -> int:
         """D: numbers in one step."""
-        return 3 + ROTATION_SIZE[self.rotation] + (self.gripper != "none")
+        return self.arm_size + (self.gripper != "none")
+
+    @model_validator(mode="after")
+    def _joints_are_named(self) -> ActionSpec:
+        if self.space == "joint" and not self.joints:
+            raise ValueError(
+                "space 'joint' needs joints: the names of the arm's joints in column order"
+            )
+        if self.joints and self.space != "joint":
+            raise ValueError("joints are named, and space is 'tcp'; set space: joint")
+        return self
 
     @model_validator(mode="after")
     def _absolute_is_in_base(self) -> ActionSpec:
+        if self.space == "joint" and self.frame != "base":
+            raise ValueError("joints have no frame; leave frame out")
         if self.kind == "absolute" and self.frame != "base":
             raise ValueError("an absolute pose is given in the base frame; set frame: base")
         return self
